@@ -1,0 +1,1 @@
+"""The inference backends, one file each."""

@@ -1,0 +1,135 @@
+"""The protocol of a backend: ask for parameters, tell it simulations, read off a density.
+
+A backend works in *reference coordinates* z: a d-dimensional real space in which the prior is the
+standard normal wherever the model's distributions allow it. It never calls the simulator, so the
+caller owns parallelism, checkpoints and resumption.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["Backend", "Density", "Problem", "RoundInfo", "State"]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a backend knows about the model and the data.
+
+    Attributes:
+        num_parameters: Dimension d of the reference coordinates.
+        observation: Features of the observation, ``(F,)`` or a raw array for a trained network.
+        sample_prior: Draws n points from the prior, ``(n, d)``, using torch's global stream.
+        log_prior: Log density of the prior at points ``(n, d)``, shape ``(n,)``.
+        is_prior_standard_normal: Whether the prior is exactly N(0, I).
+        build_network: Makes an untrained embedding network for arrays of the observation's shape,
+            learnt jointly with the estimator; ``None`` if the features are final.
+        device: Where to train.
+    """
+
+    num_parameters: int
+    observation: Tensor
+    sample_prior: Callable[[int], Tensor]
+    log_prior: Callable[[Tensor], Tensor]
+    is_prior_standard_normal: bool = True
+    build_network: Callable[[], nn.Module] | None = None
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+
+
+class Density(ABC):
+    """A density over reference coordinates: one ensemble member's posterior given x_o."""
+
+    @abstractmethod
+    def sample(self, num_samples: int) -> Tensor:
+        """Draws ``(num_samples, d)`` from torch's global stream."""
+
+    @abstractmethod
+    def log_prob(self, z: Tensor) -> Tensor:
+        """Returns the log density at ``(n, d)``, shape ``(n,)``."""
+
+
+@dataclass(frozen=True)
+class State:
+    """What the next round needs; each backend extends it."""
+
+    round: int
+
+
+@dataclass(frozen=True)
+class RoundInfo:
+    """What a person wants to see of a round.
+
+    Attributes:
+        num_simulations: Simulations told this round.
+        num_failed: Of these, how many were dropped because they were not finite.
+        seconds: Training time.
+        losses: Figures by name, e.g. ``validation_log_prob`` per member.
+    """
+
+    num_simulations: int
+    num_failed: int
+    seconds: float
+    losses: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Backend(ABC):
+    """An inference method, INFER of Algorithm 1 (Muratore et al. 2021).
+
+    A backend is immutable: its options are constructor arguments, everything that changes is in
+    the state. :meth:`ask` and :meth:`tell` draw from torch's global stream, which the caller seeds.
+
+    Attributes:
+        name: Word that selects it, e.g. ``"snpe-c"``.
+        summary: One line for tables.
+    """
+
+    name: ClassVar[str]
+    summary: ClassVar[str]
+
+    @abstractmethod
+    def init(self, problem: Problem) -> State:
+        """Returns the state before any simulation."""
+
+    @abstractmethod
+    def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
+        """Proposes parameters to simulate, ``(num_simulations, d)``."""
+
+    @abstractmethod
+    def tell(
+        self,
+        problem: Problem,
+        state: State,
+        z: Tensor,
+        x: Tensor,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> tuple[State, RoundInfo]:
+        """Learns from a round of simulations.
+
+        Args:
+            problem: The problem given to :meth:`init`.
+            state: The present state.
+            z: Parameters simulated, ``(n, d)``.
+            x: Their features, ``(n,) + observation.shape``; rows that are not finite failed.
+            progress: Called with the fraction done and a short status.
+
+        Returns:
+            The next state and the round's figures.
+        """
+
+    @abstractmethod
+    def densities(self, problem: Problem, state: State) -> list[Density]:
+        """Returns the posterior of every ensemble member."""
+
+    @abstractmethod
+    def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Splits a state into tensors and JSON-serialisable values, to be written to disk."""
+
+    @abstractmethod
+    def restore(
+        self, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
+    ) -> State:
+        """Rebuilds a state from :meth:`tensors`."""

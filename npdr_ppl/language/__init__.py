@@ -1,0 +1,1 @@
+"""The language: channels, simulators, black-box sample sites, priors and effects."""

@@ -1,0 +1,90 @@
+"""What a simulator declares about itself: channels, parameters and ports, each with a unit."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from npdr_ppl.errors import ModelError
+
+__all__ = ["Channel", "Parameter", "Port", "PortKind"]
+
+PortKind = Literal["force", "action", "sensor", "environment"]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One column of a trajectory: a state, a sensor reading or an action.
+
+    Attributes:
+        name: Name as in data files, e.g. ``"arm_angle"``.
+        unit: SI unit, e.g. ``"rad/s"``.
+        lower: Least possible value, in ``unit``.
+        upper: Greatest possible value, in ``unit``.
+        rate_of: Name of the channel whose time derivative this one is; lets the state at a
+            segment's start be estimated from position readings alone.
+    """
+
+    name: str
+    unit: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    rate_of: str | None = None
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A domain parameter of a simulator or an effect.
+
+    Attributes:
+        name: Name as it appears as a sample site, e.g. ``"pole_mass"``.
+        unit: SI unit, ``"1"`` if it has none.
+        nominal: Data-sheet value, in ``unit``.
+        description: A few words for tables.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Port:
+    """A place where effects attach.
+
+    Attributes:
+        name: Name in sites and JSON. A group of sensor channels that one device reads joins their
+            names with commas: ``"arm_velocity,pole_velocity"``.
+        kind: What passes through: a generalised force at a joint, an action on its way to the
+            dynamics, a sensor's reading, or the environment's own quantities.
+        unit: SI unit of what passes through.
+        rated: Typical magnitude, in ``unit``; effects scale their priors by it.
+    """
+
+    name: str
+    kind: PortKind
+    unit: str
+    rated: float = 1.0
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels that the port covers."""
+        return tuple(self.name.split(","))
+
+
+def find_port(ports: tuple[Port, ...], name: str, simulator_name: str) -> Port:
+    """Returns the port called ``name``; groups of sensor ports are formed on demand.
+
+    Raises:
+        ModelError: There is no such port, or the group mixes kinds.
+    """
+    by_name = {port.name: port for port in ports}
+    if name in by_name:
+        return by_name[name]
+    members = [by_name[part] for part in name.split(",") if part in by_name]
+    if len(members) == len(name.split(",")) and all(port.kind == "sensor" for port in members):
+        return Port(name, "sensor", members[0].unit, max(port.rated for port in members))
+    raise ModelError(
+        f"{simulator_name} has no port {name!r}; its ports are "
+        f"{', '.join(sorted(by_name)) or '(none)'}."
+    )

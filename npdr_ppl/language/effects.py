@@ -1,0 +1,195 @@
+"""Effects: physical causes a simulator may miss, declared once and attached to ports.
+
+An effect is data plus one law. The law is written against plain tensors that carry the batch
+dimensions, so any engine that can hand over velocities, commands or readings can apply it.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.channels import Parameter, Port, PortKind
+
+__all__ = [
+    "ActionEffect",
+    "Commands",
+    "Effect",
+    "EnvironmentEffect",
+    "ForceEffect",
+    "SensorEffect",
+]
+
+
+class Effect(ABC):
+    """One physical cause with a law, parameters with units and priors, and a port.
+
+    The parameters' nominal value is zero strength: with it the simulator reproduces its
+    trajectory without the effect bit for bit.
+
+    Args:
+        port: Name of the port to attach to.
+        priors: Priors that replace the effect's own, by parameter name.
+
+    Attributes:
+        id: Name in code and JSON, e.g. ``"coulomb_friction"``.
+        port_kinds: Kinds of port the effect can attach to.
+        parameters: Its parameters; units are those of :meth:`prior`'s scale at the port.
+    """
+
+    id: ClassVar[str]
+    port_kinds: ClassVar[tuple[PortKind, ...]]
+    parameters: ClassVar[tuple[Parameter, ...]]
+
+    def __init__(self, port: str, *, priors: Mapping[str, Distribution] | None = None) -> None:
+        self.port = port
+        self._priors = dict(priors or {})
+        unknown = sorted(set(self._priors) - {parameter.name for parameter in self.parameters})
+        if unknown:
+            raise ModelError(
+                f"{self.id} has no parameter {', '.join(unknown)}; it has "
+                f"{', '.join(parameter.name for parameter in self.parameters)}."
+            )
+
+    @abstractmethod
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Returns the priors of all parameters, scaled to the port's rated value."""
+
+    def priors(self, port: Port) -> dict[str, Distribution]:
+        """Returns the priors of all parameters, the user's where given."""
+        return {**self.default_priors(port), **self._priors}
+
+    @property
+    def name(self) -> str:
+        """``"<port>.<effect>"``, unique within a simulator."""
+        return f"{self.port}.{self.id}"
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the sample sites: ``"<port>.<effect>.<parameter>"``."""
+        return tuple(f"{self.name}.{parameter.name}" for parameter in self.parameters)
+
+    def own_parameters(self, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Picks this effect's parameters by their short names; missing ones have no strength."""
+        some = next(iter(parameters.values()), torch.zeros(()))
+        return {
+            parameter.name: parameters[site]
+            if site in parameters
+            else torch.as_tensor(parameter.nominal, dtype=some.dtype, device=some.device)
+            for parameter, site in zip(self.parameters, self.parameter_names, strict=True)
+        }
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(port={self.port!r})"
+
+
+class ForceEffect(Effect):
+    """An effect at a joint: a generalised force, a dry friction, or both."""
+
+    port_kinds: ClassVar[tuple[PortKind, ...]] = ("force",)
+
+    def initial_memory(self, position: Tensor, velocity: Tensor) -> Any:
+        """Returns the effect's own state at a segment's start; ``None`` if it has none."""
+        return None
+
+    def force(
+        self,
+        position: Tensor,
+        velocity: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: Any,
+    ) -> Tensor | None:
+        """Returns a generalised force that is smooth in the state, or ``None``.
+
+        Evaluated within the integrator's stages.
+        """
+        return None
+
+    def dry_friction(
+        self,
+        position: Tensor,
+        velocity: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: Any,
+    ) -> Tensor | None:
+        """Returns the greatest magnitude of dry friction, or ``None``.
+
+        The engine applies up to this much against the motion, and at rest just what keeps the
+        joint at rest (stiction): the set-valued law of Coulomb, solved within a step instead of
+        smoothed.
+        """
+        return None
+
+    def next_memory(
+        self,
+        position: Tensor,
+        velocity: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: Any,
+        time_step: float,
+    ) -> Any:
+        """Returns the effect's own state one step later."""
+        return memory
+
+
+class Commands(ABC):
+    """The commands given so far, as an action effect sees them."""
+
+    @abstractmethod
+    def now(self) -> Tensor:
+        """Returns the present command."""
+
+    @abstractmethod
+    def delayed(self, steps: Tensor) -> Tensor:
+        """Returns the command of ``steps`` (whole numbers, ≥ 0) steps ago, batch-wise."""
+
+
+class ActionEffect(Effect):
+    """An effect on a command on its way to the dynamics."""
+
+    port_kinds: ClassVar[tuple[PortKind, ...]] = ("action",)
+
+    def initial_memory(self, command: Tensor) -> Any:
+        """Returns the effect's own state at a segment's start; ``None`` if it has none."""
+        return None
+
+    @abstractmethod
+    def act(
+        self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns what reaches the dynamics during this step, and the next memory."""
+
+
+class SensorEffect(Effect):
+    """An effect between the true value of a channel and its reading."""
+
+    port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
+
+    def initial_memory(self, value: Tensor, reading: Tensor) -> Any:
+        """Returns the effect's own state at a segment's start; ``None`` if it has none.
+
+        Args:
+            value: True value of the channel at the start.
+            reading: What the sensor reported there.
+        """
+        return None
+
+    @abstractmethod
+    def read(
+        self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns the reading after a step, and the next memory."""
+
+
+class EnvironmentEffect(Effect):
+    """An effect that changes a quantity of the environment before the simulation starts."""
+
+    port_kinds: ClassVar[tuple[PortKind, ...]] = ("environment",)
+
+    @abstractmethod
+    def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
+        """Returns the changed quantity, e.g. the gravity vector (x, y, z) in m/s²."""

@@ -1,0 +1,140 @@
+"""The protocol of a simulator: anything that maps parameters and inputs to a trajectory."""
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.errors import DataError, ModelError
+from npdr_ppl.language.channels import Channel, Parameter, Port, find_port
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.inputs import Inputs
+
+__all__ = ["Simulator"]
+
+
+class Simulator(ABC):
+    """Maps domain parameters and inputs to the readings of a trajectory, in batches.
+
+    Only :meth:`simulate` is required; everything else is declaration. Simulators are immutable:
+    :meth:`with_effects` returns a changed copy.
+
+    Attributes:
+        states: The state's components.
+        actions: The action channels.
+        sensors: The channels of a trajectory, what the sensors report.
+        parameters: Domain parameters with nominal values; a parameter that a model does not
+            sample keeps its nominal value.
+        ports: Where effects attach.
+        time_step: Seconds per step.
+        is_deterministic: Whether equal parameters and inputs give equal trajectories.
+        is_differentiable: Whether gradients flow from trajectories to parameters.
+        effects: The effects attached, in the order of attachment.
+    """
+
+    states: tuple[Channel, ...]
+    actions: tuple[Channel, ...]
+    sensors: tuple[Channel, ...]
+    parameters: tuple[Parameter, ...]
+    ports: tuple[Port, ...] = ()
+    time_step: float
+    is_deterministic: bool = True
+    is_differentiable: bool = False
+    effects: tuple[Effect, ...] = ()
+
+    @abstractmethod
+    def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
+        """Replays the inputs' actions from the inputs' initial states.
+
+        Args:
+            parameters: Values by name, in the declared units, each of a shape that broadcasts to
+                the batch shape B. Missing ones are nominal. Parameters of attached effects are
+                named ``"<port>.<effect>.<parameter>"``.
+            inputs: Segments to simulate.
+
+        Returns:
+            Readings *after* each step, shape ``B + (segments, steps, sensors)``, in the sensors'
+            units; zero where ``inputs.mask`` is false.
+        """
+
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        return type(self).__name__
+
+    def with_effects(self, *effects: Effect) -> Self:
+        """Returns a copy with effects attached after the present ones.
+
+        Raises:
+            ModelError: A port does not exist, has the wrong kind, or the effect is there already.
+        """
+        changed = copy.copy(self)
+        for effect in effects:
+            port = find_port(self.ports, effect.port, self.name)
+            if port.kind not in effect.port_kinds:
+                raise ModelError(
+                    f"{effect.id} attaches to a port of kind {' or '.join(effect.port_kinds)}, "
+                    f"but {port.name!r} of {self.name} is of kind {port.kind}."
+                )
+            if effect.name in {present.name for present in changed.effects}:
+                raise ModelError(f"{effect.name} is attached to {self.name} already.")
+            changed.effects = (*changed.effects, effect)
+        return changed
+
+    def port(self, name: str) -> Port:
+        """Returns the port called ``name``; see :class:`Port` for groups."""
+        return find_port(self.ports, name, self.name)
+
+    def check_parameters(self, parameters: Mapping[str, Tensor]) -> None:
+        """Raises a ModelError that lists parameters this simulator does not have."""
+        known = {parameter.name for parameter in self.parameters}
+        known |= {name for effect in self.effects for name in effect.parameter_names}
+        unknown = sorted(set(parameters) - known)
+        if unknown:
+            raise ModelError(
+                f"{self.name} has no parameter {', '.join(unknown)}; "
+                f"it has {', '.join(sorted(known))}."
+            )
+
+    def check_inputs(self, inputs: Inputs) -> None:
+        """Raises a DataError where the inputs' channels or time step do not fit."""
+        missing = [a.name for a in self.actions if a.name not in inputs.action_names]
+        if missing:
+            raise DataError(
+                f"{self.name} needs the action {', '.join(missing)}; the data have "
+                f"{', '.join(inputs.action_names) or 'no actions'}."
+            )
+
+    def initial_states(self, inputs: Inputs) -> tuple[Tensor, ...]:
+        """Returns each state component at the start of each segment, ``(..., S)`` each.
+
+        A rate whose position is measured is taken from the estimated derivative of the position
+        readings where the inputs carry one, otherwise from its own reading.
+
+        Raises:
+            DataError: A component was neither recorded nor can be estimated.
+        """
+        columns = {name: i for i, name in enumerate(inputs.channel_names)}
+        result = []
+        for state in self.states:
+            if inputs.initial_rates is not None and state.rate_of in columns:
+                result.append(inputs.initial_rates[..., columns[state.rate_of]])
+            elif state.name in columns:
+                result.append(inputs.initial_values[..., columns[state.name]])
+            else:
+                raise DataError(
+                    f"{state.name} was not recorded, so the state at a segment's start is "
+                    "unknown; use initial_state='estimated' with readings of "
+                    f"{state.rate_of or state.name}."
+                )
+        return tuple(result)
+
+    def nominal(self) -> dict[str, Tensor]:
+        """Returns the nominal parameters as scalar float64 tensors."""
+        return {
+            parameter.name: torch.tensor(parameter.nominal, dtype=torch.float64)
+            for parameter in self.parameters
+        }
