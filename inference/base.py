@@ -80,7 +80,7 @@ class Backend(ABC):
     """An inference method, INFER of Algorithm 1 (Muratore et al. 2021).
 
     A backend is immutable: its options are constructor arguments, everything that changes is in
-    the state. :meth:`ask` and :meth:`tell` draw from torch's global stream, which the caller seeds.
+    the state. :meth:`ask` and :meth:`tell` draw from torch's global stream; the caller seeds it.
 
     Attributes:
         name: Word that selects it, e.g. ``"snpe-c"``.

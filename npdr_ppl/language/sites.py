@@ -118,7 +118,7 @@ class BlackBox(TorchDistribution):
         expanded._batch_shape = batch_shape
         return expanded
 
-    def sample(self, sample_shape: torch.Size | tuple[int, ...] = torch.Size()) -> Tensor:
+    def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         """Simulates the whole batch, and adds the noise where there is one."""
         with torch.no_grad():
             shape = torch.Size(sample_shape) + self.batch_shape
@@ -139,6 +139,22 @@ class BlackBox(TorchDistribution):
         Raises:
             IntractableError: No noise was declared, or the simulator is itself random.
         """
+        pointwise, event_dim = self._pointwise_log_prob(value)
+        return pointwise.flatten(-event_dim).sum(-1) if event_dim else pointwise
+
+    def segment_log_prob(self, value: Tensor) -> Tensor:
+        """Returns the density of each segment, batch shape plus ``(segments,)``.
+
+        A plain function's first event dimension takes the segments' place.
+
+        Raises:
+            IntractableError: As :meth:`log_prob`.
+        """
+        pointwise, event_dim = self._pointwise_log_prob(value)
+        return pointwise.flatten(1 - event_dim).sum(-1) if event_dim > 1 else pointwise
+
+    def _pointwise_log_prob(self, value: Tensor) -> tuple[Tensor, int]:
+        """Returns the density of every reading and the number of event dimensions."""
         if self.noise is None:
             raise IntractableError(
                 f"The density of site {self.site!r} is intractable, because its simulator is a "
@@ -158,25 +174,7 @@ class BlackBox(TorchDistribution):
         mask = self._mask()
         if mask is not None:
             log_prob = torch.where(mask, log_prob, torch.zeros_like(log_prob))
-        return log_prob.flatten(-event_dim).sum(-1) if event_dim else log_prob
-
-    def segment_log_prob(self, value: Tensor) -> Tensor:
-        """Returns the density of each segment, batch shape plus ``(segments,)``.
-
-        Raises:
-            IntractableError: As :meth:`log_prob`.
-        """
-        if self.noise is None or not self._is_deterministic:
-            return self.log_prob(value)
-        output = self._run(self.batch_shape)
-        event_dim = output.dim() - len(self.batch_shape)
-        log_prob = reading_distribution(
-            self.noise, output, event_dim, self._channel_names
-        ).log_prob(value.to(output.dtype))
-        mask = self._mask()
-        if mask is not None:
-            log_prob = torch.where(mask, log_prob, torch.zeros_like(log_prob))
-        return log_prob.flatten(1 - event_dim).sum(-1)
+        return log_prob, event_dim
 
 
 class SimulatorBlackBox(BlackBox):

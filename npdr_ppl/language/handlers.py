@@ -1,0 +1,144 @@
+"""Effect handlers: change a model's black-box sites without touching the model's code."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pyro
+import torch
+from pyro.poutine.messenger import Messenger
+
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
+
+__all__ = ["EffectMessenger", "ModelWithEffects", "SkipSimulation", "add_effect", "remove_effect"]
+
+Model = Callable[..., Any]
+
+
+class EffectMessenger(Messenger):
+    """Attaches one effect to the simulators of a program while it runs.
+
+    Inside the handler the effect's parameters become sample sites
+    ``"<port>.<effect>.<parameter>"``, drawn right before the black-box site they act on. Several
+    black-box sites whose simulators have the port share one device and therefore the parameters.
+
+    Args:
+        effect: The effect.
+        site: Name of the only black-box site to attach to; ``None`` for all that have the port.
+    """
+
+    def __init__(self, effect: Effect, site: str | None = None) -> None:
+        super().__init__()
+        self.effect = effect
+        self.site = site
+        self._drawn: dict[str, torch.Tensor] | None = None
+        self._attached = False
+
+    def __enter__(self) -> Any:
+        self._drawn = None
+        self._attached = False
+        return super().__enter__()
+
+    def __exit__(self, exc_type: Any, exc_value: Any, traceback: Any) -> Any:
+        if exc_type is None and not self._attached:
+            raise ModelError(
+                f"{self.effect!r} found no black-box site to attach to"
+                + (f" (looked for {self.site!r})." if self.site else ".")
+            )
+        return super().__exit__(exc_type, exc_value, traceback)
+
+    def _pyro_sample(self, msg: Any) -> None:
+        box = msg["fn"]
+        if not isinstance(box, SimulatorBlackBox):
+            return
+        if self.site is not None and msg["name"] != self.site:
+            return
+        if self._drawn is None:
+            priors = self.effect.priors(box.simulator.port(self.effect.port))
+            self._drawn = {
+                f"{self.effect.name}.{name}": pyro.sample(f"{self.effect.name}.{name}", prior)
+                for name, prior in priors.items()
+            }
+        changed = box.with_effects(self.effect, parameters=self._drawn)
+        # The plates may have expanded the site already, because they are entered inside.
+        shape = torch.broadcast_shapes(changed.batch_shape, box.batch_shape)
+        msg["fn"] = changed.expand(shape)
+        self._attached = True
+
+
+class ModelWithEffects:
+    """A Pyro model with effects attached; calling it runs the base model inside the handlers.
+
+    Attributes:
+        base: The model without effects.
+        effects: The effects with the site each is restricted to, in the order of attachment.
+    """
+
+    def __init__(self, base: Model, effects: tuple[tuple[Effect, str | None], ...]) -> None:
+        self.base = base
+        self.effects = effects
+        self.__name__ = getattr(base, "__name__", type(base).__name__)
+        self.__doc__ = base.__doc__
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Runs the base model with all effects attached."""
+        run = self.base
+        # The handler entered last sees a site first, so the last effect goes outside.
+        for effect, site in self.effects:
+            run = EffectMessenger(effect, site)(run)
+        return run(*args, **kwargs)
+
+    def __repr__(self) -> str:
+        names = " + ".join(effect.name for effect, _ in self.effects)
+        return f"{self.__name__} + {names}"
+
+
+def add_effect(model: Model, effect: Effect, *, site: str | None = None) -> ModelWithEffects:
+    """Returns the model with an effect attached; it is still a Pyro model.
+
+    Args:
+        model: A Pyro model with a black-box site.
+        effect: The effect, bound to a port.
+        site: Name of the black-box site to attach to; ``None`` for all that have the port.
+
+    Raises:
+        ModelError: The effect is attached already.
+    """
+    base, effects = _parts(model)
+    if effect.name in {present.name for present, _ in effects}:
+        raise ModelError(f"{effect.name} is attached to {model!r} already.")
+    return ModelWithEffects(base, (*effects, (effect, site)))
+
+
+def remove_effect(model: Model, name: str) -> Model:
+    """Returns the model without the effect called ``"<port>.<effect>"``.
+
+    Raises:
+        ModelError: The model has no such effect.
+    """
+    base, effects = _parts(model)
+    kept = tuple((effect, site) for effect, site in effects if effect.name != name)
+    if len(kept) == len(effects):
+        present = ", ".join(effect.name for effect, _ in effects) or "none"
+        raise ModelError(f"The model has no effect {name!r}; it has {present}.")
+    return ModelWithEffects(base, kept) if kept else base
+
+
+def _parts(model: Model) -> tuple[Model, tuple[tuple[Effect, str | None], ...]]:
+    if isinstance(model, ModelWithEffects):
+        return model.base, model.effects
+    return model, ()
+
+
+class SkipSimulation(Messenger):
+    """Runs a program without simulating: black-box sites get zeros of the right shape.
+
+    For looking at a program's priors only.
+    """
+
+    def _pyro_sample(self, msg: Any) -> None:
+        box = msg["fn"]
+        if isinstance(box, BlackBox) and msg["value"] is None:
+            event = box.event_shape if isinstance(box, SimulatorBlackBox) else torch.Size()
+            msg["value"] = torch.zeros(()).expand(box.batch_shape + event)
