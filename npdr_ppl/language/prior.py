@@ -1,0 +1,281 @@
+"""The prior of a whole program, in reference coordinates.
+
+Site by site, in the order in which the program samples them, each latent site is written as a
+function of standard normal coordinates and of the sites before it (see
+:mod:`npdr_ppl.language.reference`). The joint prior of any program, dependent and hierarchical
+ones included, thereby becomes N(0, I), and every point maps to a plausible parameter.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pyro
+import torch
+from pyro import poutine
+from pyro.poutine.messenger import Messenger
+from pyro.poutine.util import site_is_subsample
+from torch import Tensor
+
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.handlers import SkipSimulation
+from npdr_ppl.language.reference import reference_map
+from npdr_ppl.language.sites import BlackBox
+
+__all__ = ["LatentSite", "Prior"]
+
+BATCH_PLATE = "_npdr_batch"
+
+
+@dataclass(frozen=True)
+class LatentSite:
+    """A latent sample site of a program.
+
+    Attributes:
+        name: Name of the site.
+        batch_shape: Shape of its plates.
+        shape: Shape of one value, plates included.
+        coordinate_shape: Shape of its reference coordinates, plates included.
+        coordinates: Its place in the vector z.
+        dtype: Precision in which the program samples it.
+    """
+
+    name: str
+    batch_shape: torch.Size
+    shape: torch.Size
+    coordinate_shape: torch.Size
+    coordinates: slice
+    dtype: torch.dtype
+
+
+class Prior:
+    """The joint prior of a program's latent sites.
+
+    Args:
+        model: A Pyro model.
+        args: Its positional arguments.
+
+    Attributes:
+        sites: The latent sites, in the order of sampling.
+        black_boxes: Names of the black-box sites.
+        num_parameters: Dimension d of the reference coordinates.
+        is_standard_normal: Whether the prior over z is exactly N(0, I).
+        max_plate_nesting: Depth of the model's plates.
+
+    Raises:
+        ModelError: A latent site is discrete, there is none, or an ordinary site is observed
+            whose density depends on latent sites.
+    """
+
+    def __init__(self, model: Callable[..., Any], args: tuple[Any, ...] = ()) -> None:
+        self.model = model
+        self.args = args
+        with torch.no_grad(), torch.random.fork_rng(devices=[]), SkipSimulation():
+            torch.manual_seed(0)
+            prototype = poutine.trace(model).get_trace(*args)
+        self.black_boxes = tuple(
+            name for name, site in _samples(prototype) if isinstance(site["fn"], BlackBox)
+        )
+        self.sites: tuple[LatentSite, ...] = self._latent_sites(prototype)
+        if not self.sites:
+            raise ModelError("The model has no latent sample sites, so there is nothing to infer.")
+        self.num_parameters = self.sites[-1].coordinates.stop
+        self._check_observed_sites(prototype)
+
+    def _latent_sites(self, prototype: Any) -> tuple[LatentSite, ...]:
+        depths = [0]
+        sites = []
+        stop = 0
+        self.is_standard_normal = True
+        for name, site in _samples(prototype):
+            depths += [-frame.dim for frame in site["cond_indep_stack"] if frame.dim is not None]
+            if site["is_observed"] or name in self.black_boxes:
+                continue
+            fn = site["fn"]
+            if fn.support.is_discrete:
+                raise ModelError(
+                    f"Site {name!r} is discrete ({type(fn).__name__}); latent sites must be "
+                    "continuous: marginalise it inside the simulator, or relax it."
+                )
+            to_value = reference_map(fn)
+            self.is_standard_normal &= to_value.is_standard_normal
+            coordinate_shape = torch.Size(fn.batch_shape + to_value.event_shape)
+            start, stop = stop, stop + coordinate_shape.numel()
+            sites.append(
+                LatentSite(
+                    name,
+                    torch.Size(fn.batch_shape),
+                    site["value"].shape,
+                    coordinate_shape,
+                    slice(start, stop),
+                    site["value"].dtype,
+                )
+            )
+        self.max_plate_nesting = max(depths)
+        return tuple(sites)
+
+    def _check_observed_sites(self, prototype: Any) -> None:
+        """Refuses ordinary likelihoods, which no likelihood-free backend would see."""
+        ordinary = [
+            name
+            for name, site in _samples(prototype)
+            if site["is_observed"] and name not in self.black_boxes
+        ]
+        if not ordinary:
+            return
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            trace = self._run(_WriteCoordinates(self, torch.randn(8, self.num_parameters)))
+        for name in ordinary:
+            site = trace.nodes[name]
+            log_prob = site["fn"].log_prob(site["value"])
+            if log_prob.numel() > 1 and not torch.allclose(
+                log_prob, log_prob.flatten()[0].expand_as(log_prob)
+            ):
+                raise ModelError(
+                    f"Site {name!r} is observed and depends on latent sites, but is not a "
+                    "black-box site; declare it with npdr.simulate, or use NUTS."
+                )
+
+    def sample(self, num_samples: int) -> Tensor:
+        """Draws z from the prior, ``(num_samples, d)`` float64, from torch's global stream."""
+        if self.is_standard_normal:
+            return torch.randn(num_samples, self.num_parameters, dtype=torch.float64)
+        with torch.no_grad(), SkipSimulation(), self._plate(num_samples):
+            trace = poutine.trace(self.model).get_trace(*self.args)
+        return self.to_reference(
+            {
+                site.name: self._without_padding(site, trace.nodes[site.name]["value"])
+                for site in self.sites
+            }
+        )
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        """Returns the log density of the prior over z, ``(n,)``, at ``(n, d)``."""
+        z = z.detach().double()
+        if self.is_standard_normal:
+            return -0.5 * (z.square() + math.log(2 * math.pi)).sum(-1)
+        writer = _WriteCoordinates(self, z)
+        self._run(writer)
+        return writer.log_prob
+
+    def to_parameters(self, z: Tensor) -> dict[str, Tensor]:
+        """Maps z, ``(n, d)``, to the values of every latent site, ``(n,) + site.shape``."""
+        trace = self._run(_WriteCoordinates(self, z))
+        return {
+            site.name: self._without_padding(site, trace.nodes[site.name]["value"])
+            for site in self.sites
+        }
+
+    def to_reference(self, parameters: dict[str, Tensor]) -> Tensor:
+        """Maps values of every latent site, ``(n,) + site.shape``, to z, ``(n, d)``."""
+        num = next(iter(parameters.values())).shape[0]
+        data = {
+            site.name: self._with_padding(site, parameters[site.name].to(site.dtype))
+            for site in self.sites
+        }
+        messenger = _ReadCoordinates(self)
+        with torch.no_grad(), SkipSimulation(), self._plate(num):
+            with poutine.condition(data=data), messenger:
+                self.model(*self.args)
+        return torch.cat([messenger.z[site.name].expand(num, -1) for site in self.sites], dim=-1)
+
+    def log_prob_parameters(self, z: Tensor) -> Tensor:
+        """Returns the prior's log density over the parameters at z, ``(n,)``."""
+        trace = self._run(_WriteCoordinates(self, z))
+        total = torch.zeros(z.shape[0], dtype=torch.float64)
+        for site in self.sites:
+            node = trace.nodes[site.name]
+            total = total + _per_point(node["fn"].log_prob(node["value"]), z.shape[0])
+        return total
+
+    def log_jacobian(self, z: Tensor) -> Tensor:
+        """Returns log |∂ξ/∂z|, ``(n,)``, so that log q(ξ) = log q(z) − log |∂ξ/∂z|."""
+        return self.log_prob(z) - self.log_prob_parameters(z)
+
+    def execute(self, z: Tensor) -> dict[str, Tensor]:
+        """Simulates the program at n points, ``(n, d)``, at once.
+
+        Returns:
+            The output of each black-box site, ``(n,) + plates + event``.
+        """
+        writer = _WriteCoordinates(self, z)
+        with torch.no_grad(), writer, self._plate(z.shape[0]):
+            trace = poutine.trace(self.model).get_trace(*self.args)
+        result = {}
+        for name in self.black_boxes:
+            node = trace.nodes[name]
+            depths = [
+                -frame.dim for frame in node["cond_indep_stack"] if frame.name != BATCH_PLATE
+            ]
+            # Dimensions of plates that do not enclose this site stand behind the batch.
+            skipped = self.max_plate_nesting - max(depths, default=0)
+            value = node["value"]
+            result[name] = value.reshape((value.shape[0], *value.shape[1 + skipped :]))
+        return result
+
+    def _run(self, writer: "_WriteCoordinates") -> Any:
+        """Runs the program at all of a writer's points at once, without simulating."""
+        with torch.no_grad(), SkipSimulation(), writer, self._plate(writer.num_points):
+            return poutine.trace(self.model).get_trace(*self.args)
+
+    def _plate(self, num: int) -> Any:
+        return pyro.plate(BATCH_PLATE, num, dim=-1 - self.max_plate_nesting)
+
+    def _with_padding(self, site: LatentSite, value: Tensor) -> Tensor:
+        padding = (1,) * (self.max_plate_nesting - len(site.batch_shape))
+        return value.reshape((value.shape[0], *padding, *site.shape))
+
+    def _without_padding(self, site: LatentSite, value: Tensor) -> Tensor:
+        return value.reshape((value.shape[0], *site.shape))
+
+
+class _WriteCoordinates(Messenger):
+    """Gives each latent site the value that its coordinates stand for."""
+
+    def __init__(self, prior: Prior, z: Tensor) -> None:
+        super().__init__()
+        self._sites = {site.name: site for site in prior.sites}
+        self._z = z.detach().double()
+        self.num_points = z.shape[0]
+        self.log_prob = torch.zeros(self.num_points, dtype=torch.float64)
+
+    def _pyro_sample(self, msg: Any) -> None:
+        site = self._sites.get(msg["name"])
+        if site is None:
+            return
+        fn = msg["fn"]
+        to_value = reference_map(fn)
+        z = self._z[:, site.coordinates].reshape(tuple(fn.batch_shape) + to_value.event_shape)
+        msg["value"] = to_value(z).to(site.dtype)
+        self.log_prob = self.log_prob + _per_point(to_value.log_prob(z), self.num_points)
+
+
+class _ReadCoordinates(Messenger):
+    """Reads the coordinates of each latent site off its value."""
+
+    def __init__(self, prior: Prior) -> None:
+        super().__init__()
+        self._sites = {site.name: site for site in prior.sites}
+        self.z: dict[str, Tensor] = {}
+
+    def _pyro_post_sample(self, msg: Any) -> None:
+        if msg["name"] in self._sites:
+            z = reference_map(msg["fn"]).inverse(msg["value"])
+            self.z[msg["name"]] = z.double().reshape(z.shape[0], -1)
+
+
+def _samples(trace: Any) -> list[tuple[str, Any]]:
+    return [
+        (name, site)
+        for name, site in trace.nodes.items()
+        if site["type"] == "sample" and not site_is_subsample(site)
+    ]
+
+
+def _per_point(log_prob: Tensor, num_points: int) -> Tensor:
+    """Sums a log density over all dimensions but the batch's."""
+    if log_prob.dim() == 0:
+        return log_prob.expand(num_points)
+    return log_prob.flatten(1).sum(-1) if log_prob.dim() > 1 else log_prob
