@@ -1,0 +1,558 @@
+"""Rollouts: an immutable set of recorded or simulated episodes."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.rollouts import checks, segments
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Rollouts"]
+
+Array = NDArray[np.float64]
+Path = str | PathLike[str]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Rollouts:
+    """R recorded or simulated episodes with the same columns and the same time step.
+
+    Episodes may differ in length: T below is the number of steps of one of them. The readings
+    need not be the whole state, e.g. a position without its velocity.
+
+    Attributes:
+        readings: What the sensors reported before each step and after the last, one
+            ``(T + 1, C)`` per rollout, in ``channel_units``.
+        actions: Commands, each held for one step, one ``(T, A)`` per rollout, in ``action_units``.
+        channel_names: Names of the C channels.
+        action_names: Names of the A actions.
+        time_step: Seconds between readings.
+        rewards: Rewards of the steps, one ``(T,)`` per rollout, or ``None``.
+        time: Time stamps in s, one ``(T + 1,)`` per rollout; ``k·time_step`` if not given.
+        channel_units: Units of the channels, ``""`` where unknown.
+        action_units: Units of the actions, ``""`` where unknown.
+
+    Raises:
+        DataError: Columns are named wrongly, shapes do not fit each other, values are not finite,
+            or the sampling is not constant.
+    """
+
+    readings: tuple[Array, ...]
+    actions: tuple[Array, ...]
+    channel_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+    time_step: float
+    rewards: tuple[Array, ...] | None = None
+    time: tuple[Array, ...] = ()
+    channel_units: tuple[str, ...] = ()
+    action_units: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Copies the arrays, makes them read-only and checks them."""
+        freeze = object.__setattr__
+        checks.check_names((*self.channel_names, *self.action_names), "column")
+        taken = set(checks.RESERVED_NAMES) & {*self.channel_names, *self.action_names}
+        if taken:
+            raise DataError(f"{min(taken)} is a reserved name, not a channel's or an action's.")
+        if not self.channel_names:
+            raise DataError("the data have no channels, only actions.")
+        if not self.readings:
+            raise DataError("the data have no rollouts.")
+        if not (math.isfinite(self.time_step) and self.time_step > 0):
+            raise DataError(f"the time step is {self.time_step} s, but it must be positive.")
+        time_step = float(self.time_step)
+        freeze(self, "time_step", time_step)
+        freeze(self, "channel_names", tuple(self.channel_names))
+        freeze(self, "action_names", tuple(self.action_names))
+        freeze(self, "readings", tuple(_frozen(values) for values in self.readings))
+        freeze(self, "actions", tuple(_frozen(values) for values in self.actions))
+        if not self.time:
+            lengths = (len(values) for values in self.readings)
+            freeze(self, "time", tuple(time_step * np.arange(length) for length in lengths))
+        freeze(self, "time", tuple(_frozen(values) for values in self.time))
+        if self.rewards is not None:
+            freeze(self, "rewards", tuple(_frozen(values) for values in self.rewards))
+        for field, names in (
+            ("channel_units", self.channel_names),
+            ("action_units", self.action_names),
+        ):
+            units = tuple(getattr(self, field)) or ("",) * len(names)
+            if len(units) != len(names):
+                raise DataError(f"{field} has {len(units)} entries for {len(names)} columns.")
+            freeze(self, field, units)
+        self._check_arrays()
+
+    def _check_arrays(self) -> None:
+        per_rollout = {"actions": self.actions, "time": self.time, "rewards": self.rewards}
+        for name, arrays in per_rollout.items():
+            if arrays is not None and len(arrays) != len(self.readings):
+                raise DataError(
+                    f"there are {len(self.readings)} rollouts of readings, but {len(arrays)} of "
+                    f"{name}."
+                )
+        for index, readings in enumerate(self.readings):
+            where = f"rollout {index}"
+            steps = len(readings) - 1
+            if steps < 1:
+                raise DataError(
+                    f"{where} has {steps + 1} row, but at least two are needed for one step."
+                )
+            wanted = {
+                "readings": (readings, (steps + 1, len(self.channel_names))),
+                "actions": (self.actions[index], (steps, len(self.action_names))),
+                "time": (self.time[index], (steps + 1,)),
+            }
+            if self.rewards is not None:
+                wanted["rewards"] = (self.rewards[index], (steps,))
+            for name, (values, shape) in wanted.items():
+                if values.shape != shape:
+                    raise DataError(
+                        f"{name} of {where} should have shape {shape}, got {values.shape}."
+                    )
+            checks.check_finite(readings, self.channel_names, where)
+            checks.check_finite(self.actions[index], self.action_names, where)
+            checks.check_finite(self.time[index][:, None], ("time",), where)
+            if self.rewards is not None:
+                checks.check_finite(self.rewards[index][:, None], ("reward",), where)
+            checks.check_time(self.time[index], where)
+        found = checks.canonical_time_step(self.time)
+        if abs(found - self.time_step) > checks.MAX_RATE_DIFFERENCE * self.time_step:
+            raise DataError(
+                f"time stamps are {found:.6g} s apart, but the time step is said to be "
+                f"{self.time_step:.6g} s."
+            )
+
+    # -- Construction ------------------------------------------------------------------------
+
+    @classmethod
+    def from_arrays(
+        cls,
+        readings: ArrayLike | Tensor | Sequence[Any],
+        actions: ArrayLike | Tensor | Sequence[Any] | None = None,
+        *,
+        channel_names: Sequence[str],
+        action_names: Sequence[str] = (),
+        time_step: float | None = None,
+        rewards: ArrayLike | Tensor | Sequence[Any] | None = None,
+        time: ArrayLike | Tensor | Sequence[Any] | None = None,
+        channel_units: Sequence[str] = (),
+        action_units: Sequence[str] = (),
+    ) -> "Rollouts":
+        """Makes rollouts of arrays or tensors.
+
+        Args:
+            readings: ``(R, T + 1, C)``, or a list of ``(T + 1, C)`` of different lengths.
+            actions: ``(R, T, A)`` or a list of ``(T, A)``; ``None`` where nothing is commanded.
+            channel_names: Names of the C channels.
+            action_names: Names of the A actions.
+            time_step: Seconds between readings; may be left out where ``time`` is given.
+            rewards: ``(R, T)`` or a list of ``(T,)``.
+            time: Time stamps in s, ``(R, T + 1)`` or a list of ``(T + 1,)``.
+            channel_units: Units of the channels.
+            action_units: Units of the actions.
+
+        Raises:
+            DataError: The arrays do not fit each other or are not valid data.
+        """
+        values = _arrays(readings, "readings")
+        times = () if time is None else _arrays(time, "time")
+        if time_step is None:
+            if not times or min(len(t) for t in times) < 2:
+                raise DataError("give a time step or time stamps of at least two readings.")
+            time_step = checks.canonical_time_step(times)
+        if actions is None:
+            commands = tuple(np.zeros((max(len(v) - 1, 0), 0)) for v in values)
+        else:
+            commands = _arrays(actions, "actions")
+        return cls(
+            readings=values,
+            actions=commands,
+            channel_names=tuple(channel_names),
+            action_names=tuple(action_names),
+            time_step=time_step,
+            rewards=None if rewards is None else _arrays(rewards, "rewards"),
+            time=times,
+            channel_units=tuple(channel_units),
+            action_units=tuple(action_units),
+        )
+
+    @classmethod
+    def from_csv(cls, path: Path, *, actions: Sequence[str] | None = None) -> "Rollouts":
+        """Reads a CSV file with the columns ``rollout,time,<channels…>,<actions…>``.
+
+        Units are SI. Actions, and a column ``reward``, are the columns that are empty in the last
+        row of every rollout: there is one more row of readings than of actions.
+
+        Args:
+            path: The file, UTF-8 with commas.
+            actions: Names of the action columns, for files whose last rows are not empty; the
+                actions of the last rows are then ignored.
+
+        Raises:
+            DataError: The file cannot be read; the message says why in one sentence.
+        """
+        from npdr_ppl.rollouts.csv_files import read_csv
+
+        return read_csv(path, actions)
+
+    @classmethod
+    def from_parquet(cls, path: Path, *, actions: Sequence[str] | None = None) -> "Rollouts":
+        """Reads a Parquet file with the columns of :meth:`from_csv`."""
+        from npdr_ppl.rollouts.files import read_parquet
+
+        return read_parquet(path, actions)
+
+    @classmethod
+    def from_npz(cls, path: Path) -> "Rollouts":
+        """Reads a file written by :meth:`to_npz`; nothing is unpickled."""
+        from npdr_ppl.rollouts.files import read_npz
+
+        return read_npz(path)
+
+    @classmethod
+    def from_netcdf(cls, path: Path) -> "Rollouts":
+        """Reads a NetCDF4 file written by :meth:`to_netcdf`."""
+        from npdr_ppl.rollouts.files import read_netcdf
+
+        return read_netcdf(path)
+
+    @classmethod
+    def from_xarray(cls, dataset: "xr.Dataset") -> "Rollouts":
+        """Converts a data set laid out as by :meth:`to_xarray`."""
+        from npdr_ppl.rollouts.files import from_xarray
+
+        return from_xarray(dataset)
+
+    @classmethod
+    def load(cls, path: Path) -> "Rollouts":
+        """Reads ``.csv``, ``.parquet``, ``.npz`` or ``.nc``, as the suffix says.
+
+        Raises:
+            DataError: The suffix is unknown or the file cannot be read.
+        """
+        from npdr_ppl.rollouts.files import load
+
+        return load(path)
+
+    # -- Export ------------------------------------------------------------------------------
+
+    def to_csv(self, path: Path) -> None:
+        """Writes the CSV layout of :meth:`from_csv`; numbers keep every bit, units are lost."""
+        from npdr_ppl.rollouts.csv_files import write_csv
+
+        write_csv(self, path)
+
+    def to_parquet(self, path: Path) -> None:
+        """Writes the columns of the CSV layout, with units in the file's metadata."""
+        from npdr_ppl.rollouts.files import write_parquet
+
+        write_parquet(self, path)
+
+    def to_npz(self, path: Path) -> None:
+        """Writes zero-padded arrays ``(R, T + 1, C)`` and so on, with names, units and lengths."""
+        from npdr_ppl.rollouts.files import write_npz
+
+        write_npz(self, path)
+
+    def to_netcdf(self, path: Path) -> None:
+        """Writes the data set of :meth:`to_xarray` as NetCDF4."""
+        from npdr_ppl.rollouts.files import write_netcdf
+
+        write_netcdf(self, path)
+
+    def to_xarray(self) -> "xr.Dataset":
+        """Returns a data set with one variable ``(rollout, step)`` per column, padded with NaN.
+
+        Each variable has the attributes ``kind`` (``channel``, ``action`` or ``reward``) and
+        ``units``; ``num_steps`` holds the length of each rollout.
+        """
+        from npdr_ppl.rollouts.files import to_xarray
+
+        return to_xarray(self)
+
+    def stacked(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Returns readings ``(R, T + 1, C)``, actions ``(R, T, A)`` and mask ``(R, T)``.
+
+        T is the length of the longest rollout; shorter ones are zero-padded where the mask is
+        false.
+        """
+        longest = max(self.lengths)
+        readings = np.zeros((len(self), longest + 1, len(self.channel_names)))
+        actions = np.zeros((len(self), longest, len(self.action_names)))
+        mask = np.zeros((len(self), longest), dtype=bool)
+        for index, length in enumerate(self.lengths):
+            readings[index, : length + 1] = self.readings[index]
+            actions[index, :length] = self.actions[index]
+            mask[index, :length] = True
+        return readings, actions, mask
+
+    # -- As a collection ---------------------------------------------------------------------
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Number of steps T of each rollout."""
+        return tuple(len(actions) for actions in self.actions)
+
+    def __len__(self) -> int:
+        return len(self.readings)
+
+    def __iter__(self) -> Iterator["Rollouts"]:
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> "Rollouts":
+        """Returns the chosen rollouts, always as Rollouts."""
+        if isinstance(index, int | np.integer):
+            if not -len(self) <= index < len(self):
+                # Iteration protocols rely on IndexError, so it is not a DataError.
+                raise IndexError(f"there is no rollout {index}; there are {len(self)}.")
+            chosen = [int(index)]
+        elif isinstance(index, slice):
+            chosen = list(range(len(self)))[index]
+        else:
+            selected = np.asarray(index)
+            if selected.dtype == bool and selected.shape != (len(self),):
+                raise DataError(f"a mask over {len(self)} rollouts cannot have {selected.shape}.")
+            if selected.size and selected.dtype.kind not in "iub":
+                raise DataError(f"rollouts are chosen by integers, not {selected.dtype}.")
+            if selected.dtype == bool:
+                selected = np.flatnonzero(selected)
+            chosen = [int(i) for i in selected]
+            if any(not -len(self) <= i < len(self) for i in chosen):
+                raise IndexError(f"rollouts {chosen} were asked for; there are {len(self)}.")
+        if not chosen:
+            raise DataError("no rollout was chosen.")
+        return replace(
+            self,
+            readings=tuple(self.readings[i] for i in chosen),
+            actions=tuple(self.actions[i] for i in chosen),
+            time=tuple(self.time[i] for i in chosen),
+            rewards=None if self.rewards is None else tuple(self.rewards[i] for i in chosen),
+        )
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Rollouts):
+            return NotImplemented
+        mine, others = self.rewards or (), other.rewards or ()
+        return (
+            self.channel_names == other.channel_names
+            and self.action_names == other.action_names
+            and self.channel_units == other.channel_units
+            and self.action_units == other.action_units
+            and self.time_step == other.time_step
+            and self.lengths == other.lengths
+            and (self.rewards is None) == (other.rewards is None)
+            and all(
+                np.array_equal(a, b)
+                for left, right in (
+                    (self.readings, other.readings),
+                    (self.actions, other.actions),
+                    (self.time, other.time),
+                    (mine, others),
+                )
+                for a, b in zip(left, right, strict=True)
+            )
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        low, high = min(self.lengths), max(self.lengths)
+        steps = f"{low}" if low == high else f"{low}–{high}"
+        return (
+            f"Rollouts({len(self)} × {steps} steps of {self.time_step:.6g} s; "
+            f"channels {_listed(self.channel_names, self.channel_units)}; "
+            f"actions {_listed(self.action_names, self.action_units)}"
+            f"{'' if self.rewards is None else '; rewards'})"
+        )
+
+    def split(
+        self,
+        train: Sequence[int] | float,
+        test: Sequence[int] | None = None,
+        *,
+        seed: int | None = None,
+    ) -> tuple["Rollouts", "Rollouts"]:
+        """Splits by rollout, never by sample: samples of one rollout are not independent.
+
+        Args:
+            train: Indices of the rollouts to learn from, or their fraction, which is rounded so
+                that both sides get at least one.
+            test: Indices of the rollouts to test on; the others if left out.
+            seed: Shuffles before a fractional split; without it the first ones train.
+
+        Returns:
+            Training and test rollouts.
+
+        Raises:
+            DataError: A side is empty, or a rollout is on both sides.
+        """
+        if isinstance(train, int | float):
+            if not 0 < train < 1 or len(self) < 2 or test is not None:
+                raise DataError(
+                    "a fractional split needs a fraction between 0 and 1, two rollouts and no "
+                    f"test indices, got {train=}, {len(self)} rollouts, {test=}."
+                )
+            order = np.arange(len(self))
+            if seed is not None:
+                np.random.default_rng(seed).shuffle(order)
+            size = min(max(round(train * len(self)), 1), len(self) - 1)
+            return self[np.sort(order[:size])], self[np.sort(order[size:])]
+        chosen = [int(i) for i in train]
+        others = [i for i in range(len(self)) if i not in chosen] if test is None else list(test)
+        shared = sorted({i % len(self) for i in chosen} & {int(i) % len(self) for i in others})
+        if shared:
+            raise DataError(f"rollout {shared[0]} is on both sides of the split.")
+        return self[chosen], self[others]
+
+    def concatenate(self, *others: "Rollouts") -> "Rollouts":
+        """Returns these rollouts followed by others with the same columns and time step.
+
+        Raises:
+            DataError: Columns or time steps differ.
+        """
+        parts = (self, *others)
+        for other in others:
+            for field in ("channel_names", "action_names", "channel_units", "action_units"):
+                if getattr(self, field) != getattr(other, field):
+                    raise DataError(
+                        f"{field} differ: {', '.join(getattr(self, field))} and "
+                        f"{', '.join(getattr(other, field))}."
+                    )
+            if not math.isclose(self.time_step, other.time_step, rel_tol=1e-6):
+                raise DataError(f"time steps differ: {self.time_step} and {other.time_step} s.")
+            if (self.rewards is None) != (other.rewards is None):
+                raise DataError("some of the rollouts have rewards and some have not.")
+        rewards = None
+        if self.rewards is not None:
+            rewards = tuple(values for part in parts for values in part.rewards or ())
+        return replace(
+            self,
+            readings=tuple(values for part in parts for values in part.readings),
+            actions=tuple(values for part in parts for values in part.actions),
+            time=tuple(values for part in parts for values in part.time),
+            rewards=rewards,
+        )
+
+    def select(self, channels: Sequence[str]) -> "Rollouts":
+        """Returns the rollouts with only these channels, in this order."""
+        columns = segments.columns_of(channels, self.channel_names)
+        return replace(
+            self,
+            readings=tuple(values[:, columns] for values in self.readings),
+            channel_names=tuple(channels),
+            channel_units=tuple(self.channel_units[i] for i in columns),
+        )
+
+    # -- For inference -----------------------------------------------------------------------
+
+    def check(
+        self,
+        channels: Sequence[Channel] = (),
+        actions: Sequence[Channel] = (),
+        *,
+        allow_extra: bool = False,
+    ) -> None:
+        """Checks that the data fit a simulator: columns, units and no rollout twice.
+
+        Args:
+            channels: The simulator's state or sensor channels.
+            actions: The simulator's actions.
+            allow_extra: Accept channels that the simulator does not know.
+
+        Raises:
+            DataError: Something is wrong; the message says what in one sentence.
+        """
+        checks.check_duplicates(self)
+        if channels or actions:
+            checks.check_channels(self, channels, actions, allow_extra=allow_extra)
+            checks.check_units(self, (*channels, *actions))
+
+    def inputs(
+        self,
+        segment_length: int | None = None,
+        initial_state: Literal["estimated", "recorded"] = "estimated",
+        *,
+        history: int = segments.DEFAULT_HISTORY,
+        dtype: torch.dtype = torch.float64,
+    ) -> Inputs:
+        """Returns what a simulator is told to replay these rollouts.
+
+        Args:
+            segment_length: Steps after which the simulation is re-synchronised with the data;
+                ``None`` for whole rollouts. The last segment of a rollout may be shorter.
+            initial_state: ``"estimated"`` smooths the readings around each segment's start and
+                differentiates them; ``"recorded"`` takes the readings as the truth.
+            history: Steps of commands before each segment to hand over, for delays.
+            dtype: Floating-point type of the tensors.
+
+        Raises:
+            DataError: An argument is out of range.
+        """
+        return segments.inputs(
+            self,
+            segment_length=segment_length,
+            initial_state=initial_state,
+            history=history,
+            dtype=dtype,
+        )
+
+    def observation(
+        self, inputs: Inputs | int | None = None, channels: Sequence[str] | None = None
+    ) -> Tensor:
+        """Returns the readings after each step, the data's counterpart of a trajectory.
+
+        Args:
+            inputs: Result of :meth:`inputs`, or a segment length as given to it.
+            channels: Names and order of the channels wanted; all if ``None``.
+
+        Returns:
+            ``(segments, steps, channels)``, zero where ``inputs.mask`` is false.
+
+        Raises:
+            DataError: A channel was not recorded.
+        """
+        return segments.observation(self, inputs, channels)
+
+    def series(self, channels: Sequence[str] | None = None) -> list[Tensor]:
+        """Returns the readings *before* each step, ``(T, C)`` float64 per rollout.
+
+        This is the ground truth of the paper's metrics; see :func:`segments.stitch`.
+        """
+        names = self.channel_names if channels is None else tuple(channels)
+        columns = segments.columns_of(names, self.channel_names)
+        return [torch.from_numpy(values[:-1, columns].copy()) for values in self.readings]
+
+
+def _frozen(values: ArrayLike) -> Array:
+    """Returns a read-only float64 copy."""
+    copied = np.array(values, dtype=np.float64)
+    copied.flags.writeable = False
+    return copied
+
+
+def _arrays(values: Any, name: str) -> tuple[Array, ...]:
+    """Returns one float64 array per rollout."""
+    try:
+        return tuple(
+            np.asarray(v.detach().cpu() if isinstance(v, Tensor) else v, dtype=np.float64)
+            for v in values
+        )
+    except (TypeError, ValueError):
+        raise DataError(f"{name} should be one array of numbers per rollout.") from None
+
+
+def _listed(names: Sequence[str], units: Sequence[str]) -> str:
+    entries = (f"{n} [{u}]" if u else n for n, u in zip(names, units, strict=True))
+    return ", ".join(entries) or "none"

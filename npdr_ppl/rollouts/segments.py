@@ -1,0 +1,168 @@
+"""Segments: rollouts cut into stretches that are simulated from re-synchronised states."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npdr_ppl.errors import DataError, ShapeError
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.rollouts.states import estimate_states
+
+if TYPE_CHECKING:
+    from npdr_ppl.rollouts.container import Rollouts
+
+__all__ = ["DEFAULT_HISTORY", "columns_of", "inputs", "observation", "stitch"]
+
+DEFAULT_HISTORY = 64
+"""Steps of past commands handed over by default: 64 ms at 1 kHz, beyond any input delay of a
+working control loop, and nothing compared with the size of a segment."""
+
+
+def columns_of(wanted: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Returns the positions of ``wanted`` in ``names``.
+
+    Raises:
+        DataError: Some are not there; the message names them.
+    """
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise DataError(
+            f"{', '.join(missing)} was not recorded; the channels are {', '.join(names)}."
+        )
+    return [list(names).index(name) for name in wanted]
+
+
+def inputs(
+    rollouts: "Rollouts",
+    *,
+    segment_length: int | None,
+    initial_state: Literal["estimated", "recorded"],
+    history: int,
+    dtype: torch.dtype,
+) -> Inputs:
+    """Cuts rollouts into segments; see :meth:`Rollouts.inputs`."""
+    if initial_state not in ("estimated", "recorded"):
+        raise DataError(f"initial_state is 'estimated' or 'recorded', not {initial_state!r}.")
+    if segment_length is not None and segment_length < 1:
+        raise DataError(f"a segment has at least one step, but {segment_length=}.")
+    if history < 0:
+        raise DataError(f"a history cannot be negative, but {history=}.")
+    layout = _layout(rollouts.lengths, segment_length)
+    num_steps = max(stop - start for _, start, stop in layout)
+    num_actions = len(rollouts.action_names)
+    actions = np.zeros((len(layout), num_steps, num_actions))
+    past = np.zeros((len(layout), history, num_actions))
+    mask = np.zeros((len(layout), num_steps), dtype=bool)
+    readings = np.zeros((len(layout), len(rollouts.channel_names)))
+    for row, (rollout, start, stop) in enumerate(layout):
+        actions[row, : stop - start] = rollouts.actions[rollout][start:stop]
+        known = min(history, start)
+        past[row, history - known :] = rollouts.actions[rollout][start - known : start]
+        mask[row, : stop - start] = True
+        readings[row] = rollouts.readings[rollout][start]
+    values, rates = readings, None
+    if initial_state == "estimated":
+        values, rates = _estimated(rollouts, layout)
+    return Inputs(
+        actions=torch.tensor(actions, dtype=dtype),
+        action_names=rollouts.action_names,
+        initial_readings=torch.tensor(readings, dtype=dtype),
+        initial_values=torch.tensor(values, dtype=dtype),
+        initial_rates=None if rates is None else torch.tensor(rates, dtype=dtype),
+        channel_names=rollouts.channel_names,
+        past_actions=torch.tensor(past, dtype=dtype),
+        time_step=rollouts.time_step,
+        mask=torch.tensor(mask),
+        rollout=torch.tensor([rollout for rollout, _, _ in layout]),
+        start=torch.tensor([start for _, start, _ in layout]),
+    )
+
+
+def observation(
+    rollouts: "Rollouts", inputs: Inputs | int | None, channels: Sequence[str] | None
+) -> Tensor:
+    """Returns the readings after each step; see :meth:`Rollouts.observation`."""
+    names = rollouts.channel_names if channels is None else tuple(channels)
+    columns = columns_of(names, rollouts.channel_names)
+    if isinstance(inputs, Inputs):
+        starts = zip(inputs.rollout.tolist(), inputs.start.tolist(), strict=True)
+        counts = inputs.mask.sum(-1).tolist()
+        layout = [(r, start, start + n) for (r, start), n in zip(starts, counts, strict=True)]
+        num_steps, dtype = inputs.num_steps, inputs.actions.dtype
+        for rollout, _, stop in layout:
+            if rollout >= len(rollouts) or stop > rollouts.lengths[rollout]:
+                raise DataError("the inputs were made of other rollouts than these.")
+    else:
+        layout = _layout(rollouts.lengths, inputs)
+        num_steps, dtype = max(stop - start for _, start, stop in layout), torch.float64
+    result = np.zeros((len(layout), num_steps, len(columns)))
+    for row, (rollout, start, stop) in enumerate(layout):
+        result[row, : stop - start] = rollouts.readings[rollout][start + 1 : stop + 1, columns]
+    return torch.tensor(result, dtype=dtype)
+
+
+def stitch(
+    trajectory: Tensor, inputs: Inputs, channels: Sequence[str] | None = None
+) -> list[Tensor]:
+    """Joins simulated segments into series of the states *before* each step, per rollout.
+
+    Each segment contributes the value it started from and its readings but the last, so that the
+    series of a rollout compares with :meth:`Rollouts.series`, as the paper's metrics need.
+
+    Args:
+        trajectory: Readings after each step, ``(..., S, K, C)``.
+        inputs: What was simulated, S segments of K steps.
+        channels: Names of the trajectory's channels; those of the inputs if ``None``.
+
+    Returns:
+        One ``(..., T, C)`` per rollout.
+
+    Raises:
+        DataError: A channel has no start value because it was not recorded.
+        ShapeError: The trajectory does not fit the inputs.
+    """
+    names = inputs.channel_names if channels is None else tuple(channels)
+    shape = (inputs.num_segments, inputs.num_steps, len(names))
+    if tuple(trajectory.shape[-3:]) != shape:
+        raise ShapeError(
+            f"a trajectory of these inputs ends in the shape {shape}, got "
+            f"{tuple(trajectory.shape)}."
+        )
+    start = inputs.initial_values[..., columns_of(names, inputs.channel_names)]
+    start = start.to(trajectory)[..., None, :].expand(*trajectory.shape[:-2], 1, len(names))
+    states = torch.cat([start, trajectory[..., :-1, :]], dim=-2)
+    result = []
+    for rollout in torch.unique(inputs.rollout).tolist():
+        rows = torch.nonzero(inputs.rollout == rollout)[:, 0]
+        rows = rows[torch.argsort(inputs.start[rows])]
+        pieces = [states[..., row, inputs.mask[row], :] for row in rows.tolist()]
+        result.append(torch.cat(pieces, dim=-2))
+    return result
+
+
+def _layout(lengths: Sequence[int], segment_length: int | None) -> list[tuple[int, int, int]]:
+    """Returns rollout, first step and end of every segment."""
+    if segment_length is not None and segment_length < 1:
+        raise DataError(f"a segment has at least one step, but {segment_length=}.")
+    return [
+        (rollout, start, min(start + (segment_length or length), length))
+        for rollout, length in enumerate(lengths)
+        for start in range(0, length, segment_length or length)
+    ]
+
+
+def _estimated(
+    rollouts: "Rollouts", layout: Sequence[tuple[int, int, int]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns values and rates at the segments' starts, ``(S, C)`` each."""
+    values, rates = [], []
+    for index, readings in enumerate(rollouts.readings):
+        starts = np.array([start for rollout, start, _ in layout if rollout == index])
+        value, rate = estimate_states(readings, starts, rollouts.time_step)
+        values.append(value)
+        rates.append(rate)
+    return np.concatenate(values), np.concatenate(rates)
