@@ -1,1 +1,74 @@
-"""Probabilistic programming for robot simulators."""
+"""Probabilistic programming for robot simulators.
+
+Declare a simulator and its domain parameters as a Pyro model, hand over measured rollouts, and get
+a posterior with ArviZ diagnostics::
+
+    import npdr_ppl as npdr
+
+    posterior = npdr.infer(model, npdr.Rollouts.from_csv("measured.csv"), backend="snpe-c")
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__all__ = [
+    "Channel",
+    "Effect",
+    "Inputs",
+    "NpdrError",
+    "Parameter",
+    "Port",
+    "Posterior",
+    "Rollouts",
+    "Simulator",
+    "add_effect",
+    "diagnose",
+    "infer",
+    "remove_effect",
+    "simulate",
+]
+
+if TYPE_CHECKING:
+    from npdr_ppl.errors import NpdrError
+    from npdr_ppl.language.channels import Channel, Parameter, Port
+    from npdr_ppl.language.effects import Effect
+    from npdr_ppl.language.handlers import add_effect, remove_effect
+    from npdr_ppl.language.inputs import Inputs
+    from npdr_ppl.language.simulator import Simulator
+    from npdr_ppl.language.sites import simulate
+    from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.workflows.diagnostics import diagnose
+    from npdr_ppl.workflows.infer import infer
+    from npdr_ppl.workflows.posterior import Posterior
+
+# Loaded when first used, so that importing the package stays quick.
+_HOMES = {
+    "Channel": "language.channels",
+    "Effect": "language.effects",
+    "Inputs": "language.inputs",
+    "NpdrError": "errors",
+    "Parameter": "language.channels",
+    "Port": "language.channels",
+    "Posterior": "workflows.posterior",
+    "Rollouts": "rollouts",
+    "Simulator": "language.simulator",
+    "add_effect": "language.handlers",
+    "diagnose": "workflows.diagnostics",
+    "infer": "workflows.infer",
+    "remove_effect": "language.handlers",
+    "simulate": "language.sites",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("npdr-ppl")
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"npdr_ppl.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'npdr_ppl' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*__all__, "__version__"})

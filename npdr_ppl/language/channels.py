@@ -59,12 +59,14 @@ class Port:
             dynamics, a sensor's reading, or the environment's own quantities.
         unit: SI unit of what passes through.
         rated: Typical magnitude, in ``unit``; effects scale their priors by it.
+        rated_speed: Typical speed of a joint that a force acts on, in its coordinate per second.
     """
 
     name: str
     kind: PortKind
     unit: str
     rated: float = 1.0
+    rated_speed: float = 1.0
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ class Effect(ABC):
     Attributes:
         id: Name in code and JSON, e.g. ``"coulomb_friction"``.
         port_kinds: Kinds of port the effect can attach to.
-        parameters: Its parameters; units are those of :meth:`prior`'s scale at the port.
+        parameters: Its parameters; ``{port}`` in a unit stands for the port's unit.
     """
 
     id: ClassVar[str]
@@ -62,6 +62,10 @@ class Effect(ABC):
     def priors(self, port: Port) -> dict[str, Distribution]:
         """Returns the priors of all parameters, the user's where given."""
         return {**self.default_priors(port), **self._priors}
+
+    def units(self, port: Port) -> dict[str, str]:
+        """Returns the unit of each parameter at a port."""
+        return {p.name: p.unit.format(port=port.unit) for p in self.parameters}
 
     @property
     def name(self) -> str:
@@ -154,8 +158,15 @@ class ActionEffect(Effect):
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("action",)
 
     def initial_memory(self, command: Tensor) -> Any:
-        """Returns the effect's own state at a segment's start; ``None`` if it has none."""
+        """Returns the effect's own state when ``command`` has been given for long.
+
+        ``None`` if it has none.
+        """
         return None
+
+    def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
+        """Returns the number of past commands that :meth:`act` may ask for."""
+        return 0
 
     @abstractmethod
     def act(

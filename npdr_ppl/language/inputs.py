@@ -1,5 +1,6 @@
 """What a simulator is told: actions, time step and how each segment starts."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -151,3 +152,34 @@ class Inputs:
             rollout=self.rollout[index],
             start=self.start[index],
         )
+
+    def select_channels(self, names: Sequence[str]) -> "Inputs":
+        """Returns the inputs with only these channels, in this order."""
+        columns = [self.channel_names.index(name) for name in names]
+        rates = self.initial_rates
+        return replace(
+            self,
+            initial_readings=self.initial_readings[..., columns],
+            initial_values=self.initial_values[..., columns],
+            initial_rates=None if rates is None else rates[..., columns],
+            channel_names=tuple(names),
+        )
+
+    def element(self, index: int) -> "Inputs":
+        """Returns the inputs of one element of the (flattened) batch; all share unbatched ones."""
+        if not self.batch_shape:
+            return self
+        depth = len(self.batch_shape)
+        changed = {}
+        for name in (
+            "actions",
+            "past_actions",
+            "initial_readings",
+            "initial_values",
+            "initial_rates",
+        ):
+            value = getattr(self, name)
+            if value is not None:
+                event = value.shape[depth:]
+                changed[name] = value.expand(self.batch_shape + event).flatten(0, depth - 1)[index]
+        return replace(self, **changed)

@@ -39,6 +39,7 @@ class LatentSite:
         coordinate_shape: Shape of its reference coordinates, plates included.
         coordinates: Its place in the vector z.
         dtype: Precision in which the program samples it.
+        plates: Its plates as (name, size, dimension), outermost first.
     """
 
     name: str
@@ -47,6 +48,7 @@ class LatentSite:
     coordinate_shape: torch.Size
     coordinates: slice
     dtype: torch.dtype
+    plates: tuple[tuple[str, int, int], ...] = ()
 
 
 class Prior:
@@ -58,7 +60,7 @@ class Prior:
 
     Attributes:
         sites: The latent sites, in the order of sampling.
-        black_boxes: Names of the black-box sites.
+        black_boxes: The black-box sites by name, as one run of the program made them.
         num_parameters: Dimension d of the reference coordinates.
         is_standard_normal: Whether the prior over z is exactly N(0, I).
         max_plate_nesting: Depth of the model's plates.
@@ -74,9 +76,11 @@ class Prior:
         with torch.no_grad(), torch.random.fork_rng(devices=[]), SkipSimulation():
             torch.manual_seed(0)
             prototype = poutine.trace(model).get_trace(*args)
-        self.black_boxes = tuple(
-            name for name, site in _samples(prototype) if isinstance(site["fn"], BlackBox)
-        )
+        self.black_boxes: dict[str, BlackBox] = {
+            name: site["fn"]
+            for name, site in _samples(prototype)
+            if isinstance(site["fn"], BlackBox)
+        }
         self.sites: tuple[LatentSite, ...] = self._latent_sites(prototype)
         if not self.sites:
             raise ModelError("The model has no latent sample sites, so there is nothing to infer.")
@@ -110,6 +114,10 @@ class Prior:
                     coordinate_shape,
                     slice(start, stop),
                     site["value"].dtype,
+                    tuple(
+                        (frame.name, frame.size, frame.dim)
+                        for frame in sorted(site["cond_indep_stack"], key=lambda f: f.dim)
+                    ),
                 )
             )
         self.max_plate_nesting = max(depths)
@@ -214,6 +222,16 @@ class Prior:
             value = node["value"]
             result[name] = value.reshape((value.shape[0], *value.shape[1 + skipped :]))
         return result
+
+    def segment_log_prob(self, name: str, value: Tensor, z: Tensor) -> Tensor:
+        """Returns the density of a black-box site's segments at n points, ``(n, …, segments)``.
+
+        Raises:
+            IntractableError: The site has no density.
+        """
+        trace = self._run(_WriteCoordinates(self, z))
+        with torch.no_grad():
+            return trace.nodes[name]["fn"].segment_log_prob(value)
 
     def _run(self, writer: "_WriteCoordinates") -> Any:
         """Runs the program at all of a writer's points at once, without simulating."""

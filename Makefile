@@ -1,0 +1,43 @@
+# Two commands matter: `make demo` and `make test`. Both make .venv first, if it is not there.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+WORKERS ?= 2
+# A worker per core: torch's own threads would only get in each other's way.
+TEST_ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NPDR_NUM_THREADS=1
+
+.PHONY: demo test lint bench clean
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	@echo "==> making $(VENV) with $$($(PYTHON) --version)"
+	$(PYTHON) -m venv $(VENV)
+	@echo "==> installing torch, then everything else with constraints.txt (a few minutes)"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
+	@touch $@
+
+demo: $(VENV)/installed
+	@echo "==> fitting the Furuta model to a recording made by MuJoCo; figures go to demo-output/"
+	$(BIN)/npdr demo --out demo-output
+
+lint: $(VENV)/installed
+	@echo "==> style"
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	@echo "==> types"
+	$(BIN)/pyright
+	@echo "==> layers"
+	$(BIN)/lint-imports
+
+test: lint
+	@echo "==> tests on $(WORKERS) workers"
+	$(TEST_ENV) $(BIN)/python -m pytest -n $(WORKERS) --durations=15
+
+bench: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev,bench]"
+	$(BIN)/python benchmarks/simulation.py
+	$(BIN)/python benchmarks/inference.py
+
+clean:
+	rm -rf $(VENV) build dist demo-output *.egg-info

@@ -1,0 +1,241 @@
+"""A model bound to measured data: what every backend and every workflow starts from."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.embeddings import Embedding, embedding_by_name
+from npdr_ppl.errors import DataError, ModelError, ShapeError
+from npdr_ppl.inference.base import Problem
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["BindingOptions", "BoundModel", "Data", "bind", "problem_of"]
+
+Data = Rollouts | Tensor | Mapping[str, Rollouts | Tensor]
+"""Observations: rollouts or a tensor for a model with one black-box site, or one for each site by
+name."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What was observed at one black-box site.
+
+    Attributes:
+        value: The observation in the shape of the site's value: plates, then the event. Channels
+            that the data lack are zero.
+        channels: Positions of the measured channels among the simulator's sensors, ``None`` for
+            a plain function.
+        inputs: The segments' inputs with just these channels, ``None`` for a plain function.
+        embedding: Maps trajectories to features, ``None`` for the output itself.
+    """
+
+    value: Tensor
+    channels: tuple[int, ...] | None
+    inputs: Inputs | None
+    embedding: Embedding | None
+
+    def features(self, output: Tensor) -> Tensor:
+        """Maps simulator output, ``(n,) + value.shape``, to features ``(n, ...)``."""
+        if self.embedding is None or self.inputs is None or self.channels is None:
+            return output.flatten(1)
+        measured = output[..., list(self.channels)]
+        plates = measured.shape[1:-3]
+        if not plates:
+            return self.embedding.features(measured, self.inputs)
+        elements = [
+            self.embedding.features(part, self.inputs.element(index))
+            for index, part in enumerate(measured.flatten(1, len(plates)).unbind(1))
+        ]
+        return torch.stack(elements, dim=1).flatten(1, 2)
+
+
+@dataclass(frozen=True)
+class BindingOptions:
+    """How measured data are prepared for inference.
+
+    Attributes:
+        embedding: Maps trajectories to features: a name such as ``"bayessim"`` or ``"all/10"``,
+            or an embedding of one's own. Plain functions have none.
+        segment_length: Steps between re-synchronisations; ``None`` for whole rollouts.
+        initial_state: How the state at a segment's start is found: ``"estimated"`` by a smoother,
+            or ``"recorded"``.
+        precision: ``"float64"`` or ``"float32"``, of the simulation.
+    """
+
+    embedding: str | Embedding | None = "bayessim"
+    segment_length: int | None = None
+    initial_state: Literal["estimated", "recorded"] = "estimated"
+    precision: Literal["float64", "float32"] = "float64"
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision as torch's type."""
+        return {"float64": torch.float64, "float32": torch.float32}[self.precision]
+
+
+@dataclass(frozen=True)
+class BoundModel:
+    """A model, its arguments and what was observed.
+
+    Attributes:
+        model: The Pyro model.
+        args: Its positional arguments.
+        prior: Its prior in reference coordinates.
+        observations: What was observed, by black-box site.
+        data: The data as given, by black-box site.
+        options: How the data were prepared.
+    """
+
+    model: Callable[..., Any]
+    args: tuple[Any, ...]
+    prior: Prior
+    observations: Mapping[str, Observation]
+    data: Mapping[str, Rollouts | Tensor]
+    options: "BindingOptions"
+
+    def conditioned(self) -> Callable[..., Any]:
+        """Returns the model with all black-box sites observed, e.g. for Pyro's NUTS."""
+        import pyro
+
+        data = {name: observation.value for name, observation in self.observations.items()}
+        return pyro.condition(self.model, data=data)
+
+    def features(self, outputs: Mapping[str, Tensor]) -> Tensor:
+        """Maps the sites' outputs to one feature array per simulation."""
+        parts = [o.features(outputs[name]) for name, o in self.observations.items()]
+        if len(parts) == 1:
+            return parts[0]
+        return torch.cat([part.flatten(1) for part in parts], dim=1)
+
+    def observed_features(self) -> Tensor:
+        """Returns the features of the observation, without batch dimension."""
+        return self.features({n: o.value[None] for n, o in self.observations.items()})[0]
+
+    def network_builder(self) -> Callable[[], torch.nn.Module] | None:
+        """Returns what makes an embedding network to be trained, if the embedding has one."""
+        embeddings = [o.embedding for o in self.observations.values()]
+        trained = [e for e in embeddings if e is not None and e.is_trained]
+        if not trained:
+            return None
+        if len(embeddings) > 1:
+            raise ModelError(
+                "A trained embedding serves models with one black-box site; use a fixed "
+                "embedding, or join the sites."
+            )
+        shape = self.observed_features().shape
+        return lambda: trained[0].network(shape)
+
+
+def bind(model: Callable[..., Any], data: Data, options: BindingOptions) -> BoundModel:
+    """Binds a model to measured data.
+
+    Args:
+        model: A Pyro model with black-box sites; it takes the inputs of its site (a dictionary of
+            inputs by site name if rollouts were measured at several), or nothing if all its sites
+            are plain functions.
+        data: The observations.
+        options: How they are prepared.
+
+    Raises:
+        DataError: The data do not fit the model.
+        ModelError: The model cannot be inferred; see :class:`~npdr_ppl.language.prior.Prior`.
+    """
+    if isinstance(data, Mapping):
+        by_site: dict[str | None, Rollouts | Tensor] = dict(data)
+    else:
+        by_site = {None: data}
+    layout = {
+        name: rollouts.inputs(options.segment_length, options.initial_state, dtype=options.dtype)
+        for name, rollouts in by_site.items()
+        if isinstance(rollouts, Rollouts)
+    }
+    args: tuple[Any, ...] = ()
+    if len(layout) == 1:
+        args = (next(iter(layout.values())),)
+    elif layout:
+        args = (layout,)
+    prior = Prior(model, args)
+    boxes = prior.black_boxes
+    if not boxes:
+        raise ModelError("The model has no black-box site; declare one with npdr.simulate.")
+    if None in by_site:
+        if len(boxes) > 1:
+            raise DataError(
+                f"The model has the black-box sites {', '.join(boxes)}; give the data of each as "
+                "a dictionary."
+            )
+        by_site = {next(iter(boxes)): by_site[None]}
+        layout = {next(iter(boxes)): inputs for inputs in layout.values()}
+    if set(by_site) != set(boxes):
+        raise DataError(
+            f"The data are for {', '.join(map(str, by_site))}, but the model's black-box sites "
+            f"are {', '.join(boxes)}."
+        )
+    embedding = options.embedding
+    chosen = embedding_by_name(embedding) if isinstance(embedding, str) else embedding
+    observations = {
+        name: _observe(name, box, by_site[name], layout.get(name), chosen, prior)
+        for name, box in boxes.items()
+    }
+    return BoundModel(model, args, prior, observations, by_site, options)
+
+
+def problem_of(bound: BoundModel, device: str | torch.device = "cpu") -> Problem:
+    """Returns what a backend may know of a bound model."""
+    prior = bound.prior
+    return Problem(
+        num_parameters=prior.num_parameters,
+        observation=bound.observed_features().float(),
+        sample_prior=lambda num: prior.sample(num).float(),
+        log_prior=lambda z: prior.log_prob(z).to(z),
+        is_prior_standard_normal=prior.is_standard_normal,
+        build_network=bound.network_builder(),
+        device=torch.device(device),
+    )
+
+
+def _observe(
+    name: str,
+    box: BlackBox,
+    data: Rollouts | Tensor,
+    inputs: Inputs | None,
+    embedding: Embedding | None,
+    prior: Prior,
+) -> Observation:
+    if not isinstance(box, SimulatorBlackBox):
+        if isinstance(data, Rollouts):
+            raise DataError(f"Site {name!r} is a plain function; give a tensor, not rollouts.")
+        value = torch.as_tensor(data, dtype=torch.get_default_dtype())
+        simulated = prior.execute(prior.sample(2))[name].shape[1:]
+        if value.shape != simulated:
+            raise ShapeError(
+                f"The observation of {name!r} has shape {tuple(value.shape)}, but the model "
+                f"simulates {tuple(simulated)}."
+            )
+        if not bool(torch.isfinite(value).all()):
+            raise DataError(f"The observation of {name!r} contains NaN or infinity.")
+        return Observation(value, None, None, None)
+    if not isinstance(data, Rollouts) or inputs is None:
+        raise DataError(f"Site {name!r} simulates trajectories; give rollouts, not a tensor.")
+    simulator = box.simulator
+    simulator.check_inputs(inputs)
+    names = [sensor.name for sensor in simulator.sensors]
+    measured = [channel for channel in names if channel in data.channel_names]
+    if not measured:
+        raise DataError(
+            f"The data have none of the channels {', '.join(names)} that {simulator.name} "
+            f"reports; they have {', '.join(data.channel_names)}."
+        )
+    if embedding is None:
+        raise ModelError("Trajectories need an embedding; the default is 'bayessim'.")
+    recorded = data.observation(inputs, channels=measured)
+    columns = tuple(names.index(channel) for channel in measured)
+    value = recorded.new_zeros((*recorded.shape[:-1], len(names)))
+    value[..., list(columns)] = recorded
+    return Observation(value, columns, inputs.select_channels(measured), embedding)

@@ -1,0 +1,161 @@
+"""`infer`: a model, data and a backend in, a posterior out (INFER of Algorithm 1)."""
+
+import time
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.embeddings import Embedding
+from npdr_ppl.errors import BackendError, NpdrError
+from npdr_ppl.inference.base import Backend, RoundInfo
+from npdr_ppl.inference.registry import backend as backend_by_name
+from npdr_ppl.randomness import seeded
+from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data, bind, problem_of
+from npdr_ppl.workflows.posterior import Posterior, Provenance
+from npdr_ppl.workflows.progress import Reporter, reporter
+from npdr_ppl.workflows.run_folder import RunFolder
+
+__all__ = ["infer", "simulate_features"]
+
+# Readings that one chunk of simulations may hold, about 128 MiB in float64.
+MAX_READINGS_PER_CHUNK = 16_000_000
+
+
+def infer(
+    model: Callable[..., Any],
+    data: Data,
+    *,
+    backend: str | Backend = "snpe-c",
+    rounds: int = 1,
+    num_simulations: int = 1_000,
+    seed: int = 0,
+    embedding: str | Embedding | None = "bayessim",
+    segment_length: int | None = None,
+    initial_state: Literal["estimated", "recorded"] = "estimated",
+    precision: Literal["float64", "float32"] = "float64",
+    device: str | torch.device = "cpu",
+    checkpoint: str | PathLike[str] | None = None,
+    progress: bool | None = None,
+) -> Posterior:
+    """Infers the posterior over a model's domain parameters from measured data.
+
+    Args:
+        model: A Pyro model whose observation is a black-box site.
+        data: Measured rollouts, or a tensor for a plain function's output; a dictionary of them
+            by site name if the model has several black-box sites.
+        backend: Name of a backend, or one with options of its own.
+        rounds: Rounds of proposing, simulating and training.
+        num_simulations: Simulations of each round.
+        seed: Seed of everything random.
+        embedding: Maps trajectories to features; see :mod:`npdr_ppl.embeddings`.
+        segment_length: Steps between re-synchronisations; ``None`` for whole rollouts.
+        initial_state: State at a segment's start: ``"estimated"`` or ``"recorded"``.
+        precision: Floating-point type of the simulation.
+        device: Where the backend trains.
+        checkpoint: Folder to save every round in; an interrupted run continues from there.
+        progress: Whether to show progress; ``None`` shows it on a terminal.
+
+    Returns:
+        The posterior.
+
+    Raises:
+        DataError: The data are malformed or do not fit the model.
+        ModelError: The model cannot be inferred.
+        BackendError: The backend is unknown or cannot handle the model.
+
+    Example:
+        >>> import pyro, pyro.distributions as dist, torch
+        >>> import npdr_ppl as npdr
+        >>> def model():
+        ...     mean = pyro.sample("mean", dist.Normal(0.0, 1.0))
+        ...     npdr.simulate("x", lambda mean: mean + torch.randn_like(mean), {"mean": mean})
+        >>> posterior = npdr.infer(model, torch.tensor(1.0), num_simulations=500, progress=False)
+        >>> posterior.sample(100)["mean"].shape
+        torch.Size([100])
+    """
+    if rounds < 1 or num_simulations < 10:
+        raise BackendError(
+            f"rounds must be at least 1 and num_simulations at least 10, got {rounds} and "
+            f"{num_simulations}."
+        )
+    method = backend_by_name(backend) if isinstance(backend, str) else backend
+    options = BindingOptions(embedding, segment_length, initial_state, precision)
+    bound = bind(model, data, options)
+    problem = problem_of(bound, device)
+    state = method.init(problem)
+    infos: list[RoundInfo] = []
+    seconds = {"simulate": 0.0, "train": 0.0, "sample": 0.0}
+    store = None if checkpoint is None else RunFolder(Path(checkpoint))
+    if store is not None:
+        store.begin(bound, method, seed=seed, rounds=rounds, num_simulations=num_simulations)
+        resumed = store.last_round()
+        if resumed is not None:
+            tensors, values, infos, seconds = resumed
+            state = method.restore(problem, tensors, values)
+    with reporter(progress) as report:
+        for index in range(len(infos), rounds):
+            label = f"round {index + 1}/{rounds}"
+            started = time.perf_counter()
+            with seeded(seed, "propose", index):
+                z = method.ask(problem, state, num_simulations)
+            x = None if store is None else store.simulations(index, z)
+            if x is None:
+                x = simulate_features(bound, z, seed, f"round {index}", report, label)
+                if store is not None:
+                    store.save_simulations(index, z, x)
+            simulated = time.perf_counter()
+            with seeded(seed, "train", index):
+                state, info = method.tell(problem, state, z, x, report.stage(f"{label}: train"))
+            seconds["simulate"] += simulated - started
+            seconds["train"] += time.perf_counter() - simulated
+            infos.append(info)
+            if store is not None:
+                store.save_round(index, *method.tensors(state), infos, seconds)
+    provenance = Provenance(seed, num_simulations, tuple(infos), seconds)
+    return Posterior(bound, method, problem, state, provenance)
+
+
+def simulate_features(
+    bound: BoundModel,
+    z: Tensor,
+    seed: int,
+    purpose: str,
+    report: Reporter,
+    label: str = "",
+) -> Tensor:
+    """Simulates the model at points and embeds the outputs, chunk by chunk.
+
+    Only features are kept, so memory does not grow with simulations × steps unless the embedding
+    wants raw trajectories.
+
+    Args:
+        bound: The model and its data.
+        z: Points, ``(n, d)``.
+        seed: Seed of the run.
+        purpose: Names the random stream.
+        report: Where to report progress.
+        label: Words for the progress bar.
+
+    Returns:
+        Features, ``(n, ...)`` float32; a simulation that failed has a row that is not finite.
+    """
+    per_simulation = sum(o.value.numel() for o in bound.observations.values())
+    chunk = max(1, min(len(z), MAX_READINGS_PER_CHUNK // max(1, per_simulation)))
+    step = report.stage(f"{label}: simulate")
+    features = []
+    for start in range(0, len(z), chunk):
+        part = z[start : start + chunk]
+        # A stream for each chunk, so that a resumed run simulates the same.
+        with seeded(seed, "simulate", purpose, start):
+            features.append(bound.features(bound.prior.execute(part)).float())
+        step(min(1.0, (start + chunk) / len(z)), f"{start + len(part)} simulations")
+    result = torch.cat(features)
+    if not bool(torch.isfinite(result).flatten(1).all(1).any()):
+        raise NpdrError(
+            "Every simulation failed (NaN or infinity); check the priors' ranges and the units."
+        )
+    return result

@@ -1,0 +1,54 @@
+"""Progress bars for what takes longer than a moment; silent where there is no terminal."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+__all__ = ["Reporter", "reporter"]
+
+Step = Callable[[float, str], None]
+
+
+class Reporter:
+    """Hands out one callback per stage of a workflow; this one reports nothing."""
+
+    def stage(self, label: str) -> Step:
+        """Returns a callback for a stage: fraction done and a short status."""
+        return lambda fraction, status: None
+
+
+class _RichReporter(Reporter):
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self.bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[status]}"),
+            console=Console(stderr=True),
+        )
+
+    def stage(self, label: str) -> Step:
+        task = self.bars.add_task(label, total=1.0, status="")
+
+        def step(fraction: float, status: str) -> None:
+            self.bars.update(task, completed=fraction, status=status)
+
+        return step
+
+
+@contextmanager
+def reporter(show: bool | None = None) -> Iterator[Reporter]:
+    """Shows progress bars inside the block.
+
+    Args:
+        show: Whether to show them; ``None`` shows them if standard error is a terminal.
+    """
+    if not (sys.stderr.isatty() if show is None else show):
+        yield Reporter()
+        return
+    rich = _RichReporter()
+    with rich.bars:
+        yield rich

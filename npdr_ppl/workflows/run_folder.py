@@ -1,0 +1,241 @@
+"""An inference run as a folder: JSON, safetensors and NetCDF; no pickle is written or read.
+
+    run.json                      backend, options, seeds, versions, the model's source
+    data_<site>.nc                measured rollouts (or data.safetensors for plain observations)
+    round_<r>_simulations.safetensors   parameters z and features x of a round
+    round_<r>.safetensors, round_<r>.json   the backend's state after that round
+
+Every file replaces its predecessor in one step, so a run killed at any moment leaves a folder that
+:func:`npdr_ppl.infer` continues from.
+"""
+
+import dataclasses
+import hashlib
+import inspect
+import json
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from npdr_ppl.errors import BackendError, DataError
+from npdr_ppl.inference.base import Backend, RoundInfo
+from npdr_ppl.language.handlers import ModelWithEffects
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.atomic import replacing
+from npdr_ppl.workflows.binding import BoundModel
+
+__all__ = ["RunFolder", "source_text", "versions", "write_json"]
+
+FORMAT = 1
+_PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
+
+
+class RunFolder:
+    """Reads and writes the folder of one inference run.
+
+    Args:
+        path: The folder; it is made if absent.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def begin(
+        self, bound: BoundModel, method: Backend, *, seed: int, rounds: int, num_simulations: int
+    ) -> None:
+        """Describes the run, or checks that the folder holds this very run already.
+
+        Raises:
+            BackendError: The folder holds a run with other settings or data.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        description = {
+            "format": FORMAT,
+            "backend": method.name,
+            "options": dataclasses.asdict(method) if dataclasses.is_dataclass(method) else {},
+            "binding": _binding(bound),
+            "seed": seed,
+            "num_simulations": num_simulations,
+            "fingerprint": _fingerprint(bound.observed_features()),
+        }
+        file = self.path / "run.json"
+        if file.exists():
+            present = read_json(file)
+            differing = [k for k, v in _plain(description).items() if present.get(k) != v]
+            if differing:
+                raise BackendError(
+                    f"{self.path} holds a run that differs in {', '.join(differing)}; choose "
+                    "another folder, or remove it."
+                )
+            return
+        for name, data in bound.data.items():
+            if isinstance(data, Rollouts):
+                data.to_netcdf(self.path / f"data_{name}.nc")
+            else:
+                file_name = f"data_{name}.safetensors"
+                _save_tensors(self.path / file_name, {"value": torch.as_tensor(data)})
+        write_json(
+            file,
+            description
+            | {
+                "rounds": rounds,
+                "versions": versions(),
+                "model": {"name": repr(bound.model), "source": source_text(bound.model)},
+            },
+        )
+
+    def last_round(
+        self,
+    ) -> tuple[dict[str, Tensor], dict[str, Any], list[RoundInfo], dict[str, float]] | None:
+        """Returns the state after the last complete round, its values, figures and times."""
+        done = [int(f.stem.removeprefix("round_")) for f in self.path.glob("round_*.json")]
+        if not done:
+            return None
+        stem = self.path / f"round_{max(done)}"
+        record = read_json(stem.with_suffix(".json"))
+        infos = [RoundInfo(**info) for info in record["infos"]]
+        tensors = _load_tensors(stem.with_suffix(".safetensors"))
+        return tensors, record["values"], infos, record["seconds"]
+
+    def save_round(
+        self,
+        index: int,
+        tensors: Mapping[str, Tensor],
+        values: Mapping[str, Any],
+        infos: Sequence[RoundInfo],
+        seconds: Mapping[str, float],
+    ) -> None:
+        """Saves the state after a round; the JSON goes last and makes the round count."""
+        _save_tensors(self.path / f"round_{index}.safetensors", tensors)
+        write_json(
+            self.path / f"round_{index}.json",
+            {
+                "values": dict(values),
+                "infos": [dataclasses.asdict(info) for info in infos],
+                "seconds": dict(seconds),
+            },
+        )
+
+    def save_simulations(self, index: int, z: Tensor, x: Tensor) -> None:
+        """Saves a round's simulations before anything is learnt from them."""
+        _save_tensors(self._simulations(index), {"z": z, "x": x})
+
+    def simulations(self, index: int, z: Tensor) -> Tensor | None:
+        """Returns the features of a round simulated before the run was interrupted."""
+        file = self._simulations(index)
+        if not file.exists():
+            return None
+        saved = _load_tensors(file)
+        return saved["x"] if torch.equal(saved["z"], z.cpu()) else None
+
+    def description(self) -> dict[str, Any]:
+        """Returns what :meth:`begin` wrote.
+
+        Raises:
+            DataError: The folder holds no run.
+        """
+        file = self.path / "run.json"
+        if not file.exists():
+            raise DataError(f"{self.path} holds no inference run (run.json is missing).")
+        return read_json(file)
+
+    def data(self) -> dict[str, Rollouts | Tensor]:
+        """Returns the measured data by site."""
+        result: dict[str, Rollouts | Tensor] = {}
+        for file in sorted(self.path.glob("data_*")):
+            name = file.stem.removeprefix("data_")
+            if file.suffix == ".nc":
+                result[name] = Rollouts.from_netcdf(file)
+            else:
+                result[name] = _load_tensors(file)["value"]
+        return result
+
+    def _simulations(self, index: int) -> Path:
+        return self.path / f"round_{index}_simulations.safetensors"
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes JSON in one step."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(_plain(value), indent=2, allow_nan=True) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON object.
+
+    Raises:
+        DataError: The file is not JSON.
+    """
+    try:
+        value = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} is not readable JSON: {error}.") from error
+    if not isinstance(value, dict):
+        raise DataError(f"{path} should hold a JSON object.")
+    return value
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions that a result depends on."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def source_text(model: Any) -> str:
+    """Returns the source of a model, and what was attached to it."""
+    if isinstance(model, ModelWithEffects):
+        attached = "\n".join(f"# with {effect!r}" for effect, _ in model.effects)
+        return f"{source_text(model.base)}\n{attached}"
+    try:
+        return inspect.getsource(model)
+    except (OSError, TypeError):
+        return repr(model)
+
+
+def _binding(bound: BoundModel) -> dict[str, Any]:
+    values = dataclasses.asdict(bound.options)
+    embedding = bound.options.embedding
+    values["embedding"] = embedding if isinstance(embedding, str | None) else repr(embedding)
+    return values
+
+
+def _fingerprint(tensor: Tensor) -> str:
+    values = tensor.detach().cpu().double().contiguous().numpy()
+    return hashlib.sha256(values.tobytes()).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """Turns tensors, tuples and mappings into what JSON has."""
+    if isinstance(value, Tensor):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(v) for v in value]
+    if hasattr(value, "item") and not isinstance(value, str):
+        return value.item()
+    return value
+
+
+def _save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    with replacing(path) as temporary:
+        save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary)
+
+
+def _load_tensors(path: Path) -> dict[str, Tensor]:
+    try:
+        return load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise DataError(f"{path} is not a readable safetensors file: {error}.") from error
