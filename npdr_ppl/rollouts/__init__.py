@@ -2,5 +2,6 @@
 
 from npdr_ppl.rollouts.container import Rollouts
 from npdr_ppl.rollouts.segments import stitch
+from npdr_ppl.rollouts.simurlacra import load_simurlacra
 
-__all__ = ["Rollouts", "stitch"]
+__all__ = ["Rollouts", "load_simurlacra", "stitch"]
