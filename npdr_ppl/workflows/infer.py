@@ -86,22 +86,22 @@ def infer(
     options = BindingOptions(embedding, segment_length, initial_state, precision)
     bound = bind(model, data, options)
     problem = problem_of(bound, device)
-    state = method.init(problem)
+    states = [method.init(problem)]
     infos: list[RoundInfo] = []
-    seconds = {"simulate": 0.0, "train": 0.0, "sample": 0.0}
+    seconds = {"simulate": 0.0, "train": 0.0}
     store = None if checkpoint is None else RunFolder(Path(checkpoint))
     if store is not None:
         store.begin(bound, method, seed=seed, rounds=rounds, num_simulations=num_simulations)
-        resumed = store.last_round()
-        if resumed is not None:
-            tensors, values, infos, seconds = resumed
-            state = method.restore(problem, tensors, values)
+        for index in store.rounds()[:rounds]:
+            saved = store.load_round(index)
+            states.append(method.restore(problem, saved.tensors, saved.values))
+            infos, seconds = saved.infos, saved.seconds
     with reporter(progress) as report:
         for index in range(len(infos), rounds):
             label = f"round {index + 1}/{rounds}"
             started = time.perf_counter()
             with seeded(seed, "propose", index):
-                z = method.ask(problem, state, num_simulations)
+                z = method.ask(problem, states[-1], num_simulations)
             x = None if store is None else store.simulations(index, z)
             if x is None:
                 x = simulate_features(bound, z, seed, f"round {index}", report, label)
@@ -109,14 +109,16 @@ def infer(
                     store.save_simulations(index, z, x)
             simulated = time.perf_counter()
             with seeded(seed, "train", index):
-                state, info = method.tell(problem, state, z, x, report.stage(f"{label}: train"))
+                step = report.stage(f"{label}: train")
+                state, info = method.tell(problem, states[-1], z, x, step)
+            states.append(state)
             seconds["simulate"] += simulated - started
             seconds["train"] += time.perf_counter() - simulated
             infos.append(info)
             if store is not None:
                 store.save_round(index, *method.tensors(state), infos, seconds)
     provenance = Provenance(seed, num_simulations, tuple(infos), seconds)
-    return Posterior(bound, method, problem, state, provenance)
+    return Posterior(bound, method, problem, states[1:], provenance)
 
 
 def simulate_features(

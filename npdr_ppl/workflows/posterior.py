@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.distributions import constraints
 
 from npdr_ppl.embeddings import Embedding
-from npdr_ppl.errors import DataError, ShapeError
+from npdr_ppl.errors import BackendError, DataError, ShapeError
 from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.language.prior import Prior
@@ -55,7 +55,7 @@ class Posterior:
         bound: The model and its data.
         backend: The backend that learnt it.
         problem: What the backend knew.
-        state: The backend's state after the last round.
+        states: The backend's state after each round known, the last one being this posterior's.
         densities: The members, in reference coordinates.
         provenance: How they came about.
     """
@@ -65,14 +65,14 @@ class Posterior:
         bound: BoundModel,
         backend: Backend,
         problem: Problem,
-        state: State,
+        states: Sequence[State],
         provenance: Provenance,
     ) -> None:
         self.bound = bound
         self.backend = backend
         self.problem = problem
-        self.state = state
-        self.densities = tuple(backend.densities(problem, state))
+        self.states = tuple(states)
+        self.densities = tuple(backend.densities(problem, self.states[-1]))
         self.provenance = provenance
 
     @property
@@ -190,7 +190,7 @@ class Posterior:
             rounds=rounds,
             num_simulations=own.num_simulations,
         )
-        tensors, values = self.backend.tensors(self.state)
+        tensors, values = self.backend.tensors(self.states[-1])
         folder.save_round(rounds - 1, tensors, values, own.rounds, own.seconds)
 
     @classmethod
@@ -215,21 +215,35 @@ class Posterior:
         """
         folder = RunFolder(Path(path))
         description = folder.description()
-        last = folder.last_round()
-        if last is None:
+        rounds = folder.rounds()
+        if not rounds:
             raise DataError(f"{path} holds a run without a complete round.")
-        tensors, values, infos, seconds = last
+        last = folder.load_round(rounds[-1])
         options = BindingOptions(**description["binding"])
         if embedding is not None:
             options = replace(options, embedding=embedding)
         bound = bind(model, folder.data(), options)
         problem = problem_of(bound, device)
         method = backend_by_name(description["backend"], **description["options"])
-        state = method.restore(problem, tensors, values)
+        state = method.restore(problem, last.tensors, last.values)
         provenance = Provenance(
-            description["seed"], description["num_simulations"], tuple(infos), seconds
+            description["seed"], description["num_simulations"], tuple(last.infos), last.seconds
         )
-        return cls(bound, method, problem, state, provenance)
+        return cls(bound, method, problem, [state], provenance)
+
+    def after_round(self, index: int) -> "Posterior":
+        """Returns the posterior as it was after round ``index``, counted from 0.
+
+        Raises:
+            BackendError: That round's state is not known, e.g. after loading from disk.
+        """
+        if not 0 <= index < len(self.states):
+            raise BackendError(
+                f"Round {index} is not known; this posterior knows {len(self.states)}."
+            )
+        provenance = replace(self.provenance, rounds=self.provenance.rounds[: index + 1])
+        states = self.states[: index + 1]
+        return Posterior(self.bound, self.backend, self.problem, states, provenance)
 
     def to_arviz(self, num_samples: int = 1_000, *, seed: int = 0) -> "az.InferenceData":
         """Returns an ArviZ object; see :func:`npdr_ppl.workflows.arviz_export.to_arviz`."""

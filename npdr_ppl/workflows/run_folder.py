@@ -37,6 +37,16 @@ FORMAT = 1
 _PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
 
 
+@dataclasses.dataclass(frozen=True)
+class SavedRound:
+    """A backend's state after a round, and the figures of all rounds up to it."""
+
+    tensors: dict[str, Tensor]
+    values: dict[str, Any]
+    infos: list[RoundInfo]
+    seconds: dict[str, float]
+
+
 class RunFolder:
     """Reads and writes the folder of one inference run.
 
@@ -91,18 +101,17 @@ class RunFolder:
             },
         )
 
-    def last_round(
-        self,
-    ) -> tuple[dict[str, Tensor], dict[str, Any], list[RoundInfo], dict[str, float]] | None:
-        """Returns the state after the last complete round, its values, figures and times."""
-        done = [int(f.stem.removeprefix("round_")) for f in self.path.glob("round_*.json")]
-        if not done:
-            return None
-        stem = self.path / f"round_{max(done)}"
+    def rounds(self) -> list[int]:
+        """Returns the complete rounds, in order."""
+        return sorted(int(f.stem.removeprefix("round_")) for f in self.path.glob("round_*.json"))
+
+    def load_round(self, index: int) -> "SavedRound":
+        """Returns what :meth:`save_round` wrote after a round."""
+        stem = self.path / f"round_{index}"
         record = read_json(stem.with_suffix(".json"))
         infos = [RoundInfo(**info) for info in record["infos"]]
         tensors = _load_tensors(stem.with_suffix(".safetensors"))
-        return tensors, record["values"], infos, record["seconds"]
+        return SavedRound(tensors, record["values"], infos, record["seconds"])
 
     def save_round(
         self,
