@@ -1,1 +1,1 @@
-"""engines."""
+"""Simulator engines: what turns a model author's equations into batched trajectories."""

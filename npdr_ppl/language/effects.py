@@ -189,6 +189,14 @@ class SensorEffect(Effect):
         """
         return None
 
+    def initial_value(self, reading: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns the true value at a segment's start behind what was read there.
+
+        By default the reading itself; an offset or a wrong scale has to be taken out, or
+        re-synchronised segments would start from the wrong state.
+        """
+        return reading
+
     @abstractmethod
     def read(
         self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float

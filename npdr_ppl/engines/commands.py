@@ -1,0 +1,109 @@
+"""Commands given so far, as action effects see them: recorded ones and those of a live loop."""
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.language.effects import Commands
+from npdr_ppl.language.inputs import Inputs
+
+__all__ = ["CommandRecord", "RecentCommands", "RecordedCommands"]
+
+
+class CommandRecord:
+    """All commands of one action channel in a batch of segments, past ones included.
+
+    Before the oldest command on record a segment saw zero if it starts its rollout, and
+    otherwise, for want of anything better, the oldest command itself.
+
+    Args:
+        inputs: The segments; their actions may carry batch dimensions.
+        column: Column of the channel in the inputs' actions.
+        batch_shape: The batch shape including the segments, of numel N.
+        limits: Least and greatest command that the device accepts.
+        dtype: Floating type of the simulation.
+    """
+
+    def __init__(
+        self,
+        inputs: Inputs,
+        column: int,
+        batch_shape: torch.Size,
+        limits: tuple[float, float],
+        dtype: torch.dtype,
+    ) -> None:
+        known = torch.cat((inputs.past_actions, inputs.actions), dim=-2)[..., column]
+        known = known.to(dtype).clamp(*limits)
+        before = torch.where(inputs.start == 0, torch.zeros_like(known[..., 0]), known[..., 0])
+        # Time first, so that the commands of one step lie side by side.
+        self._table = torch.cat((before[..., None], known), dim=-1).movedim(-1, 0).contiguous()
+        self._batch_shape = batch_shape
+        segments = self._table.shape[1:]
+        row = torch.arange(segments.numel(), device=known.device).reshape(segments)
+        self.rows = row.expand(batch_shape).reshape(-1)
+        self.first = 1 + inputs.past_actions.shape[-2]
+
+    @property
+    def table(self) -> Tensor:
+        """Commands in time-major order, flat."""
+        return self._table.reshape(-1)
+
+    @property
+    def stride(self) -> int:
+        """Entries of the table per time step."""
+        return self._table[0].numel()
+
+    def at(self, step: int) -> Tensor:
+        """Returns the command of each simulation at a step, ``(N,)``; steps before 0 are past."""
+        return self._table[self.first + step].expand(self._batch_shape).reshape(-1)
+
+
+class RecordedCommands(Commands):
+    """View of a record at one step.
+
+    Args:
+        present: The command of this step, ``(N,)``.
+        table: The record's table.
+        rows: Entry of each simulation within a time step of the table, ``(N,)``.
+        time: Time index of the present command in the table.
+        stride: Entries of the table per time step.
+    """
+
+    def __init__(
+        self, present: Tensor, table: Tensor, rows: Tensor, time: Tensor | int, stride: int
+    ) -> None:
+        self._present = present
+        self._table, self._rows, self._time, self._stride = table, rows, time, stride
+
+    def now(self) -> Tensor:
+        """Returns the present command."""
+        return self._present
+
+    def delayed(self, steps: Tensor) -> Tensor:
+        """Returns the command of ``steps`` steps ago."""
+        time = (self._time - steps.to(self._rows.dtype)).clamp_min(0)
+        return self._table[time * self._stride + self._rows]
+
+
+class RecentCommands(Commands):
+    """The present command and a few before it.
+
+    Args:
+        present: The command of this step, ``(N,)``.
+        past: Earlier commands, latest first.
+    """
+
+    def __init__(self, present: Tensor, past: tuple[Tensor, ...]) -> None:
+        self._present = present
+        self._past = past
+
+    def now(self) -> Tensor:
+        """Returns the present command."""
+        return self._present
+
+    def delayed(self, steps: Tensor) -> Tensor:
+        """Returns the command of ``steps`` steps ago, at most as many as there are."""
+        # A chain of selections instead of a gather: it stays in registers once compiled.
+        command = self._present
+        for age, earlier in enumerate(self._past, start=1):
+            command = torch.where(steps >= age, earlier, command)
+        return command

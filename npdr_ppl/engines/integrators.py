@@ -1,0 +1,105 @@
+"""Fixed-step integrators for second-order mechanical systems q̈ = a(q, q̇)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from npdr_ppl.errors import ModelError
+
+__all__ = ["INTEGRATORS", "Acceleration", "Components", "Integrator", "integrator"]
+
+Components = tuple[Tensor, ...]
+"""One tensor per generalised coordinate, all of one shape."""
+
+Acceleration = Callable[[Components, Components], Components]
+"""Maps positions q and velocities v to accelerations a."""
+
+StepFn = Callable[
+    [Acceleration, Components, Components, Components, float], tuple[Components, Components]
+]
+
+
+@dataclass(frozen=True)
+class Integrator:
+    """A one-step method with a constant step.
+
+    Attributes:
+        name: Name as an option of simulators.
+        step: Function of the acceleration function, q, v, a(q, v) and the step h in seconds that
+            returns the next q and v. The acceleration at the start is an argument because dry
+            friction has computed it already.
+        order: The global error is O(h^order).
+    """
+
+    name: str
+    step: StepFn
+    order: int
+
+
+def _advance(x: Components, rate: Components, time: float) -> Components:
+    """Returns x + time · rate."""
+    return tuple(a + time * b for a, b in zip(x, rate, strict=True))
+
+
+def _constant_acceleration(
+    acceleration: Acceleration, q: Components, v: Components, a: Components, h: float
+) -> tuple[Components, Components]:
+    """Advances v' = v + h a, q' = q + h v + h²/2 a; exact under constant acceleration."""
+    half = 0.5 * h * h
+    positions = tuple(qi + h * vi + half * ai for qi, vi, ai in zip(q, v, a, strict=True))
+    return positions, _advance(v, a, h)
+
+
+def _semi_implicit_euler(
+    acceleration: Acceleration, q: Components, v: Components, a: Components, h: float
+) -> tuple[Components, Components]:
+    """Advances v' = v + h a, q' = q + h v'; symplectic, so energy errors stay bounded."""
+    velocities = _advance(v, a, h)
+    return _advance(q, velocities, h), velocities
+
+
+def _rk4(
+    acceleration: Acceleration, q: Components, v: Components, a: Components, h: float
+) -> tuple[Components, Components]:
+    """The classical Runge–Kutta method on (q, v), whose rates are (v, a)."""
+    v2 = _advance(v, a, 0.5 * h)
+    a2 = acceleration(_advance(q, v, 0.5 * h), v2)
+    v3 = _advance(v, a2, 0.5 * h)
+    a3 = acceleration(_advance(q, v2, 0.5 * h), v3)
+    v4 = _advance(v, a3, h)
+    a4 = acceleration(_advance(q, v3, h), v4)
+    sixth = h / 6.0
+    positions = tuple(
+        x + sixth * (r1 + 2.0 * (r2 + r3) + r4)
+        for x, r1, r2, r3, r4 in zip(q, v, v2, v3, v4, strict=True)
+    )
+    velocities = tuple(
+        x + sixth * (r1 + 2.0 * (r2 + r3) + r4)
+        for x, r1, r2, r3, r4 in zip(v, a, a2, a3, a4, strict=True)
+    )
+    return positions, velocities
+
+
+INTEGRATORS: dict[str, Integrator] = {
+    method.name: method
+    for method in (
+        Integrator("constant-acceleration", _constant_acceleration, order=1),
+        Integrator("semi-implicit-euler", _semi_implicit_euler, order=1),
+        Integrator("rk4", _rk4, order=4),
+    )
+}
+
+
+def integrator(name: str) -> Integrator:
+    """Returns the integrator called ``name``.
+
+    Raises:
+        ModelError: There is none of that name.
+    """
+    try:
+        return INTEGRATORS[name]
+    except KeyError:
+        raise ModelError(
+            f"There is no integrator {name!r}; there are {', '.join(INTEGRATORS)}."
+        ) from None

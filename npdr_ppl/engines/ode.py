@@ -1,0 +1,275 @@
+"""Batched simulation of mechanical systems whose accelerations are written in torch."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from npdr_ppl.engines.commands import CommandRecord, RecordedCommands
+from npdr_ppl.engines.integrators import Components, Integrator, integrator
+from npdr_ppl.engines.stepping import State, Stepper, Tables
+from npdr_ppl.errors import ModelError, ShapeError
+from npdr_ppl.language.channels import Parameter
+from npdr_ppl.language.effects import EnvironmentEffect
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.simulator import Simulator
+
+__all__ = ["CompileMode", "Forces", "ODESimulator"]
+
+CompileMode = Literal["auto", "always", "never"]
+
+Forces = tuple[Tensor | float, ...]
+"""Generalised forces to add, one per joint; 0.0 where no effect acts."""
+
+
+class ODESimulator(Simulator):
+    """A second-order mechanical system q̈ = a(q, q̇, u, f), simulated for a whole batch at once.
+
+    A subclass declares channels, parameters and ports, and writes :meth:`accelerations`. The
+    state is the positions, then the velocities, in the order of ``joints``; every velocity names
+    its position in ``rate_of``.
+
+    Computations run in the widest floating type among the given parameters and the inputs'
+    actions, on the actions' device.
+
+    Args:
+        integrator: Name of the integration method; ``None`` for the model's default.
+        substeps: Integration steps per time step.
+        compile: Whether to compile the time loop: ``auto`` where a compiler exists and one call
+            is large enough to pay back some ten seconds of compilation.
+
+    Attributes:
+        joints: Names of the force ports, one per generalised coordinate.
+        default_integrator: The model's integration method.
+    """
+
+    is_deterministic = True
+    is_differentiable = True
+    joints: tuple[str, ...]
+    default_integrator: str = "rk4"
+
+    def __init__(
+        self,
+        *,
+        integrator: str | None = None,
+        substeps: int = 1,
+        compile: CompileMode = "auto",
+    ) -> None:
+        if substeps < 1:
+            raise ModelError(f"{self.name} needs at least one substep, got {substeps=}.")
+        if compile not in ("auto", "always", "never"):
+            raise ModelError(f"compile is 'auto', 'always' or 'never', got {compile!r}.")
+        self.integrator: Integrator = _integrator(integrator or self.default_integrator)
+        self.substeps = substeps
+        self.compile: CompileMode = compile
+
+    @abstractmethod
+    def accelerations(
+        self,
+        positions: Components,
+        velocities: Components,
+        actions: Components,
+        forces: Forces,
+        constants: Any,
+    ) -> Components:
+        """Returns the acceleration of each joint; must be affine in ``forces``.
+
+        Args:
+            positions: Generalised positions, one tensor per joint.
+            velocities: Their rates.
+            actions: Commands, limited to their channels' bounds and changed by action effects.
+            forces: Generalised forces of attached effects, to be added to the joints' own.
+            constants: What :meth:`constants` returned.
+        """
+
+    def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Returns the quantities that environment ports stand for, by port name."""
+        return {}
+
+    def constants(self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]) -> Any:
+        """Returns what :meth:`accelerations` needs, computed once per simulation.
+
+        Any nesting of tuples and dictionaries of tensors. By default the parameters by name,
+        overlaid by the environment's quantities.
+        """
+        return {**parameters, **environment}
+
+    def inverse_inertia(
+        self, positions: Components, velocities: Components, constants: Any
+    ) -> tuple[Components, ...] | None:
+        """Returns the rows of W = ∂a/∂f, or ``None`` to have it probed with unit forces."""
+        return None
+
+    def readings(
+        self, positions: Components, velocities: Components, constants: Any
+    ) -> Components:
+        """Returns the true value of every sensor channel; by default the states of that name."""
+        values = dict(zip((s.name for s in self.states), (*positions, *velocities), strict=True))
+        return tuple(values[sensor.name] for sensor in self.sensors)
+
+    def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
+        """Replays the inputs' actions; see :meth:`Simulator.simulate`."""
+        self.check_parameters(parameters)
+        self.check_inputs(inputs)
+        dtype = self.common_dtype(parameters, inputs.actions)
+        inputs = inputs.to(dtype=dtype)
+        shapes = [p.shape for p in map(torch.as_tensor, parameters.values())]
+        batch_shape = torch.broadcast_shapes(inputs.batch_shape, *shapes)
+        shape = torch.Size((*batch_shape, inputs.num_segments))
+        device = inputs.actions.device
+        given = {
+            name: torch.as_tensor(value).to(dtype=dtype, device=device)[..., None]
+            for name, value in parameters.items()
+        }
+        tables, histories = self.tables(given, shape, inputs.time_step, dtype, device)
+        stepper = Stepper(self, inputs.time_step, histories)
+        records = self._records(inputs, shape, dtype)
+        state = self._start(stepper, tables, inputs, records, shape)
+        readings: list[Tensor] = []
+        for step in range(inputs.num_steps):
+            commands = tuple(
+                RecordedCommands(r.at(step), r.table, r.rows, r.first + step, r.stride)
+                for r in records
+            )
+            state, actions = stepper.act(state, commands, tables)
+            state = stepper.move(state, actions, tables)
+            state, values = stepper.read(state, tables)
+            readings.extend(values)
+        trajectory = torch.stack(readings, dim=-1).reshape(
+            *shape, inputs.num_steps, len(self.sensors)
+        )
+        if bool(inputs.mask.all()):
+            return trajectory
+        return torch.where(inputs.mask[..., None], trajectory, torch.zeros_like(trajectory))
+
+    def common_dtype(self, parameters: Mapping[str, Tensor], other: Tensor) -> torch.dtype:
+        """Returns the widest floating type among the tensors."""
+        dtype = other.dtype
+        for value in parameters.values():
+            if isinstance(value, Tensor) and value.is_floating_point():
+                dtype = torch.promote_types(dtype, value.dtype)
+        return dtype
+
+    def tables(
+        self,
+        parameters: Mapping[str, Tensor],
+        shape: torch.Size,
+        time_step: float,
+        dtype: torch.dtype,
+        device: torch.device,
+    ) -> tuple[Tables, tuple[int, ...]]:
+        """Returns the constants of a simulation, flat, and the lengths of command histories.
+
+        Args:
+            parameters: Domain and effect parameters, each broadcasting to ``shape``; missing
+                ones are nominal.
+            shape: Shape of the batch, of numel N.
+            time_step: Seconds per step.
+            dtype: Floating type of the simulation.
+            device: Device of the simulation.
+        """
+
+        def value(site: str, parameter: Parameter) -> Tensor:
+            if site in parameters:
+                return parameters[site]
+            return torch.tensor(parameter.nominal, dtype=dtype, device=device)
+
+        own = {p.name: value(p.name, p) for p in self.parameters}
+        effects = tuple(
+            {
+                p.name: value(site, p)
+                for p, site in zip(effect.parameters, effect.parameter_names, strict=True)
+            }
+            for effect in self.effects
+        )
+        environment = self.environment(own)
+        for effect, values in zip(self.effects, effects, strict=True):
+            if isinstance(effect, EnvironmentEffect):
+                quantity = environment[effect.port]
+                environment[effect.port] = effect.environment(quantity, values)
+        constants = self.constants(own, environment)
+        histories = Stepper.needed_histories(self, effects, time_step)
+        return flatten(Tables(constants, effects), shape), histories
+
+    def _records(
+        self, inputs: Inputs, shape: torch.Size, dtype: torch.dtype
+    ) -> tuple[CommandRecord, ...]:
+        """Returns the commands of each action channel."""
+        columns = {name: i for i, name in enumerate(inputs.action_names)}
+        return tuple(
+            CommandRecord(inputs, columns[a.name], shape, (a.lower, a.upper), dtype)
+            for a in self.actions
+        )
+
+    def _start(
+        self,
+        stepper: Stepper,
+        tables: Tables,
+        inputs: Inputs,
+        records: tuple[CommandRecord, ...],
+        shape: torch.Size,
+    ) -> State:
+        """Returns the state at the segments' start, effects' memory included."""
+
+        def spread(value: Tensor) -> Tensor:
+            return value.expand(shape).reshape(-1)
+
+        components = [spread(value) for value in self.initial_states(inputs)]
+        names = [state.name for state in self.states]
+        for place, effect, columns in stepper.sensor_effects:
+            for name in (self.sensors[column].name for column in columns):
+                if name in names:
+                    i = names.index(name)
+                    values = tables.effects[place]
+                    components[i] = effect.initial_value(components[i], values)
+        num_joints = len(self.joints)
+        if len(components) != 2 * num_joints:
+            raise ShapeError(
+                f"{self.name} has {num_joints} joints, so it should declare {2 * num_joints} "
+                f"states, got {len(components)}."
+            )
+        columns = {name: i for i, name in enumerate(inputs.channel_names)}
+        reported = tuple(
+            spread(inputs.initial_readings[..., columns[s.name]]) if s.name in columns else None
+            for s in self.sensors
+        )
+        past = inputs.past_actions.shape[-2]
+        before = tuple(record.at(-1 - past) for record in records)
+        state = stepper.start(
+            tuple(components[:num_joints]),
+            tuple(components[num_joints:]),
+            tables,
+            before,
+            reported,
+        )
+        if stepper.action_effects:
+            # The effects' memory at the start is what the recorded past made of it.
+            for step in range(-past, 0):
+                commands = tuple(
+                    RecordedCommands(r.at(step), r.table, r.rows, r.first + step, r.stride)
+                    for r in records
+                )
+                state, _ = stepper.act(state, commands, tables)
+        return state
+
+
+def flatten(tree: Any, shape: torch.Size) -> Any:
+    """Returns the tree with every tensor expanded to ``shape`` and flat; single numbers stay so.
+
+    One flat axis vectorises well whatever the batch's shape is.
+    """
+
+    def flat(leaf: Any) -> Any:
+        if not isinstance(leaf, Tensor):
+            return leaf
+        return leaf.reshape(()) if leaf.numel() == 1 else leaf.expand(shape).reshape(-1)
+
+    return pytree.tree_map(flat, tree)
+
+
+def _integrator(name: str) -> Integrator:
+    """Returns the integrator called ``name``, out of reach of the argument of that name."""
+    return integrator(name)

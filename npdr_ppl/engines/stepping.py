@@ -1,0 +1,286 @@
+"""One step of a mechanical system with its effects: what open and closed loop share."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from torch import Tensor
+
+from npdr_ppl.engines.commands import RecentCommands
+from npdr_ppl.engines.dry_friction import solve_dry_friction
+from npdr_ppl.engines.integrators import Components
+from npdr_ppl.language.effects import ActionEffect, Commands, ForceEffect, SensorEffect
+
+if TYPE_CHECKING:
+    from npdr_ppl.engines.ode import ODESimulator
+
+__all__ = ["State", "Stepper", "Tables"]
+
+# Histories come in multiples of this many steps, so that draws of a delay share a compiled kernel.
+_HISTORY_GRAIN = 4
+
+
+class State(NamedTuple):
+    """What the next step needs; every tensor has the flat batch shape ``(N,)``.
+
+    Attributes:
+        positions: Generalised positions.
+        velocities: Generalised velocities.
+        force_memory: Own state of each force effect.
+        action_memory: Own state of each action effect.
+        past_commands: Past commands that each action effect may ask for, latest first.
+        sensor_memory: Own state of each sensor effect for each of its channels.
+    """
+
+    positions: Components
+    velocities: Components
+    force_memory: tuple[Any, ...] = ()
+    action_memory: tuple[Any, ...] = ()
+    past_commands: tuple[Components, ...] = ()
+    sensor_memory: tuple[tuple[Any, ...], ...] = ()
+
+
+class Tables(NamedTuple):
+    """What stays constant during a simulation.
+
+    Attributes:
+        constants: The model author's constants.
+        effects: Parameters of each effect by short name, in the order of attachment.
+    """
+
+    constants: Any
+    effects: tuple[dict[str, Tensor], ...]
+
+
+class Stepper:
+    """Advances states by one time step under the effects attached to a simulator.
+
+    Args:
+        simulator: The system and its effects.
+        time_step: Seconds per step.
+        histories: Past commands that each action effect may ask for; see :meth:`histories`.
+    """
+
+    def __init__(
+        self, simulator: "ODESimulator", time_step: float, histories: tuple[int, ...]
+    ) -> None:
+        self.simulator = simulator
+        self.time_step = time_step
+        self.histories = histories
+        self._substep = time_step / simulator.substeps
+        actions = [channel.name for channel in simulator.actions]
+        sensors = [channel.name for channel in simulator.sensors]
+        # Each entry: place in Tables.effects, the effect, what it acts on.
+        self.force_effects: list[tuple[int, ForceEffect, int]] = []
+        self.action_effects: list[tuple[int, ActionEffect, int]] = []
+        self.sensor_effects: list[tuple[int, SensorEffect, tuple[int, ...]]] = []
+        for place, effect in enumerate(simulator.effects):
+            if isinstance(effect, ForceEffect):
+                joint = simulator.joints.index(effect.port)
+                self.force_effects.append((place, effect, joint))
+            elif isinstance(effect, ActionEffect):
+                self.action_effects.append((place, effect, actions.index(effect.port)))
+            elif isinstance(effect, SensorEffect):
+                channels = simulator.port(effect.port).channels
+                columns = tuple(sensors.index(name) for name in channels)
+                self.sensor_effects.append((place, effect, columns))
+
+    @staticmethod
+    def needed_histories(
+        simulator: "ODESimulator", effects: tuple[Mapping[str, Tensor], ...], time_step: float
+    ) -> tuple[int, ...]:
+        """Returns how many past commands each action effect may ask for, rounded up."""
+        needed = [
+            effect.history(effects[place], time_step)
+            for place, effect in enumerate(simulator.effects)
+            if isinstance(effect, ActionEffect)
+        ]
+        return tuple(-(-number // _HISTORY_GRAIN) * _HISTORY_GRAIN for number in needed)
+
+    def start(
+        self,
+        positions: Components,
+        velocities: Components,
+        tables: Tables,
+        commands: Components,
+        readings: tuple[Tensor | None, ...],
+    ) -> State:
+        """Returns the state at the start of an episode or segment.
+
+        Args:
+            positions: Positions, ``(N,)`` each.
+            velocities: Velocities, ``(N,)`` each.
+            tables: Constants of the simulation.
+            commands: What each action channel saw for long before the start, ``(N,)`` each.
+            readings: What each sensor reported at the start, ``(N,)`` each; ``None`` for the
+                true value.
+        """
+        true = self.simulator.readings(positions, velocities, tables.constants)
+        reported = [
+            value if read is None else read for value, read in zip(true, readings, strict=True)
+        ]
+        return State(
+            positions,
+            velocities,
+            tuple(
+                effect.initial_memory(positions[joint], velocities[joint])
+                for _, effect, joint in self.force_effects
+            ),
+            tuple(
+                effect.initial_memory(commands[channel])
+                for _, effect, channel in self.action_effects
+            ),
+            tuple(
+                (commands[channel],) * length
+                for (_, _, channel), length in zip(
+                    self.action_effects, self.histories, strict=True
+                )
+            ),
+            tuple(
+                tuple(effect.initial_memory(true[c], reported[c]) for c in columns)
+                for _, effect, columns in self.sensor_effects
+            ),
+        )
+
+    def act(
+        self, state: State, commands: tuple[Commands, ...], tables: Tables
+    ) -> tuple[State, Components]:
+        """Passes the commands of one step through the action effects.
+
+        Args:
+            state: State at the step's start.
+            commands: One per action channel, within the channel's limits already: a limit sits
+                where the command enters the device, and recordings hold limited commands.
+            tables: Constants of the simulation.
+
+        Returns:
+            The state with the action effects' memory advanced, and what reaches the dynamics.
+        """
+        present = [channel.now() for channel in commands]
+        memory, past = list(state.action_memory), list(state.past_commands)
+        is_raw = [True] * len(commands)
+        for k, (place, effect, channel) in enumerate(self.action_effects):
+            # The first effect of a chain can look into the record; later ones see what those
+            # before them made of it, and keep a history of that.
+            command = present[channel]
+            seen = commands[channel] if is_raw[channel] else RecentCommands(command, past[k])
+            present[channel], memory[k] = effect.act(
+                seen, tables.effects[place], memory[k], self.time_step
+            )
+            if self.histories[k]:
+                past[k] = (command, *past[k][:-1])
+            is_raw[channel] = False
+        changed = state._replace(action_memory=tuple(memory), past_commands=tuple(past))
+        return changed, tuple(present)
+
+    def move(self, state: State, actions: Components, tables: Tables) -> State:
+        """Advances the dynamics by one time step under constant actions."""
+        for _ in range(self.simulator.substeps):
+            state = self._move_once(state, actions, tables)
+        return state
+
+    def read(self, state: State, tables: Tables) -> tuple[State, Components]:
+        """Returns the state with the sensor effects' memory advanced, and the readings."""
+        readings = list(
+            self.simulator.readings(state.positions, state.velocities, tables.constants)
+        )
+        if not self.sensor_effects:
+            return state, tuple(readings)
+        memories = []
+        for (place, effect, columns), memory in zip(
+            self.sensor_effects, state.sensor_memory, strict=True
+        ):
+            changed = list(memory)
+            for m, column in enumerate(columns):
+                readings[column], changed[m] = effect.read(
+                    readings[column], tables.effects[place], memory[m], self.time_step
+                )
+            memories.append(tuple(changed))
+        return state._replace(sensor_memory=tuple(memories)), tuple(readings)
+
+    def _move_once(self, state: State, actions: Components, tables: Tables) -> State:
+        simulator, constants = self.simulator, tables.constants
+        q, v = state.positions, state.velocities
+
+        def smooth_forces(positions: Components, velocities: Components) -> list[Any]:
+            forces: list[Any] = [0.0] * len(positions)
+            for k, (place, effect, joint) in enumerate(self.force_effects):
+                force = effect.force(
+                    positions[joint],
+                    velocities[joint],
+                    tables.effects[place],
+                    state.force_memory[k],
+                )
+                if force is not None:
+                    forces[joint] = forces[joint] + force
+            return forces
+
+        def acceleration(positions: Components, velocities: Components) -> Components:
+            forces = smooth_forces(positions, velocities)
+            return simulator.accelerations(
+                positions, velocities, actions, tuple(forces), constants
+            )
+
+        first = acceleration(q, v)
+        bounds = self._dry_friction_bounds(state, tables)
+        if any(bound is not None for bound in bounds):
+            smooth = tuple(smooth_forces(q, v))
+            inertia = simulator.inverse_inertia(q, v, constants) or _probe_inverse_inertia(
+                simulator, q, v, actions, smooth, constants, first
+            )
+            dry = solve_dry_friction(bounds, v, first, inertia, self._substep)
+            # Accelerations are affine in the forces, so the first evaluation is not repeated.
+            first = tuple(
+                a + sum(w * f for w, f, b in zip(row, dry, bounds, strict=True) if b is not None)
+                for a, row in zip(first, inertia, strict=True)
+            )
+
+            def acceleration(positions: Components, velocities: Components) -> Components:
+                forces = smooth_forces(positions, velocities)
+                total = tuple(s + d for s, d in zip(forces, dry, strict=True))
+                return simulator.accelerations(positions, velocities, actions, total, constants)
+
+        q, v = simulator.integrator.step(acceleration, q, v, first, self._substep)
+        memory = tuple(
+            effect.next_memory(
+                state.positions[joint],
+                state.velocities[joint],
+                tables.effects[place],
+                state.force_memory[k],
+                self._substep,
+            )
+            for k, (place, effect, joint) in enumerate(self.force_effects)
+        )
+        return state._replace(positions=q, velocities=v, force_memory=memory)
+
+    def _dry_friction_bounds(self, state: State, tables: Tables) -> tuple[Tensor | None, ...]:
+        """Returns the summed bounds of dry friction per joint."""
+        bounds: list[Tensor | None] = [None] * len(state.positions)
+        for k, (place, effect, joint) in enumerate(self.force_effects):
+            bound = effect.dry_friction(
+                state.positions[joint],
+                state.velocities[joint],
+                tables.effects[place],
+                state.force_memory[k],
+            )
+            if bound is not None:
+                present = bounds[joint]
+                bounds[joint] = bound if present is None else present + bound
+        return tuple(bounds)
+
+
+def _probe_inverse_inertia(
+    simulator: "ODESimulator",
+    positions: Components,
+    velocities: Components,
+    actions: Components,
+    forces: tuple[Any, ...],
+    constants: Any,
+    accelerations: Components,
+) -> tuple[Components, ...]:
+    """Returns the rows of W by applying a unit force at one joint after the other."""
+    columns = []
+    for joint in range(len(positions)):
+        pushed = tuple(f + 1.0 if i == joint else f for i, f in enumerate(forces))
+        moved = simulator.accelerations(positions, velocities, actions, pushed, constants)
+        columns.append(tuple(b - a for a, b in zip(accelerations, moved, strict=True)))
+    return tuple(zip(*columns, strict=True))
