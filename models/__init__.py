@@ -1,1 +1,75 @@
-"""The model zoo."""
+"""The model zoo: simulators, their Pyro models, and the catalogue of effects."""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from npdr_ppl.language.simulator import Simulator
+
+__all__ = ["ZooEntry", "zoo"]
+
+
+@dataclass(frozen=True)
+class ZooEntry:
+    """A model of the zoo; its module is imported when it is asked for.
+
+    Attributes:
+        name: Name on the command line.
+        summary: One line for tables.
+        module: Module that holds the model.
+        model_name: Name of the Pyro model function in the module.
+        simulator_name: Name of the simulator class in the module.
+    """
+
+    name: str
+    summary: str
+    module: str
+    model_name: str
+    simulator_name: str
+
+    @property
+    def model(self) -> Callable[..., Tensor]:
+        """The Pyro model, a function of the inputs."""
+        return getattr(importlib.import_module(self.module), self.model_name)
+
+    @property
+    def simulator(self) -> type[Simulator]:
+        """The simulator's class."""
+        return getattr(importlib.import_module(self.module), self.simulator_name)
+
+
+_ENTRIES = (
+    ZooEntry(
+        "pendulum",
+        "Pendulum with unknown mass and length, torque at the hinge",
+        "npdr_ppl.models.pendulum",
+        "pendulum",
+        "Pendulum",
+    ),
+    ZooEntry(
+        "furuta",
+        "Furuta pendulum (Quanser Qube), nine parameters, plausible damping priors",
+        "npdr_ppl.models.furuta",
+        "furuta",
+        "Furuta",
+    ),
+    ZooEntry(
+        "furuta_paper",
+        "Furuta pendulum with the prior of the NPDR paper",
+        "npdr_ppl.models.furuta",
+        "furuta_paper",
+        "Furuta",
+    ),
+)
+
+
+def zoo() -> dict[str, ZooEntry]:
+    """Returns every model of the zoo by name.
+
+    Example:
+        >>> sorted(zoo())
+        ['furuta', 'furuta_paper', 'pendulum']
+    """
+    return {entry.name: entry for entry in _ENTRIES}

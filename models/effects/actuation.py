@@ -1,0 +1,127 @@
+"""What happens to a command on its way to the dynamics."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.language.channels import Parameter, Port
+from npdr_ppl.language.effects import ActionEffect, Commands
+from npdr_ppl.models.effects.lag import remaining
+
+__all__ = ["ActuatorGain", "ActuatorLag", "DeadZone", "InputDelay", "SupplySag"]
+
+
+class InputDelay(ActionEffect):
+    """u(t − d) with a delay d that need not be a whole number of steps.
+
+    Commands are held for a step, so with d = (n + f) h a step of length h sees u_{k−n−1} for the
+    fraction f and u_{k−n} for the rest; their mean acts: (1 − f) u_{k−n} + f u_{k−n−1}.
+    """
+
+    id = "input_delay"
+    parameters = (Parameter("delay", "s", 0.0, "delay d"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Uniform up to 30 ms."""
+        return {"delay": dist.Uniform(0.0, 0.03)}
+
+    def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
+        """Returns the steps that the longest delay reaches back."""
+        return math.floor(float(parameters["delay"].detach().max()) / time_step) + 1
+
+    def act(
+        self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns the mean command of the delayed step."""
+        steps = parameters["delay"] / time_step
+        whole = torch.floor(steps.detach())
+        fraction = steps - whole
+        later, earlier = commands.delayed(whole), commands.delayed(whole + 1.0)
+        return (1.0 - fraction) * later + fraction * earlier, memory
+
+
+class ActuatorLag(ActionEffect):
+    """τ̇ = (u − τ)/T: a first-order lag with time constant T; the mean over a step acts."""
+
+    id = "actuator_lag"
+    parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Uniform up to 50 ms."""
+        return {"time_constant": dist.Uniform(0.0, 0.05)}
+
+    def initial_memory(self, command: Tensor) -> Tensor:
+        """Returns the settled output."""
+        return command
+
+    def act(
+        self,
+        commands: Commands,
+        parameters: Mapping[str, Tensor],
+        memory: Tensor,
+        time_step: float,
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the mean output during the step, and the output at its end."""
+        command, time_constant = commands.now(), parameters["time_constant"]
+        decay = remaining(time_constant, time_step)
+        missing = memory - command
+        mean = command + missing * (time_constant / time_step * (1.0 - decay))
+        return mean, command + missing * decay
+
+
+class ActuatorGain(ActionEffect):
+    """(1 + ε) u."""
+
+    id = "actuator_gain"
+    parameters = (Parameter("error", "1", 0.0, "relative gain error ε"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Normal; 7 %."""
+        return {"error": dist.Normal(0.0, 0.07)}
+
+    def act(
+        self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns (1 + ε) u."""
+        return (1.0 + parameters["error"]) * commands.now(), memory
+
+
+class SupplySag(ActionEffect):
+    """(1 − a |u|/u_rated) u: a gain that falls with the load."""
+
+    id = "supply_sag"
+    parameters = (Parameter("sag", "1/({port})", 0.0, "relative loss of gain per command a"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal; 10 % at the rated command."""
+        return {"sag": dist.HalfNormal(0.1 / port.rated)}
+
+    def act(
+        self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns (1 − a |u|) u."""
+        command = commands.now()
+        return (1.0 - parameters["sag"] * command.abs()) * command, memory
+
+
+class DeadZone(ActionEffect):
+    """sign(u) max(|u| − δ, 0)."""
+
+    id = "dead_zone"
+    parameters = (Parameter("width", "{port}", 0.0, "half width δ"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal; 3 % of the rated command."""
+        return {"width": dist.HalfNormal(0.03 * port.rated)}
+
+    def act(
+        self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns u − clip(u, ±δ), which is the same."""
+        command, width = commands.now(), parameters["width"]
+        return command - command.clamp(-width, width), memory

@@ -1,0 +1,93 @@
+"""Forces at a joint that are not friction."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.language.channels import Parameter, Port
+from npdr_ppl.language.effects import ForceEffect
+
+__all__ = ["Bias", "HardeningSpring", "Spring", "Unbalance"]
+
+
+class Bias(ForceEffect):
+    """A constant force c."""
+
+    id = "bias"
+    parameters = (Parameter("offset", "{port}", 0.0, "constant force c"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Normal; 2 % of the rated force."""
+        return {"offset": dist.Normal(0.0, 0.02 * port.rated)}
+
+    def force(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
+    ) -> Tensor:
+        """Returns c."""
+        return parameters["offset"]
+
+
+class Spring(ForceEffect):
+    """−k (q − q₀): a spring, or a cable that is dragged along."""
+
+    id = "spring"
+    parameters = (
+        Parameter("stiffness", "{port}/rad", 0.0, "stiffness k"),
+        Parameter("rest", "rad", 0.0, "position q₀ without force"),
+    )
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Stiffness half-normal, 5 % of the rated force per radian; rest normal, 0.5 rad."""
+        return {
+            "stiffness": dist.HalfNormal(0.05 * port.rated),
+            "rest": dist.Normal(0.0, 0.5),
+        }
+
+    def force(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
+    ) -> Tensor:
+        """Returns −k (q − q₀)."""
+        return -parameters["stiffness"] * (position - parameters["rest"])
+
+
+class HardeningSpring(ForceEffect):
+    """−k₃ q³."""
+
+    id = "hardening_spring"
+    parameters = (Parameter("stiffness", "{port}/rad³", 0.0, "cubic stiffness k₃"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal; 5 % of the rated force at one radian."""
+        return {"stiffness": dist.HalfNormal(0.05 * port.rated)}
+
+    def force(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
+    ) -> Tensor:
+        """Returns −k₃ q³."""
+        return -parameters["stiffness"] * position * position * position
+
+
+class Unbalance(ForceEffect):
+    """a sin q + b cos q: an eccentric mass m r under gravity, a = m r g cos φ, b = m r g sin φ."""
+
+    id = "unbalance"
+    parameters = (
+        Parameter("sine", "{port}", 0.0, "force a at q = 90°"),
+        Parameter("cosine", "{port}", 0.0, "force b at q = 0"),
+    )
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Normal; 3 % of the rated force each."""
+        scale = 0.03 * port.rated
+        return {"sine": dist.Normal(0.0, scale), "cosine": dist.Normal(0.0, scale)}
+
+    def force(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
+    ) -> Tensor:
+        """Returns a sin q + b cos q."""
+        sine = parameters["sine"] * torch.sin(position)
+        return sine + parameters["cosine"] * torch.cos(position)

@@ -1,0 +1,121 @@
+"""Friction at a joint."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.language.channels import Parameter, Port
+from npdr_ppl.language.effects import ForceEffect
+
+__all__ = [
+    "AsymmetricCoulombFriction",
+    "CoulombFriction",
+    "QuadraticDrag",
+    "StribeckFriction",
+    "ViscousFriction",
+]
+
+
+class ViscousFriction(ForceEffect):
+    """−b v with damping b; not to be told from a motor's back-EMF."""
+
+    id = "viscous_friction"
+    parameters = (Parameter("damping", "{port} s", 0.0, "force per speed b"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal; 10 % of the rated force at rated speed."""
+        return {"damping": dist.HalfNormal(0.1 * port.rated / port.rated_speed)}
+
+    def force(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
+    ) -> Tensor:
+        """Returns −b v."""
+        return -parameters["damping"] * velocity
+
+
+class CoulombFriction(ForceEffect):
+    """−F sign v in motion, and at rest just what keeps the joint at rest, up to F."""
+
+    id = "coulomb_friction"
+    parameters = (Parameter("magnitude", "{port}", 0.0, "dry friction F"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal; 5 % of the rated force."""
+        return {"magnitude": dist.HalfNormal(0.05 * port.rated)}
+
+    def dry_friction(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
+    ) -> Tensor:
+        """Returns F."""
+        return parameters["magnitude"]
+
+
+class AsymmetricCoulombFriction(ForceEffect):
+    """−F₊ in forward and +F₋ in backward motion; not to be told from Coulomb plus a bias."""
+
+    id = "asymmetric_coulomb_friction"
+    parameters = (
+        Parameter("forward", "{port}", 0.0, "dry friction F₊ in forward motion"),
+        Parameter("backward", "{port}", 0.0, "dry friction F₋ in backward motion"),
+    )
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal; 5 % of the rated force each."""
+        scale = 0.05 * port.rated
+        return {"forward": dist.HalfNormal(scale), "backward": dist.HalfNormal(scale)}
+
+    def dry_friction(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
+    ) -> Tensor:
+        """Returns the bound in the present direction; at rest the smaller one holds."""
+        forward, backward = parameters["forward"], parameters["backward"]
+        smaller = torch.minimum(forward, backward)
+        moving = torch.where(velocity > 0.0, forward, backward)
+        return torch.where(velocity == 0.0, smaller, moving)
+
+
+class StribeckFriction(ForceEffect):
+    """Dry friction that is ΔF exp(−|v/v_s|) greater near rest: −ΔF exp(−|v/v_s|) sign v.
+
+    Attaches next to Coulomb friction, of which ΔF is the excess of static over sliding friction.
+    """
+
+    id = "stribeck_friction"
+    parameters = (
+        Parameter("excess", "{port}", 0.0, "static minus sliding friction ΔF"),
+        Parameter("speed", "1/s", 0.1, "Stribeck velocity v_s in the joint's coordinate"),
+    )
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Excess half-normal, 3 % of the rated force; speed log-normal about 0.1 per second."""
+        return {
+            "excess": dist.HalfNormal(0.03 * port.rated),
+            "speed": dist.LogNormal(-2.3, 0.8),
+        }
+
+    def dry_friction(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
+    ) -> Tensor:
+        """Returns ΔF exp(−|v/v_s|)."""
+        return parameters["excess"] * torch.exp(-velocity.abs() / parameters["speed"])
+
+
+class QuadraticDrag(ForceEffect):
+    """−c v|v| with drag c."""
+
+    id = "quadratic_drag"
+    parameters = (Parameter("drag", "{port} s²", 0.0, "force per squared speed c"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal; 10 % of the rated force at rated speed."""
+        return {"drag": dist.HalfNormal(0.1 * port.rated / port.rated_speed**2)}
+
+    def force(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
+    ) -> Tensor:
+        """Returns −c v|v|."""
+        return -parameters["drag"] * velocity * velocity.abs()

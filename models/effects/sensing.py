@@ -1,0 +1,83 @@
+"""What happens between a true value and its reading."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pyro.distributions as dist
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.language.channels import Parameter, Port
+from npdr_ppl.language.effects import SensorEffect
+from npdr_ppl.models.effects.lag import remaining
+
+__all__ = ["EncoderBias", "EncoderScale", "SensorLowPass"]
+
+
+class SensorLowPass(SensorEffect):
+    """ẏ = (x − y)/T: a filtered reading, e.g. a velocity derived from an encoder.
+
+    Discretised as drivers do it: y_k = x_k + exp(−h/T) (y_{k−1} − x_k). The filter's output at a
+    segment's start is what was read there. Attach it to a group of channels,
+    ``"arm_velocity,pole_velocity"``, where one driver filters them all.
+    """
+
+    id = "sensor_low_pass"
+    parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Uniform up to 30 ms."""
+        return {"time_constant": dist.Uniform(0.0, 0.03)}
+
+    def initial_memory(self, value: Tensor, reading: Tensor) -> Tensor:
+        """Returns the reading."""
+        return reading
+
+    def read(
+        self, value: Tensor, parameters: Mapping[str, Tensor], memory: Tensor, time_step: float
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the filter's output, which is its memory too."""
+        output = value + remaining(parameters["time_constant"], time_step) * (memory - value)
+        return output, output
+
+
+class EncoderBias(SensorEffect):
+    """q + β."""
+
+    id = "encoder_bias"
+    parameters = (Parameter("offset", "{port}", 0.0, "offset β of the reading"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Normal; 1 % of the rated value."""
+        return {"offset": dist.Normal(0.0, 0.01 * port.rated)}
+
+    def initial_value(self, reading: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Takes the offset out."""
+        return reading - parameters["offset"]
+
+    def read(
+        self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns q + β."""
+        return value + parameters["offset"], memory
+
+
+class EncoderScale(SensorEffect):
+    """(1 + s) q."""
+
+    id = "encoder_scale"
+    parameters = (Parameter("error", "1", 0.0, "relative scale error s"),)
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Normal; 1 %."""
+        return {"error": dist.Normal(0.0, 0.01)}
+
+    def initial_value(self, reading: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Takes the scale error out."""
+        return reading / (1.0 + parameters["error"])
+
+    def read(
+        self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns (1 + s) q."""
+        return (1.0 + parameters["error"]) * value, memory

@@ -1,0 +1,224 @@
+"""The contract of every effect of the catalogue, on every port of every ODE model of the zoo."""
+
+import pytest
+import torch
+
+from npdr_ppl.engines.integrators import INTEGRATORS
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.effects import (
+    ActuatorGain,
+    ActuatorLag,
+    Bias,
+    CoulombFriction,
+    EncoderBias,
+    InputDelay,
+    SensorLowPass,
+    Tilt,
+    effects,
+)
+from npdr_ppl.models.furuta import Furuta
+from npdr_ppl.models.pendulum import Pendulum
+
+CASES = [
+    pytest.param(simulator, effect, port, id=f"{simulator.__name__}-{port}-{name}")
+    for simulator in (Pendulum, Furuta)
+    for name, effect in effects().items()
+    for port in (
+        *(port.name for port in simulator.ports if port.kind in effect.port_kinds),
+        *(
+            (",".join(s.name for s in simulator.states if s.rate_of),)
+            if "sensor" in effect.port_kinds and len(simulator.states) > 2
+            else ()
+        ),
+    )
+]
+
+
+def some_inputs(simulator, dtype=torch.float64, num_segments=3, num_steps=40) -> Inputs:
+    generator = torch.Generator().manual_seed(11)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
+
+    states = draw(num_segments, len(simulator.states))
+    return Inputs(
+        actions=simulator.actions[0].upper * draw(num_segments, num_steps, 1),
+        action_names=(simulator.actions[0].name,),
+        initial_readings=states + 0.1 * draw(*states.shape),
+        initial_values=states,
+        initial_rates=None,
+        channel_names=tuple(state.name for state in simulator.states),
+        past_actions=draw(num_segments, 6, 1),
+        time_step=simulator.time_step,
+        mask=torch.arange(num_steps) < torch.tensor([[num_steps], [num_steps - 5], [1]]),
+        rollout=torch.tensor([0, 0, 1]),
+        start=torch.tensor([0, num_steps, 0]),
+    )
+
+
+def no_strength(effect, dtype, shape=()):
+    return {
+        site: torch.full(shape, parameter.nominal, dtype=dtype)
+        for site, parameter in zip(effect.parameter_names, effect.parameters, strict=True)
+    }
+
+
+def draws(effect, port, num_draws, seed=0):
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return {
+            f"{effect.name}.{name}": prior.sample((num_draws,)).double()
+            for name, prior in effect.priors(port).items()
+        }
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("simulator", "effect", "port"), CASES)
+def test_zero_strength_changes_no_bit(simulator, effect, port, dtype, integrator):
+    attached = effect(port)
+    base = simulator(integrator=integrator)
+    inputs = some_inputs(simulator, dtype, num_steps=12)
+    expected = base.simulate({}, inputs)
+    assert expected.dtype == dtype
+    changed = base.with_effects(attached)
+    assert torch.equal(changed.simulate({}, inputs), expected)
+    assert torch.equal(changed.simulate(no_strength(attached, dtype), inputs), expected)
+    batch = changed.simulate(no_strength(attached, dtype, (2, 1)), inputs)
+    assert torch.equal(batch, expected.expand(2, 1, *expected.shape))
+
+
+@pytest.mark.parametrize(("simulator", "effect", "port"), CASES)
+def test_batch_equals_a_loop(simulator, effect, port):
+    attached = effect(port)
+    changed = simulator().with_effects(attached)
+    inputs = some_inputs(simulator)
+    parameters = draws(attached, changed.port(port), 4)
+    parameters["gravity"] = torch.linspace(9.0, 10.0, 4, dtype=torch.float64)
+    batch = changed.simulate(parameters, inputs)
+    assert batch.shape == (4, 3, 40, len(simulator.states))
+    for i in range(4):
+        for s in range(3):
+            one = changed.simulate(
+                {name: value[i] for name, value in parameters.items()}, inputs.segments([s])
+            )
+            torch.testing.assert_close(batch[i, s], one[0], rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(("simulator", "effect", "port"), CASES)
+def test_prior_draws_matter_and_stay_finite(simulator, effect, port):
+    attached = effect(port)
+    changed = simulator().with_effects(attached)
+    inputs = some_inputs(simulator, num_steps=200)
+    assert set(attached.priors(changed.port(port))) == {p.name for p in attached.parameters}
+    out = changed.simulate(draws(attached, changed.port(port), 50), inputs)
+    base = simulator().simulate({}, inputs)
+    assert out.isfinite().all()
+    assert (out[..., ~inputs.mask, :] == 0.0).all()
+    matters = ((out - base).abs().flatten(1).amax(1) > 1e-12).float().mean()
+    # Nothing depends on where the arm's zero is, and a segment starts from its own reading.
+    is_symmetry = port == "arm_angle" and effect is EncoderBias
+    assert matters == 0.0 if is_symmetry else matters > 0.9
+
+
+@pytest.mark.parametrize(("simulator", "effect", "port"), CASES)
+def test_gradients_exist_for_every_parameter(simulator, effect, port):
+    attached = effect(port)
+    changed = simulator().with_effects(attached)
+    parameters = {
+        name: value[0].requires_grad_()
+        for name, value in draws(attached, changed.port(port), 1).items()
+    }
+    out = changed.simulate(parameters, some_inputs(simulator))
+    gradients = torch.autograd.grad(out.square().sum(), list(parameters.values()))
+    assert all(gradient.isfinite() for gradient in gradients)
+
+
+def test_effects_compose_in_the_order_of_attachment():
+    inputs = some_inputs(Furuta)
+    gain, lag, delay = ActuatorGain("voltage"), ActuatorLag("voltage"), InputDelay("voltage")
+    strengths = {
+        "voltage.actuator_gain.error": torch.tensor(0.2, dtype=torch.float64),
+        "voltage.actuator_lag.time_constant": torch.tensor(0.01, dtype=torch.float64),
+        "voltage.input_delay.delay": torch.tensor(0.005, dtype=torch.float64),
+    }
+    # These three are linear and time-invariant, so that any order gives the same trajectory,
+    # but only if later effects see the history of what earlier ones let through.
+    expected = Furuta().with_effects(delay, gain, lag).simulate(strengths, inputs)
+    for order in ((gain, delay, lag), (gain, lag, delay), (lag, gain, delay)):
+        out = Furuta().with_effects(*order).simulate(strengths, inputs)
+        torch.testing.assert_close(out[0], expected[0], rtol=1e-9, atol=1e-9)
+
+
+def test_all_kinds_at_once_reduce_to_the_base_at_zero_strength():
+    attached = (
+        Tilt("gravity"),
+        CoulombFriction("arm"),
+        CoulombFriction("pole"),
+        Bias("arm"),
+        ActuatorLag("voltage"),
+        InputDelay("voltage"),
+        SensorLowPass("arm_velocity,pole_velocity"),
+    )
+    inputs = some_inputs(Furuta, torch.float32)
+    base = Furuta()
+    changed = base.with_effects(*attached)
+    zero = {}
+    for effect in attached:
+        zero |= no_strength(effect, torch.float32)
+    expected = base.simulate({}, inputs)
+    assert torch.equal(changed.simulate(zero, inputs), expected)
+    assert base.effects == ()
+
+
+@pytest.mark.parametrize("steps", [1.0, 2.5, 5.0])
+def test_delay_shifts_the_commands(steps):
+    """A delayed command equals the same command given later, in whole and half steps."""
+    commands = torch.randn(60, 1, generator=torch.Generator().manual_seed(1)).double()
+    names = tuple(state.name for state in Furuta.states)
+
+    def replay(actions, simulator, parameters):
+        inputs = Inputs.single(
+            actions,
+            torch.zeros(4),
+            action_names=("voltage",),
+            state_names=names,
+            time_step=0.002,
+        )
+        return simulator.simulate(parameters, inputs)
+
+    padded = torch.cat((torch.zeros(6, 1, dtype=torch.float64), commands))
+    whole, part = int(steps), steps - int(steps)
+    shifted = (1 - part) * padded[6 - whole : 66 - whole] + part * padded[5 - whole : 65 - whole]
+    delay = torch.tensor(steps * 0.002, dtype=torch.float64)
+    delayed = replay(
+        commands,
+        Furuta().with_effects(InputDelay("voltage")),
+        {"voltage.input_delay.delay": delay},
+    )
+    torch.testing.assert_close(delayed, replay(shifted, Furuta(), {}), rtol=1e-9, atol=1e-9)
+
+
+def test_delay_longer_than_the_segment_sees_the_recorded_past():
+    inputs = some_inputs(Furuta, num_steps=3)
+    simulator = Furuta().with_effects(InputDelay("voltage"))
+    delay = {"voltage.input_delay.delay": torch.tensor(0.01, dtype=torch.float64)}
+    out = simulator.simulate(delay, inputs)
+    everything = torch.cat((inputs.past_actions, inputs.actions), dim=1)
+    shifted = Inputs(**{**vars(inputs), "actions": everything[:, 1:4]})
+    torch.testing.assert_close(out, Furuta().simulate({}, shifted), rtol=1e-9, atol=1e-9)
+
+
+def test_wrong_ports_are_named():
+    with pytest.raises(ModelError, match="kind force"):
+        Furuta().with_effects(CoulombFriction("voltage"))
+    with pytest.raises(ModelError, match="no port 'elbow'"):
+        Furuta().with_effects(CoulombFriction("elbow"))
+    with pytest.raises(ModelError, match="attached to Furuta already"):
+        Furuta().with_effects(CoulombFriction("arm"), CoulombFriction("arm"))
+
+
+def test_units_are_those_of_the_port():
+    port = Furuta().port("arm")
+    assert CoulombFriction("arm").units(port) == {"magnitude": "N m"}
