@@ -1,1 +1,21 @@
-"""embeddings."""
+"""Embeddings: from trajectories to the features that a backend conditions on."""
+
+from npdr_ppl.embeddings.base import Embedding
+from npdr_ppl.embeddings.networks import Convolutional, Recurrent
+from npdr_ppl.embeddings.registry import embedding_by_name, embedding_names
+from npdr_ppl.embeddings.statistics import AllSteps, BayesSimStatistic, Differences, LastStep
+from npdr_ppl.embeddings.wrappers import Masked, Strided
+
+__all__ = [
+    "AllSteps",
+    "BayesSimStatistic",
+    "Convolutional",
+    "Differences",
+    "Embedding",
+    "LastStep",
+    "Masked",
+    "Recurrent",
+    "Strided",
+    "embedding_by_name",
+    "embedding_names",
+]

@@ -1,0 +1,56 @@
+"""Embeddings by name."""
+
+import re
+from collections.abc import Callable
+
+from npdr_ppl.embeddings.base import Embedding
+from npdr_ppl.embeddings.networks import Convolutional, Recurrent
+from npdr_ppl.embeddings.statistics import AllSteps, BayesSimStatistic, Differences, LastStep
+from npdr_ppl.embeddings.wrappers import Masked, Strided
+from npdr_ppl.errors import ModelError
+
+__all__ = ["embedding_by_name", "embedding_names"]
+
+_EMBEDDINGS: dict[str, Callable[[], Embedding]] = {
+    "bayessim": BayesSimStatistic,
+    "last": LastStep,
+    "all": AllSteps,
+    "differences": Differences,
+    "gru": Recurrent,
+    "conv": Convolutional,
+}
+
+_WORD = re.compile(r"(?P<name>[a-z]+)(\[(?P<channels>[^\[\]]+)\])?(/(?P<stride>[1-9][0-9]{0,6}))?")
+
+
+def embedding_names() -> tuple[str, ...]:
+    """Returns the names that :func:`embedding_by_name` knows."""
+    return tuple(_EMBEDDINGS)
+
+
+def embedding_by_name(word: str) -> Embedding:
+    """Returns the embedding that a word describes: ``name[channel,channel]/stride``.
+
+    Args:
+        word: A name of :func:`embedding_names`, optionally with the channels to embed and the
+            stride in steps, e.g. ``"bayessim"``, ``"all/10"`` or ``"all[ball_x,ball_y]/2"``.
+
+    Raises:
+        ModelError: There is no such embedding.
+
+    Example:
+        >>> embedding_by_name("all/10")
+        Strided(inner=AllSteps(), stride=10)
+    """
+    match = _WORD.fullmatch(word)
+    if match is None or match["name"] not in _EMBEDDINGS:
+        raise ModelError(
+            f"there is no embedding {word!r}; write one of {', '.join(_EMBEDDINGS)}, with a "
+            "stride as in all/10 or channels as in all[x,y]/10."
+        )
+    result = _EMBEDDINGS[match["name"]]()
+    if match["channels"] is not None:
+        result = Masked(result, tuple(part.strip() for part in match["channels"].split(",")))
+    if match["stride"] is not None:
+        result = Strided(result, int(match["stride"]))
+    return result

@@ -1,0 +1,121 @@
+"""Embeddings of a part of the trajectory: every k-th step, chosen channels, chosen steps."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from npdr_ppl.embeddings.base import Embedding, check_trajectory
+from npdr_ppl.errors import DataError, ModelError, ShapeError
+from npdr_ppl.language.inputs import Inputs
+
+__all__ = ["Masked", "Strided"]
+
+
+@dataclass(frozen=True)
+class Strided(Embedding):
+    """Hands every k-th reading to another embedding.
+
+    Readings after steps k, 2k, … of a segment are kept, each with the action of the first of its
+    k steps; the rest of a segment that k does not divide is dropped.
+
+    Attributes:
+        inner: The embedding that gets the thinned trajectory.
+        stride: k.
+    """
+
+    inner: Embedding
+    stride: int
+
+    def __post_init__(self) -> None:
+        """Checks the stride."""
+        if self.stride < 1:
+            raise ModelError(f"a stride is at least 1, got {self.stride}.")
+
+    @property
+    def is_trained(self) -> bool:  # type: ignore[override]
+        """Whether the inner embedding is trained."""
+        return self.inner.is_trained
+
+    def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
+        """Returns the inner embedding's features of the thinned trajectory."""
+        check_trajectory(trajectory, inputs)
+        k = self.stride
+        mask = inputs.mask[:, k - 1 :: k]
+        num_steps = mask.shape[1]
+        if not bool(mask.any()):
+            raise ShapeError(
+                f"a stride of {k} leaves nothing of segments of {inputs.num_steps} steps."
+            )
+        thinned = replace(
+            inputs,
+            actions=inputs.actions[..., ::k, :][..., :num_steps, :],
+            mask=mask,
+            time_step=inputs.time_step * k,
+        )
+        return self.inner.features(trajectory[:, :, k - 1 :: k], thinned)
+
+    def network(self, feature_shape: torch.Size) -> nn.Module | None:
+        """Returns the inner embedding's network."""
+        return self.inner.network(feature_shape)
+
+
+@dataclass(frozen=True)
+class Masked(Embedding):
+    """Hands chosen channels and steps to another embedding.
+
+    Attributes:
+        inner: The embedding that gets the rest.
+        channels: Names and order of the channels kept, ``None`` for all.
+        first_step: First step of each segment that counts, from 0.
+        last_step: Step before which counting ends, ``None`` for the segment's end.
+    """
+
+    inner: Embedding
+    channels: tuple[str, ...] | None = None
+    first_step: int = 0
+    last_step: int | None = None
+
+    def __post_init__(self) -> None:
+        """Checks the choice."""
+        if self.channels is not None and not self.channels:
+            raise ModelError("no channel was chosen.")
+        if self.first_step < 0 or (
+            self.last_step is not None and self.last_step <= self.first_step
+        ):
+            raise ModelError(
+                f"steps are chosen as 0 <= first < last, got {self.first_step} and "
+                f"{self.last_step}."
+            )
+
+    @property
+    def is_trained(self) -> bool:  # type: ignore[override]
+        """Whether the inner embedding is trained."""
+        return self.inner.is_trained
+
+    def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
+        """Returns the inner embedding's features of what is kept."""
+        check_trajectory(trajectory, inputs)
+        if self.channels is not None:
+            missing = [name for name in self.channels if name not in inputs.channel_names]
+            if missing:
+                raise DataError(
+                    f"there is no channel {', '.join(missing)} to embed; there are "
+                    f"{', '.join(inputs.channel_names)}."
+                )
+            trajectory = trajectory[..., [inputs.channel_names.index(c) for c in self.channels]]
+            inputs = inputs.select_channels(self.channels)
+        steps = torch.arange(inputs.num_steps, device=inputs.mask.device)
+        kept = steps >= self.first_step
+        if self.last_step is not None:
+            kept &= steps < self.last_step
+        mask = inputs.mask & kept
+        if not bool(mask.any()):
+            raise ShapeError(
+                f"no segment has steps from {self.first_step} on; they have {inputs.num_steps}."
+            )
+        return self.inner.features(trajectory, replace(inputs, mask=mask))
+
+    def network(self, feature_shape: torch.Size) -> nn.Module | None:
+        """Returns the inner embedding's network."""
+        return self.inner.network(feature_shape)
