@@ -26,13 +26,14 @@ __all__ = [
     "infer",
     "remove_effect",
     "simulate",
+    "with_noise",
 ]
 
 if TYPE_CHECKING:
     from npdr_ppl.errors import NpdrError
     from npdr_ppl.language.channels import Channel, Parameter, Port
     from npdr_ppl.language.effects import Effect
-    from npdr_ppl.language.handlers import add_effect, remove_effect
+    from npdr_ppl.language.handlers import add_effect, remove_effect, with_noise
     from npdr_ppl.language.inputs import Inputs
     from npdr_ppl.language.simulator import Simulator
     from npdr_ppl.language.sites import simulate
@@ -57,6 +58,7 @@ _HOMES = {
     "infer": "workflows.infer",
     "remove_effect": "language.handlers",
     "simulate": "language.sites",
+    "with_noise": "language.handlers",
 }
 
 

@@ -9,9 +9,18 @@ from pyro.poutine.messenger import Messenger
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.noise import Noise
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
 
-__all__ = ["EffectMessenger", "ModelWithEffects", "SkipSimulation", "add_effect", "remove_effect"]
+__all__ = [
+    "EffectMessenger",
+    "ModelWithEffects",
+    "NoiseMessenger",
+    "SkipSimulation",
+    "add_effect",
+    "remove_effect",
+    "with_noise",
+]
 
 Model = Callable[..., Any]
 
@@ -129,6 +138,27 @@ def _parts(model: Model) -> tuple[Model, tuple[tuple[Effect, str | None], ...]]:
     if isinstance(model, ModelWithEffects):
         return model.base, model.effects
     return model, ()
+
+
+class NoiseMessenger(Messenger):
+    """Replaces the noise of the readings at a program's black-box sites while it runs.
+
+    Args:
+        noise: The noise, ``None`` for none.
+    """
+
+    def __init__(self, noise: Noise | None) -> None:
+        super().__init__()
+        self.noise = noise
+
+    def _pyro_sample(self, msg: Any) -> None:
+        if isinstance(msg["fn"], BlackBox):
+            msg["fn"] = msg["fn"].with_noise(self.noise)
+
+
+def with_noise(model: Model, noise: Noise | None) -> Model:
+    """Returns the model with another noise of the readings; see :func:`npdr_ppl.simulate`."""
+    return NoiseMessenger(noise)(model)
 
 
 class SkipSimulation(Messenger):

@@ -7,7 +7,7 @@ ones included, thereby becomes N(0, I), and every point maps to a plausible para
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -176,13 +176,10 @@ class Prior:
             for site in self.sites
         }
 
-    def to_reference(self, parameters: dict[str, Tensor]) -> Tensor:
+    def to_reference(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Maps values of every latent site, ``(n,) + site.shape``, to z, ``(n, d)``."""
         num = next(iter(parameters.values())).shape[0]
-        data = {
-            site.name: self._with_padding(site, parameters[site.name].to(site.dtype))
-            for site in self.sites
-        }
+        data = self._padded(parameters)
         messenger = _ReadCoordinates(self)
         with torch.no_grad(), SkipSimulation(), self._plate(num):
             with poutine.condition(data=data), messenger:
@@ -208,9 +205,24 @@ class Prior:
         Returns:
             The output of each black-box site, ``(n,) + plates + event``.
         """
-        writer = _WriteCoordinates(self, z)
-        with torch.no_grad(), writer, self._plate(z.shape[0]):
-            trace = poutine.trace(self.model).get_trace(*self.args)
+        with torch.no_grad(), _WriteCoordinates(self, z), self._plate(z.shape[0]):
+            return self._outputs(poutine.trace(self.model).get_trace(*self.args))
+
+    def execute_at(self, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Simulates the program at n given values of its latent sites.
+
+        Args:
+            parameters: Values ``(n,) + site.shape`` by site name, on the support or not.
+
+        Returns:
+            The output of each black-box site, ``(n,) + plates + event``.
+        """
+        num = next(iter(parameters.values())).shape[0]
+        data = self._padded(parameters)
+        with torch.no_grad(), self._plate(num), poutine.condition(data=data):
+            return self._outputs(poutine.trace(self.model).get_trace(*self.args))
+
+    def _outputs(self, trace: Any) -> dict[str, Tensor]:
         result = {}
         for name in self.black_boxes:
             node = trace.nodes[name]
@@ -222,6 +234,12 @@ class Prior:
             value = node["value"]
             result[name] = value.reshape((value.shape[0], *value.shape[1 + skipped :]))
         return result
+
+    def _padded(self, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {
+            site.name: self._with_padding(site, parameters[site.name].to(site.dtype))
+            for site in self.sites
+        }
 
     def segment_log_prob(self, name: str, value: Tensor, z: Tensor) -> Tensor:
         """Returns the density of a black-box site's segments at n points, ``(n, …, segments)``.

@@ -118,6 +118,12 @@ class BlackBox(TorchDistribution):
         expanded._batch_shape = batch_shape
         return expanded
 
+    def with_noise(self, noise: Noise | None) -> "BlackBox":
+        """Returns the same site with another noise of the readings, ``None`` for none."""
+        changed = self.expand(torch.broadcast_shapes(self.batch_shape, noise_batch_shape(noise)))
+        changed.noise = noise
+        return changed
+
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         """Simulates the whole batch, and adds the noise where there is one."""
         with torch.no_grad():

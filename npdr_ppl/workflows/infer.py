@@ -21,8 +21,9 @@ from npdr_ppl.workflows.run_folder import RunFolder
 
 __all__ = ["infer", "simulate_features"]
 
-# Readings that one chunk of simulations may hold, about 128 MiB in float64.
-MAX_READINGS_PER_CHUNK = 16_000_000
+# Readings that one chunk of simulations may hold, 16 MiB in float64: larger arrays leave the cache
+# and are mapped afresh by the allocator every time, smaller ones pay the overhead of many calls.
+MAX_READINGS_PER_CHUNK = 2_000_000
 
 
 def infer(

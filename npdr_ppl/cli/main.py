@@ -1,0 +1,40 @@
+"""Entry point of `npdr`: the commands, and one sentence with exit code 2 for bad input."""
+
+import sys
+
+import typer
+
+from npdr_ppl.cli import demo, fit, listings, reproduce
+from npdr_ppl.errors import NpdrError
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="npdr",
+    help="Probabilistic programming for robot simulators.",
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+app.command(rich_help_panel="See it work")(demo.demo)
+app.command(rich_help_panel="Infer parameters")(fit.fit)
+app.command(rich_help_panel="See it work")(reproduce.reproduce)
+app.command("models", rich_help_panel="What there is")(listings.models)
+app.command("backends", rich_help_panel="What there is")(listings.backends)
+app.command("effects", rich_help_panel="What there is")(listings.effects)
+
+
+def main() -> None:
+    """Runs the command line."""
+    try:
+        app()
+    except NpdrError as error:
+        _refuse(str(error))
+    except OSError as error:
+        _refuse(f"{error.filename or 'A file'}: {error.strerror or error}.")
+
+
+def _refuse(sentence: str) -> None:
+    typer.echo(f"npdr: {sentence}", err=True)
+    sys.exit(2)

@@ -1,0 +1,60 @@
+"""Result tables on the terminal."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+__all__ = ["show_fit", "show_rows"]
+
+
+def show_fit(result: Mapping[str, Any], out: Path) -> None:
+    """Prints the content of ``fit.json``."""
+    console = Console()
+    table = Table(title=f"Posterior ({result['backend']})")
+    for column in ("parameter", "mean", "sd", "94 % HDI", "most likely", "contraction"):
+        table.add_column(column, justify="left" if column == "parameter" else "right")
+    contraction = result["diagnosis"]["contraction"]
+    for name, p in result["parameters"].items():
+        table.add_row(
+            name,
+            f"{p['mean']:.4g}",
+            f"{p['sd']:.2g}",
+            f"{p['hdi_94'][0]:.4g} … {p['hdi_94'][1]:.4g}",
+            f"{result['most_likely'][name]:.4g}",
+            f"{contraction[name]:.0%}",
+        )
+    console.print(table)
+    metrics, seconds = result["metrics"], result["seconds"]
+    console.print(
+        f"RMSE {metrics['rmse']:.3f}, DTW {metrics['dtw']:.0f} on {metrics['evaluated_on']} "
+        f"rollouts (most likely draw); simulate {seconds['simulate']:.1f} s, "
+        f"train {seconds['train']:.1f} s, sample {seconds['sample']:.1f} s"
+    )
+    console.print(
+        f"[bold]{result['diagnosis']['decision']}[/bold]: {result['diagnosis']['reason']}"
+    )
+    console.print(f"Results and figures are in {out}/")
+
+
+def show_rows(title: str, result: Mapping[str, Any]) -> None:
+    """Prints the content of a reproduction's JSON: ours beside the paper's."""
+    table = Table(title=title)
+    metrics = sorted({m for row in result["rows"].values() for m in row})
+    table.add_column("method")
+    for metric in metrics:
+        table.add_column(f"{metric}, here", justify="right")
+        table.add_column(f"{metric}, paper", justify="right")
+    for method, row in result["rows"].items():
+        cells = [method]
+        for metric in metrics:
+            paper = result["paper"].get(method, {}).get(metric)
+            cells += [_figure(row.get(metric)), _figure(paper)]
+        table.add_row(*cells)
+    Console().print(table)
+
+
+def _figure(value: Mapping[str, float] | None) -> str:
+    return "–" if value is None else f"{value['mean']:.4g} ± {value['std']:.2g}"
