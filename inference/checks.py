@@ -1,0 +1,69 @@
+"""What every backend checks of the simulations it is told."""
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.errors import BackendError, ShapeError
+from npdr_ppl.inference.base import Problem
+
+__all__ = ["check_problem", "finite_rows"]
+
+
+def check_problem(problem: Problem) -> None:
+    """Checks what a backend is told before any simulation.
+
+    Raises:
+        ShapeError: There are no parameters, or the features are not a vector.
+        BackendError: The observation is not finite.
+    """
+    if problem.num_parameters < 1:
+        raise ShapeError(f"There must be a parameter to infer, got {problem.num_parameters=}.")
+    observation = problem.observation
+    if problem.build_network is None and (observation.ndim != 1 or not len(observation)):
+        raise ShapeError(
+            "Features of an observation must be a vector (F,) unless a network is trained on raw "
+            f"arrays; got {tuple(observation.shape)}."
+        )
+    if not observation.isfinite().all():
+        raise BackendError(
+            f"{int((~observation.isfinite()).sum())} of {observation.numel()} features of the "
+            "observation are not finite; leave them out or choose another embedding."
+        )
+
+
+def finite_rows(
+    problem: Problem, z: Tensor, x: Tensor, min_rows: int
+) -> tuple[Tensor, Tensor, int]:
+    """Drops failed simulations.
+
+    Args:
+        problem: The problem simulated.
+        z: Parameters, ``(n, d)``.
+        x: Features, ``(n,) + observation.shape``; rows that are not finite failed.
+        min_rows: Successful simulations needed.
+
+    Returns:
+        The parameters and features of the other rows, in float32, and the number dropped.
+
+    Raises:
+        ShapeError: The shapes do not fit the problem or each other.
+        BackendError: Parameters are not finite, or too few simulations are left.
+    """
+    if z.ndim != 2 or z.shape[1] != problem.num_parameters:
+        raise ShapeError(
+            f"Parameters must have shape (n, {problem.num_parameters}), got {tuple(z.shape)}."
+        )
+    expected = (len(z), *problem.observation.shape)
+    if tuple(x.shape) != expected:
+        raise ShapeError(f"Features must have shape {expected}, got {tuple(x.shape)}.")
+    if not z.isfinite().all():
+        raise BackendError("Simulated parameters must be finite; some are NaN or infinite.")
+    x = x.to(torch.float32)  # before the test: what overflows float32 is of no use either
+    finite = x.flatten(1).isfinite().all(1)
+    num_failed = len(z) - int(finite.sum())
+    if len(z) - num_failed < min_rows:
+        raise BackendError(
+            f"{num_failed} of {len(z)} simulations failed (their features are not finite); at "
+            f"least {min_rows} must succeed. Check the simulator over the whole prior."
+        )
+    return z[finite].to(torch.float32), x[finite], num_failed

@@ -1,0 +1,71 @@
+"""Truncated proposals: the prior restricted to where the present posterior has its mass.
+
+Deistler, Goncalves & Macke (2022), *Truncated proposals for scalable and hassle-free
+simulation-based inference*, https://arxiv.org/abs/2210.04815.
+"""
+
+import logging
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.inference.base import Density, Problem
+
+__all__ = ["sample_truncated_prior"]
+
+logger = logging.getLogger(__name__)
+
+NUM_BOUND_SAMPLES = 10_000
+"""Posterior samples from which the region's bound is read."""
+
+CHUNK = 16_384
+"""Prior draws tested at once."""
+
+MIN_ACCEPTANCE = 5e-3
+"""Share of accepted prior draws below which importance resampling takes over from rejection."""
+
+OVERSAMPLING = 32
+"""Posterior draws per resampled one. Deistler et al. (2022, Appendix 6.4) use 1024 and draw one of
+each group; resampling one weighted set without replacement needs fewer."""
+
+
+def sample_truncated_prior(
+    problem: Problem, num_samples: int, posterior: Density, outside: float
+) -> Tensor:
+    """Draws from p(z) restricted to a region {z: log q(z | x_o) > tau} (their Eq. 2).
+
+    The bound tau leaves a fraction epsilon of the posterior's mass outside. Prior draws are
+    rejected outside the region; where it is too small a part of the prior for that, draws of q
+    inside it are resampled with weights p / q (their §3.2 and Appendix 6.4).
+
+    Args:
+        problem: Gives the prior.
+        num_samples: Number of draws n.
+        posterior: The present posterior q.
+        outside: Fraction epsilon.
+
+    Returns:
+        Draws ``(num_samples, d)``.
+    """
+    tau = posterior.log_prob(posterior.sample(NUM_BOUND_SAMPLES)).quantile(outside)
+    accepted: list[Tensor] = []
+    found, tried = 0, 0
+    while found < num_samples:
+        z = problem.sample_prior(CHUNK)
+        z = z[posterior.log_prob(z) > tau]
+        accepted.append(z)
+        found, tried = found + len(z), tried + CHUNK
+        if found < num_samples and found < MIN_ACCEPTANCE * tried:
+            logger.info("Resampling: %d of %d prior draws lie in the region.", found, tried)
+            return _resample(problem, num_samples, posterior, tau)
+    return torch.cat(accepted)[:num_samples]
+
+
+def _resample(problem: Problem, num_samples: int, posterior: Density, tau: Tensor) -> Tensor:
+    """Draws by sampling importance resampling with the posterior as the proposal."""
+    z = posterior.sample(OVERSAMPLING * num_samples)
+    log_q = posterior.log_prob(z)
+    log_weight = (problem.log_prior(z) - log_q).masked_fill(log_q <= tau, -torch.inf)
+    # Gumbel top-k: sampling without replacement in proportion to the weights.
+    gumbel = -torch.empty_like(log_weight).exponential_().log()
+    return z[(log_weight + gumbel).topk(num_samples).indices]

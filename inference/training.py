@@ -1,0 +1,245 @@
+"""Training of an ensemble of density estimators, all members in one pass.
+
+The members' weights are stacked, and one vectorised call evaluates all of them on their own
+mini-batches: on small networks the cost of a step is mostly that of starting kernels, which is
+then paid once.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, stack_module_state, vmap
+
+from npdr_ppl.errors import BackendError
+
+__all__ = ["Fit", "LogProb", "Loss", "TrainingOptions", "train"]
+
+LogProb = Callable[[Tensor, Tensor], Tensor]
+"""Log densities of all members, of u's leading shape: takes whitened parameters u,
+``(members, n, d)`` or, several for each context, ``(members, n, atoms, d)``, and features f,
+``(members, n, ...)``."""
+
+Loss = Callable[[LogProb, Tensor], Tensor]
+"""Losses of the rows numbered by the second argument, ``(members, n)`` to ``(members, n)``. Rows
+come in random order, so that a row's neighbours are a random sample of the others."""
+
+GRADIENT_NORM = 5.0
+"""Largest norm of a member's gradient: rows in a flow's tail can have losses of any size."""
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How to train.
+
+    Attributes:
+        epochs: Passes through the data at most.
+        batch_size: Rows of a mini-batch.
+        learning_rate: Peak of the one-cycle schedule (Smith & Topin 2019).
+        weight_decay: Decoupled weight decay (Loshchilov & Hutter 2019).
+        averaging: Decay of the running average of the weights, which is what is validated and
+            kept; 0 keeps the last weights instead.
+        validation_fraction: Fraction of the rows held out, different ones for every member.
+        patience: Epochs without improvement after which training stops; fewer, but at least
+            :data:`MIN_PATIENCE`, while the best epoch is an early one, so that little is spent
+            where the preconditioner has left nothing to learn.
+    """
+
+    epochs: int
+    batch_size: int
+    learning_rate: float
+    weight_decay: float
+    averaging: float
+    validation_fraction: float
+    patience: int
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A trained ensemble.
+
+    Attributes:
+        weights: Parameters and buffers by name, each ``(members, ...)``.
+        validation: Best mean validation objective of every member, ``(members,)``.
+        best_epochs: Epoch it was reached at, ``(members,)``; 0 is before the first step.
+        epochs: Epochs trained.
+    """
+
+    weights: dict[str, Tensor]
+    validation: Tensor
+    best_epochs: Tensor
+    epochs: int
+
+
+MIN_PATIENCE = 3
+"""Epochs trained at least; nonlinear problems improve in the first one."""
+
+VALIDATION_CHUNK = 4096
+"""Held-out rows evaluated at once."""
+
+WARM_UP = 0.2
+"""Fraction of the steps in which the learning rate rises."""
+
+START_RATE, END_RATE = 0.1, 0.01
+"""Learning rate of the first and of the last step, relative to the peak."""
+
+
+def one_cycle(fraction: float) -> float:
+    """Returns the learning rate relative to its peak after a fraction of all steps.
+
+    Half a cosine up and half a cosine down (Smith & Topin 2019).
+    """
+    if fraction < WARM_UP:
+        edge, position = START_RATE, 1 - fraction / WARM_UP
+    else:
+        edge, position = END_RATE, (fraction - WARM_UP) / (1 - WARM_UP)
+    return edge + (1 - edge) * 0.5 * (1 + math.cos(math.pi * position))
+
+
+def train(
+    networks: Sequence[nn.Module],
+    loss: Loss,
+    num_rows: int,
+    options: TrainingOptions,
+    device: torch.device,
+    is_vectorised: bool = True,
+    progress: Callable[[float, str], None] | None = None,
+) -> Fit:
+    """Trains an ensemble; every member has its own held-out rows and mini-batches.
+
+    Draws from torch's global stream on the CPU, whatever the device.
+
+    Args:
+        networks: Untrained members of equal structure, maps (u, f) to log densities.
+        loss: The objective.
+        num_rows: Rows of the data.
+        options: How to train.
+        device: Where the data are.
+        is_vectorised: Whether the networks consist of operations that vmap knows; otherwise the
+            members are evaluated in turn.
+        progress: Called after every epoch with the fraction done and a short status.
+    """
+    members = len(networks)
+    networks = [network.to(device).train() for network in networks]
+    parameters, buffers = stack_module_state(list(networks))
+    log_prob = _vectorised if is_vectorised else _in_turn
+    evaluate = log_prob(networks[0], parameters, buffers)
+    weights = [w for w in parameters.values()]
+    optimizer = torch.optim.AdamW(
+        weights,
+        lr=options.learning_rate,
+        betas=(0.9, 0.99),
+        weight_decay=options.weight_decay,
+        fused=True,
+    )
+    average = [w.detach().clone() for w in weights]
+    best = [w.detach().clone() for w in weights]
+    best_value = torch.full((members,), -math.inf, device=device)
+    best_epochs = torch.zeros(members, dtype=torch.long, device=device)
+
+    rows = torch.stack([torch.randperm(num_rows) for _ in range(members)]).to(device)
+    num_held_out = max(1, round(options.validation_fraction * num_rows))
+    held_out, rows = rows[:, :num_held_out], rows[:, num_held_out:]
+    batch_size = min(options.batch_size, rows.shape[1])
+    num_batches = rows.shape[1] // batch_size
+    num_steps, step, epoch = options.epochs * num_batches, 0, 0
+    for epoch in range(options.epochs + 1):
+        if epoch:
+            shuffle = torch.stack([torch.randperm(rows.shape[1]) for _ in range(members)])
+            rows = rows.gather(1, shuffle.to(device))
+            for batch in rows[:, : num_batches * batch_size].split(batch_size, dim=1):
+                optimizer.param_groups[0]["lr"] = options.learning_rate * one_cycle(
+                    step / num_steps
+                )
+                optimizer.zero_grad()
+                loss(evaluate, batch).mean(1).sum().backward()
+                _clip_gradients(weights)
+                optimizer.step()
+                step += 1
+                # Early on the average forgets faster, so that it leaves the initial weights.
+                decay = min(options.averaging, (1 + step) / (10 + step))
+                with torch.no_grad():
+                    for mean, new in zip(average, weights, strict=True):
+                        mean.lerp_(new, 1 - decay)
+        value = _validate(evaluate, loss, held_out, weights, average)
+        improved = value > best_value
+        best_value = torch.where(improved, value, best_value)
+        best_epochs = torch.where(improved, epoch, best_epochs)
+        for kept, new in zip(best, average, strict=True):
+            kept[improved] = new[improved]
+        if progress is not None:
+            progress(
+                epoch / options.epochs,
+                f"epoch {epoch}, validation {best_value.mean().item():.3f}",
+            )
+        last = int(best_epochs.max())
+        if epoch - last >= min(options.patience, max(MIN_PATIENCE, last)):
+            break
+    if not best_value.isfinite().all():
+        raise BackendError("Training diverged: the validation objective was never finite.")
+    trained = dict(zip(parameters, best, strict=True)) | buffers
+    return Fit({k: v.detach() for k, v in trained.items()}, best_value, best_epochs, epoch)
+
+
+def _vectorised(
+    network: nn.Module, parameters: dict[str, Tensor], buffers: dict[str, Tensor]
+) -> LogProb:
+    """Returns the log densities of all members as one call."""
+
+    def single(p: dict[str, Tensor], b: dict[str, Tensor], u: Tensor, f: Tensor) -> Tensor:
+        return functional_call(network, (p, b), (u, f))
+
+    stacked = vmap(single, randomness="different")
+    return lambda u, f: stacked(parameters, buffers, u, f)
+
+
+def _in_turn(
+    network: nn.Module, parameters: dict[str, Tensor], buffers: dict[str, Tensor]
+) -> LogProb:
+    """Returns the log densities of all members as one call per member."""
+
+    def stacked(u: Tensor, f: Tensor) -> Tensor:
+        values = []
+        for k in range(len(u)):
+            state = {name: w[k] for name, w in (parameters | buffers).items()}
+            values.append(functional_call(network, state, (u[k], f[k])))
+        return torch.stack(values)
+
+    return stacked
+
+
+@torch.no_grad()
+def _clip_gradients(weights: list[Tensor]) -> None:
+    """Limits the norm of each member's gradient; one that is not finite becomes zero."""
+    gradients = [w.grad for w in weights if w.grad is not None]
+    square = sum((g.flatten(1) ** 2).sum(1) for g in gradients)
+    norm = torch.as_tensor(square).sqrt()
+    finite = norm.isfinite()
+    scale = (GRADIENT_NORM / norm.clamp(min=GRADIENT_NORM)).where(finite, torch.zeros_like(norm))
+    for g in gradients:
+        shape = (-1,) + (1,) * (g.ndim - 1)
+        if not finite.all():
+            g.nan_to_num_(0.0, 0.0, 0.0)
+        g.mul_(scale.view(shape))
+
+
+@torch.no_grad()
+def _validate(
+    evaluate: LogProb,
+    loss: Loss,
+    rows: Tensor,
+    weights: list[Tensor],
+    average: list[Tensor],
+) -> Tensor:
+    """Returns minus the mean loss of each member's held-out rows, ``(members,)``, at `average`."""
+    current = [w.detach().clone() for w in weights]
+    for w, mean in zip(weights, average, strict=True):
+        w.copy_(mean)
+    total = torch.zeros(len(rows), device=rows.device)
+    for chunk in rows.split(VALIDATION_CHUNK, dim=1):
+        total -= loss(evaluate, chunk).sum(1)
+    for w, value in zip(weights, current, strict=True):
+        w.copy_(value)
+    return total / rows.shape[1]
