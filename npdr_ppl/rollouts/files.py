@@ -216,7 +216,7 @@ def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
         present = {member.filename.removesuffix(".npy") for member in archive.infolist()}
         missing = [name for name in _NPZ_ARRAYS if name not in present]
         if missing:
-            raise DataError(f"there is no array {missing[0]}; was it written by to_npz?")
+            raise DataError(f"there is no array {missing[0]}, which to_npz would have written.")
         wanted = [name for name in (*_NPZ_ARRAYS, "rewards") if name in present]
         arrays = {}
         for name in wanted:
@@ -336,10 +336,14 @@ def write_netcdf(rollouts: Rollouts, path: AnyPath) -> None:
 
 def read_netcdf(path: AnyPath) -> Rollouts:
     """Reads a NetCDF4 file; see :meth:`Rollouts.from_netcdf`."""
+    import h5py
     import xarray as xr
 
     path = checks.check_file(path)
     with checks.named(path), _refusing("NetCDF"):
+        # h5netcdf begins like this, and where it fails leaves an object that complains at its end.
+        with h5py.File(path, "r") as file:
+            dict(file.attrs)
         # Seconds since nothing in particular: no calendar is to be applied.
         with xr.open_dataset(
             path, engine="h5netcdf", decode_times=False, decode_timedelta=False

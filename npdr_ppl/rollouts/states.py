@@ -15,6 +15,10 @@ DEGREE = 3
 HALF_WIDTHS = (2, 3, 4, 5, 7, 9, 12, 16, 21, 28, 37, 49, 65, 86, 114, 151, 200)
 """Candidate windows, in samples to each side, growing by about 4/3."""
 
+NEIGHBOURS = (-2, -1, 0, 1, 2)
+"""Where else the window is chosen, in samples: the median of the choices is taken, so that one
+chance disagreement between small windows does not stop the growth."""
+
 CONFIDENCE = 2.0
 """Half-width of the compared confidence intervals, in standard errors."""
 
@@ -24,10 +28,11 @@ def estimate_states(
 ) -> tuple[Array, Array]:
     """Estimates every channel and its time derivative at chosen steps.
 
-    A cubic is fitted to a window around each step. The window is chosen for each step and channel
-    by the intersection of confidence intervals: it grows while the interval of its derivative
-    still meets those of all smaller windows, i.e. until bias shows. No global smoothness is
-    assumed, so a swing-up's slow and fast spells each get their own window.
+    A cubic is fitted to a window around each step. The window is chosen, for each step, channel
+    and for value and rate apart, by the intersection of confidence intervals: it grows while its
+    interval still meets those of all smaller windows, i.e. until bias shows. No global smoothness
+    is assumed, so a swing-up's slow and fast spells each get their own window, and the ends of a
+    rollout are windows with one side only.
 
     Args:
         readings: ``(T + 1, C)``, constant sampling, in the channels' units.
@@ -42,50 +47,52 @@ def estimate_states(
         regression, 1997; V. Katkovnik, A new method for varying adaptive bandwidth selection,
         1999 (the rule).
     """
-    num_rows, num_channels = readings.shape
-    noise = np.array([_noise(readings[:, c]) for c in range(num_channels)])
-    is_change = np.concatenate([np.zeros((1, num_channels)), np.diff(readings, axis=0) != 0])
+    num_rows = len(readings)
+    noise = np.array([_noise(channel) for channel in readings.T])
+    is_change = np.diff(readings, axis=0, prepend=readings[:1]) != 0
     num_changes = np.cumsum(is_change, axis=0)
-    shape = (len(steps), num_channels)
-    values, rates = np.zeros(shape), np.zeros(shape)
-    lower, upper = np.full(shape, -np.inf), np.full(shape, np.inf)
-    is_growing = np.ones(shape, dtype=bool)
-    for half_width in HALF_WIDTHS:
-        value, rate, error = _fit(readings, steps, half_width, num_changes)
-        spread = CONFIDENCE * error * noise
-        new_lower = np.maximum(lower, rate - spread)
-        new_upper = np.minimum(upper, rate + spread)
-        is_growing &= new_lower <= new_upper
-        values = np.where(is_growing, value, values)
-        rates = np.where(is_growing, rate, rates)
-        lower, upper = new_lower, new_upper
-        if not is_growing.any() or half_width >= num_rows:
-            break
-    return values, rates / time_step
+    widths = [w for w in HALF_WIDTHS if w < num_rows] or [HALF_WIDTHS[0]]
+    around = np.clip(steps[:, None] + np.array(NEIGHBOURS), 0, num_rows - 1)
+    where, which = np.unique(around, return_inverse=True)
+    # Axes: window, value or rate, step, channel.
+    fits = np.empty((len(widths), 2, len(where), readings.shape[1]))
+    errors = np.empty_like(fits)
+    for index, width in enumerate(widths):
+        fits[index], errors[index] = _fit(readings, where, width, num_changes)
+    spread = CONFIDENCE * errors * noise
+    meets = np.maximum.accumulate(fits - spread) <= np.minimum.accumulate(fits + spread)
+    largest = np.logical_and.accumulate(meets).sum(axis=0) - 1
+    chosen = np.median(largest[:, which.reshape(around.shape)], axis=2).astype(int)
+    at = np.searchsorted(where, steps)
+    estimate = np.take_along_axis(fits[:, :, at], chosen[None], axis=0)[0]
+    return estimate[0], estimate[1] / time_step
 
 
 def _fit(
-    readings: Array, steps: NDArray[np.int64], half_width: int, num_changes: Array
-) -> tuple[Array, Array, Array]:
-    """Fits one window: value, rate per row, and the rate's standard error for unit noise."""
+    readings: Array, steps: NDArray[np.int64], half_width: int, num_changes: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Fits one window: value and rate per row, and their standard errors for unit noise.
+
+    Both are ``(2, P, C)``.
+    """
     last = len(readings) - 1
     left = np.maximum(steps - half_width, 0)
     right = np.minimum(steps + half_width, last)
-    value = np.empty((len(steps), readings.shape[1]))
-    rate, error = np.empty_like(value), np.empty_like(value)
+    fit = np.empty((2, len(steps), readings.shape[1]))
+    error = np.empty_like(fit)
     extents = np.stack([steps - left, right - steps], axis=1)
     for before, after in np.unique(extents, axis=0):
         rows = np.flatnonzero((extents == (before, after)).all(axis=1))
         weights = _weights(int(before), int(after))
         windows = readings[steps[rows, None] + np.arange(-before, after + 1)]
-        fitted = np.einsum("kn,pnc->kpc", weights, windows)
-        value[rows], rate[rows] = fitted
+        fit[:, rows] = np.einsum("kn,pnc->kpc", weights, windows)
         # A reading that stays on one encoder count repeats the same error: a window holds only
         # as many independent ones as the reading took values.
         size = before + after + 1
         independent = 1 + num_changes[right[rows]] - num_changes[left[rows]]
-        error[rows] = np.linalg.norm(weights[1]) * np.sqrt(size / independent)
-    return value, rate, error
+        norms = np.linalg.norm(weights, axis=1)
+        error[:, rows] = norms[:, None, None] * np.sqrt(size / independent)
+    return fit, error
 
 
 @functools.lru_cache(maxsize=1024)

@@ -63,11 +63,7 @@ def from_table(
             raise DataError(f"{name} is a reserved name, not a channel's or an action's.")
     spans = [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
     times = [columns["time"][span] for span in spans]
-    for index, (time, span) in enumerate(zip(times, spans, strict=True)):
-        if len(time) < 2:
-            raise DataError(
-                f"rollout {index} has one row{at(span.start)}, but at least two are needed."
-            )
+    for index, time in enumerate(times):
         checks.check_time(time, f"rollout {index}")
     units = units or {}
     stepwise_spans = [slice(span.start, span.stop - 1) for span in spans]
@@ -129,7 +125,13 @@ def _rollout_bounds(rollout: Array, at: _Location) -> NDArray[np.int64]:
                 "follow each other."
             )
         seen.add(identifier)
-    return np.concatenate([starts, [len(rollout)]])
+    bounds = np.concatenate([starts, [len(rollout)]])
+    for index in np.flatnonzero(np.diff(bounds) < 2)[:1].tolist():
+        raise DataError(
+            f"rollout {rollout[bounds[index]]:.0f} has one row{at(bounds[index])}, but at least "
+            "two are needed."
+        )
+    return bounds
 
 
 def _stepwise_columns(
