@@ -1,11 +1,33 @@
 """`npdr fit`: a posterior from measured rollouts."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-__all__ = ["fit"]
+__all__ = ["InitialState", "fit"]
+
+
+class InitialState(StrEnum):
+    """How the state at a segment's start is found."""
+
+    ESTIMATED = "estimated"
+    RECORDED = "recorded"
+
+
+class Precision(StrEnum):
+    """Floating-point type."""
+
+    FLOAT64 = "float64"
+    FLOAT32 = "float32"
+
+
+class Noise(StrEnum):
+    """Where the readings' noise comes from."""
+
+    AUTO = "auto"
+    MODEL = "model"
 
 
 def fit(
@@ -20,13 +42,21 @@ def fit(
     effect: Annotated[
         list[str] | None, typer.Option(help="Effect to attach, port.effect; may be repeated.")
     ] = None,
-    embedding: Annotated[str, typer.Option(help="Trajectory features.")] = "bayessim",
+    embedding: Annotated[
+        str, typer.Option(help="Trajectory features: bayessim, all/50, gru/10, ...")
+    ] = "bayessim",
     segment_length: Annotated[
         int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")
     ] = 0,
     initial_state: Annotated[
-        str, typer.Option(help="State at a segment's start: estimated or recorded.")
-    ] = "estimated",
+        InitialState, typer.Option(help="State at a segment's start.")
+    ] = InitialState.ESTIMATED,
+    precision: Annotated[
+        Precision, typer.Option(help="Floating-point type of the simulation.")
+    ] = Precision.FLOAT64,
+    noise: Annotated[
+        Noise, typer.Option(help="Noise of readings: auto estimates it, model takes the model's.")
+    ] = Noise.AUTO,
     device: Annotated[str, typer.Option(help="Where to train: cpu or cuda.")] = "cpu",
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
 ) -> None:
@@ -38,27 +68,28 @@ def fit(
     """
     from npdr_ppl.cli.resolve import resolve_effects, resolve_model, resolve_rollouts
     from npdr_ppl.cli.show import show_fit
-    from npdr_ppl.errors import DataError
-    from npdr_ppl.workflows.fit import fit_and_write
+    from npdr_ppl.plots.fit_figures import write_fit_figures
+    from npdr_ppl.workflows.binding import BindingOptions
+    from npdr_ppl.workflows.fit import fit as run_fit
 
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_rollouts(data, holdout)
-    if initial_state not in ("estimated", "recorded"):
-        raise DataError(f"--initial-state is estimated or recorded, not {initial_state!r}.")
-    result = fit_and_write(
+    posterior, result = run_fit(
         chosen,
         train,
         test,
-        out,
+        out=out,
         backend=backend,
         rounds=rounds,
         num_simulations=simulations,
         seed=seed,
-        embedding=embedding,
-        segment_length=segment_length or None,
-        initial_state=initial_state,
+        options=BindingOptions(
+            embedding, segment_length or None, initial_state.value, precision.value
+        ),
+        noise=noise.value,
         device=device,
         progress=False if quiet else None,
     )
+    write_fit_figures(posterior, chosen, train if test is None else test, out, seed=seed)
     if not quiet:
         show_fit(result, out)

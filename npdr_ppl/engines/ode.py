@@ -2,24 +2,22 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils import _pytree as pytree
 
+from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward, roll_out
 from npdr_ppl.engines.commands import CommandRecord, RecordedCommands
+from npdr_ppl.engines.compilation import CompileMode
 from npdr_ppl.engines.integrators import Components, Integrator, integrator
-from npdr_ppl.engines.stepping import State, Stepper, Tables
+from npdr_ppl.engines.stepping import State, Stepper, Tables, flatten
 from npdr_ppl.errors import ModelError, ShapeError
-from npdr_ppl.language.channels import Parameter
 from npdr_ppl.language.effects import EnvironmentEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 
-__all__ = ["CompileMode", "Forces", "ODESimulator"]
-
-CompileMode = Literal["auto", "always", "never"]
+__all__ = ["Forces", "ODESimulator"]
 
 Forces = tuple[Tensor | float, ...]
 """Generalised forces to add, one per joint; 0.0 where no effect acts."""
@@ -116,25 +114,20 @@ class ODESimulator(Simulator):
         self.check_inputs(inputs)
         dtype = self.common_dtype(parameters, inputs.actions)
         inputs = inputs.to(dtype=dtype)
-        shapes = [p.shape for p in map(torch.as_tensor, parameters.values())]
-        batch_shape = torch.broadcast_shapes(inputs.batch_shape, *shapes)
+        domain = self.complete(parameters, dtype, inputs.actions.device)
+        batch_shape = torch.broadcast_shapes(
+            inputs.batch_shape, *(value.shape for value in domain.values())
+        )
         shape = torch.Size((*batch_shape, inputs.num_segments))
-        device = inputs.actions.device
-        given = {
-            name: torch.as_tensor(value).to(dtype=dtype, device=device)[..., None]
-            for name, value in parameters.items()
-        }
-        tables, histories = self.tables(given, shape, inputs.time_step, dtype, device)
+        # Behind the batch, an axis for the segments.
+        domain = {name: value[..., None] for name, value in domain.items()}
+        tables, histories = self.tables(domain, shape, inputs.time_step)
         stepper = Stepper(self, inputs.time_step, histories)
         records = self._records(inputs, shape, dtype)
         state = self._start(stepper, tables, inputs, records, shape)
         readings: list[Tensor] = []
         for step in range(inputs.num_steps):
-            commands = tuple(
-                RecordedCommands(r.at(step), r.table, r.rows, r.first + step, r.stride)
-                for r in records
-            )
-            state, actions = stepper.act(state, commands, tables)
+            state, actions = _act_on_record(stepper, state, tables, records, step)
             state = stepper.move(state, actions, tables)
             state, values = stepper.read(state, tables)
             readings.extend(values)
@@ -145,6 +138,51 @@ class ODESimulator(Simulator):
             return trajectory
         return torch.where(inputs.mask[..., None], trajectory, torch.zeros_like(trajectory))
 
+    def roll_out(
+        self,
+        parameters: Mapping[str, Tensor],
+        policy: FeedbackPolicy,
+        initial_states: Tensor,
+        num_steps: int,
+        *,
+        reward: Reward | None = None,
+        time_step: float | None = None,
+        record: bool = False,
+        compile: CompileMode | None = None,
+        expected_calls: int = 1,
+    ) -> Episodes:
+        """Simulates closed-loop episodes of a batch of policies, domains and initial states.
+
+        The batch shape B is what the three broadcast to: keep policies on one axis, domains on
+        another and states on a third. Commands are limited to the channels' bounds, then pass the
+        action effects; policies see readings, and the first reading is true. Before the start
+        commands were zero.
+
+        Args:
+            parameters: Domain and effect parameters; missing ones are nominal.
+            policy: The policies; ``policy.parameters`` has the shape ``(..., parameters)``.
+            initial_states: True states at the start, ``(..., states)``.
+            num_steps: Greatest number of steps.
+            reward: Reward of a step.
+            time_step: Seconds per step; ``None`` for the simulator's.
+            record: Whether to return readings and commands; recording is not compiled.
+            compile: Replaces the simulator's choice.
+            expected_calls: How many calls of this size are to come, so that ``auto`` can tell
+                whether compilation pays back.
+        """
+        return roll_out(
+            self,
+            parameters,
+            policy,
+            initial_states,
+            num_steps,
+            reward=reward,
+            time_step=time_step,
+            record=record,
+            compile=compile,
+            expected_calls=expected_calls,
+        )
+
     def common_dtype(self, parameters: Mapping[str, Tensor], other: Tensor) -> torch.dtype:
         """Returns the widest floating type among the tensors."""
         dtype = other.dtype
@@ -153,46 +191,50 @@ class ODESimulator(Simulator):
                 dtype = torch.promote_types(dtype, value.dtype)
         return dtype
 
+    def complete(
+        self, parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
+    ) -> dict[str, Tensor]:
+        """Returns all parameters, missing ones nominal and effects' included.
+
+        Args:
+            parameters: Some of the parameters, tensors or numbers.
+            dtype: Floating type of the result.
+            device: Device of the result.
+        """
+        values = {parameter.name: parameter.nominal for parameter in self.parameters}
+        for effect in self.effects:
+            nominal = [parameter.nominal for parameter in effect.parameters]
+            values |= dict(zip(effect.parameter_names, nominal, strict=True))
+        return {
+            name: torch.as_tensor(value, dtype=dtype, device=device)
+            for name, value in {**values, **parameters}.items()
+        }
+
     def tables(
         self,
         parameters: Mapping[str, Tensor],
         shape: torch.Size,
         time_step: float,
-        dtype: torch.dtype,
-        device: torch.device,
+        *,
+        expand: bool = False,
     ) -> tuple[Tables, tuple[int, ...]]:
         """Returns the constants of a simulation, flat, and the lengths of command histories.
 
         Args:
-            parameters: Domain and effect parameters, each broadcasting to ``shape``; missing
-                ones are nominal.
+            parameters: What :meth:`complete` returned, each broadcasting to ``shape``.
             shape: Shape of the batch, of numel N.
             time_step: Seconds per step.
-            dtype: Floating type of the simulation.
-            device: Device of the simulation.
+            expand: Whether to expand what does not vary; see :func:`flatten`.
         """
-
-        def value(site: str, parameter: Parameter) -> Tensor:
-            if site in parameters:
-                return parameters[site]
-            return torch.tensor(parameter.nominal, dtype=dtype, device=device)
-
-        own = {p.name: value(p.name, p) for p in self.parameters}
-        effects = tuple(
-            {
-                p.name: value(site, p)
-                for p, site in zip(effect.parameters, effect.parameter_names, strict=True)
-            }
-            for effect in self.effects
-        )
-        environment = self.environment(own)
+        effects = tuple(effect.own_parameters(parameters) for effect in self.effects)
+        environment = self.environment(parameters)
         for effect, values in zip(self.effects, effects, strict=True):
             if isinstance(effect, EnvironmentEffect):
                 quantity = environment[effect.port]
                 environment[effect.port] = effect.environment(quantity, values)
-        constants = self.constants(own, environment)
+        constants = self.constants(parameters, environment)
         histories = Stepper.needed_histories(self, effects, time_step)
-        return flatten(Tables(constants, effects), shape), histories
+        return flatten(Tables(constants, effects), shape, expand=expand), histories
 
     def _records(
         self, inputs: Inputs, shape: torch.Size, dtype: torch.dtype
@@ -248,26 +290,24 @@ class ODESimulator(Simulator):
         if stepper.action_effects:
             # The effects' memory at the start is what the recorded past made of it.
             for step in range(-past, 0):
-                commands = tuple(
-                    RecordedCommands(r.at(step), r.table, r.rows, r.first + step, r.stride)
-                    for r in records
-                )
-                state, _ = stepper.act(state, commands, tables)
+                state, _ = _act_on_record(stepper, state, tables, records, step)
         return state
 
 
-def flatten(tree: Any, shape: torch.Size) -> Any:
-    """Returns the tree with every tensor expanded to ``shape`` and flat; single numbers stay so.
-
-    One flat axis vectorises well whatever the batch's shape is.
-    """
-
-    def flat(leaf: Any) -> Any:
-        if not isinstance(leaf, Tensor):
-            return leaf
-        return leaf.reshape(()) if leaf.numel() == 1 else leaf.expand(shape).reshape(-1)
-
-    return pytree.tree_map(flat, tree)
+def _act_on_record(
+    stepper: Stepper,
+    state: State,
+    tables: Tables,
+    records: tuple[CommandRecord, ...],
+    step: int,
+) -> tuple[State, Components]:
+    """Passes the recorded commands of a step through the action effects."""
+    commands = tuple(record.at(step) for record in records)
+    views = tuple(
+        RecordedCommands(command, r.table, r.rows, r.first + step, r.stride)
+        for command, r in zip(commands, records, strict=True)
+    )
+    return stepper.act(state, commands, tables, views)
 
 
 def _integrator(name: str) -> Integrator:

@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.commands import RecentCommands
 from npdr_ppl.engines.dry_friction import solve_dry_friction
@@ -13,7 +15,7 @@ from npdr_ppl.language.effects import ActionEffect, Commands, ForceEffect, Senso
 if TYPE_CHECKING:
     from npdr_ppl.engines.ode import ODESimulator
 
-__all__ = ["State", "Stepper", "Tables"]
+__all__ = ["State", "Stepper", "Tables", "flatten"]
 
 # Histories come in multiples of this many steps, so that draws of a delay share a compiled kernel.
 _HISTORY_GRAIN = 4
@@ -142,7 +144,11 @@ class Stepper:
         )
 
     def act(
-        self, state: State, commands: tuple[Commands, ...], tables: Tables
+        self,
+        state: State,
+        commands: Components,
+        tables: Tables,
+        records: tuple[Commands, ...] | None = None,
     ) -> tuple[State, Components]:
         """Passes the commands of one step through the action effects.
 
@@ -151,18 +157,24 @@ class Stepper:
             commands: One per action channel, within the channel's limits already: a limit sits
                 where the command enters the device, and recordings hold limited commands.
             tables: Constants of the simulation.
+            records: Where the whole past of each channel is on record, a view of it.
 
         Returns:
             The state with the action effects' memory advanced, and what reaches the dynamics.
         """
-        present = [channel.now() for channel in commands]
+        if not self.action_effects:
+            return state, commands
+        present = list(commands)
         memory, past = list(state.action_memory), list(state.past_commands)
-        is_raw = [True] * len(commands)
+        is_raw = [True] * len(present)
         for k, (place, effect, channel) in enumerate(self.action_effects):
             # The first effect of a chain can look into the record; later ones see what those
             # before them made of it, and keep a history of that.
             command = present[channel]
-            seen = commands[channel] if is_raw[channel] else RecentCommands(command, past[k])
+            if records is not None and is_raw[channel]:
+                seen = records[channel]
+            else:
+                seen = RecentCommands(command, past[k])
             present[channel], memory[k] = effect.act(
                 seen, tables.effects[place], memory[k], self.time_step
             )
@@ -284,3 +296,24 @@ def _probe_inverse_inertia(
         moved = simulator.accelerations(positions, velocities, actions, pushed, constants)
         columns.append(tuple(b - a for a, b in zip(accelerations, moved, strict=True)))
     return tuple(zip(*columns, strict=True))
+
+
+def flatten(tree: Any, shape: torch.Size, *, expand: bool = False) -> Any:
+    """Returns the tree with every tensor expanded to ``shape`` and flat.
+
+    One flat axis vectorises well whatever the batch's shape is.
+
+    Args:
+        tree: Nested tuples and dictionaries of tensors that broadcast to ``shape``.
+        shape: The batch's shape.
+        expand: Whether to expand single numbers too: a compiled kernel should not depend on which
+            parameters happen to vary.
+    """
+
+    def flat(leaf: Tensor) -> Tensor:
+        if leaf.numel() == 1 and not expand:
+            return leaf.reshape(())
+        # A single number expands to a view with stride 0, which would be a kernel of its own.
+        return leaf.expand(shape).reshape(-1).contiguous()
+
+    return pytree.tree_map_only(Tensor, flat, tree)

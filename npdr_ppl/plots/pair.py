@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from npdr_ppl.plots.marginals import Samples, draw_marginal
@@ -49,6 +50,11 @@ def plot_pair(
                 for label, values in (marks or {}).items():
                     _mark(axis, label, values, column, row if i != j else None)
                 axis.tick_params(labelbottom=i == count - 1, labelleft=j == 0 and i > 0)
+                for side in (axis.xaxis, axis.yaxis):
+                    side.set_major_locator(MaxNLocator(3))
+                    side.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                if i == j:
+                    axis.set_yticks([])
                 if i == count - 1:
                     axis.set_xlabel(column, fontsize=7)
                     axis.tick_params(axis="x", rotation=45)
@@ -75,7 +81,6 @@ def _draw_joint(axis: Axes, posterior: Samples, prior: Samples, x: str, y: str) 
             centres_x, centres_y, _smooth(density).T, levels=levels, colors=COLORS["posterior"],
             linewidths=0.8,
         )  # fmt: skip
-    axis.ticklabel_format(scilimits=(-2, 3))
 
 
 def _mark(axis: Axes, label: str, values: Mapping[str, float], x: str, y: str | None) -> None:

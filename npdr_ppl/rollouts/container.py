@@ -14,14 +14,14 @@ from torch import Tensor
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.rollouts import checks, segments
+from npdr_ppl.rollouts import arrays, checks, indices, segments
+from npdr_ppl.rollouts.arrays import Array
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["Rollouts"]
 
-Array = NDArray[np.float64]
 Path = str | PathLike[str]
 
 
@@ -62,77 +62,19 @@ class Rollouts:
     def __post_init__(self) -> None:
         """Copies the arrays, makes them read-only and checks them."""
         freeze = object.__setattr__
-        checks.check_names((*self.channel_names, *self.action_names), "column")
-        taken = set(checks.RESERVED_NAMES) & {*self.channel_names, *self.action_names}
-        if taken:
-            raise DataError(f"{min(taken)} is a reserved name, not a channel's or an action's.")
-        if not self.channel_names:
-            raise DataError("the data have no channels, only actions.")
-        if not self.readings:
-            raise DataError("the data have no rollouts.")
-        if not (math.isfinite(self.time_step) and self.time_step > 0):
-            raise DataError(f"the time step is {self.time_step} s, but it must be positive.")
-        time_step = float(self.time_step)
-        freeze(self, "time_step", time_step)
-        freeze(self, "channel_names", tuple(self.channel_names))
-        freeze(self, "action_names", tuple(self.action_names))
-        freeze(self, "readings", tuple(_frozen(values) for values in self.readings))
-        freeze(self, "actions", tuple(_frozen(values) for values in self.actions))
+        for field in ("channel_names", "action_names", "channel_units", "action_units"):
+            freeze(self, field, tuple(getattr(self, field)))
+        arrays.check_columns(self)
+        freeze(self, "time_step", float(self.time_step))
         if not self.time:
             lengths = (len(values) for values in self.readings)
-            freeze(self, "time", tuple(time_step * np.arange(length) for length in lengths))
-        freeze(self, "time", tuple(_frozen(values) for values in self.time))
-        if self.rewards is not None:
-            freeze(self, "rewards", tuple(_frozen(values) for values in self.rewards))
-        for field, names in (
-            ("channel_units", self.channel_names),
-            ("action_units", self.action_names),
-        ):
-            units = tuple(getattr(self, field)) or ("",) * len(names)
-            if len(units) != len(names):
-                raise DataError(f"{field} has {len(units)} entries for {len(names)} columns.")
-            freeze(self, field, units)
-        self._check_arrays()
-
-    def _check_arrays(self) -> None:
-        per_rollout = {"actions": self.actions, "time": self.time, "rewards": self.rewards}
-        for name, arrays in per_rollout.items():
-            if arrays is not None and len(arrays) != len(self.readings):
-                raise DataError(
-                    f"there are {len(self.readings)} rollouts of readings, but {len(arrays)} of "
-                    f"{name}."
-                )
-        for index, readings in enumerate(self.readings):
-            where = f"rollout {index}"
-            steps = len(readings) - 1
-            if steps < 1:
-                raise DataError(
-                    f"{where} has {steps + 1} row, but at least two are needed for one step."
-                )
-            wanted = {
-                "readings": (readings, (steps + 1, len(self.channel_names))),
-                "actions": (self.actions[index], (steps, len(self.action_names))),
-                "time": (self.time[index], (steps + 1,)),
-            }
-            if self.rewards is not None:
-                wanted["rewards"] = (self.rewards[index], (steps,))
-            for name, (values, shape) in wanted.items():
-                if values.shape != shape:
-                    raise DataError(
-                        f"{name} of {where} should have shape {shape}, got {values.shape}."
-                    )
-            checks.check_finite(readings, self.channel_names, where)
-            checks.check_finite(self.actions[index], self.action_names, where)
-            checks.check_finite(self.time[index][:, None], ("time",), where)
-            if self.rewards is not None:
-                checks.check_finite(self.rewards[index][:, None], ("reward",), where)
-            checks.check_time(self.time[index], where)
-        found = checks.canonical_time_step(self.time)
-        if abs(found - self.time_step) > checks.MAX_RATE_DIFFERENCE * self.time_step:
-            raise DataError(
-                f"time stamps are {found:.6g} s apart, but the time step is said to be "
-                f"{self.time_step:.6g} s."
-            )
+            freeze(self, "time", tuple(self.time_step * np.arange(n) for n in lengths))
+        for field in ("readings", "actions", "time", "rewards"):
+            values = getattr(self, field)
+            freeze(self, field, values and tuple(arrays.frozen(v) for v in values))
+        freeze(self, "channel_units", self.channel_units or ("",) * len(self.channel_names))
+        freeze(self, "action_units", self.action_units or ("",) * len(self.action_names))
+        arrays.check_arrays(self)
 
     # -- Construction ------------------------------------------------------------------------
 
@@ -166,8 +108,8 @@ class Rollouts:
         Raises:
             DataError: The arrays do not fit each other or are not valid data.
         """
-        values = _arrays(readings, "readings")
-        times = () if time is None else _arrays(time, "time")
+        values = arrays.as_arrays(readings, "readings")
+        times = () if time is None else arrays.as_arrays(time, "time")
         if time_step is None:
             if not times or min(len(t) for t in times) < 2:
                 raise DataError("give a time step or time stamps of at least two readings.")
@@ -175,14 +117,14 @@ class Rollouts:
         if actions is None:
             commands = tuple(np.zeros((max(len(v) - 1, 0), 0)) for v in values)
         else:
-            commands = _arrays(actions, "actions")
+            commands = arrays.as_arrays(actions, "actions")
         return cls(
             readings=values,
             actions=commands,
             channel_names=tuple(channel_names),
             action_names=tuple(action_names),
             time_step=time_step,
-            rewards=None if rewards is None else _arrays(rewards, "rewards"),
+            rewards=None if rewards is None else arrays.as_arrays(rewards, "rewards"),
             time=times,
             channel_units=tuple(channel_units),
             action_units=tuple(action_units),
@@ -311,28 +253,9 @@ class Rollouts:
     def __iter__(self) -> Iterator["Rollouts"]:
         return (self[index] for index in range(len(self)))
 
-    def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> "Rollouts":
+    def __getitem__(self, index: indices.Index) -> "Rollouts":
         """Returns the chosen rollouts, always as Rollouts."""
-        if isinstance(index, int | np.integer):
-            if not -len(self) <= index < len(self):
-                # Iteration protocols rely on IndexError, so it is not a DataError.
-                raise IndexError(f"there is no rollout {index}; there are {len(self)}.")
-            chosen = [int(index)]
-        elif isinstance(index, slice):
-            chosen = list(range(len(self)))[index]
-        else:
-            selected = np.asarray(index)
-            if selected.dtype == bool and selected.shape != (len(self),):
-                raise DataError(f"a mask over {len(self)} rollouts cannot have {selected.shape}.")
-            if selected.size and selected.dtype.kind not in "iub":
-                raise DataError(f"rollouts are chosen by integers, not {selected.dtype}.")
-            if selected.dtype == bool:
-                selected = np.flatnonzero(selected)
-            chosen = [int(i) for i in selected]
-            if any(not -len(self) <= i < len(self) for i in chosen):
-                raise IndexError(f"rollouts {chosen} were asked for; there are {len(self)}.")
-        if not chosen:
-            raise DataError("no rollout was chosen.")
+        chosen = indices.chosen(index, len(self))
         return replace(
             self,
             readings=tuple(self.readings[i] for i in chosen),
@@ -398,23 +321,8 @@ class Rollouts:
         Raises:
             DataError: A side is empty, or a rollout is on both sides.
         """
-        if isinstance(train, int | float):
-            if not 0 < train < 1 or len(self) < 2 or test is not None:
-                raise DataError(
-                    "a fractional split needs a fraction between 0 and 1, two rollouts and no "
-                    f"test indices, got {train=}, {len(self)} rollouts, {test=}."
-                )
-            order = np.arange(len(self))
-            if seed is not None:
-                np.random.default_rng(seed).shuffle(order)
-            size = min(max(round(train * len(self)), 1), len(self) - 1)
-            return self[np.sort(order[:size])], self[np.sort(order[size:])]
-        chosen = [int(i) for i in train]
-        others = [i for i in range(len(self)) if i not in chosen] if test is None else list(test)
-        shared = sorted({i % len(self) for i in chosen} & {int(i) % len(self) for i in others})
-        if shared:
-            raise DataError(f"rollout {shared[0]} is on both sides of the split.")
-        return self[chosen], self[others]
+        left, right = indices.split(len(self), train, test, seed)
+        return self[left], self[right]
 
     def concatenate(self, *others: "Rollouts") -> "Rollouts":
         """Returns these rollouts followed by others with the same columns and time step.
@@ -533,24 +441,6 @@ class Rollouts:
         names = self.channel_names if channels is None else tuple(channels)
         columns = segments.columns_of(names, self.channel_names)
         return [torch.from_numpy(values[:-1, columns].copy()) for values in self.readings]
-
-
-def _frozen(values: ArrayLike) -> Array:
-    """Returns a read-only float64 copy."""
-    copied = np.array(values, dtype=np.float64)
-    copied.flags.writeable = False
-    return copied
-
-
-def _arrays(values: Any, name: str) -> tuple[Array, ...]:
-    """Returns one float64 array per rollout."""
-    try:
-        return tuple(
-            np.asarray(v.detach().cpu() if isinstance(v, Tensor) else v, dtype=np.float64)
-            for v in values
-        )
-    except (TypeError, ValueError):
-        raise DataError(f"{name} should be one array of numbers per rollout.") from None
 
 
 def _listed(names: Sequence[str], units: Sequence[str]) -> str:

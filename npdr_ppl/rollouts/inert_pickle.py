@@ -28,7 +28,9 @@ _DTYPE = "numpy dtype"
 _FUNCTIONS = frozenset(
     {
         _DTYPE,
+        "__builtin__ bytes",
         "_codecs encode",
+        "builtins bytes",
         "collections OrderedDict",
         "numpy.core.multiarray _reconstruct",
         "numpy.core.multiarray scalar",
@@ -66,8 +68,14 @@ class _Global:
 
 @dataclass
 class _PickledArray:
-    """An array whose shape, type and bytes follow in a BUILD instruction."""
+    """An array whose shape, type and bytes follow in a BUILD instruction.
 
+    Attributes:
+        is_joblib: Whether the bytes follow behind the instruction instead, as joblib puts them.
+        values: The array once it is built.
+    """
+
+    is_joblib: bool = False
     values: NDArray[Any] | None = None
 
 
@@ -224,7 +232,10 @@ class _Machine:
             raise TypeError
         if not isinstance(arguments, tuple):
             raise TypeError
-        self.stack.append(Record(cls.name, arguments))
+        if cls.name == _JOBLIB_ARRAY:
+            self.stack.append(_PickledArray(is_joblib=True))
+        else:
+            self.stack.append(Record(cls.name, arguments))
 
     def reduce(self) -> None:
         arguments, function = self.stack.pop(), self.stack.pop()
@@ -252,10 +263,10 @@ class _Machine:
             if encoding not in ("latin1", "latin-1"):
                 raise DataError("the pickle encodes text in an unexpected way.")
             self.stack.append(text.encode("latin-1"))
-        else:  # OrderedDict
-            if arguments != ():
-                raise TypeError
-            self.stack.append({})
+        elif arguments == ():
+            self.stack.append(b"" if member == "bytes" else {})
+        else:
+            raise DataError(f"the pickle makes a {member} of arguments.")
 
     def build(self) -> None:
         """Gives the topmost object its state; an array of joblib's then follows in the file."""
@@ -268,22 +279,15 @@ class _Machine:
             ):
                 raise DataError("the pickle has an array that is not of plain numbers.")
             target.byte_order = state[1]
+        elif isinstance(target, _PickledArray) and target.is_joblib:
+            target.values = self.read_joblib_array(state)
         elif isinstance(target, _PickledArray):
             _, shape, dtype, is_fortran, content = state
             target.values = _array(content, shape, dtype, "F" if is_fortran else "C")
         elif isinstance(target, Record):
-            if isinstance(state, tuple) and len(state) == 2 and state[0] is None:
-                state = state[1]
             if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
                 raise TypeError
             target.fields.update(state)
-            if target.kind == _JOBLIB_ARRAY:
-                array = self.read_joblib_array(target.fields)
-                self.stack[-1] = array
-                # The memo entry of the wrapper stands for the array from here on.
-                for key, value in self.memo.items():
-                    if value is target:
-                        self.memo[key] = array
         else:
             raise DataError(f"the pickle sets the state of a {type(target).__name__}.")
 
@@ -291,8 +295,6 @@ class _Machine:
         subclass = fields["subclass"]
         if not isinstance(subclass, _Global) or subclass.name != _NDARRAY:
             raise TypeError
-        if fields.get("numpy_array_alignment_bytes") is not None:
-            self.file.seek(self.file.read(1)[0], io.SEEK_CUR)
         shape, dtype = fields["shape"], fields["dtype"]
         if isinstance(dtype, _PickledDtype) and dtype.code in _LABEL_DTYPES:
             # joblib puts a whole pickle of such an array here; it gets no more rights than this
@@ -300,6 +302,8 @@ class _Machine:
             if self.is_nested:
                 raise TypeError
             return _Machine(self.file, self.size, self.records, is_nested=True).run()
+        if fields.get("numpy_array_alignment_bytes") is not None:
+            self.file.seek(self.file.read(1)[0], io.SEEK_CUR)
         num_bytes = _num_bytes(shape, dtype)
         content = self.file.read(num_bytes) if num_bytes <= self.size else b""
         return _array(content, shape, dtype, fields["order"])
@@ -340,7 +344,7 @@ _STEPS: dict[str, Callable[[_Machine], None]] = {
 
 def _plain(value: Any) -> Any:
     """Returns the array behind a finished array's stand-in, anything else as it is."""
-    if isinstance(value, _Mark):
+    if isinstance(value, _Mark) or (isinstance(value, _PickledArray) and value.values is None):
         raise TypeError
     return value.values if isinstance(value, _PickledArray) else value
 

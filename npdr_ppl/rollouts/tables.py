@@ -128,8 +128,8 @@ def _rollout_bounds(rollout: Array, at: _Location) -> NDArray[np.int64]:
     bounds = np.concatenate([starts, [len(rollout)]])
     for index in np.flatnonzero(np.diff(bounds) < 2)[:1].tolist():
         raise DataError(
-            f"rollout {rollout[bounds[index]]:.0f} has one row{at(bounds[index])}, but at least "
-            "two are needed."
+            f"rollout {rollout[bounds[index]]:.0f} has one row{at(int(bounds[index]))}, but at "
+            "least two are needed."
         )
     return bounds
 

@@ -10,7 +10,7 @@ from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.randomness import seeded
 
 if TYPE_CHECKING:
-    import arviz as az
+    from npdr_ppl.workflows.arviz_module import az
 
     from npdr_ppl.workflows.posterior import Posterior
 
@@ -40,7 +40,7 @@ def to_arviz(
         num_samples: Draws per member.
         seed: Seed of the draws.
     """
-    import arviz as az
+    from npdr_ppl.workflows.arviz_module import az
 
     prior = posterior.prior
     z = posterior.sample_reference(num_samples, seed=seed)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 
 if TYPE_CHECKING:
-    import arviz as az
+    from npdr_ppl.workflows.arviz_module import az
 
 __all__ = ["Decision", "Diagnosis", "Thresholds", "diagnose"]
 
@@ -106,7 +106,7 @@ def diagnose(
     Raises:
         DataError: A needed group is missing.
     """
-    import arviz as az
+    from npdr_ppl.workflows.arviz_module import az
 
     limits = thresholds or Thresholds()
     groups = set(data.groups())
@@ -268,7 +268,7 @@ def _worst_segment_p_value(
 
 
 def _loo(data: "az.InferenceData") -> tuple[tuple[float, float], float]:
-    import arviz as az
+    from npdr_ppl.workflows.arviz_module import az
 
     if "log_likelihood" not in data.groups() or len(data.log_likelihood.data_vars) != 1:
         return (float("nan"), float("nan")), float("nan")

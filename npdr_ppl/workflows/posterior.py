@@ -24,7 +24,7 @@ from npdr_ppl.workflows.binding import BindingOptions, BoundModel, bind, problem
 from npdr_ppl.workflows.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    import arviz as az
+    from npdr_ppl.workflows.arviz_module import az
 
 __all__ = ["Posterior", "Provenance"]
 

@@ -1,0 +1,69 @@
+"""`npdr reproduce`: the paper's experiments."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from npdr_ppl.cli.fit import InitialState
+
+__all__ = ["reproduce"]
+
+
+class Experiment(StrEnum):
+    """An experiment of Muratore et al. (2021)."""
+
+    TABLE2 = "table2"
+    PENDULUM = "pendulum"
+
+
+def reproduce(
+    experiment: Annotated[Experiment, typer.Argument(help="Which table or figure.")],
+    data: Annotated[
+        Path | None, typer.Option(help="The paper's recordings; needed for table2.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("reproduction"),
+    backend: Annotated[str, typer.Option(help="Backend of NPDR's column.")] = "snpe-c",
+    initial_state: Annotated[
+        InitialState, typer.Option(help="State at a segment's start; the paper took recorded.")
+    ] = InitialState.RECORDED,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+) -> None:
+    """Reproduce an experiment of the NPDR paper, and compare with its figures.
+
+    Example: npdr reproduce table2 --data swing_up_500hz_5s.csv --out table2
+    """
+    from npdr_ppl.cli.show import show_rows
+    from npdr_ppl.errors import DataError
+
+    progress = False if quiet else None
+    out = out / experiment.value
+    if experiment is Experiment.PENDULUM:
+        from npdr_ppl.plots.pendulum import write_pendulum_figure
+        from npdr_ppl.workflows.pendulum_ridge import reproduce_pendulum
+
+        outcome = reproduce_pendulum(out, backend=backend, seed=seed, progress=progress)
+        write_pendulum_figure(outcome, out)
+        result = outcome.result
+    else:
+        from npdr_ppl.models.furuta import furuta
+        from npdr_ppl.plots.fit_figures import write_fit_figures
+        from npdr_ppl.rollouts import Rollouts
+        from npdr_ppl.workflows.table2 import reproduce_table2
+
+        if data is None:
+            raise DataError("table2 needs the paper's recordings: pass --data FILE.")
+        rollouts = Rollouts.load(data)
+        posterior, result = reproduce_table2(
+            rollouts,
+            out,
+            backend=backend,
+            initial_state=initial_state.value,
+            seed=seed,
+            progress=progress,
+        )
+        write_fit_figures(posterior, furuta, rollouts[result["held_out"]], out, seed=seed)
+    if not quiet:
+        show_rows(experiment.value, result)

@@ -1,0 +1,286 @@
+"""How far simulations are from measurements: RMSE, DTW, CRPS, PIT and coverage.
+
+RMSE and DTW compare one simulated series per rollout with the measured one, as the tables of
+Muratore et al. (2021) do; the others compare an ensemble of trajectories, i.e. a predictive
+distribution, with the observation.
+"""
+
+from collections.abc import Sequence
+from typing import TypedDict
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npdr_ppl.errors import ShapeError
+
+__all__ = [
+    "Summary",
+    "coverage",
+    "crps",
+    "crps_by_step",
+    "dtw",
+    "pit",
+    "rmse",
+    "summarise",
+]
+
+_DTW_ELEMENTS = 2**22
+"""Numbers per work array of a batch of alignments: 32 MiB."""
+
+
+class Summary(TypedDict):
+    """Mean and population standard deviation over rollouts."""
+
+    mean: float
+    std: float
+
+
+def summarise(values: Tensor) -> Summary:
+    """Returns mean and population standard deviation of all values, as tables print them."""
+    return {"mean": float(values.mean()), "std": float(values.std(correction=0))}
+
+
+def rmse(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> Tensor:
+    """Root-mean-square error per rollout in units of each channel's range.
+
+    ``RMSE = 1/C Σ_c sqrt(1/T Σ_t ((x_tc − y_tc) / max_t |y_tc|)²)``
+
+    Args:
+        simulated: Series x, one ``(..., T, C)`` per rollout, e.g. of
+            :func:`npdr_ppl.rollouts.stitch`.
+        measured: Series y, one ``(T, C)`` per rollout, in the same units.
+
+    Returns:
+        ``(..., R)``, dimensionless.
+
+    Raises:
+        ShapeError: The series do not fit each other.
+
+    References:
+        Muratore et al., Neural Posterior Domain Randomization, 2021, Tables 1 and 2. The paper
+        says that it divides by the state bounds; its figures come from dividing by the range.
+    """
+    _check(simulated, measured)
+    result = []
+    for x, y in zip(simulated, measured, strict=True):
+        error = (x - y.to(x)) / _scale(y).to(x)
+        result.append(error.square().mean(-2).sqrt().mean(-1))
+    return torch.stack(result, dim=-1)
+
+
+def dtw(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> Tensor:
+    """Distance of dynamic time warping per rollout, channels in units of their range.
+
+    With ``d_ij`` the Euclidean distance between step i of the measured and step j of the
+    simulated series, both divided by ``max |measured|`` per channel::
+
+        D_ij = min(D_(i−1)(j−1) + 2 d_ij, D_(i−1)j + d_ij, D_i(j−1) + d_ij),   D_00 = d_00
+
+    The alignment starts at the beginning of both series and spends the whole measured one, but
+    may leave out the end of the simulated one: the result is ``D_(T−1)j`` where
+    ``D_(T−1)j / (T + j + 1)`` is least. This is ``dtw-python`` with the query measured,
+    ``symmetric2``, ``open_end=True``, and the distance cumulative, not normalised; but memory
+    grows with T instead of T².
+
+    Args:
+        simulated: One ``(..., T, C)`` per rollout.
+        measured: One ``(T, C)`` per rollout, in the same units.
+
+    Returns:
+        ``(..., R)`` float64, dimensionless; NaN where a simulation is not finite.
+
+    Raises:
+        ShapeError: The series do not fit each other.
+
+    References:
+        H. Sakoe and S. Chiba, Dynamic programming algorithm optimization for spoken word
+        recognition, 1978 (the recursion); P. Tormene et al., Matching incomplete time series with
+        dynamic time warping, 2009 (the open end).
+    """
+    _check(simulated, measured)
+    result = []
+    for x, y in zip(simulated, measured, strict=True):
+        scale = _scale(y)
+        query = (y / scale).double().cpu().numpy().T
+        batch = (x.double().cpu() / scale.double().cpu()).reshape(-1, *x.shape[-2:])
+        chunk = max(1, _DTW_ELEMENTS // max(x.shape[-2] * x.shape[-1], 1))
+        distances = [
+            _open_end_dtw(query, part.permute(2, 0, 1).numpy()) for part in batch.split(chunk)
+        ]
+        result.append(torch.from_numpy(np.concatenate(distances)).reshape(x.shape[:-2]))
+    return torch.stack(result, dim=-1)
+
+
+def _open_end_dtw(
+    query: NDArray[np.float64], references: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Aligns one query ``(C, n)`` with B references ``(C, B, m)``; returns ``(B,)``.
+
+    All entries of an anti-diagonal i + j = k depend only on the two before it, so a diagonal is
+    computed at once, for all references.
+    """
+    num_channels, n = query.shape
+    _, batch, m = references.shape
+    # Row j of the diagonal arrays is the reference's step; the query is reversed so that a
+    # diagonal is a pair of slices.
+    reverse = np.ascontiguousarray(query[:, ::-1])
+    previous = np.full((batch, m + 1), np.inf)  # diagonal k − 1, shifted by one: [0] is j = −1
+    before = np.full((batch, m + 1), np.inf)  # diagonal k − 2
+    last_row = np.empty((batch, m))
+    for k in range(n + m - 1):
+        low, high = max(0, k - n + 1), min(k, m - 1) + 1  # j of this diagonal
+        offset = n - 1 - k  # reverse[offset + j] is the query's step i = k − j
+        local = np.zeros((batch, high - low))
+        for c in range(num_channels):
+            gap = references[c, :, low:high] - reverse[c, offset + low : offset + high]
+            local += gap * gap
+        np.sqrt(local, out=local)
+        if k == 0:
+            best = local
+        else:
+            # (i − 1, j) and (i, j − 1) lie on diagonal k − 1, (i − 1, j − 1) on k − 2.
+            straight = np.minimum(previous[:, low + 1 : high + 1], previous[:, low:high])
+            best = np.minimum(straight, before[:, low:high] + local) + local
+        current = before
+        current.fill(np.inf)
+        current[:, low + 1 : high + 1] = best
+        before, previous = previous, current
+        if k >= n - 1:
+            last_row[:, k - n + 1] = best[:, 0]
+    ends = np.argmin(last_row / (n + 1 + np.arange(m)), axis=1)
+    result = last_row[np.arange(batch), ends]
+    is_finite = np.isfinite(references).all(axis=(0, 2)) & np.isfinite(query).all()
+    return np.where(is_finite, result, np.nan)
+
+
+def crps(samples: Tensor, observation: Tensor, *, is_fair: bool = False) -> Tensor:
+    """Continuous ranked probability score of an ensemble, element by element.
+
+    ``CRPS = 1/B Σ_b |x_b − y| − 1/(2 B²) Σ_b Σ_b' |x_b − x_b'|``; the fair form divides the
+    second sum by ``2 B (B − 1)``, which removes the bias of a small ensemble.
+
+    Args:
+        samples: Ensemble x, ``(B, ...)``, in the observation's units.
+        observation: Observed values y, ``(...)``.
+        is_fair: Whether to use the fair form, which needs B > 1.
+
+    Returns:
+        ``(...)`` in the observation's units; smaller is better, |x − y| for B = 1.
+
+    Raises:
+        ShapeError: The shapes do not fit, or the fair form got one sample.
+
+    References:
+        T. Gneiting and A. Raftery, Strictly proper scoring rules, prediction, and estimation,
+        2007, eq. 21; C. Ferro, Fair scores for ensemble forecasts, 2014.
+    """
+    _check_ensemble(samples, observation)
+    size = samples.shape[0]
+    if is_fair and size < 2:
+        raise ShapeError("the fair CRPS needs two samples, got one.")
+    error = (samples - observation.to(samples)).abs().mean(0)
+    # In ascending order the i-th sample enters the double sum with weight 2 (2 i − B − 1).
+    ordered = samples.sort(dim=0).values
+    weights = 2 * torch.arange(1, size + 1).to(samples) - size - 1
+    spread = (weights @ ordered.flatten(1)).reshape(observation.shape)
+    return error - spread / (size * (size - 1 if is_fair else size))
+
+
+def crps_by_step(
+    samples: Tensor, observation: Tensor, mask: Tensor, *, is_fair: bool = False
+) -> Tensor:
+    """CRPS of the k-step-ahead prediction: averaged over segments, for each step k.
+
+    Args:
+        samples: Trajectories, ``(B, S, K, C)``.
+        observation: Readings after each step, ``(S, K, C)``.
+        mask: True for steps that exist, ``(S, K)``.
+        is_fair: Whether to use the fair form; see :func:`crps`.
+
+    Returns:
+        ``(K, C)`` in the channels' units; row k − 1 is the k-step prediction.
+    """
+    values = crps(samples, observation, is_fair=is_fair)
+    mask = mask.to(values.device)
+    values = torch.where(mask[..., None], values, 0.0)
+    return values.sum(0) / mask.sum(0).clamp_min(1)[:, None]
+
+
+def pit(samples: Tensor, observation: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """Probability integral transform: where the observation ranks among the ensemble.
+
+    ``(#{x_b < y} + u (1 + #{x_b = y})) / (B + 1)`` with ``u`` uniform on [0, 1]: exactly uniform
+    if the observation is one more draw of the ensemble's distribution, with ties as well.
+
+    Args:
+        samples: Ensemble x, ``(B, ...)``.
+        observation: Observed values y, ``(...)``.
+        generator: Source of ``u``; ``None`` takes ``u = 1/2``.
+
+    Returns:
+        ``(...)`` in [0, 1].
+
+    Raises:
+        ShapeError: The shapes do not fit.
+
+    References:
+        C. Czado et al., Predictive model assessment for count data, 2009 (randomised PIT).
+    """
+    _check_ensemble(samples, observation)
+    observation = observation.to(samples)
+    below = (samples < observation).sum(0)
+    equal = (samples == observation).sum(0)
+    if generator is None:
+        u = torch.full(observation.shape, 0.5)
+    else:
+        u = torch.rand(observation.shape, generator=generator, device=generator.device)
+    return (below + u.to(samples) * (1 + equal)) / (samples.shape[0] + 1)
+
+
+def coverage(pit_values: Tensor, levels: Sequence[float], mask: Tensor | None = None) -> Tensor:
+    """Fraction of observations inside the central predictive intervals.
+
+    Args:
+        pit_values: Result of :func:`pit`, ``(..., C)`` or any shape.
+        levels: Nominal probabilities of the intervals, L of them, in [0, 1].
+        mask: Which values count, broadcast against ``pit_values`` from the left, e.g. ``(S, K)``.
+
+    Returns:
+        ``(L,)``; calibrated where it equals ``levels``.
+    """
+    distance = (pit_values - 0.5).abs()
+    if mask is not None:
+        distance = distance[mask.to(distance.device)]
+    bounds = torch.as_tensor(levels, dtype=distance.dtype, device=distance.device) / 2
+    # A bound is itself a float: the whole interval must hold 0 and 1.
+    inside = distance.flatten() <= bounds[:, None] + torch.finfo(distance.dtype).eps
+    return inside.to(distance.dtype).mean(-1)
+
+
+def _scale(measured: Tensor) -> Tensor:
+    """Returns each channel's largest magnitude ``(C,)``, one where a channel is always zero."""
+    largest = measured.abs().amax(-2)
+    return torch.where(largest > 0, largest, torch.ones_like(largest))
+
+
+def _check(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> None:
+    if len(simulated) != len(measured) or not measured:
+        raise ShapeError(
+            f"there are {len(simulated)} simulated and {len(measured)} measured rollouts."
+        )
+    for index, (x, y) in enumerate(zip(simulated, measured, strict=True)):
+        if y.ndim != 2 or x.shape[-2:] != y.shape or 0 in y.shape:
+            raise ShapeError(
+                f"rollout {index} was measured with shape {tuple(y.shape)} and simulated with "
+                f"{tuple(x.shape)}; (T, C) and (..., T, C) are needed."
+            )
+
+
+def _check_ensemble(samples: Tensor, observation: Tensor) -> None:
+    if samples.ndim == 0 or samples.shape[1:] != observation.shape or samples.shape[0] == 0:
+        raise ShapeError(
+            f"an ensemble for an observation of shape {tuple(observation.shape)} has one more "
+            f"dimension in front, got {tuple(samples.shape)}."
+        )

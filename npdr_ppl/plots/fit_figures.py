@@ -1,0 +1,96 @@
+"""The figures of a fit: marginals, pairs, and predictive bands over the recording."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npdr_ppl.plots.bands import plot_bands
+from npdr_ppl.plots.marginals import plot_marginals
+from npdr_ppl.plots.pair import plot_pair
+from npdr_ppl.plots.theme import save_figure
+from npdr_ppl.randomness import seeded
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.evaluation import replay
+from npdr_ppl.workflows.fit import units
+from npdr_ppl.workflows.posterior import Posterior
+
+__all__ = ["write_fit_figures"]
+
+NUM_DRAWS = 2_000
+NUM_PREDICTIVE = 100
+MAX_PAIRS = 12
+"""Parameters of a pair plot; more would be too small to read."""
+
+
+def write_fit_figures(
+    posterior: Posterior,
+    model: Any,
+    rollouts: Rollouts,
+    out: Path,
+    *,
+    marks: dict[str, dict[str, float]] | None = None,
+    seed: int = 0,
+) -> list[Path]:
+    """Draws a posterior and its predictions for one rollout.
+
+    Args:
+        posterior: The posterior.
+        model: The model without reading noise, to draw the simulator's own spread.
+        rollouts: The first of these is drawn.
+        out: Folder for ``marginals.png``, ``pairs.png`` and ``bands.png``.
+        marks: Values to mark, by legend entry and parameter.
+        seed: Seed of the draws.
+    """
+    draws = posterior.sample(NUM_DRAWS, seed=seed)
+    prior = posterior.prior
+    samples = _columns(draws)
+    with seeded(seed, "figures"):
+        prior_samples = _columns(prior.to_parameters(prior.sample(NUM_DRAWS)))
+    most_likely = posterior.most_likely(seed=seed)
+    marks = {"most likely": _values(most_likely)} | (marks or {})
+    paths = [
+        save_figure(
+            plot_marginals(samples, prior_samples, marks=marks, units=units(posterior)),
+            out / "marginals.png",
+        )
+    ]
+    if 1 < len(samples) <= MAX_PAIRS:
+        figure = plot_pair(samples, prior_samples, marks=marks)
+        paths.append(save_figure(figure, out / "pairs.png"))
+    few = {name: value[:NUM_PREDICTIVE] for name, value in draws.items()}
+    options = posterior.bound.options
+    shown = rollouts[[0]]
+    replayed = replay(model, shown, few, options)
+    single = replay(model, shown, {n: v[None] for n, v in most_likely.items()}, options)
+    names = replayed.channel_names
+    figure = plot_bands(
+        shown.time[0][:-1],
+        shown.series(names)[0].numpy(),
+        replayed.series()[0].double().numpy(),
+        channel_names=names,
+        units=[shown.channel_units[shown.channel_names.index(name)] for name in names],
+        lines={"most likely": single.series()[0][0].double().numpy()},
+        resets=replayed.inputs.start.double().numpy() * shown.time_step,
+    )
+    paths.append(save_figure(figure, out / "bands.png"))
+    return paths
+
+
+def _columns(parameters: dict[str, Tensor]) -> dict[str, NDArray[np.float64]]:
+    """Returns one column per scalar parameter."""
+    columns: dict[str, NDArray[np.float64]] = {}
+    for name, value in parameters.items():
+        flat = value.reshape(len(value), -1).double().numpy()
+        if flat.shape[1] == 1:
+            columns[name] = flat[:, 0]
+        else:
+            columns |= {f"{name}[{i}]": flat[:, i] for i in range(flat.shape[1])}
+    return columns
+
+
+def _values(parameters: dict[str, Tensor]) -> dict[str, float]:
+    columns = _columns({name: value[None] for name, value in parameters.items()})
+    return {name: float(value[0]) for name, value in columns.items()}

@@ -1,0 +1,140 @@
+"""`npdr fit` as a function: infer, evaluate, diagnose, draw, and write it all down."""
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from npdr_ppl.inference.base import Backend
+from npdr_ppl.language.handlers import with_noise
+from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.diagnostics import diagnose
+from npdr_ppl.workflows.evaluation import residual_noise, score
+from npdr_ppl.workflows.infer import infer
+from npdr_ppl.workflows.posterior import Posterior
+from npdr_ppl.workflows.run_folder import write_json
+
+if TYPE_CHECKING:
+    from npdr_ppl.workflows.arviz_module import az
+
+__all__ = ["describe", "fit"]
+
+
+def fit(
+    model: Callable[..., Any],
+    train: Rollouts,
+    test: Rollouts | None = None,
+    *,
+    out: Path | None = None,
+    backend: str | Backend = "snpe-c",
+    rounds: int = 2,
+    num_simulations: int = 2_000,
+    seed: int = 0,
+    options: BindingOptions | None = None,
+    noise: Literal["auto", "model"] = "auto",
+    device: str = "cpu",
+    progress: bool | None = None,
+) -> tuple[Posterior, dict[str, Any]]:
+    """Fits a model to measured rollouts and reports on held-out ones.
+
+    Args:
+        model: A Pyro model with one black-box site.
+        train: Rollouts to fit.
+        test: Held-out rollouts to report on; the fitted ones if ``None``.
+        out: Folder for ``posterior.nc``, ``fit.json`` and the run itself, from which an
+            interrupted fit continues; nothing is written if ``None``.
+        backend: The inference backend.
+        rounds: Rounds of simulating and training.
+        num_simulations: Simulations of each round.
+        seed: Seed of everything random.
+        options: How the data are prepared.
+        noise: ``"auto"`` gives a model without noise the scale of
+            :func:`~npdr_ppl.workflows.evaluation.residual_noise`; ``"model"`` takes it as it is.
+        device: Where the backend trains.
+        progress: Whether to show progress; ``None`` shows it on a terminal.
+
+    Returns:
+        The posterior and the content of ``fit.json``.
+    """
+    options = options or BindingOptions()
+    used_noise = residual_noise(model, train, options, seed=seed) if noise == "auto" else None
+    noisy = model if used_noise is None else with_noise(model, used_noise)
+    posterior = infer(
+        noisy,
+        train,
+        backend=backend,
+        rounds=rounds,
+        num_simulations=num_simulations,
+        seed=seed,
+        embedding=options.embedding,
+        segment_length=options.segment_length,
+        initial_state=options.initial_state,
+        precision=options.precision,
+        device=device,
+        checkpoint=None if out is None else out / "run",
+        progress=progress,
+    )
+    started = time.perf_counter()
+    most_likely = posterior.most_likely(seed=seed)
+    data = posterior.to_arviz(seed=seed)
+    sampled = time.perf_counter() - started
+    evaluated = train if test is None else test
+    metrics = score(model, evaluated, most_likely, options)
+    result = {
+        "backend": posterior.backend.name,
+        **describe(data),
+        "most_likely": {name: _plain(value) for name, value in most_likely.items()},
+        "metrics": {
+            "rmse": float(metrics["rmse"].mean()),
+            "dtw": float(metrics["dtw"].mean()),
+            "rmse_per_rollout": metrics["rmse"].tolist(),
+            "dtw_per_rollout": metrics["dtw"].tolist(),
+            "evaluated_on": "fitted" if test is None else "held-out",
+        },
+        "noise": used_noise,
+        "seconds": {**posterior.provenance.seconds, "sample": sampled},
+        "diagnosis": diagnose(data).to_dict(),
+        "units": units(posterior),
+    }
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        data.to_netcdf(str(out / "posterior.nc"), engine="h5netcdf")
+        write_json(out / "fit.json", result)
+    return posterior, result
+
+
+def describe(data: "az.InferenceData") -> dict[str, Any]:
+    """Returns mean, standard deviation and 94 % highest-density interval of every parameter."""
+    from npdr_ppl.workflows.arviz_module import az
+
+    parameters: dict[str, Mapping[str, Any]] = {}
+    intervals = az.hdi(data, hdi_prob=0.94, group="posterior")
+    for name in data.posterior.data_vars:
+        values = data.posterior[name]
+        parameters[str(name)] = {
+            "mean": _plain(values.mean(("chain", "draw")).to_numpy()),
+            "sd": _plain(values.std(("chain", "draw")).to_numpy()),
+            "hdi_94": _plain(intervals[name].to_numpy()),
+        }
+    return {"parameters": parameters}
+
+
+def units(posterior: Posterior) -> dict[str, str]:
+    """Returns the units of the latent sites that carry a parameter's name."""
+    known: dict[str, str] = {}
+    for box in posterior.prior.black_boxes.values():
+        if isinstance(box, SimulatorBlackBox):
+            known |= {p.name: p.unit for p in box.simulator.parameters}
+            for effect in box.simulator.effects:
+                pairs = zip(effect.parameter_names, effect.parameters, strict=True)
+                known |= {site: p.unit for site, p in pairs}
+    return {site.name: known[site.name] for site in posterior.prior.sites if site.name in known}
+
+
+def _plain(value: Any) -> Any:
+    """Returns numbers for scalars and nested lists for arrays."""
+    return np.asarray(value, dtype=float).tolist()
