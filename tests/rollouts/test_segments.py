@@ -1,0 +1,125 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from npdr_ppl.errors import DataError, ShapeError
+from npdr_ppl.rollouts import Rollouts, stitch
+
+torch.set_num_threads(1)
+
+
+def counting(lengths, channels=2, actions=1):
+    """Rollouts whose every value tells where it comes from: rollout, row and column."""
+    return Rollouts.from_arrays(
+        [
+            1000.0 * (r + 1) + np.arange(n + 1)[:, None] + 0.1 * np.arange(channels)
+            for r, n in enumerate(lengths)
+        ],
+        [
+            -1000.0 * (r + 1) - np.arange(n)[:, None] - 0.1 * np.arange(actions)
+            for r, n in enumerate(lengths)
+        ],
+        channel_names=[f"c{i}" for i in range(channels)],
+        action_names=[f"a{i}" for i in range(actions)],
+        time_step=0.1,
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 12), min_size=1, max_size=4),
+    segment_length=st.none() | st.integers(1, 15),
+    history=st.integers(0, 5),
+)
+def test_every_step_is_in_exactly_one_segment(lengths, segment_length, history):
+    rollouts = counting(lengths)
+    inputs = rollouts.inputs(segment_length, "recorded", history=history)
+    observation = rollouts.observation(inputs)
+    length = segment_length or max(lengths)
+    assert inputs.num_segments == sum(-(-n // (segment_length or n)) for n in lengths)
+    assert inputs.num_steps == min(length, max(lengths))
+    assert int(inputs.mask.sum()) == sum(lengths)
+    for s in range(inputs.num_segments):
+        rollout, start = int(inputs.rollout[s]), int(inputs.start[s])
+        base = 1000.0 * (rollout + 1)
+        assert inputs.initial_readings[s, 0] == base + start
+        steps = int(inputs.mask[s].sum())
+        assert inputs.mask[s, :steps].all()
+        rows = torch.arange(start, start + steps, dtype=torch.float64)
+        torch.testing.assert_close(inputs.actions[s, :steps, 0], -base - rows)
+        torch.testing.assert_close(observation[s, :steps, 0], base + rows + 1)
+        assert not inputs.actions[s, steps:].any() and not observation[s, steps:].any()
+        for h in range(history):
+            row = start - history + h
+            assert inputs.past_actions[s, h, 0] == (-base - row if row >= 0 else 0)
+    torch.testing.assert_close(rollouts.observation(segment_length), observation)
+    for series, measured in zip(stitch(observation, inputs), rollouts.series(), strict=True):
+        assert torch.equal(series, measured)
+
+
+def test_stitching_keeps_leading_dimensions_and_picks_channels():
+    rollouts = counting((5, 3), channels=3)
+    inputs = rollouts.inputs(2, "recorded")
+    trajectory = rollouts.observation(inputs, ["c2", "c0"]).expand(4, 6, -1, -1, -1)
+    pieces = stitch(trajectory, inputs, ["c2", "c0"])
+    assert [tuple(piece.shape) for piece in pieces] == [(4, 6, 5, 2), (4, 6, 3, 2)]
+    for piece, measured in zip(pieces, rollouts.series(["c2", "c0"]), strict=True):
+        assert torch.equal(piece[3, 5], measured)
+    # The order of segments does not matter.
+    order = torch.tensor([3, 1, 4, 0, 2])
+    shuffled = stitch(trajectory[..., order, :, :], inputs.segments(order), ["c2", "c0"])
+    assert all(torch.equal(a, b) for a, b in zip(shuffled, pieces, strict=True))
+
+
+def test_stitching_refuses_what_does_not_fit():
+    rollouts = counting((5,))
+    inputs = rollouts.inputs(2, "recorded")
+    with pytest.raises(ShapeError, match=r"ends in the shape \(3, 2, 2\), got \(3, 2, 1\)"):
+        stitch(torch.zeros(3, 2, 1), inputs)
+    with pytest.raises(DataError, match="speed was not recorded"):
+        stitch(torch.zeros(3, 2, 1), inputs, ["speed"])
+
+
+def test_observation_of_chosen_segments_and_channels():
+    rollouts = counting((5, 3))
+    inputs = rollouts.inputs(2, "recorded", dtype=torch.float32)
+    chosen = rollouts.observation(inputs.segments([4, 1]), ["c1"])
+    assert chosen.dtype == torch.float32 and tuple(chosen.shape) == (2, 2, 1)
+    assert chosen[0, 0, 0] == torch.tensor(2003.1) and chosen[1, 1, 0] == torch.tensor(1004.1)
+    with pytest.raises(DataError, match="c7 was not recorded; the channels are c0, c1"):
+        rollouts.observation(inputs, ["c7"])
+    with pytest.raises(DataError, match="other rollouts"):
+        rollouts[0].observation(inputs)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"segment_length": 0}, "at least one step"),
+        ({"history": -1}, "cannot be negative"),
+        ({"initial_state": "guessed"}, "'estimated' or 'recorded', not 'guessed'"),
+    ],
+)
+def test_wrong_arguments(small, arguments, sentence):
+    with pytest.raises(DataError, match=sentence):
+        small.inputs(**arguments)
+
+
+def test_estimated_states_come_with_rates():
+    time = 0.01 * np.arange(201)
+    rollouts = Rollouts.from_arrays(
+        [np.sin(5 * time)[:, None], np.cos(5 * time[:120])[:, None]],
+        channel_names=("angle",),
+        time_step=0.01,
+    )
+    inputs = rollouts.inputs(50)
+    assert inputs.initial_rates is not None
+    at = 0.01 * inputs.start.double()
+    exact = torch.where(inputs.rollout == 0, 5 * torch.cos(5 * at), -5 * torch.sin(5 * at))
+    torch.testing.assert_close(inputs.initial_rates[:, 0], exact, atol=2e-2, rtol=0)
+    torch.testing.assert_close(inputs.initial_values, inputs.initial_readings, atol=1e-4, rtol=0)
+    recorded = rollouts.inputs(50, "recorded")
+    assert recorded.initial_rates is None
+    assert torch.equal(recorded.initial_values, recorded.initial_readings)
