@@ -63,8 +63,8 @@ def test_tilted_gravity_is_the_gradient_of_the_potential():
     tilt = {"gravity.tilt.roll": 0.3, "gravity.tilt.pitch": -0.2}
     given = {name: torch.tensor([value], dtype=torch.float64) for name, value in tilt.items()}
     simulator = Furuta().with_effects(Tilt("gravity"))
-    one = torch.Size((1,))
-    tables, _ = simulator.tables(given, one, 0.002, torch.float64, torch.device("cpu"))
+    domain = simulator.complete(given, torch.float64, torch.device("cpu"))
+    tables, _ = simulator.tables(domain, torch.Size((1,)), 0.002)
     q = torch.tensor([0.7, 1.9], dtype=torch.float64, requires_grad=True)
     theta, alpha = q
     p = simulator.nominal()
