@@ -13,7 +13,7 @@ import torch
 from pyro.distributions.torch_distribution import ExpandedDistribution
 from scipy import special
 from torch import Tensor, distributions
-from torch.distributions import biject_to
+from torch.distributions import biject_to, constraints
 from torch.distributions.transforms import ComposeTransform
 
 __all__ = ["ReferenceMap", "reference_map"]
@@ -138,7 +138,11 @@ class _Unconstrained(ReferenceMap):
 
     def __init__(self, distribution: distributions.Distribution) -> None:
         self.distribution = distribution
-        self.transform = biject_to(distribution.support)
+        support = distribution.support
+        if isinstance(distribution, distributions.VonMises):
+            # Torch calls the real line its support; its density is one per turn.
+            support = constraints.interval(-math.pi, math.pi)
+        self.transform = biject_to(support)
         shape = self.transform.inverse_shape(distribution.batch_shape + distribution.event_shape)
         self.event_shape = shape[len(distribution.batch_shape) :]
 
