@@ -102,9 +102,9 @@ def dtw(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> Tensor:
     _check(simulated, measured)
     result = []
     for x, y in zip(simulated, measured, strict=True):
-        scale = _scale(y)
-        query = (y / scale).double().cpu().numpy().T
-        batch = (x.double().cpu() / scale.double().cpu()).reshape(-1, *x.shape[-2:])
+        scale = _scale(y).double().cpu()
+        query = (y.double().cpu() / scale).numpy().T
+        batch = (x.detach().double().cpu() / scale).reshape(-1, *x.shape[-2:])
         chunk = max(1, _DTW_ELEMENTS // max(x.shape[-2] * x.shape[-1], 1))
         distances = [
             _open_end_dtw(query, part.permute(2, 0, 1).numpy()) for part in batch.split(chunk)

@@ -85,8 +85,9 @@ class _Pooled(nn.Module):
 
     def __init__(self, encoder: nn.Module, segments: int, hidden: int, output: int) -> None:
         super().__init__()
-        self.encoder = encoder
-        self.segment_code = nn.Parameter(0.1 * torch.randn(segments, hidden))
+        # Codes of unit scale, whatever the encoder: beside them the segments' own codes count.
+        self.encoder = nn.Sequential(encoder, nn.LayerNorm(hidden))
+        self.segment_code = nn.Parameter(torch.randn(segments, hidden))
         self.mix = nn.Sequential(
             nn.Linear(2 * hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden)
         )

@@ -55,9 +55,13 @@ _MAX_NAME_LENGTH = 100
 
 def shown(value: object, limit: int = 40) -> str:
     """Returns a printable, shortened form of anything, for messages."""
-    text = repr(value) if isinstance(value, str | bytes) else str(value)
-    text = text if text.isprintable() else ascii(text)
-    return text if len(text) <= limit else text[: limit - 1] + "…"
+    is_text = isinstance(value, str | bytes)
+    shown_whole = repr(value) if is_text else str(value)
+    if not shown_whole.isprintable():
+        shown_whole = ascii(shown_whole)
+    if len(shown_whole) <= limit:
+        return shown_whole
+    return shown_whole[: limit - 2] + "…" + (shown_whole[-1] if is_text else "")
 
 
 @contextmanager
