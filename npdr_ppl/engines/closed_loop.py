@@ -110,14 +110,7 @@ class _Body:
     @property
     def signature(self) -> Any:
         """Equal for bodies that compile to the same code."""
-        stepper = self.stepper
-        return (
-            signature(stepper.simulator),
-            stepper.time_step,
-            stepper.histories,
-            signature(self.policy),
-            signature(self.reward),
-        )
+        return "roll_out", self.stepper.signature, signature(self.policy), signature(self.reward)
 
     def step(
         self, loop: _Loop, tables: Tables, policy_constants: Any, time: Tensor | float
@@ -255,8 +248,7 @@ def _run_compiled(
         part, block_tables, block_constants = pytree.tree_map_only(
             Tensor, block, (loop, tables, constants)
         )
-        if last - first > 1:
-            mark_sizes_dynamic((part, block_tables, block_constants))
+        mark_sizes_dynamic((part, block_tables, block_constants))
         for start in starts:
             part = run(part, block_tables, block_constants, start)
         for k in range(num_calls * _STEPS_PER_CALL, num_steps):

@@ -69,7 +69,12 @@ class RecordedCommands(Commands):
     """
 
     def __init__(
-        self, present: Tensor, table: Tensor, rows: Tensor, time: Tensor | int, stride: int
+        self,
+        present: Tensor,
+        table: Tensor,
+        rows: Tensor,
+        time: Tensor | int,
+        stride: Tensor | int,
     ) -> None:
         self._present = present
         self._table, self._rows, self._time, self._stride = table, rows, time, stride

@@ -116,7 +116,10 @@ def mark_sizes_dynamic(tree: Any) -> None:
     torch.compile(dynamic=True) would do, but it also turns every number that the code reads from
     an object into a variable; that made the Furuta loop 1.7 times slower.
     """
-    pytree.tree_map_only_(Tensor, lambda leaf: torch._dynamo.mark_dynamic(leaf, 0), tree)
+    for leaf in pytree.tree_leaves(tree):
+        # Torch gives the sizes 0 and 1 kernels of their own.
+        if isinstance(leaf, Tensor) and leaf.ndim and leaf.shape[0] > 1:
+            torch._dynamo.maybe_mark_dynamic(leaf, 0)
 
 
 def signature(thing: Any) -> Hashable:

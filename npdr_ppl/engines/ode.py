@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward, roll_out
-from npdr_ppl.engines.commands import CommandRecord, RecordedCommands
 from npdr_ppl.engines.compilation import CompileMode
 from npdr_ppl.engines.integrators import Components, Integrator, integrator
-from npdr_ppl.engines.stepping import State, Stepper, Tables, flatten
-from npdr_ppl.errors import ModelError, ShapeError
+from npdr_ppl.engines.open_loop import replay
+from npdr_ppl.engines.stepping import Stepper, Tables, flatten
+from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import EnvironmentEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
@@ -110,33 +110,7 @@ class ODESimulator(Simulator):
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
         """Replays the inputs' actions; see :meth:`Simulator.simulate`."""
-        self.check_parameters(parameters)
-        self.check_inputs(inputs)
-        dtype = self.common_dtype(parameters, inputs.actions)
-        inputs = inputs.to(dtype=dtype)
-        domain = self.complete(parameters, dtype, inputs.actions.device)
-        batch_shape = torch.broadcast_shapes(
-            inputs.batch_shape, *(value.shape for value in domain.values())
-        )
-        shape = torch.Size((*batch_shape, inputs.num_segments))
-        # Behind the batch, an axis for the segments.
-        domain = {name: value[..., None] for name, value in domain.items()}
-        tables, histories = self.tables(domain, shape, inputs.time_step)
-        stepper = Stepper(self, inputs.time_step, histories)
-        records = self._records(inputs, shape, dtype)
-        state = self._start(stepper, tables, inputs, records, shape)
-        readings: list[Tensor] = []
-        for step in range(inputs.num_steps):
-            state, actions = _act_on_record(stepper, state, tables, records, step)
-            state = stepper.move(state, actions, tables)
-            state, values = stepper.read(state, tables)
-            readings.extend(values)
-        trajectory = torch.stack(readings, dim=-1).reshape(
-            *shape, inputs.num_steps, len(self.sensors)
-        )
-        if bool(inputs.mask.all()):
-            return trajectory
-        return torch.where(inputs.mask[..., None], trajectory, torch.zeros_like(trajectory))
+        return replay(self, parameters, inputs)
 
     def roll_out(
         self,
@@ -235,79 +209,6 @@ class ODESimulator(Simulator):
         constants = self.constants(parameters, environment)
         histories = Stepper.needed_histories(self, effects, time_step)
         return flatten(Tables(constants, effects), shape, expand=expand), histories
-
-    def _records(
-        self, inputs: Inputs, shape: torch.Size, dtype: torch.dtype
-    ) -> tuple[CommandRecord, ...]:
-        """Returns the commands of each action channel."""
-        columns = {name: i for i, name in enumerate(inputs.action_names)}
-        return tuple(
-            CommandRecord(inputs, columns[a.name], shape, (a.lower, a.upper), dtype)
-            for a in self.actions
-        )
-
-    def _start(
-        self,
-        stepper: Stepper,
-        tables: Tables,
-        inputs: Inputs,
-        records: tuple[CommandRecord, ...],
-        shape: torch.Size,
-    ) -> State:
-        """Returns the state at the segments' start, effects' memory included."""
-
-        def spread(value: Tensor) -> Tensor:
-            return value.expand(shape).reshape(-1)
-
-        components = [spread(value) for value in self.initial_states(inputs)]
-        names = [state.name for state in self.states]
-        for place, effect, columns in stepper.sensor_effects:
-            for name in (self.sensors[column].name for column in columns):
-                if name in names:
-                    i = names.index(name)
-                    values = tables.effects[place]
-                    components[i] = effect.initial_value(components[i], values)
-        num_joints = len(self.joints)
-        if len(components) != 2 * num_joints:
-            raise ShapeError(
-                f"{self.name} has {num_joints} joints, so it should declare {2 * num_joints} "
-                f"states, got {len(components)}."
-            )
-        columns = {name: i for i, name in enumerate(inputs.channel_names)}
-        reported = tuple(
-            spread(inputs.initial_readings[..., columns[s.name]]) if s.name in columns else None
-            for s in self.sensors
-        )
-        past = inputs.past_actions.shape[-2]
-        before = tuple(record.at(-1 - past) for record in records)
-        state = stepper.start(
-            tuple(components[:num_joints]),
-            tuple(components[num_joints:]),
-            tables,
-            before,
-            reported,
-        )
-        if stepper.action_effects:
-            # The effects' memory at the start is what the recorded past made of it.
-            for step in range(-past, 0):
-                state, _ = _act_on_record(stepper, state, tables, records, step)
-        return state
-
-
-def _act_on_record(
-    stepper: Stepper,
-    state: State,
-    tables: Tables,
-    records: tuple[CommandRecord, ...],
-    step: int,
-) -> tuple[State, Components]:
-    """Passes the recorded commands of a step through the action effects."""
-    commands = tuple(record.at(step) for record in records)
-    views = tuple(
-        RecordedCommands(command, r.table, r.rows, r.first + step, r.stride)
-        for command, r in zip(commands, records, strict=True)
-    )
-    return stepper.act(state, commands, tables, views)
 
 
 def _integrator(name: str) -> Integrator:

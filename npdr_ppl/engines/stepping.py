@@ -1,6 +1,6 @@
 """One step of a mechanical system with its effects: what open and closed loop share."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.commands import RecentCommands
+from npdr_ppl.engines.compilation import signature
 from npdr_ppl.engines.dry_friction import solve_dry_friction
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.language.effects import ActionEffect, Commands, ForceEffect, SensorEffect
@@ -85,6 +86,11 @@ class Stepper:
                 channels = simulator.port(effect.port).channels
                 columns = tuple(sensors.index(name) for name in channels)
                 self.sensor_effects.append((place, effect, columns))
+
+    @property
+    def signature(self) -> Hashable:
+        """Equal for steppers that compile to the same code."""
+        return signature(self.simulator), self.time_step, self.histories
 
     @staticmethod
     def needed_histories(

@@ -7,13 +7,15 @@ ones included, thereby becomes N(0, I), and every point maps to a plausible para
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import pyro
 import torch
 from pyro import poutine
+from pyro.poutine.broadcast_messenger import BroadcastMessenger
+from pyro.poutine.indep_messenger import CondIndepStackFrame
 from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
@@ -73,7 +75,7 @@ class Prior:
     def __init__(self, model: Callable[..., Any], args: tuple[Any, ...] = ()) -> None:
         self.model = model
         self.args = args
-        with torch.no_grad(), torch.random.fork_rng(devices=[]), SkipSimulation():
+        with _alone(), torch.random.fork_rng(devices=[]), SkipSimulation():
             torch.manual_seed(0)
             prototype = poutine.trace(model).get_trace(*args)
         self.black_boxes: dict[str, BlackBox] = {
@@ -150,7 +152,7 @@ class Prior:
         """Draws z from the prior, ``(num_samples, d)`` float64, from torch's global stream."""
         if self.is_standard_normal:
             return torch.randn(num_samples, self.num_parameters, dtype=torch.float64)
-        with torch.no_grad(), SkipSimulation(), self._plate(num_samples):
+        with _alone(), SkipSimulation(), _Batch(self, num_samples):
             trace = poutine.trace(self.model).get_trace(*self.args)
         return self.to_reference(
             {
@@ -181,7 +183,7 @@ class Prior:
         num = next(iter(parameters.values())).shape[0]
         data = self._padded(parameters)
         messenger = _ReadCoordinates(self)
-        with torch.no_grad(), SkipSimulation(), self._plate(num):
+        with _alone(), SkipSimulation(), _Batch(self, num):
             with poutine.condition(data=data), messenger:
                 self.model(*self.args)
         return torch.cat([messenger.z[site.name].expand(num, -1) for site in self.sites], dim=-1)
@@ -205,7 +207,7 @@ class Prior:
         Returns:
             The output of each black-box site, ``(n,) + plates + event``.
         """
-        with torch.no_grad(), _WriteCoordinates(self, z), self._plate(z.shape[0]):
+        with _alone(), _WriteCoordinates(self, z), _Batch(self, z.shape[0]):
             return self._outputs(poutine.trace(self.model).get_trace(*self.args))
 
     def execute_at(self, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -219,7 +221,7 @@ class Prior:
         """
         num = next(iter(parameters.values())).shape[0]
         data = self._padded(parameters)
-        with torch.no_grad(), self._plate(num), poutine.condition(data=data):
+        with _alone(), _Batch(self, num), poutine.condition(data=data):
             return self._outputs(poutine.trace(self.model).get_trace(*self.args))
 
     def _outputs(self, trace: Any) -> dict[str, Tensor]:
@@ -253,11 +255,8 @@ class Prior:
 
     def _run(self, writer: "_WriteCoordinates") -> Any:
         """Runs the program at all of a writer's points at once, without simulating."""
-        with torch.no_grad(), SkipSimulation(), writer, self._plate(writer.num_points):
+        with _alone(), SkipSimulation(), writer, _Batch(self, writer.num_points):
             return poutine.trace(self.model).get_trace(*self.args)
-
-    def _plate(self, num: int) -> Any:
-        return pyro.plate(BATCH_PLATE, num, dim=-1 - self.max_plate_nesting)
 
     def _with_padding(self, site: LatentSite, value: Tensor) -> Tensor:
         padding = (1,) * (self.max_plate_nesting - len(site.batch_shape))
@@ -265,6 +264,23 @@ class Prior:
 
     def _without_padding(self, site: LatentSite, value: Tensor) -> Tensor:
         return value.reshape((value.shape[0], *site.shape))
+
+
+class _Batch(Messenger):
+    """A plate left of the model's own: all points in one run.
+
+    ``pyro.plate`` itself would compete with plates of a caller's program, such as Predictive's,
+    for the same dimension.
+    """
+
+    def __init__(self, prior: Prior, size: int) -> None:
+        super().__init__()
+        self._frame = CondIndepStackFrame(BATCH_PLATE, -1 - prior.max_plate_nesting, size, 0)
+
+    def _process_message(self, msg: Any) -> None:
+        msg["cond_indep_stack"] = (self._frame, *msg["cond_indep_stack"])
+        if msg["type"] == "sample":
+            BroadcastMessenger._pyro_sample(msg)
 
 
 class _WriteCoordinates(Messenger):
@@ -300,6 +316,13 @@ class _ReadCoordinates(Messenger):
         if msg["name"] in self._sites:
             z = reference_map(msg["fn"]).inverse(msg["value"])
             self.z[msg["name"]] = z.double().reshape(z.shape[0], -1)
+
+
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Keeps a run of the program to itself: outside handlers do not see it, nor do gradients."""
+    with torch.no_grad(), poutine.block():
+        yield
 
 
 def _samples(trace: Any) -> list[tuple[str, Any]]:

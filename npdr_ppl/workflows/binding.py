@@ -13,6 +13,7 @@ from npdr_ppl.inference.base import Problem
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
+from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["BindingOptions", "BoundModel", "Data", "bind", "problem_of"]
@@ -212,7 +213,8 @@ def _observe(
         if isinstance(data, Rollouts):
             raise DataError(f"Site {name!r} is a plain function; give a tensor, not rollouts.")
         value = torch.as_tensor(data, dtype=torch.get_default_dtype())
-        simulated = prior.execute(prior.sample(2))[name].shape[1:]
+        with seeded(0, "bind", name):
+            simulated = prior.execute(prior.sample(2))[name].shape[1:]
         if value.shape != simulated:
             raise ShapeError(
                 f"The observation of {name!r} has shape {tuple(value.shape)}, but the model "

@@ -1,0 +1,187 @@
+"""Open loop: recorded commands replayed from the segments' initial states."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.commands import CommandRecord, RecordedCommands
+from npdr_ppl.engines.compilation import compiled, is_worthwhile, mark_sizes_dynamic
+from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.stepping import State, Stepper, Tables, flatten
+from npdr_ppl.errors import ShapeError
+from npdr_ppl.language.inputs import Inputs
+
+if TYPE_CHECKING:
+    from npdr_ppl.engines.ode import ODESimulator
+
+__all__ = ["replay"]
+
+# Steps per call of a compiled kernel; see closed_loop.
+_STEPS_PER_CALL = 10
+
+
+def replay(simulator: "ODESimulator", parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
+    """Simulates all parameters, segments and steps; see :meth:`Simulator.simulate`."""
+    simulator.check_parameters(parameters)
+    simulator.check_inputs(inputs)
+    device = inputs.actions.device
+    dtype = simulator.common_dtype(parameters, inputs.actions)
+    inputs = inputs.to(dtype=dtype)
+    domain = simulator.complete(parameters, dtype, device)
+    batch_shape = torch.broadcast_shapes(
+        inputs.batch_shape, *(value.shape for value in domain.values())
+    )
+    shape = torch.Size((*batch_shape, inputs.num_segments))
+    # Behind the batch, an axis for the segments.
+    domain = {name: value[..., None] for name, value in domain.items()}
+    is_compiled = is_worthwhile(simulator.compile, shape.numel() * inputs.num_steps, device)
+    tables, histories = simulator.tables(domain, shape, inputs.time_step, expand=is_compiled)
+    body = _Body(Stepper(simulator, inputs.time_step, histories))
+    columns = {name: i for i, name in enumerate(inputs.action_names)}
+    records = tuple(
+        CommandRecord(inputs, columns[action.name], shape, (action.lower, action.upper), dtype)
+        for action in simulator.actions
+    )
+    state = _start(body, tables, inputs, records, shape)
+    readings: list[Tensor] = []
+    first = 0
+    if is_compiled:
+        first = inputs.num_steps // _STEPS_PER_CALL * _STEPS_PER_CALL
+        state = _run_compiled(body, state, tables, records, first, readings)
+    for step in range(first, inputs.num_steps):
+        commands = tuple(record.at(step) for record in records)
+        state, values = body.step(state, tables, commands, _views(records, step))
+        readings.extend(values)
+    trajectory = torch.stack(readings, dim=-1).reshape(
+        *shape, inputs.num_steps, len(simulator.sensors)
+    )
+    if bool(inputs.mask.all()):
+        return trajectory
+    return torch.where(inputs.mask[..., None], trajectory, torch.zeros_like(trajectory))
+
+
+_View = tuple[Tensor, Tensor, Tensor | int, Tensor | int]
+"""Table, rows, time and stride of a record; see :class:`RecordedCommands`."""
+
+
+class _Body:
+    """The loop's body; everything in it is fixed before the first step."""
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper = stepper
+
+    def act(
+        self, state: State, tables: Tables, commands: Components, views: tuple[_View, ...]
+    ) -> tuple[State, Components]:
+        """Passes the recorded commands of a step through the action effects."""
+        records = tuple(
+            RecordedCommands(command, *view)
+            for command, view in zip(commands, views, strict=bool(views))
+        )
+        return self.stepper.act(state, commands, tables, records)
+
+    def step(
+        self, state: State, tables: Tables, commands: Components, views: tuple[_View, ...]
+    ) -> tuple[State, Components]:
+        """Advances the state by one step and reads the sensors."""
+        state, actions = self.act(state, tables, commands, views)
+        state = self.stepper.move(state, actions, tables)
+        return self.stepper.read(state, tables)
+
+    def run(
+        self,
+        state: State,
+        tables: Tables,
+        commands: tuple[Components, ...],
+        views: tuple[_View, ...],
+    ) -> tuple[State, Components]:
+        """Advances the state by as many steps as there are commands."""
+        readings: list[Tensor] = []
+        for k, present in enumerate(commands):
+            later = tuple((table, rows, time + k, stride) for table, rows, time, stride in views)
+            state, values = self.step(state, tables, present, later)
+            readings.extend(values)
+        return state, tuple(readings)
+
+
+def _views(records: tuple[CommandRecord, ...], step: int) -> tuple[_View, ...]:
+    return tuple((r.table, r.rows, r.first + step, r.stride) for r in records)
+
+
+def _run_compiled(
+    body: _Body,
+    state: State,
+    tables: Tables,
+    records: tuple[CommandRecord, ...],
+    num_steps: int,
+    readings: list[Tensor],
+) -> State:
+    """Runs steps with the compiled body and appends their readings."""
+    run = compiled(("replay", body.stepper.signature), body.run)
+    state = flatten(state, state.positions[0].shape, expand=True)
+
+    for step in range(0, num_steps, _STEPS_PER_CALL):
+        commands = tuple(
+            tuple(record.at(k).contiguous() for record in records)
+            for k in range(step, step + _STEPS_PER_CALL)
+        )
+        # As tensors, because numbers would be compiled in. Without action effects nobody looks.
+        views = tuple(
+            (table, rows, torch.as_tensor(time), torch.as_tensor(stride))
+            for table, rows, time, stride in _views(records, step)
+            if body.stepper.action_effects
+        )
+        mark_sizes_dynamic((state, tables, commands, views))
+        state, values = run(state, tables, commands, views)
+        readings.extend(values)
+    return state
+
+
+def _start(
+    body: _Body,
+    tables: Tables,
+    inputs: Inputs,
+    records: tuple[CommandRecord, ...],
+    shape: torch.Size,
+) -> State:
+    """Returns the state at the segments' start, effects' memory included."""
+    stepper = body.stepper
+    simulator = stepper.simulator
+
+    def spread(value: Tensor) -> Tensor:
+        return value.expand(shape).reshape(-1)
+
+    components = [spread(value) for value in simulator.initial_states(inputs)]
+    num_joints = len(simulator.joints)
+    if len(components) != 2 * num_joints:
+        raise ShapeError(
+            f"{simulator.name} has {num_joints} joints, so it should declare {2 * num_joints} "
+            f"states, got {len(components)}."
+        )
+    names = [state.name for state in simulator.states]
+    for place, effect, columns in stepper.sensor_effects:
+        for name in (simulator.sensors[column].name for column in columns):
+            if name in names:
+                i = names.index(name)
+                components[i] = effect.initial_value(components[i], tables.effects[place])
+    columns = {name: i for i, name in enumerate(inputs.channel_names)}
+    reported = tuple(
+        spread(inputs.initial_readings[..., columns[s.name]]) if s.name in columns else None
+        for s in simulator.sensors
+    )
+    past = inputs.past_actions.shape[-2]
+    state = stepper.start(
+        tuple(components[:num_joints]),
+        tuple(components[num_joints:]),
+        tables,
+        tuple(record.at(-1 - past) for record in records),
+        reported,
+    )
+    if stepper.action_effects:
+        # The effects' memory at the start is what the recorded past made of it.
+        for step in range(-past, 0):
+            commands = tuple(record.at(step) for record in records)
+            state, _ = body.act(state, tables, commands, _views(records, step))
+    return state
