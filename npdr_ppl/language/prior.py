@@ -20,7 +20,7 @@ from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
 
-from npdr_ppl.errors import ModelError
+from npdr_ppl.errors import ModelError, NpdrError
 from npdr_ppl.language.handlers import SkipSimulation
 from npdr_ppl.language.reference import reference_map
 from npdr_ppl.language.sites import BlackBox
@@ -77,7 +77,7 @@ class Prior:
         self.args = args
         with _alone(), torch.random.fork_rng(devices=[]), SkipSimulation():
             torch.manual_seed(0)
-            prototype = poutine.trace(model).get_trace(*args)
+            prototype = _trace(model, args)
         self.black_boxes: dict[str, BlackBox] = {
             name: site["fn"]
             for name, site in _samples(prototype)
@@ -153,7 +153,7 @@ class Prior:
         if self.is_standard_normal:
             return torch.randn(num_samples, self.num_parameters, dtype=torch.float64)
         with _alone(), SkipSimulation(), _Batch(self, num_samples):
-            trace = poutine.trace(self.model).get_trace(*self.args)
+            trace = _trace(self.model, self.args)
         return self.to_reference(
             {
                 site.name: self._without_padding(site, trace.nodes[site.name]["value"])
@@ -208,7 +208,7 @@ class Prior:
             The output of each black-box site, ``(n,) + plates + event``.
         """
         with _alone(), _WriteCoordinates(self, z), _Batch(self, z.shape[0]):
-            return self._outputs(poutine.trace(self.model).get_trace(*self.args))
+            return self._outputs(_trace(self.model, self.args))
 
     def execute_at(self, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Simulates the program at n given values of its latent sites.
@@ -222,7 +222,7 @@ class Prior:
         num = next(iter(parameters.values())).shape[0]
         data = self._padded(parameters)
         with _alone(), _Batch(self, num), poutine.condition(data=data):
-            return self._outputs(poutine.trace(self.model).get_trace(*self.args))
+            return self._outputs(_trace(self.model, self.args))
 
     def _outputs(self, trace: Any) -> dict[str, Tensor]:
         result = {}
@@ -256,7 +256,7 @@ class Prior:
     def _run(self, writer: "_WriteCoordinates") -> Any:
         """Runs the program at all of a writer's points at once, without simulating."""
         with _alone(), SkipSimulation(), writer, _Batch(self, writer.num_points):
-            return poutine.trace(self.model).get_trace(*self.args)
+            return _trace(self.model, self.args)
 
     def _with_padding(self, site: LatentSite, value: Tensor) -> Tensor:
         padding = (1,) * (self.max_plate_nesting - len(site.batch_shape))
@@ -323,6 +323,16 @@ def _alone() -> Iterator[None]:
     """Keeps a run of the program to itself: outside handlers do not see it, nor do gradients."""
     with torch.no_grad(), poutine.block():
         yield
+
+
+def _trace(model: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    """Traces a run of the program; our own errors come out without Pyro's table of shapes."""
+    try:
+        return poutine.trace(model).get_trace(*args)
+    except NpdrError as error:
+        while isinstance(error.__cause__, NpdrError):
+            error = error.__cause__
+        raise error from None
 
 
 def _samples(trace: Any) -> list[tuple[str, Any]]:

@@ -48,8 +48,8 @@ def reproduce_table2(
     *,
     holdout: tuple[int, ...] = (3, 4),
     backend: str | Backend = "snpe-c",
-    rounds: int = ROUNDS,
-    num_simulations: int = NUM_SIMULATIONS,
+    rounds: int | None = None,
+    num_simulations: int | None = None,
     initial_state: str = "recorded",
     seed: int = 0,
     progress: bool | None = None,
@@ -61,8 +61,8 @@ def reproduce_table2(
         out: Folder for results.
         holdout: Rollouts to be judged on; the others are fitted.
         backend: The backend of NPDR's column.
-        rounds: Rounds of inference.
-        num_simulations: Simulations of each round.
+        rounds: Rounds of inference; :data:`ROUNDS` if not given.
+        num_simulations: Simulations of each; :data:`NUM_SIMULATIONS` if not given.
         initial_state: ``"recorded"``, the paper's way, or ``"estimated"``.
         seed: Seed of everything random.
         progress: Whether to show progress; ``None`` shows it on a terminal.
@@ -80,8 +80,8 @@ def reproduce_table2(
         test,
         out=out,
         backend=backend,
-        rounds=rounds,
-        num_simulations=num_simulations,
+        rounds=rounds or ROUNDS,
+        num_simulations=num_simulations or NUM_SIMULATIONS,
         seed=seed,
         options=options,
         progress=progress,

@@ -1,0 +1,153 @@
+"""The command line: JSON that others rely on, figures, and one sentence for bad input."""
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from npdr_ppl.cli import main as cli
+from npdr_ppl.rollouts import Rollouts
+
+RECORDING = Path(__file__).parents[3] / "shared/data/quanser_qube/swing_up_500hz_5s.csv"
+
+
+def run(monkeypatch, capsys, *words):
+    """Runs the command line in this process; returns exit code, output and error text."""
+    monkeypatch.setattr(sys, "argv", ["npdr", *map(str, words)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    out, err = capsys.readouterr()
+    return stop.value.code or 0, out, err
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A pendulum recording made by scipy, with a little noise."""
+    from scipy.integrate import solve_ivp
+
+    time = 0.02 * np.arange(101)
+    torque = 2.0 * np.sin(2 * math.pi * time)
+    rng = np.random.default_rng(0)
+
+    def swing(t, y):
+        # The torque is held over each step, as a controller does.
+        held = torque[min(int(t / 0.02 + 1e-9), 100)]
+        return [y[1], (held - 0.9 * 9.81 * 0.55 * math.sin(y[0])) / (0.9 * 1.1**2 / 3)]
+
+    readings, actions = [], []
+    for start in (0.0, 0.4):
+        exact = solve_ivp(swing, (0, 2.0), [start, 0.0], t_eval=time, max_step=0.02).y.T
+        readings.append(exact + rng.normal(0, [0.005, 0.02], exact.shape))
+        actions.append(torque[:-1, None])
+    path = tmp_path / "pendulum.csv"
+    Rollouts.from_arrays(
+        readings=readings, actions=actions, channel_names=("angle", "velocity"),
+        action_names=("torque",), time_step=0.02,
+    ).to_csv(path)  # fmt: skip
+    return path
+
+
+def test_fit_writes_what_the_documentation_promises(monkeypatch, capsys, tmp_path, recording):
+    out = tmp_path / "fit"
+    words = [
+        "fit", "pendulum", "--data", recording, "--holdout", 1, "--out", out, "--rounds", 1,
+        "--simulations", 200, "--segment-length", 25, "--embedding", "all/5",
+    ]  # fmt: skip
+    code, text, _ = run(monkeypatch, capsys, *words)
+    assert code == 0
+    assert "most likely" in text
+    fit = json.loads((out / "fit.json").read_text())
+    assert fit["backend"] == "snpe-c"
+    assert set(fit["parameters"]["mass"]) == {"mean", "sd", "hdi_94"}
+    assert 0.3 <= fit["most_likely"]["length"] <= 1.7
+    assert {"rmse", "dtw"} <= set(fit["metrics"])
+    assert set(fit["seconds"]) == {"simulate", "train", "sample"}
+    assert fit["diagnosis"]["decision"] in {
+        "accept", "more rounds", "widen", "new rollout", "revise the model", "stop"
+    }  # fmt: skip
+    for name in ("posterior.nc", "marginals.png", "pairs.png", "bands.png"):
+        assert (out / name).stat().st_size > 1_000
+    # The same command again continues, finds everything done, and says the same.
+    code, _, _ = run(monkeypatch, capsys, *words)
+    again = json.loads((out / "fit.json").read_text())
+    assert code == 0
+    assert again["parameters"] == fit["parameters"]
+
+
+def test_fit_takes_a_models_file_and_effects(monkeypatch, capsys, tmp_path, recording):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import pyro, pyro.distributions as dist\n"
+        "import npdr_ppl as npdr\n"
+        "from npdr_ppl.models.pendulum import Pendulum\n\n"
+        "def heavy(inputs):\n"
+        "    mass = pyro.sample('mass', dist.Uniform(0.3, 1.7))\n"
+        "    return npdr.simulate('trajectory', Pendulum(), {'mass': mass}, inputs)\n"
+    )
+    out = tmp_path / "fit"
+    code, _, _ = run(
+        monkeypatch, capsys, "fit", f"{file}:heavy", "--data", recording, "--out", out,
+        "--effect", "hinge.coulomb_friction", "--rounds", 1, "--simulations", 100, "--quiet",
+    )  # fmt: skip
+    assert code == 0
+    fit = json.loads((out / "fit.json").read_text())
+    assert set(fit["parameters"]) == {"mass", "hinge.coulomb_friction.magnitude"}
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["fit", "pendulun", "--data", "DATA", "--out", "OUT"], "did you mean 'pendulum'"),
+        (["fit", "nothing.py:f", "--data", "DATA", "--out", "OUT"], "nothing.py does not exist"),
+        (["fit", "furuta", "--data", "DATA", "--out", "OUT"], "voltage"),
+        (["fit", "pendulum", "--data", "missing.csv", "--out", "OUT"], "missing.csv"),
+        (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "7"], "has 2"),
+        (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "x"], "3,4"),
+        (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--backend", "mcmc"], "mcmc"),
+        (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--effect", "hinge.coulomb"],
+         "did you mean 'coulomb_friction'"),
+        (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--effect", "knee.bias"],
+         "no port 'knee'"),
+        (["reproduce", "table2"], "pass --data"),
+    ],
+)  # fmt: skip
+def test_bad_input_gets_one_sentence(monkeypatch, capsys, tmp_path, recording, words, sentence):
+    replaced = {"DATA": recording, "OUT": tmp_path / "out"}
+    code, _, err = run(monkeypatch, capsys, *[replaced.get(word, word) for word in words])
+    assert code == 2
+    assert sentence in err
+    assert "Traceback" not in err
+    assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["models", "backends", "effects"])
+def test_listings(monkeypatch, capsys, command):
+    code, text, _ = run(monkeypatch, capsys, command, "--json")
+    rows = json.loads(text)
+    assert code == 0
+    assert all(row["summary"] for row in rows)
+    code, table, _ = run(monkeypatch, capsys, command)
+    assert code == 0
+    assert rows[0]["name"][:8] in table
+
+
+@pytest.mark.skipif(not RECORDING.exists(), reason=f"the recordings {RECORDING} are absent")
+def test_table2_has_both_columns_beside_the_papers(monkeypatch, capsys, tmp_path):
+    from npdr_ppl.workflows import table2
+
+    # Two rounds of few simulations: the machinery, not the figure; see docs/reproduction.md.
+    monkeypatch.setattr(table2, "ROUNDS", 1)
+    monkeypatch.setattr(table2, "NUM_SIMULATIONS", 100)
+    code, text, _ = run(
+        monkeypatch, capsys, "reproduce", "table2", "--data", RECORDING, "--out", tmp_path
+    )
+    assert code == 0
+    result = json.loads((tmp_path / "table2/table2.json").read_text())
+    # The paper's own figures, which its recipe reproduces.
+    assert abs(result["rows"]["nominal"]["rmse"]["mean"] - 0.384) < 0.002
+    assert abs(result["rows"]["nominal"]["dtw"]["mean"] - 1431) < 15
+    assert result["rows"]["snpe-c"]["rmse"]["mean"] < result["rows"]["nominal"]["rmse"]["mean"]
+    assert result["paper"]["snpe-c"]["rmse"]["mean"] == 0.263
