@@ -239,6 +239,7 @@ class Stepper:
             )
 
         first = acceleration(q, v)
+        dry: tuple[Tensor | float, ...] = ()
         bounds = self._dry_friction_bounds(state, tables)
         if any(bound is not None for bound in bounds):
             smooth = tuple(smooth_forces(q, v))
@@ -258,6 +259,13 @@ class Stepper:
                 return simulator.accelerations(positions, velocities, actions, total, constants)
 
         q, v = simulator.integrator.step(acceleration, q, v, first, self._substep)
+        if dry:
+            # Friction within its bound has stopped the joint; rounding must not leave a velocity
+            # whose sign then means something to a policy.
+            v = tuple(
+                vi if b is None else torch.where(torch.as_tensor(f).abs() < b, 0.0, vi)
+                for vi, f, b in zip(v, dry, bounds, strict=True)
+            )
         memory = tuple(
             effect.next_memory(
                 state.positions[joint],
