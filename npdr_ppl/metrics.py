@@ -5,7 +5,13 @@ Muratore et al. (2021) do; the others compare an ensemble of trajectories, i.e. 
 distribution, with the observation.
 """
 
+import importlib
+import math
 from collections.abc import Sequence
+from contextlib import redirect_stdout
+from functools import cache
+from io import StringIO
+from types import ModuleType
 from typing import TypedDict
 
 import numpy as np
@@ -25,9 +31,6 @@ __all__ = [
     "rmse",
     "summarise",
 ]
-
-_DTW_ELEMENTS = 2**22
-"""Numbers per work array of a batch of alignments: 32 MiB."""
 
 
 class Summary(TypedDict):
@@ -80,9 +83,8 @@ def dtw(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> Tensor:
 
     The alignment starts at the beginning of both series and spends the whole measured one, but
     may leave out the end of the simulated one: the result is ``D_(T−1)j`` where
-    ``D_(T−1)j / (T + j + 1)`` is least. This is ``dtw-python`` with the query measured,
-    ``symmetric2``, ``open_end=True``, and the distance cumulative, not normalised; but memory
-    grows with T instead of T².
+    ``D_(T−1)j / (T + j + 1)`` is least. In dtw-python's words: the query is measured, the step
+    pattern ``symmetric2``, ``open_end=True``, the distance cumulative, not normalised.
 
     Args:
         simulated: One ``(..., T, C)`` per rollout.
@@ -103,56 +105,26 @@ def dtw(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> Tensor:
     result = []
     for x, y in zip(simulated, measured, strict=True):
         scale = _scale(y).double().cpu()
-        query = (y.double().cpu() / scale).numpy().T
-        batch = (x.detach().double().cpu() / scale).reshape(-1, *x.shape[-2:])
-        chunk = max(1, _DTW_ELEMENTS // max(x.shape[-2] * x.shape[-1], 1))
-        distances = [
-            _open_end_dtw(query, part.permute(2, 0, 1).numpy()) for part in batch.split(chunk)
-        ]
-        result.append(torch.from_numpy(np.concatenate(distances)).reshape(x.shape[:-2]))
+        query = (y.double().cpu() / scale).numpy()
+        batch = (x.detach().double().cpu() / scale).reshape(-1, *x.shape[-2:]).numpy()
+        values = [_open_end_dtw(query, reference) for reference in batch]
+        result.append(torch.tensor(values, dtype=torch.float64).reshape(x.shape[:-2]))
     return torch.stack(result, dim=-1)
 
 
-def _open_end_dtw(
-    query: NDArray[np.float64], references: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Aligns one query ``(C, n)`` with B references ``(C, B, m)``; returns ``(B,)``.
+def _open_end_dtw(query: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
+    """Aligns one query ``(n, C)`` with one reference ``(m, C)``."""
+    if not (np.isfinite(reference).all() and np.isfinite(query).all()):
+        return math.nan
+    aligned = _dtw_python().dtw(query, reference, open_end=True, distance_only=True)
+    return float(aligned.distance)
 
-    All entries of an anti-diagonal i + j = k depend only on the two before it, so a diagonal is
-    computed at once, for all references.
-    """
-    num_channels, n = query.shape
-    _, batch, m = references.shape
-    # Row j of the diagonal arrays is the reference's step; the query is reversed so that a
-    # diagonal is a pair of slices.
-    reverse = np.ascontiguousarray(query[:, ::-1])
-    previous = np.full((batch, m + 1), np.inf)  # diagonal k − 1, shifted by one: [0] is j = −1
-    before = np.full((batch, m + 1), np.inf)  # diagonal k − 2
-    last_row = np.empty((batch, m))
-    for k in range(n + m - 1):
-        low, high = max(0, k - n + 1), min(k, m - 1) + 1  # j of this diagonal
-        offset = n - 1 - k  # reverse[offset + j] is the query's step i = k − j
-        local = np.zeros((batch, high - low))
-        for c in range(num_channels):
-            gap = references[c, :, low:high] - reverse[c, offset + low : offset + high]
-            local += gap * gap
-        np.sqrt(local, out=local)
-        if k == 0:
-            best = local
-        else:
-            # (i − 1, j) and (i, j − 1) lie on diagonal k − 1, (i − 1, j − 1) on k − 2.
-            straight = np.minimum(previous[:, low + 1 : high + 1], previous[:, low:high])
-            best = np.minimum(straight, before[:, low:high] + local) + local
-        current = before
-        current.fill(np.inf)
-        current[:, low + 1 : high + 1] = best
-        before, previous = previous, current
-        if k >= n - 1:
-            last_row[:, k - n + 1] = best[:, 0]
-    ends = np.argmin(last_row / (n + 1 + np.arange(m)), axis=1)
-    result = last_row[np.arange(batch), ends]
-    is_finite = np.isfinite(references).all(axis=(0, 2)) & np.isfinite(query).all()
-    return np.where(is_finite, result, np.nan)
+
+@cache
+def _dtw_python() -> ModuleType:
+    # It greets on standard output, which belongs to the caller's JSON.
+    with redirect_stdout(StringIO()):
+        return importlib.import_module("dtw")
 
 
 def crps(samples: Tensor, observation: Tensor, *, is_fair: bool = False) -> Tensor:

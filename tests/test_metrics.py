@@ -1,5 +1,3 @@
-import contextlib
-import io
 from pathlib import Path
 
 import numpy as np
@@ -20,19 +18,18 @@ RECORDING = (
 
 @pytest.fixture(scope="module")
 def reference_dtw():
-    """dtw-python, whose import prints a banner."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        from dtw import dtw
+    """The recursion of the docstring, entry by entry."""
 
     def distance(query, reference):
-        return dtw(
-            query,
-            reference,
-            dist_method="euclidean",
-            step_pattern="symmetric2",
-            open_end=True,
-            distance_only=True,
-        ).distance
+        local = np.linalg.norm(query[:, None] - reference[None], axis=-1)
+        total = np.full(local.shape, np.inf)
+        for i, j in np.ndindex(local.shape):
+            before = [total[i - 1, j - 1] + 2 * local[i, j]] if i and j else []
+            before += [total[i - 1, j] + local[i, j]] if i else []
+            before += [total[i, j - 1] + local[i, j]] if j else []
+            total[i, j] = min(before, default=local[i, j])
+        last = total[-1]
+        return last[np.argmin(last / (len(query) + 1 + np.arange(len(last))))]
 
     return distance
 
@@ -62,7 +59,7 @@ def nominal_furuta(inputs):
     return torch.stack(readings, dim=1)
 
 
-def test_the_nominal_column_of_the_papers_table(reference_dtw):
+def test_the_nominal_column_of_the_papers_table():
     """Table 2: RMSE 0.384 ± 0.003, DTW 1430 ± 30."""
     if not RECORDING.is_file():
         pytest.skip(f"measured data are not at {RECORDING}")
@@ -75,13 +72,10 @@ def test_the_nominal_column_of_the_papers_table(reference_dtw):
     distances = metrics.dtw(simulated, measured)
     assert metrics.summarise(distances)["mean"] == pytest.approx(1431.2, abs=0.05)
     assert metrics.summarise(distances)["std"] == pytest.approx(25.7, abs=0.05)
-    scale = measured[0].abs().amax(0)
-    expected = reference_dtw((measured[0] / scale).numpy(), (simulated[0] / scale).numpy())
-    assert float(distances[0]) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("length", [1, 2, 3, 17, 60])
-def test_dtw_agrees_with_dtw_python(length, reference_dtw):
+def test_dtw_is_the_recursion_it_names(length, reference_dtw):
     rng = np.random.default_rng(length)
     measured = [torch.tensor(rng.normal(size=(length, 3)).cumsum(0)) for _ in range(2)]
     simulated = [torch.tensor(rng.normal(size=(2, 2, length, 3)).cumsum(2)) for _ in range(2)]
@@ -95,12 +89,12 @@ def test_dtw_agrees_with_dtw_python(length, reference_dtw):
         assert float(distances[index]) == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
 
-def test_dtw_in_chunks_is_the_same(monkeypatch):
+def test_dtw_of_a_batch_is_that_of_its_elements():
     torch.manual_seed(0)
     measured, simulated = [torch.randn(20, 2)], [torch.randn(7, 20, 2)]
     whole = metrics.dtw(simulated, measured)
-    monkeypatch.setattr(metrics, "_DTW_ELEMENTS", 90)
-    assert torch.equal(metrics.dtw(simulated, measured), whole)
+    single = [metrics.dtw([element], measured) for element in simulated[0]]
+    assert torch.equal(torch.stack(single), whole)
 
 
 def test_dtw_of_equal_and_delayed_series():

@@ -33,15 +33,13 @@ def demo(
 
     console = Console(quiet=quiet)
     console.print(
-        "Recording three rollouts of a Furuta pendulum in MuJoCo, with parameters you do not know …"
+        "Recording a Furuta pendulum in MuJoCo, with parameters unlike the nominal ones …"
         if data is None
         else f"Reading {data} …"
     )
     outcome = run_demo(out, data=data, seed=seed, progress=False if quiet else None)
     marks = {"truth": outcome.truth} if outcome.truth else None
-    paths = write_fit_figures(
-        outcome.posterior, furuta, outcome.test, out, marks=marks, seed=seed
-    )
+    paths = write_fit_figures(outcome.posterior, furuta, outcome.test, out, marks=marks, seed=seed)
     if not quiet:
         show_fit(outcome.result, out)
         console.print("Look at " + ", ".join(str(path) for path in paths))

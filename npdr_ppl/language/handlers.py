@@ -65,10 +65,10 @@ class EffectMessenger(Messenger):
             return
         if self._drawn is None:
             priors = self.effect.priors(box.simulator.port(self.effect.port))
-            self._drawn = {
-                f"{self.effect.name}.{name}": pyro.sample(f"{self.effect.name}.{name}", prior)
-                for name, prior in priors.items()
-            }
+            self._drawn = {}
+            for name, prior in priors.items():
+                site = f"{self.effect.name}.{name}"
+                self._drawn[site] = pyro.sample(site, prior)  # pyright: ignore[reportArgumentType]
         changed = box.with_effects(self.effect, parameters=self._drawn)
         # The plates may have expanded the site already, because they are entered inside.
         shape = torch.broadcast_shapes(changed.batch_shape, box.batch_shape)

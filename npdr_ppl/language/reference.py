@@ -8,6 +8,7 @@ whatever it is, and :attr:`ReferenceMap.is_standard_normal` says so.
 
 import math
 from abc import ABC, abstractmethod
+from typing import Any
 
 import torch
 from pyro.distributions.torch_distribution import ExpandedDistribution
@@ -105,10 +106,12 @@ class _Transformed(ReferenceMap):
 
     def __call__(self, z: Tensor) -> Tensor:
         # A transform's own matrices have the model's precision and do not mix with float64.
-        return self.transform(self.base(z).to(self.dtype))
+        value: Any = self.transform(self.base(z).to(self.dtype))
+        return value
 
     def inverse(self, value: Tensor) -> Tensor:
-        return self.base.inverse(self.transform.inv(value.to(self.dtype)))
+        base: Any = self.transform.inv(value.to(self.dtype))
+        return self.base.inverse(base)
 
     def log_prob(self, z: Tensor) -> Tensor:
         return self.base.log_prob(z)
@@ -182,7 +185,7 @@ def reference_map(distribution: distributions.Distribution) -> ReferenceMap:
     return _Unconstrained(distribution)
 
 
-def _own_dtype(distribution: distributions.Distribution) -> torch.dtype:
+def _own_dtype(distribution: Any) -> torch.dtype:
     """Returns the precision in which a distribution samples by itself."""
     while not distribution.arg_constraints and hasattr(distribution, "base_dist"):
         distribution = distribution.base_dist

@@ -20,7 +20,7 @@ COLORS = {
     "truth": "#CC79A7",
 }
 
-_STYLE: dict[str, Any] = {
+_STYLE: Any = {
     "figure.dpi": 120,
     "font.size": 9,
     "axes.spines.top": False,

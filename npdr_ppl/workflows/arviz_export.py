@@ -11,7 +11,6 @@ from npdr_ppl.randomness import seeded
 
 if TYPE_CHECKING:
     from npdr_ppl.workflows.arviz_module import az
-
     from npdr_ppl.workflows.posterior import Posterior
 
 __all__ = ["to_arviz"]
@@ -72,7 +71,7 @@ def to_arviz(
         constant[f"{name}_rollout"] = inputs.rollout.numpy()
         constant[f"{name}_start"] = inputs.start.numpy()
         constant[f"{name}_measured"] = np.isin(
-            np.arange(len(box.simulator.sensors)), observation.channels
+            np.arange(len(box.simulator.sensors)), observation.channels or ()
         )
         dims[f"{name}_mask"] = event[:2]
         dims[f"{name}_rollout"] = dims[f"{name}_start"] = event[:1]
@@ -96,7 +95,7 @@ def to_arviz(
         dims=dims,
         attrs={"inference_library": "npdr_ppl", "backend": posterior.backend.name},
     )
-    data.log_likelihood.attrs["error_model"] = ", ".join(m for _, m in likelihood.values())
+    data["log_likelihood"].attrs["error_model"] = ", ".join(m for _, m in likelihood.values())
     return data
 
 

@@ -130,7 +130,14 @@ class BoundModel:
                 "embedding, or join the sites."
             )
         shape = self.observed_features().shape
-        return lambda: trained[0].network(shape)
+
+        def build() -> torch.nn.Module:
+            network = trained[0].network(shape)
+            if network is None:
+                raise ModelError(f"{trained[0]!r} says it is trained, but has no network.")
+            return network
+
+        return build
 
 
 def bind(model: Callable[..., Any], data: Data, options: BindingOptions) -> BoundModel:
@@ -147,44 +154,45 @@ def bind(model: Callable[..., Any], data: Data, options: BindingOptions) -> Boun
         DataError: The data do not fit the model.
         ModelError: The model cannot be inferred; see :class:`~npdr_ppl.language.prior.Prior`.
     """
-    if isinstance(data, Mapping):
-        by_site: dict[str | None, Rollouts | Tensor] = dict(data)
-    else:
-        by_site = {None: data}
-    layout = {
-        name: rollouts.inputs(options.segment_length, options.initial_state, dtype=options.dtype)
-        for name, rollouts in by_site.items()
-        if isinstance(rollouts, Rollouts)
-    }
+    named: Mapping[str, Rollouts | Tensor] | None = data if isinstance(data, Mapping) else None
+    every: list[Rollouts | Tensor] = [data] if not isinstance(data, Mapping) else [*data.values()]
+    recorded = [part for part in every if isinstance(part, Rollouts)]
+    layout = [
+        part.inputs(options.segment_length, options.initial_state, dtype=options.dtype)
+        for part in recorded
+    ]
     args: tuple[Any, ...] = ()
     if len(layout) == 1:
-        args = (next(iter(layout.values())),)
-    elif layout:
-        args = (layout,)
+        args = (layout[0],)
+    elif named is not None and layout:
+        names = [name for name, part in named.items() if isinstance(part, Rollouts)]
+        args = (dict(zip(names, layout, strict=True)),)
     prior = Prior(model, args)
     boxes = prior.black_boxes
     if not boxes:
         raise ModelError("The model has no black-box site; declare one with npdr.simulate.")
-    if None in by_site:
+    if named is None:
         if len(boxes) > 1:
             raise DataError(
                 f"The model has the black-box sites {', '.join(boxes)}; give the data of each as "
                 "a dictionary."
             )
-        by_site = {next(iter(boxes)): by_site[None]}
-        layout = {next(iter(boxes)): inputs for inputs in layout.values()}
-    if set(by_site) != set(boxes):
+        named = dict.fromkeys(boxes, every[0])
+    if set(named) != set(boxes):
         raise DataError(
-            f"The data are for {', '.join(map(str, by_site))}, but the model's black-box sites "
-            f"are {', '.join(boxes)}."
+            f"The data are for {', '.join(named)}, but the model's black-box sites are "
+            f"{', '.join(boxes)}."
         )
+    site_inputs = dict(
+        zip([n for n, part in named.items() if isinstance(part, Rollouts)], layout, strict=True)
+    )
     embedding = options.embedding
     chosen = embedding_by_name(embedding) if isinstance(embedding, str) else embedding
     observations = {
-        name: _observe(name, box, by_site[name], layout.get(name), chosen, prior)
+        name: _observe(name, box, named[name], site_inputs.get(name), chosen, prior)
         for name, box in boxes.items()
     }
-    return BoundModel(model, args, prior, observations, by_site, options)
+    return BoundModel(model, args, prior, observations, named, options)
 
 
 def problem_of(bound: BoundModel, device: str | torch.device = "cpu") -> Problem:

@@ -117,7 +117,7 @@ def diagnose(
         # ArviZ warns about too few chains; a single member gets NaN here and no more.
         warnings.simplefilter("ignore")
         ess = _extreme(az.ess(data), np.nanmin)
-        several = data.posterior.sizes["chain"] > 1
+        several = data["posterior"].sizes["chain"] > 1
         r_hat = _extreme(az.rhat(data), np.nanmax) if several else float("nan")
     contraction, edge_mass = _against_prior(data)
     coverage, pit_deviation, p_value = _predictive_checks(data)
@@ -196,9 +196,11 @@ def _extreme(dataset: Any, reduce: Any) -> float:
 
 def _against_prior(data: "az.InferenceData") -> tuple[dict[str, float], dict[str, float]]:
     contraction, edge_mass = {}, {}
-    for name in data.posterior.data_vars:
-        posterior = np.asarray(data.posterior[name]).reshape(-1, *data.posterior[name].shape[2:])
-        prior = np.asarray(data.prior[name]).reshape(-1, *posterior.shape[1:])
+    for name in data["posterior"].data_vars:
+        posterior = np.asarray(data["posterior"][name]).reshape(
+            -1, *data["posterior"][name].shape[2:]
+        )
+        prior = np.asarray(data["prior"][name]).reshape(-1, *posterior.shape[1:])
         labels = (
             [str(name)]
             if posterior.ndim == 1
@@ -221,9 +223,9 @@ def _against_prior(data: "az.InferenceData") -> tuple[dict[str, float], dict[str
 
 def _predictive_checks(data: "az.InferenceData") -> tuple[float, float, float]:
     coverages, deviations, p_values = [], [], []
-    for name in data.observed_data.data_vars:
-        observed = np.asarray(data.observed_data[name])
-        predictive = np.asarray(data.posterior_predictive[name])
+    for name in data["observed_data"].data_vars:
+        observed = np.asarray(data["observed_data"][name])
+        predictive = np.asarray(data["posterior_predictive"][name])
         predictive = predictive.reshape(-1, *observed.shape)
         counted = _counted(data, str(name), observed.shape)
         # Without any spread of its own, a deterministic simulator's draws are compared as ranks.
@@ -239,10 +241,10 @@ def _predictive_checks(data: "az.InferenceData") -> tuple[float, float, float]:
 
 def _counted(data: "az.InferenceData", name: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Returns which readings exist and were measured."""
-    if "constant_data" not in data.groups() or f"{name}_mask" not in data.constant_data:
+    if "constant_data" not in data.groups() or f"{name}_mask" not in data["constant_data"]:
         return np.ones(shape, dtype=bool)
-    mask = np.asarray(data.constant_data[f"{name}_mask"])[..., None]
-    measured = np.asarray(data.constant_data[f"{name}_measured"])
+    mask = np.asarray(data["constant_data"][f"{name}_mask"])[..., None]
+    measured = np.asarray(data["constant_data"][f"{name}_measured"])
     return np.broadcast_to(mask & measured, shape)
 
 
@@ -270,7 +272,7 @@ def _worst_segment_p_value(
 def _loo(data: "az.InferenceData") -> tuple[tuple[float, float], float]:
     from npdr_ppl.workflows.arviz_module import az
 
-    if "log_likelihood" not in data.groups() or len(data.log_likelihood.data_vars) != 1:
+    if "log_likelihood" not in data.groups() or len(data["log_likelihood"].data_vars) != 1:
         return (float("nan"), float("nan")), float("nan")
     with warnings.catch_warnings():
         # A large Pareto k is reported as a figure.

@@ -112,13 +112,13 @@ def describe(data: "az.InferenceData") -> dict[str, Any]:
     from npdr_ppl.workflows.arviz_module import az
 
     parameters: dict[str, Mapping[str, Any]] = {}
-    intervals = az.hdi(data, hdi_prob=0.94, group="posterior")
-    for name in data.posterior.data_vars:
-        values = data.posterior[name]
+    intervals: Any = az.hdi(data, hdi_prob=0.94, group="posterior")
+    for name in data["posterior"].data_vars:
+        values = data["posterior"][name]
         parameters[str(name)] = {
-            "mean": _plain(values.mean(("chain", "draw")).to_numpy()),
-            "sd": _plain(values.std(("chain", "draw")).to_numpy()),
-            "hdi_94": _plain(intervals[name].to_numpy()),
+            "mean": _plain(values.mean(("chain", "draw"))),
+            "sd": _plain(values.std(("chain", "draw"))),
+            "hdi_94": _plain(intervals[name]),
         }
     return {"parameters": parameters}
 

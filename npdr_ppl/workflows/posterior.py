@@ -256,7 +256,6 @@ class _ReferencePosterior(TorchDistribution):
     """The posterior as a distribution over z whose density is that over ξ."""
 
     arg_constraints: dict[str, Any] = {}
-    support = constraints.real_vector
     has_rsample = False
 
     def __init__(
@@ -268,6 +267,10 @@ class _ReferencePosterior(TorchDistribution):
             torch.Size((posterior.prior.num_parameters,)),
             validate_args=False,
         )
+
+    @property
+    def support(self) -> constraints.Constraint:
+        return constraints.real_vector
 
     def expand(self, batch_shape: torch.Size, _instance: Any = None) -> "_ReferencePosterior":
         return _ReferencePosterior(self.posterior, batch_shape)
