@@ -3,11 +3,13 @@
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.errors import ShapeError
@@ -93,6 +95,33 @@ class Policy(ABC):
     def initial_memory(self, observation: tuple[Tensor, ...]) -> Any:
         """Returns the policy's own state at the start of an episode; ``None`` if it has none."""
         return None
+
+    def controller(
+        self, domain: Mapping[str, Tensor]
+    ) -> Callable[[NDArray[np.float64], float], float]:
+        """Returns one policy as a function of readings and time, for devices and other engines.
+
+        The function carries the policy's memory, so it serves one episode.
+
+        Args:
+            domain: Domain parameters for the policy's internal model.
+
+        Returns:
+            Function of the observed readings, ``(observations,)``, and of the time in seconds; it
+            returns the command, of policies with one action.
+        """
+        constants = self.constants(domain)
+        memory: list[Any] = []
+
+        def command(readings: NDArray[np.float64], time: float) -> float:
+            observation = torch.as_tensor(readings, dtype=self.parameters.dtype).unbind()
+            if not memory:
+                memory.append(self.initial_memory(observation))
+            with torch.no_grad():
+                (chosen,), memory[0] = self.act(observation, time, memory[0], constants)
+            return float(chosen)
+
+        return command
 
     @abstractmethod
     def act(
