@@ -4,10 +4,11 @@ from npdr_ppl.embeddings.base import Embedding
 from npdr_ppl.embeddings.networks import Convolutional, Recurrent
 from npdr_ppl.embeddings.registry import embedding_by_name, embedding_names
 from npdr_ppl.embeddings.statistics import AllSteps, BayesSimStatistic, Differences, LastStep
-from npdr_ppl.embeddings.wrappers import Masked, Strided
+from npdr_ppl.embeddings.wrappers import Averaged, Masked, Strided
 
 __all__ = [
     "AllSteps",
+    "Averaged",
     "BayesSimStatistic",
     "Convolutional",
     "Differences",

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from npdr_ppl.embeddings.base import Embedding
 from npdr_ppl.embeddings.networks import Convolutional, Recurrent
 from npdr_ppl.embeddings.statistics import AllSteps, BayesSimStatistic, Differences, LastStep
-from npdr_ppl.embeddings.wrappers import Masked, Strided
+from npdr_ppl.embeddings.wrappers import Averaged, Masked, Strided
 from npdr_ppl.errors import ModelError
 
 __all__ = ["embedding_by_name", "embedding_names"]
@@ -20,7 +20,10 @@ _EMBEDDINGS: dict[str, Callable[[], Embedding]] = {
     "conv": Convolutional,
 }
 
-_WORD = re.compile(r"(?P<name>[a-z]+)(\[(?P<channels>[^\[\]]+)\])?(/(?P<stride>[1-9][0-9]{0,6}))?")
+_WORD = re.compile(
+    r"(?P<name>[a-z]+)"
+    r"(\[(?P<channels>[^\[\]]+)\])?((?P<thinning>[/~])(?P<step>[1-9][0-9]{0,6}))?"
+)
 
 
 def embedding_names() -> tuple[str, ...]:
@@ -32,8 +35,9 @@ def embedding_by_name(word: str) -> Embedding:
     """Returns the embedding that a word describes: ``name[channel,channel]/stride``.
 
     Args:
-        word: A name of :func:`embedding_names`, optionally with the channels to embed and the
-            stride in steps, e.g. ``"bayessim"``, ``"all/10"`` or ``"all[ball_x,ball_y]/2"``.
+        word: A name of :func:`embedding_names`, optionally with the channels to embed, and a
+            stride in steps behind ``/`` or the length of blocks to average behind ``~``, e.g.
+            ``"bayessim"``, ``"all/10"``, ``"all~10"`` or ``"all[ball_x,ball_y]/2"``.
 
     Raises:
         ModelError: There is no such embedding.
@@ -46,11 +50,13 @@ def embedding_by_name(word: str) -> Embedding:
     if match is None or match["name"] not in _EMBEDDINGS:
         raise ModelError(
             f"there is no embedding {word!r}; write one of {', '.join(_EMBEDDINGS)}, with a "
-            "stride as in all/10 or channels as in all[x,y]/10."
+            "stride as in all/10, means of blocks as in all~10, or channels as in all[x,y]/10."
         )
     result = _EMBEDDINGS[match["name"]]()
     if match["channels"] is not None:
         result = Masked(result, tuple(part.strip() for part in match["channels"].split(",")))
-    if match["stride"] is not None:
-        result = Strided(result, int(match["stride"]))
+    if match["thinning"] == "/":
+        result = Strided(result, int(match["step"]))
+    elif match["thinning"] == "~":
+        result = Averaged(result, int(match["step"]))
     return result

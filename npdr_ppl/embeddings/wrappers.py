@@ -1,4 +1,4 @@
-"""Embeddings of a part of the trajectory: every k-th step, chosen channels, chosen steps."""
+"""Embeddings of a thinner trajectory: every k-th step, block means, chosen channels or steps."""
 
 from dataclasses import dataclass, replace
 
@@ -9,7 +9,7 @@ from npdr_ppl.embeddings.base import Embedding, check_trajectory
 from npdr_ppl.errors import DataError, ModelError, ShapeError
 from npdr_ppl.language.inputs import Inputs
 
-__all__ = ["Masked", "Strided"]
+__all__ = ["Averaged", "Masked", "Strided"]
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,62 @@ class Strided(Embedding):
     def network(self, feature_shape: torch.Size) -> nn.Module | None:
         """Returns the inner embedding's network."""
         return self.inner.network(feature_shape)
+
+
+@dataclass(frozen=True)
+class Averaged(Embedding):
+    """Hands the means of blocks of k readings to another embedding.
+
+    Where readings are noisy and the motion is slow against k steps, the means keep what every
+    single reading tells at a k-th of the size, which :class:`Strided` throws away. Readings after
+    steps 1 … k, k + 1 … 2k, … of a segment are averaged, as are the actions of these steps; a
+    block that is padded in part counts the steps that exist.
+
+    Attributes:
+        inner: The embedding that gets the averaged trajectory.
+        block: k.
+    """
+
+    inner: Embedding
+    block: int
+
+    def __post_init__(self) -> None:
+        """Checks the block's length."""
+        if self.block < 1:
+            raise ModelError(f"a block has at least one step, got {self.block}.")
+
+    @property
+    def is_trained(self) -> bool:  # type: ignore[override]
+        """Whether the inner embedding is trained."""
+        return self.inner.is_trained
+
+    def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
+        """Returns the inner embedding's features of the averaged trajectory."""
+        check_trajectory(trajectory, inputs)
+        mask = inputs.mask.to(trajectory.device)
+        averaged = replace(
+            inputs,
+            actions=self._means(inputs.actions, inputs.mask),
+            mask=self._blocks(inputs.mask[..., None])[..., 0].any(-1),
+            time_step=inputs.time_step * self.block,
+        )
+        return self.inner.features(self._means(trajectory, mask), averaged)
+
+    def network(self, feature_shape: torch.Size) -> nn.Module | None:
+        """Returns the inner embedding's network."""
+        return self.inner.network(feature_shape)
+
+    def _means(self, values: Tensor, mask: Tensor) -> Tensor:
+        """Averages ``(..., S, K, C)`` over blocks of the steps that exist."""
+        counted = self._blocks(mask[..., None]).to(values)
+        total = self._blocks(torch.where(mask[..., None], values, 0.0)).sum(-2)
+        return total / counted.sum(-2).clamp(min=1)
+
+    def _blocks(self, values: Tensor) -> Tensor:
+        """Splits ``(..., K, C)`` into ``(..., blocks, k, C)``, zero-padded."""
+        missing = -values.shape[-2] % self.block
+        padded = nn.functional.pad(values, (0, 0, 0, missing))
+        return padded.unflatten(-2, (-1, self.block))
 
 
 @dataclass(frozen=True)

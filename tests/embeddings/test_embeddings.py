@@ -126,7 +126,20 @@ def test_channels_and_steps_by_hand(trajectory, inputs):
     )
 
 
-WORDS = ("bayessim", "last", "all", "differences", "gru", "conv", "all/2", "gru[x]/2", "conv/4")
+def test_block_means_by_hand(trajectory, inputs):
+    features = embedding_by_name("all~3").features(trajectory, inputs).numpy()
+    kept = []
+    for _, states, _ in segments(trajectory, inputs):
+        readings = states[:, 1:]
+        for start in range(0, readings.shape[1], 3):
+            kept.append(readings[:, start : start + 3].mean(1))
+    np.testing.assert_allclose(features, np.concatenate(kept, axis=1), rtol=1e-12)
+
+
+WORDS = (
+    "bayessim", "last", "all", "differences", "gru", "conv",
+    "all/2", "all~2", "gru[x]/2", "gru~2", "conv/4",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("word", WORDS)
