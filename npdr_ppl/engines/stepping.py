@@ -216,54 +216,35 @@ class Stepper:
         return state._replace(sensor_memory=tuple(memories)), tuple(readings)
 
     def _move_once(self, state: State, actions: Components, tables: Tables) -> State:
+        """Advances the dynamics by one substep."""
         simulator, constants = self.simulator, tables.constants
-        q, v = state.positions, state.velocities
-
-        def smooth_forces(positions: Components, velocities: Components) -> list[Any]:
-            forces: list[Any] = [0.0] * len(positions)
-            for k, (place, effect, joint) in enumerate(self.force_effects):
-                force = effect.force(
-                    positions[joint],
-                    velocities[joint],
-                    tables.effects[place],
-                    state.force_memory[k],
-                )
-                if force is not None:
-                    forces[joint] = forces[joint] + force
-            return forces
+        start = state.positions, state.velocities
+        dry: tuple[Any, ...] = (0.0,) * len(state.positions)
 
         def acceleration(positions: Components, velocities: Components) -> Components:
-            forces = smooth_forces(positions, velocities)
-            return simulator.accelerations(
-                positions, velocities, actions, tuple(forces), constants
-            )
+            forces = self._forces(positions, velocities, state, tables, dry)
+            return simulator.accelerations(positions, velocities, actions, forces, constants)
 
-        first = acceleration(q, v)
-        dry: tuple[Tensor | float, ...] = ()
+        first = acceleration(*start)
         bounds = self._dry_friction_bounds(state, tables)
-        if any(bound is not None for bound in bounds):
-            smooth = tuple(smooth_forces(q, v))
-            inertia = simulator.inverse_inertia(q, v, constants) or _probe_inverse_inertia(
-                simulator, q, v, actions, smooth, constants, first
+        has_dry_friction = any(bound is not None for bound in bounds)
+        if has_dry_friction:
+            forces = self._forces(*start, state, tables, dry)
+            inertia = simulator.inverse_inertia(*start, constants) or _probe_inverse_inertia(
+                simulator, *start, actions, forces, constants, first
             )
-            dry = solve_dry_friction(bounds, v, first, inertia, self._substep)
+            dry = solve_dry_friction(bounds, state.velocities, first, inertia, self._substep)
             # Accelerations are affine in the forces, so the first evaluation is not repeated.
             first = tuple(
                 a + sum(w * f for w, f, b in zip(row, dry, bounds, strict=True) if b is not None)
                 for a, row in zip(first, inertia, strict=True)
             )
-
-            def acceleration(positions: Components, velocities: Components) -> Components:
-                forces = smooth_forces(positions, velocities)
-                total = tuple(s + d for s, d in zip(forces, dry, strict=True))
-                return simulator.accelerations(positions, velocities, actions, total, constants)
-
-        q, v = simulator.integrator.step(acceleration, q, v, first, self._substep)
-        if dry:
+        q, v = simulator.integrator.step(acceleration, *start, first, self._substep)
+        if has_dry_friction:
             # Friction within its bound has stopped the joint; rounding must not leave a velocity
             # whose sign then means something to a policy.
             v = tuple(
-                vi if b is None else torch.where(torch.as_tensor(f).abs() < b, 0.0, vi)
+                vi if b is None else torch.where(f.abs() < b, 0.0, vi)
                 for vi, f, b in zip(v, dry, bounds, strict=True)
             )
         memory = tuple(
@@ -277,6 +258,24 @@ class Stepper:
             for k, (place, effect, joint) in enumerate(self.force_effects)
         )
         return state._replace(positions=q, velocities=v, force_memory=memory)
+
+    def _forces(
+        self,
+        positions: Components,
+        velocities: Components,
+        state: State,
+        tables: Tables,
+        dry: tuple[Any, ...],
+    ) -> tuple[Any, ...]:
+        """Returns the smooth forces in a state of the integrator, on top of the dry ones."""
+        forces = list(dry)
+        for k, (place, effect, joint) in enumerate(self.force_effects):
+            force = effect.force(
+                positions[joint], velocities[joint], tables.effects[place], state.force_memory[k]
+            )
+            if force is not None:
+                forces[joint] = forces[joint] + force
+        return tuple(forces)
 
     def _dry_friction_bounds(self, state: State, tables: Tables) -> tuple[Tensor | None, ...]:
         """Returns the summed bounds of dry friction per joint."""

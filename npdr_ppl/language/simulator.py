@@ -112,7 +112,8 @@ class Simulator(ABC):
         """Returns each state component at the start of each segment, ``(..., S)`` each.
 
         A rate whose position is measured is taken from the estimated derivative of the position
-        readings where the inputs carry one, otherwise from its own reading.
+        readings where the inputs carry one, otherwise from its own reading. At a rollout's first
+        sample the derivative sees one side only, and a reading of the rate is better.
 
         Raises:
             DataError: A component was neither recorded nor can be estimated.
@@ -121,7 +122,11 @@ class Simulator(ABC):
         result = []
         for state in self.states:
             if inputs.initial_rates is not None and state.rate_of in columns:
-                result.append(inputs.initial_rates[..., columns[state.rate_of]])
+                rate = inputs.initial_rates[..., columns[state.rate_of]]
+                if state.name in columns:
+                    reading = inputs.initial_readings[..., columns[state.name]]
+                    rate = torch.where(inputs.start.to(rate.device) == 0, reading, rate)
+                result.append(rate)
             elif state.name in columns:
                 result.append(inputs.initial_values[..., columns[state.name]])
             else:

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from npdr_ppl.plots.marginals import add_legend
 from npdr_ppl.plots.theme import COLORS, theme
 
 __all__ = ["plot_bands"]
@@ -52,6 +53,5 @@ def plot_bands(
             axis.set_ylabel(f"{channel_names[c]}\n[{unit}]" if unit else channel_names[c])
         axes[-1].set_xlabel("time [s]")
         axes[0].set_xlim(time[0], time[-1])
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=5)
+        add_legend(figure, loc="outside upper center", ncols=5)
     return figure

@@ -1,6 +1,7 @@
 """Marginals of the posterior against the prior, one panel per parameter."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,7 +11,7 @@ from scipy.stats import gaussian_kde
 
 from npdr_ppl.plots.theme import COLORS, theme
 
-__all__ = ["draw_marginal", "plot_marginals"]
+__all__ = ["add_legend", "draw_marginal", "plot_marginals"]
 
 Samples = Mapping[str, NDArray[np.float64]]
 MAX_COLUMNS = 4
@@ -46,9 +47,17 @@ def plot_marginals(
             axis.set_xlabel(f"{name} [{unit}]" if unit and unit != "1" else name)
         for axis in axes[len(names) :]:
             axis.set_visible(False)
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=4)
+        add_legend(figure, loc="outside upper center", ncols=4)
     return figure
+
+
+def add_legend(figure: Figure, **placement: Any) -> None:
+    """Adds one legend with every entry that any of the figure's axes has."""
+    entries: dict[str, Any] = {}
+    for axis in figure.axes:
+        handles, labels = axis.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    figure.legend(list(entries.values()), list(entries), **placement)
 
 
 def draw_marginal(

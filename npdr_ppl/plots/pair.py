@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from npdr_ppl.plots.marginals import Samples, draw_marginal
+from npdr_ppl.plots.marginals import Samples, add_legend, draw_marginal
 from npdr_ppl.plots.theme import COLORS, theme
 
 __all__ = ["plot_pair"]
@@ -60,8 +60,7 @@ def plot_pair(
                     axis.tick_params(axis="x", rotation=45)
                 if j == 0 and i > 0:
                     axis.set_ylabel(row, fontsize=7)
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.97, 0.97))
+        add_legend(figure, loc="upper right", bbox_to_anchor=(0.97, 0.97))
     return figure
 
 

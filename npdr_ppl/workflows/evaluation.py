@@ -1,7 +1,7 @@
 """How far a model at given parameters is from measured rollouts."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -118,43 +118,55 @@ def residual_noise(
     rollouts: Rollouts,
     options: BindingOptions,
     *,
-    num_draws: int = 500,
+    iterations: int = 6,
+    population: int = 200,
     seed: int = 0,
 ) -> dict[str, float]:
     """Returns a noise scale per channel at which the model can explain the recording.
 
     A simulator that lacks an effect never reproduces a recording exactly; without noise of the
     size of what is left, the recording is unlike every simulation and a likelihood-free posterior
-    is extrapolation. The scale is the root-mean-square residual of the prior draw that comes
-    nearest, an upper bound on what remains at the best parameters.
+    is extrapolation. The scale is the root-mean-square residual of the best parameters that a
+    short cross-entropy search (Rubinstein 1999) over the prior's reference coordinates finds.
 
     Args:
-        model: The Pyro model, without noise.
+        model: The Pyro model.
         rollouts: The recording to be fitted; never the held-out one.
         options: Segments, initial states and precision.
-        num_draws: Prior draws to try.
-        seed: Seed of the draws.
+        iterations: Iterations of the search.
+        population: Parameter sets of each iteration.
+        seed: Seed of the search.
+
+    Raises:
+        DataError: No parameters could be simulated along the recording.
     """
-    options = replace(options, precision="float64")
     inputs = rollouts.inputs(options.segment_length, options.initial_state, dtype=options.dtype)
     prior = Prior(model, (inputs,))
-    with seeded(seed, "residual noise"):
-        draws = prior.to_parameters(prior.sample(num_draws))
-    best: tuple[float, Tensor] | None = None
+    centre = torch.zeros(prior.num_parameters, dtype=torch.float64)
+    spread = torch.ones_like(centre)
+    best_error, best = float("inf"), torch.empty(0)
     names: tuple[str, ...] = ()
-    chunk = 100
-    for start in range(0, num_draws, chunk):
-        part = {name: value[start : start + chunk] for name, value in draws.items()}
-        replayed = replay(model, rollouts, part, options)
+    for iteration in range(iterations):
+        with seeded(seed, "residual noise", iteration):
+            z = prior.sample(population) if iteration == 0 else torch.randn(
+                population, prior.num_parameters, dtype=torch.float64
+            ) * spread + centre  # fmt: skip
+        replayed = replay(model, rollouts, prior.to_parameters(z), options)
         names = replayed.channel_names
-        observed = rollouts.observation(replayed.inputs, channels=names)
-        mask = replayed.inputs.mask[..., None]
-        square = ((replayed.trajectory - observed) * mask).square().sum(dim=(1, 2)) / mask.sum()
-        scale = (observed * mask).abs().amax(dim=(0, 1)).clamp_min(torch.finfo(square.dtype).tiny)
-        error = (square.sqrt() / scale).mean(-1).nan_to_num(torch.inf)
-        index = int(error.argmin())
-        if best is None or float(error[index]) < best[0]:
-            best = float(error[index]), square[index].sqrt()
-    if best is None or not bool(torch.isfinite(best[1]).all()):
-        raise DataError("No prior draw could be simulated along the recording.")
-    return {name: max(float(v), 1e-9) for name, v in zip(names, best[1], strict=True)}
+        residual, error = _residuals(replayed, rollouts)
+        elite = error.argsort()[: max(2, population // 10)]
+        centre, spread = z[elite].mean(0), z[elite].std(0)
+        if float(error[elite[0]]) < best_error:
+            best_error, best = float(error[elite[0]]), residual[elite[0]]
+    if not torch.isfinite(torch.tensor(best_error)):
+        raise DataError("No parameters of the prior could be simulated along the recording.")
+    return {name: max(float(v), 1e-9) for name, v in zip(names, best, strict=True)}
+
+
+def _residuals(replayed: Replay, rollouts: Rollouts) -> tuple[Tensor, Tensor]:
+    """Returns the residuals' RMS per channel, ``(n, C)``, and their mean in units of the range."""
+    observed = rollouts.observation(replayed.inputs, channels=replayed.channel_names)
+    mask = replayed.inputs.mask[..., None]
+    square = ((replayed.trajectory - observed) * mask).square().sum(dim=(1, 2)) / mask.sum()
+    scale = (observed * mask).abs().amax(dim=(0, 1)).clamp_min(torch.finfo(square.dtype).tiny)
+    return square.sqrt(), (square.sqrt() / scale).mean(-1).nan_to_num(torch.inf)
