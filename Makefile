@@ -7,7 +7,7 @@ WORKERS ?= 2
 # A worker per core: torch's own threads would only get in each other's way.
 TEST_ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NPDR_NUM_THREADS=1
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test style types bench clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@echo "==> making $(VENV) with $$($(PYTHON) --version)"
@@ -21,18 +21,20 @@ demo: $(VENV)/installed
 	@echo "==> fitting the Furuta model to a recording made by MuJoCo; figures go to demo-output/"
 	$(BIN)/npdr demo --out demo-output
 
-lint: $(VENV)/installed
-	@echo "==> style"
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	@echo "==> types"
-	$(BIN)/pyright
-	@echo "==> layers"
-	$(BIN)/lint-imports
-
-test: lint
+test: style
 	@echo "==> tests on $(WORKERS) workers"
 	$(TEST_ENV) $(BIN)/python -m pytest -n $(WORKERS) --durations=15
+
+style: $(VENV)/installed
+	@echo "==> style and layers"
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-logo
+
+# The type checker is a Node program that fetches itself, so `make test` does without it.
+types: $(VENV)/installed
+	@echo "==> types"
+	$(BIN)/pyright
 
 bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev,bench]"

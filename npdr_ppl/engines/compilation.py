@@ -125,22 +125,21 @@ def mark_sizes_dynamic(tree: Any) -> None:
 def signature(thing: Any) -> Hashable:
     """Returns a value that is equal for objects which traced code cannot tell apart.
 
-    Tensors and functions count by identity; other objects by type and attributes.
+    Tensors and functions count by identity (a kernel keeps alive what it closes over); other
+    objects by type and attributes.
     """
     if isinstance(thing, Mapping):
         return tuple(sorted((str(key), signature(value)) for key, value in thing.items()))
     if isinstance(thing, tuple | list):
         return tuple(signature(item) for item in thing)
-    if (
-        isinstance(thing, Tensor)
-        or not hasattr(thing, "__dict__")
-        or callable_without_state(thing)
-    ):
+    if isinstance(thing, Tensor):
+        return "tensor", id(thing)
+    if not hasattr(thing, "__dict__") or _is_stateless(thing):
         return thing if isinstance(thing, Hashable) else id(thing)
     attributes = {name: value for name, value in vars(thing).items() if name not in _INVISIBLE}
     return type(thing), signature(attributes)
 
 
-def callable_without_state(thing: Any) -> bool:
+def _is_stateless(thing: Any) -> bool:
     """Returns whether ``thing`` is a plain function or a class."""
     return isinstance(thing, type) or (callable(thing) and not vars(thing))

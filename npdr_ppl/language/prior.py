@@ -243,15 +243,21 @@ class Prior:
             for site in self.sites
         }
 
-    def segment_log_prob(self, name: str, value: Tensor, z: Tensor) -> Tensor:
-        """Returns the density of a black-box site's segments at n points, ``(n, …, segments)``.
+    def pointwise_log_prob(self, name: str, value: Tensor, z: Tensor) -> Tensor:
+        """Returns the density of every reading at a black-box site, ``(n,) + value.shape``.
+
+        Args:
+            name: The site.
+            value: What was observed there.
+            z: Points, ``(n, d)``.
 
         Raises:
             IntractableError: The site has no density.
         """
         trace = self._run(_WriteCoordinates(self, z))
         with torch.no_grad():
-            return trace.nodes[name]["fn"].segment_log_prob(value)
+            log_prob, _ = trace.nodes[name]["fn"].pointwise_log_prob(value)
+        return log_prob.reshape((len(z), *value.shape))
 
     def _run(self, writer: "_WriteCoordinates") -> Any:
         """Runs the program at all of a writer's points at once, without simulating."""

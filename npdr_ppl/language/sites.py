@@ -145,22 +145,15 @@ class BlackBox(TorchDistribution):
         Raises:
             IntractableError: No noise was declared, or the simulator is itself random.
         """
-        pointwise, event_dim = self._pointwise_log_prob(value)
+        pointwise, event_dim = self.pointwise_log_prob(value)
         return pointwise.flatten(-event_dim).sum(-1) if event_dim else pointwise
 
-    def segment_log_prob(self, value: Tensor) -> Tensor:
-        """Returns the density of each segment, batch shape plus ``(segments,)``.
-
-        A plain function's first event dimension takes the segments' place.
+    def pointwise_log_prob(self, value: Tensor) -> tuple[Tensor, int]:
+        """Returns the density of every reading and the number of event dimensions.
 
         Raises:
             IntractableError: As :meth:`log_prob`.
         """
-        pointwise, event_dim = self._pointwise_log_prob(value)
-        return pointwise.flatten(1 - event_dim).sum(-1) if event_dim > 1 else pointwise
-
-    def _pointwise_log_prob(self, value: Tensor) -> tuple[Tensor, int]:
-        """Returns the density of every reading and the number of event dimensions."""
         if self.noise is None:
             raise IntractableError(
                 f"The density of site {self.site!r} is intractable, because its simulator is a "

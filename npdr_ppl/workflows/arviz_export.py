@@ -13,7 +13,10 @@ if TYPE_CHECKING:
     from npdr_ppl.workflows.arviz_module import az
     from npdr_ppl.workflows.posterior import Posterior
 
-__all__ = ["to_arviz"]
+__all__ = ["effective_share", "segment_log_likelihood", "to_arviz"]
+
+MIN_STEPS = 8
+"""Steps of a segment below which autocorrelation cannot be estimated."""
 
 MAX_PREDICTIVE_DRAWS = 100
 """Posterior predictive draws of each member; trajectories are large."""
@@ -31,8 +34,9 @@ def to_arviz(
     never count as observations.
 
     Where the model declares no noise, the log likelihood is that of a Gaussian error per channel
-    whose variance is estimated from the posterior predictive; the group's attribute
-    ``error_model`` says which.
+    whose variance is estimated from the posterior predictive. Either is weighted by the share of
+    independent readings; see :func:`effective_share`. The group's attribute ``error_model`` says
+    what was used.
 
     Args:
         posterior: The posterior.
@@ -111,27 +115,48 @@ def segment_log_likelihood(
         z: The draws, ``(n, d)``.
     """
     observation = posterior.bound.observations[name]
+    residual = (predictive - observation.value).double()
     if posterior.prior.black_boxes[name].noise is not None:
-        exact = posterior.prior.segment_log_prob(name, observation.value, z)
-        return exact.flatten(1), "declared noise"
-    residual = predictive - observation.value
-    if observation.inputs is None or observation.channels is None:
-        residual = residual.reshape(len(residual), 1, -1)
-        variance = residual.square().mean(dim=(0, 1), keepdim=True)
+        log_prob = posterior.prior.pointwise_log_prob(name, observation.value, z).double()
+        error_model = "declared noise"
     else:
-        residual = residual[..., list(observation.channels)]
-        residual = residual.reshape(len(residual), -1, *residual.shape[-2:])
-        mask = observation.inputs.mask[..., None].expand(residual.shape[1:])
-        count = mask.sum(dim=(0, 1)) * len(residual)
-        variance = (residual.square() * mask).sum(dim=(0, 1, 2)) / count
-        residual = residual * mask
-        variance = variance.expand_as(residual[0])
-    variance = variance.clamp_min(torch.finfo(residual.dtype).tiny)
-    log_prob = -0.5 * (residual.square() / variance + torch.log(2 * torch.pi * variance))
-    if observation.inputs is not None:
-        log_prob = log_prob * observation.inputs.mask[..., None].expand_as(log_prob[0])
-    # Readings of a segment are correlated; a segment weighs as much as its mean reading.
-    return log_prob.flatten(2).mean(-1), "Gaussian, estimated, mean over a segment"
+        axes = tuple(range(residual.dim() - 1))
+        variance = residual.square().mean(axes).clamp_min(torch.finfo(torch.float64).tiny)
+        log_prob = -0.5 * (residual.square() / variance + torch.log(2 * torch.pi * variance))
+        error_model = "Gaussian, variance estimated"
+    if observation.inputs is None or observation.channels is None:
+        return log_prob.flatten(1).sum(-1, keepdim=True), error_model
+    channels = list(observation.channels)
+    log_prob = log_prob[..., channels] * observation.inputs.mask[..., None]
+    log_prob = log_prob.reshape(len(z), -1, *log_prob.shape[-2:])
+    # What the mean prediction leaves over tells how far readings of a segment are independent.
+    left = residual.mean(0)[..., channels].reshape(log_prob.shape[1:])
+    share = effective_share(left, observation.inputs.mask)
+    shown = ", ".join(f"{value:.2g}" for value in share)
+    return (log_prob * share).sum((-1, -2)), f"{error_model}, independent readings {shown}"
+
+
+def effective_share(residual: Tensor, mask: Tensor) -> Tensor:
+    """Returns which share of a segment's readings is worth an independent one, per channel.
+
+    The residuals of the segments are treated as chains, whose effective sample size ArviZ
+    estimates; readings weighted by it make a composite likelihood of the right magnitude (Ribatet,
+    Cooley & Davison 2012).
+
+    Args:
+        residual: Residuals, ``(plates × segments, steps, channels)``.
+        mask: Which steps exist, ``(segments, steps)``.
+    """
+    from npdr_ppl.workflows.arviz_module import az
+
+    whole = mask.all(-1).repeat(len(residual) // len(mask))
+    chains = residual[whole] if bool(whole.any()) else residual
+    total = chains.shape[0] * chains.shape[1]
+    if chains.shape[1] < MIN_STEPS:
+        return torch.ones(residual.shape[-1], dtype=torch.float64)
+    sizes = [float(az.ess(values.numpy(), method="mean")) for values in chains.unbind(-1)]
+    share = torch.tensor(sizes, dtype=torch.float64) / total
+    return share.nan_to_num(1.0).clamp(1 / chains.shape[1], 1.0)
 
 
 def _plate_dims(name: str, num: int) -> list[str]:

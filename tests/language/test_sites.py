@@ -92,7 +92,7 @@ def test_noise_gives_the_normal_density(inputs):
     torch.testing.assert_close(site.log_prob_sum(), expected.double(), rtol=1e-4, atol=1e-4)
 
 
-def test_segment_densities_sum_to_the_density(inputs):
+def test_pointwise_densities_sum_to_the_density(inputs):
     two = Inputs(
         **{
             **{name: getattr(inputs, name) for name in inputs.__dataclass_fields__},
@@ -112,7 +112,9 @@ def test_segment_densities_sum_to_the_density(inputs):
     value = model(two)
     assert bool((value[1, 7:] == 0).all())
     box = poutine.trace(model).get_trace(two).nodes["trajectory"]["fn"]
-    torch.testing.assert_close(box.segment_log_prob(value).sum(), box.log_prob(value))
+    pointwise, event_dim = box.pointwise_log_prob(value)
+    assert event_dim == 3
+    torch.testing.assert_close(pointwise.sum(), box.log_prob(value))
     # Padding carries no information.
     changed = value.clone()
     changed[1, 7:] = 5.0
