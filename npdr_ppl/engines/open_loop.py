@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.commands import CommandRecord, RecordedCommands
 from npdr_ppl.engines.compilation import compiled, is_worthwhile, mark_sizes_dynamic
@@ -46,14 +47,25 @@ def replay(simulator: "ODESimulator", parameters: Mapping[str, Tensor], inputs: 
     )
     state = _start(body, tables, inputs, records, shape)
     readings: list[Tensor] = []
-    first = 0
+
+    def run_eagerly(state: State, first: int, last: int) -> State:
+        for step in range(first, last):
+            commands = tuple(record.at(step) for record in records)
+            state, values = body.step(state, tables, commands, _views(records, step))
+            readings.extend(values)
+        return state
+
+    first, last = 0, 0
     if is_compiled:
-        first = inputs.num_steps // _STEPS_PER_CALL * _STEPS_PER_CALL
-        state = _run_compiled(body, state, tables, records, first, readings)
-    for step in range(first, inputs.num_steps):
-        commands = tuple(record.at(step) for record in records)
-        state, values = body.step(state, tables, commands, _views(records, step))
-        readings.extend(values)
+        # The first state carries no gradient where later ones do, and would need its own kernel.
+        has_gradient = any(
+            isinstance(leaf, Tensor) and leaf.requires_grad for leaf in pytree.tree_leaves(tables)
+        )
+        first = min(_STEPS_PER_CALL, inputs.num_steps) if has_gradient else 0
+        last = inputs.num_steps - (inputs.num_steps - first) % _STEPS_PER_CALL
+        state = run_eagerly(state, 0, first)
+        state = _run_compiled(body, state, tables, records, range(first, last), readings)
+    run_eagerly(state, last, inputs.num_steps)
     trajectory = torch.stack(readings, dim=-1).reshape(
         *shape, inputs.num_steps, len(simulator.sensors)
     )
@@ -115,14 +127,14 @@ def _run_compiled(
     state: State,
     tables: Tables,
     records: tuple[CommandRecord, ...],
-    num_steps: int,
+    steps: range,
     readings: list[Tensor],
 ) -> State:
     """Runs steps with the compiled body and appends their readings."""
     run = compiled(("replay", body.stepper.signature), body.run)
     state = flatten(state, state.positions[0].shape, expand=True)
 
-    for step in range(0, num_steps, _STEPS_PER_CALL):
+    for step in steps[::_STEPS_PER_CALL]:
         commands = tuple(
             tuple(record.at(k).contiguous() for record in records)
             for k in range(step, step + _STEPS_PER_CALL)
