@@ -19,10 +19,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.errors import ShapeError
+from npdr_ppl.errors import DependencyError, ShapeError
 
 __all__ = [
     "Summary",
+    "c2st",
     "coverage",
     "crps",
     "crps_by_step",
@@ -229,6 +230,43 @@ def coverage(pit_values: Tensor, levels: Sequence[float], mask: Tensor | None = 
     # A bound is itself a float: the whole interval must hold 0 and 1.
     inside = distance.flatten() <= bounds[:, None] + torch.finfo(distance.dtype).eps
     return inside.to(distance.dtype).mean(-1)
+
+
+def c2st(samples: Tensor, reference: Tensor, *, seed: int = 0) -> float:
+    """Classifier two-sample test: how well a network tells two sets of samples apart.
+
+    The cross-validated accuracy (5 folds) of a perceptron with two hidden layers of 10 d units on
+    data standardised by the reference: 0.5 if the sets are alike, 1 if they are apart (Lueckmann
+    et al. 2021, Benchmarking simulation-based inference).
+
+    Args:
+        samples: ``(n, d)``.
+        reference: ``(m, d)``; the longer set is cut to the shorter one's length.
+        seed: Seed of the network and the folds.
+
+    Raises:
+        DependencyError: scikit-learn is not installed.
+        ShapeError: The sets do not fit each other.
+    """
+    try:
+        from sklearn.model_selection import KFold, cross_val_score
+        from sklearn.neural_network import MLPClassifier
+    except ImportError as error:
+        raise DependencyError("C2ST needs scikit-learn: pip install npdr-ppl[bench].") from error
+    if samples.ndim != 2 or reference.ndim != 2 or samples.shape[1] != reference.shape[1]:
+        raise ShapeError(
+            f"c2st compares (n, d) with (m, d), got {tuple(samples.shape)} and "
+            f"{tuple(reference.shape)}."
+        )
+    size = min(len(samples), len(reference))
+    mean, std = reference.mean(0), reference.std(0)
+    both = torch.cat([samples[:size], reference[:size]])
+    data = ((both - mean) / std).detach().cpu().numpy()
+    labels = np.repeat([0, 1], size)
+    hidden = (10 * samples.shape[1],) * 2
+    network = MLPClassifier(hidden, max_iter=1_000, solver="adam", random_state=seed)
+    folds = KFold(n_splits=5, shuffle=True, random_state=seed)
+    return float(np.mean(cross_val_score(network, data, labels, cv=folds, scoring="accuracy")))
 
 
 def _scale(measured: Tensor) -> Tensor:

@@ -41,12 +41,11 @@ def reproduce(
     progress = False if quiet else None
     out = out / experiment.value
     if experiment is Experiment.PENDULUM:
-        from npdr_ppl.plots.pendulum import write_pendulum_figure
+        from npdr_ppl.plots.pendulum import write_pendulum_figures
         from npdr_ppl.workflows.pendulum_ridge import reproduce_pendulum
 
-        outcome = reproduce_pendulum(out, backend=backend, seed=seed, progress=progress)
-        write_pendulum_figure(outcome, out)
-        result = outcome.result
+        ridges, result = reproduce_pendulum(out, backend=backend, seed=seed, progress=progress)
+        write_pendulum_figures(ridges, out)
     else:
         from npdr_ppl.models.furuta import furuta
         from npdr_ppl.plots.fit_figures import write_fit_figures
