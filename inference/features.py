@@ -112,8 +112,8 @@ class Preconditioner:
         return Preconditioner(**{k: v.to(device) for k, v in self.tensors().items()})
 
     def tensors(self) -> dict[str, Tensor]:
-        """Returns the fields by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """Returns the fields by name, contiguous, as files want them."""
+        return {field.name: getattr(self, field.name).contiguous() for field in fields(self)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "Preconditioner":
@@ -195,7 +195,11 @@ def _ridge(f: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             best = error, v @ coefficients, residuals
     assert best is not None
     _, gain, residuals = best
-    return gain.T.to(z.dtype), (z_mean - f_mean @ gain).to(z.dtype), residuals.to(z.dtype)
+    return (
+        gain.T.to(z.dtype).contiguous(),
+        (z_mean - f_mean @ gain).to(z.dtype),
+        residuals.to(z.dtype),
+    )
 
 
 def _factor(residuals: Tensor, z: Tensor) -> Tensor:
@@ -207,4 +211,6 @@ def _factor(residuals: Tensor, z: Tensor) -> Tensor:
     weight = len(r) / (len(r) + z.shape[1])
     correlation = weight * covariance / scale[:, None] / scale
     correlation.fill_diagonal_(1.0)
-    return (scale[:, None] * torch.linalg.cholesky(correlation)).to(z.dtype)
+    factor = scale[:, None] * torch.linalg.cholesky(correlation)
+    # One memory layout, so that a factor read from disk gives the same bits.
+    return factor.to(z.dtype).contiguous()

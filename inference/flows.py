@@ -10,8 +10,10 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.distributions import Transform
 from zuko.flows.autoregressive import MaskedAutoregressiveTransform
 from zuko.lazy import LazyComposedTransform
+from zuko.nn import Linear
 from zuko.transforms import MonotonicAffineTransform, MonotonicRQSTransform
 
 from npdr_ppl.errors import BackendError
@@ -30,6 +32,35 @@ SAMPLE_CHUNK = 16_384
 
 MAX_REDRAWS = 100
 """Attempts to replace samples that are not finite before a flow is declared broken."""
+
+
+class Spline(MonotonicRQSTransform):
+    """zuko's monotonic rational-quadratic spline on [-5, 5] with its knots computed faster.
+
+    The knots are those of the parent class, which normalises bin widths and heights by a softmax
+    over a last dimension of a few bins; on a CPU that takes longer than all the rest of the
+    spline together. The parameters are bounded before, so that plain exponentials cannot overflow.
+
+    Args:
+        bins: Unconstrained bin widths and heights, ``(*, 2, K)``.
+        derivatives: Unconstrained derivatives at the inner knots, ``(*, K - 1)``.
+        bound: Edge of the interval, beyond which the map is the identity.
+        slope: Smallest slope of the spline.
+    """
+
+    def __init__(
+        self, bins: Tensor, derivatives: Tensor, bound: float = 5.0, slope: float = 1e-3
+    ) -> None:
+        Transform.__init__(self)
+        limit = -math.log(slope)
+        sizes = (bins / (1 + (2 / limit) * bins.abs())).exp()
+        ends = sizes.cumsum(-1)
+        knots = nn.functional.pad(
+            ends * (2 * bound / ends[..., -1:]) - bound, (1, 0), value=-bound
+        )
+        self.horizontal, self.vertical = knots.unbind(-2)
+        inner = derivatives / (1 + derivatives.abs() / limit)
+        self.derivatives = nn.functional.pad(inner, (1, 1)).exp()
 
 
 class FlowNetwork(nn.Module):
@@ -68,7 +99,7 @@ class FlowNetwork(nn.Module):
         super().__init__()
         self.embedding = embedding
         if flow == "nsf":
-            univariate, sizes = MonotonicRQSTransform, [(bins,), (bins,), (bins - 1,)]
+            univariate, sizes = Spline, [(2, bins), (bins - 1,)]
         else:
             univariate, sizes = MonotonicAffineTransform, [(), ()]
         forwards: Any = torch.arange(num_parameters)
@@ -85,8 +116,9 @@ class FlowNetwork(nn.Module):
                 for k in range(transforms)
             )
         )
+        linear = (nn.Linear, Linear)  # with a single parameter zuko's own
         for transform in self.transform.transforms:
-            last = [layer for layer in transform.modules() if isinstance(layer, nn.Linear)][-1]
+            last = [layer for layer in transform.modules() if isinstance(layer, linear)][-1]
             with torch.no_grad():
                 last.weight.mul_(INITIAL_SCALE)
                 last.bias.zero_()

@@ -103,15 +103,15 @@ class SNPEC(Backend):
 
     flow: Literal["nsf", "maf"] = "nsf"
     transforms: int = 2
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = (128, 128)
     bins: int = 8
     members: int = 2
     proposals: Literal["truncated", "atomic"] = "truncated"
     num_atoms: int = 10
-    outside: float = 1e-3
-    epochs: int = 40
-    batch_size: int = 256
-    learning_rate: float = 5e-3
+    outside: float = 1e-2
+    epochs: int = 30
+    batch_size: int = 512
+    learning_rate: float = 1e-2
     weight_decay: float = 0.0
     averaging: float = 0.99
     validation_fraction: float = 0.1

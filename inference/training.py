@@ -163,7 +163,9 @@ def train(
                 with torch.no_grad():
                     for mean, new in zip(average, weights, strict=True):
                         mean.lerp_(new, 1 - decay)
+        networks[0].eval()
         value = _validate(evaluate, loss, held_out, weights, average)
+        networks[0].train()
         improved = value > best_value
         best_value = torch.where(improved, value, best_value)
         best_epochs = torch.where(improved, epoch, best_epochs)

@@ -1,0 +1,224 @@
+"""What every registered backend must do, on a linear-Gaussian problem with a known posterior."""
+
+import json
+import math
+
+import pytest
+import safetensors.torch
+import torch
+
+from npdr_ppl.errors import BackendError, ShapeError
+from npdr_ppl.inference.base import Problem
+from npdr_ppl.inference.mixture import Mixture
+from npdr_ppl.inference.registry import backend, backends
+from npdr_ppl.randomness import seeded
+
+GAIN = torch.tensor([[1.0, 0.5], [0.0, 1.0], [0.3, -0.6]])
+NOISE = 0.5
+OBSERVATION = torch.tensor([0.6, -0.4, 0.7])
+
+NUM_SIMULATIONS = 3000
+NUM_SAMPLES = 10_000
+
+FALSE_ALARM = 4.5
+"""Standard errors: of some twenty comparisons one fails by chance once in 7000 runs."""
+
+TRAINING_TOLERANCE = 0.1
+"""Error granted to learning from 3000 simulations, in posterior standard deviations."""
+
+
+@pytest.fixture(params=sorted(backends()))
+def method(request):
+    return backend(request.param)
+
+
+def simulate(z):
+    return z @ GAIN.T + NOISE * torch.randn(len(z), 3)
+
+
+def make_problem(device="cpu", observation=OBSERVATION):
+    normal = torch.distributions.Normal(0.0, 1.0)
+    return Problem(
+        num_parameters=2,
+        observation=observation,
+        sample_prior=lambda n: torch.randn(n, 2),
+        log_prior=lambda z: normal.log_prob(z).sum(-1),
+        device=torch.device(device),
+    )
+
+
+def run_round(method, problem, state, number, fail=0.0, n=NUM_SIMULATIONS):
+    with seeded(7, "round", number):
+        z = method.ask(problem, state, n)
+        x = simulate(z)
+        x[torch.rand(n) < fail] = math.nan
+        return method.tell(problem, state, z, x)
+
+
+def draws(method, problem, state):
+    with seeded(7, "draws"):
+        return Mixture(method.densities(problem, state)).sample(NUM_SAMPLES)
+
+
+def assert_exact_moments(z):
+    """Compares with the posterior from the joint Gaussian's precision."""
+    precision = torch.eye(2) + GAIN.T @ GAIN / NOISE**2
+    covariance = precision.inverse()
+    mean = covariance @ GAIN.T @ OBSERVATION / NOISE**2
+    sd = covariance.diagonal().sqrt()
+    assert (
+        (z.mean(0) - mean).abs() < sd * (FALSE_ALARM / len(z) ** 0.5 + TRAINING_TOLERANCE)
+    ).all()
+    # Var of a sample covariance of a Gaussian: (C_ii C_jj + C_ij^2) / n <= 2 C_ii C_jj / n.
+    limit = torch.outer(sd, sd) * (
+        FALSE_ALARM * (2 / len(z)) ** 0.5 + 2 * TRAINING_TOLERANCE + TRAINING_TOLERANCE**2
+    )
+    assert ((z.T.cov() - covariance).abs() < limit).all()
+
+
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_recovers_a_linear_gaussian_posterior(method, rounds):
+    problem = make_problem()
+    state = method.init(problem)
+    for number in range(rounds):
+        state, info = run_round(method, problem, state, number)
+        assert info.num_simulations == NUM_SIMULATIONS
+        assert info.num_failed == 0
+    assert state.round == rounds
+    assert_exact_moments(draws(method, problem, state))
+
+
+def test_density_is_normalised_and_fits_its_samples(method):
+    problem = make_problem()
+    state, _ = run_round(method, problem, method.init(problem), 0, n=500)
+    for density in method.densities(problem, state):
+        with seeded(3):
+            z = density.sample(5000)
+        assert z.shape == (5000, 2)
+        # Importance sampling of the integral of q over a wide normal that covers the samples.
+        wide = torch.distributions.MultivariateNormal(z.mean(0), 4 * z.T.cov())
+        with seeded(4), torch.no_grad():
+            points = wide.sample((20_000,))
+            ratio = (density.log_prob(points) - wide.log_prob(points)).exp()
+        error = ratio.std() / len(ratio) ** 0.5
+        assert abs(ratio.mean() - 1) < FALSE_ALARM * error
+        # The same integral of z q(z) is the samples' mean.
+        first = (ratio[:, None] * points).mean(0)
+        error = (ratio[:, None] * points).std(0) / len(ratio) ** 0.5 + z.std(0) / len(z) ** 0.5
+        assert ((first - z.mean(0)).abs() < FALSE_ALARM * error).all()
+
+
+def test_log_prob_is_differentiable(method):
+    problem = make_problem()
+    state, _ = run_round(method, problem, method.init(problem), 0, n=200)
+    z = torch.zeros(3, 2, requires_grad=True)
+    (gradient,) = torch.autograd.grad(method.densities(problem, state)[0].log_prob(z).sum(), z)
+    assert gradient.isfinite().all() and gradient.abs().sum() > 0
+
+
+def test_same_seed_same_result_also_after_resumption(method, tmp_path):
+    problem = make_problem()
+    state, _ = run_round(method, problem, method.init(problem), 0, n=400)
+    again, _ = run_round(method, problem, method.init(problem), 0, n=400)
+    assert torch.equal(draws(method, problem, state), draws(method, problem, again))
+
+    tensors, values = method.tensors(state)
+    safetensors.torch.save_file(tensors, tmp_path / "state.safetensors")
+    tensors = safetensors.torch.load_file(tmp_path / "state.safetensors")
+    restored = method.restore(problem, tensors, json.loads(json.dumps(values)))
+    assert torch.equal(draws(method, problem, state), draws(method, problem, restored))
+
+    state, _ = run_round(method, problem, state, 1, n=400)
+    restored, _ = run_round(method, problem, restored, 1, n=400)
+    assert restored.round == 2
+    assert torch.equal(draws(method, problem, state), draws(method, problem, restored))
+
+
+def test_initial_state_survives_writing(method):
+    problem = make_problem()
+    tensors, values = method.tensors(method.init(problem))
+    restored = method.restore(problem, tensors, json.loads(json.dumps(values)))
+    state, _ = run_round(method, problem, restored, 0, n=200)
+    assert state.round == 1
+
+
+def test_drops_failed_simulations(method):
+    problem = make_problem()
+    state, info = run_round(method, problem, method.init(problem), 0, fail=0.2)
+    error = (0.2 * 0.8 * NUM_SIMULATIONS) ** 0.5
+    assert abs(info.num_failed - 0.2 * NUM_SIMULATIONS) < FALSE_ALARM * error
+    assert_exact_moments(draws(method, problem, state))
+
+
+def test_refuses_when_all_simulations_failed(method):
+    problem = make_problem()
+    with pytest.raises(BackendError, match="100 of 100 simulations failed"):
+        method.tell(
+            problem, method.init(problem), torch.randn(100, 2), torch.full((100, 3), math.inf)
+        )
+
+
+@pytest.mark.parametrize(
+    ("z_shape", "x_shape"),
+    [((50, 3), (50, 3)), ((50, 2), (50, 4)), ((50, 2), (40, 3)), ((2,), (3,))],
+)
+def test_refuses_bad_shapes(method, z_shape, x_shape):
+    problem = make_problem()
+    with pytest.raises(ShapeError, match="must have shape"):
+        method.tell(problem, method.init(problem), torch.randn(z_shape), torch.randn(x_shape))
+
+
+def test_refuses_an_observation_that_is_not_finite(method):
+    with pytest.raises(BackendError, match="1 of 3 features"):
+        method.init(make_problem(observation=torch.tensor([0.0, math.nan, 1.0])))
+
+
+def test_has_no_posterior_before_the_first_round(method):
+    problem = make_problem()
+    with pytest.raises(BackendError, match="no posterior yet"):
+        method.densities(problem, method.init(problem))
+
+
+def test_stays_finite_far_from_the_simulations(method):
+    problem = make_problem(observation=torch.tensor([1e6, -1e9, 0.0]))
+    state, _ = run_round(method, problem, method.init(problem), 0, n=500)
+    z = draws(method, problem, state)
+    assert z.isfinite().all()
+    state, _ = run_round(method, problem, state, 1, n=500)
+    assert draws(method, problem, state).isfinite().all()
+
+
+def test_leaves_the_callers_random_stream_to_the_caller(method):
+    problem = make_problem()
+    state, _ = run_round(method, problem, method.init(problem), 0, n=200)
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    torch.manual_seed(0)
+    method.densities(problem, state)
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_reports_progress(method):
+    problem, seen = make_problem(), []
+    with seeded(0):
+        z = torch.randn(200, 2)
+        method.tell(
+            problem,
+            method.init(problem),
+            z,
+            simulate(z),
+            lambda done, text: seen.append((done, text)),
+        )
+    fractions = [done for done, _ in seen]
+    assert fractions and fractions == sorted(fractions) and fractions[-1] <= 1
+    assert all(text for _, text in seen)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_trains_on_the_problems_device(method):
+    problem = make_problem("cuda")
+    state, _ = run_round(method, problem, method.init(problem), 0)
+    assert torch.cuda.max_memory_allocated() > 0
+    z = draws(method, problem, state)
+    assert z.device.type == "cpu"
+    assert_exact_moments(z)
