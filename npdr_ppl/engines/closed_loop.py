@@ -81,7 +81,10 @@ class Episodes:
 
 
 class _Loop(NamedTuple):
-    """What the loop carries from step to step."""
+    """What the loop carries from step to step.
+
+    ``readings`` may be empty where sensors report the truth.
+    """
 
     state: State
     readings: Components
@@ -117,7 +120,10 @@ class _Body:
     ) -> tuple[_Loop, Components]:
         """Advances the loop by one step; also returns the commands before any limit."""
         state, stepper = loop.state, self.stepper
-        observation = tuple(loop.readings[i] for i in self.observed)
+        readings = loop.readings or stepper.simulator.readings(
+            state.positions, state.velocities, tables.constants
+        )
+        observation = tuple(readings[i] for i in self.observed)
         chosen, memory = self.policy.act(observation, time, loop.policy_memory, policy_constants)
         commands = tuple(chosen[i] for i in self.order)
         limited = tuple(
@@ -147,7 +153,16 @@ class _Body:
         for step in range(_STEPS_PER_CALL):
             time = start + step * self.stepper.time_step
             loop, _ = self.step(loop, tables, policy_constants, time)
-        return loop
+        return self.without_repetition(loop)
+
+    def without_repetition(self, loop: _Loop) -> _Loop:
+        """Returns the loop with no tensor in it twice.
+
+        One that came in twice would be another kind of argument, for which torch compiles anew.
+        """
+        if not self.stepper.sensor_effects:
+            return loop._replace(readings=())
+        return loop._replace(readings=tuple(reading.clone() for reading in loop.readings))
 
 
 def roll_out(
@@ -186,7 +201,7 @@ def roll_out(
     states = flatten(initial_states.to(dtype).unbind(-1), shape, expand=True)
     loop = _start(body, states, tables)
     if is_compiled:
-        loop = flatten(loop, loop.total.shape, expand=True)
+        loop = body.without_repetition(flatten(loop, loop.total.shape, expand=True))
         loop = _run_compiled(body, loop, tables, constants, num_steps)
         return _episodes(loop, shape, reward)
     readings, commands = [loop.readings], []
