@@ -14,7 +14,7 @@ from npdr_ppl.plots.theme import save_figure
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.evaluation import replay
-from npdr_ppl.workflows.fit import units
+from npdr_ppl.workflows.fit import parameter_units
 from npdr_ppl.workflows.posterior import Posterior
 
 __all__ = ["write_fit_figures"]
@@ -53,7 +53,7 @@ def write_fit_figures(
     marks = {"most likely": _values(most_likely)} | (marks or {})
     paths = [
         save_figure(
-            plot_marginals(samples, prior_samples, marks=marks, units=units(posterior)),
+            plot_marginals(samples, prior_samples, marks=marks, units=parameter_units(posterior)),
             out / "marginals.png",
         )
     ]

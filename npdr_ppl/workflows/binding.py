@@ -234,7 +234,7 @@ def _observe(
     if not isinstance(data, Rollouts) or inputs is None:
         raise DataError(f"Site {name!r} simulates trajectories; give rollouts, not a tensor.")
     simulator = box.simulator
-    simulator.check_inputs(inputs)
+    data.check(simulator.sensors, simulator.actions, allow_extra=True)
     names = [sensor.name for sensor in simulator.sensors]
     measured = [channel for channel in names if channel in data.channel_names]
     if not measured:

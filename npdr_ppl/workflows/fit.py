@@ -21,7 +21,7 @@ from npdr_ppl.workflows.run_folder import write_json
 if TYPE_CHECKING:
     from npdr_ppl.workflows.arviz_module import az
 
-__all__ = ["describe", "fit"]
+__all__ = ["describe", "fit", "parameter_units"]
 
 
 def fit(
@@ -98,7 +98,7 @@ def fit(
         "noise": used_noise,
         "seconds": {**posterior.provenance.seconds, "sample": sampled},
         "diagnosis": diagnose(data).to_dict(),
-        "units": units(posterior),
+        "units": parameter_units(posterior),
     }
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -123,15 +123,15 @@ def describe(data: "az.InferenceData") -> dict[str, Any]:
     return {"parameters": parameters}
 
 
-def units(posterior: Posterior) -> dict[str, str]:
+def parameter_units(posterior: Posterior) -> dict[str, str]:
     """Returns the units of the latent sites that carry a parameter's name."""
     known: dict[str, str] = {}
     for box in posterior.prior.black_boxes.values():
         if isinstance(box, SimulatorBlackBox):
             known |= {p.name: p.unit for p in box.simulator.parameters}
             for effect in box.simulator.effects:
-                pairs = zip(effect.parameter_names, effect.parameters, strict=True)
-                known |= {site: p.unit for site, p in pairs}
+                units = effect.units(box.simulator.port(effect.port))
+                known |= {f"{effect.name}.{name}": unit for name, unit in units.items()}
     return {site.name: known[site.name] for site in posterior.prior.sites if site.name in known}
 
 

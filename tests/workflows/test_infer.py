@@ -226,7 +226,19 @@ def test_bad_settings_are_refused(linear, recording):
         npdr.infer(pendulum, recording, embedding="everything", progress=False)
     with pytest.raises(DataError, match="give rollouts, not a tensor"):
         npdr.infer(lambda _=None: pendulum(recording.inputs()), observed, progress=False)
-    with pytest.raises(DataError, match="needs the action torque"):
+    with pytest.raises(DataError, match="column torque is missing"):
         from dataclasses import replace
 
         npdr.infer(pendulum, replace(recording, action_names=("voltage",)), progress=False)
+
+
+def test_data_in_degrees_and_recordings_added_twice_are_refused(recording):
+    from dataclasses import replace
+
+    degrees = replace(
+        recording, readings=tuple(values * [57.2958, 1.0] for values in recording.readings)
+    )
+    with pytest.raises(DataError, match="angle"):
+        npdr.infer(pendulum, degrees, progress=False)
+    with pytest.raises(DataError, match="identical"):
+        npdr.infer(pendulum, recording[[0, 0]], progress=False)
