@@ -166,7 +166,7 @@ def bind(model: Callable[..., Any], data: Data, options: BindingOptions) -> Boun
         args = (layout[0],)
     elif named is not None and layout:
         names = [name for name, part in named.items() if isinstance(part, Rollouts)]
-        args = (dict(zip(names, layout, strict=True)),)
+        args = (_InputsBySite(zip(names, layout, strict=True)),)
     prior = Prior(model, args)
     boxes = prior.black_boxes
     if not boxes:
@@ -207,6 +207,13 @@ def problem_of(bound: BoundModel, device: str | torch.device = "cpu") -> Problem
         build_network=bound.network_builder(),
         device=torch.device(device),
     )
+
+
+class _InputsBySite(dict[str, Inputs]):
+    """Inputs by site; a model that asks for a site without data is told so."""
+
+    def __missing__(self, name: str) -> Inputs:
+        raise DataError(f"The data are for {', '.join(self)}, but the model asks for {name!r}.")
 
 
 def _observe(

@@ -19,6 +19,7 @@ import numpy as np
 import pyro
 import torch
 from numpy.typing import NDArray
+from pyro.infer import MCMC, NUTS
 from torch import Tensor
 
 from npdr_ppl.inference.base import Backend
@@ -213,8 +214,8 @@ def nuts_samples(inputs: Inputs, observed: Tensor, *, seed: int) -> NDArray[np.f
     """Draws from the posterior by Pyro's NUTS through the differentiable simulator, ``(n, 2)``."""
     conditioned = pyro.condition(partial(pendulum, noise=NOISE), data={"trajectory": observed})
     with seeded(seed, "nuts"):
-        kernel = pyro.infer.NUTS(conditioned, max_tree_depth=6)
-        sampler = pyro.infer.MCMC(
+        kernel = NUTS(conditioned, max_tree_depth=6)
+        sampler = MCMC(
             kernel, num_samples=NUM_SAMPLES // 2, warmup_steps=200, disable_progbar=True
         )
         sampler.run(inputs)

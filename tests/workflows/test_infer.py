@@ -162,7 +162,9 @@ def test_several_sites_and_rollouts_by_name(recording, quick):
     data = {"first": recording[[0]], "second": recording[[1]]}
     posterior = npdr.infer(model, data, backend=quick, num_simulations=60, progress=False)
     assert set(posterior.predict(3)) == {"first", "second"}
-    with pytest.raises(DataError, match="the model's black-box sites are first, second"):
+    with pytest.raises(
+        DataError, match="data are for first, third, but the model asks for 'second'"
+    ):
         npdr.infer(model, {"first": recording, "third": recording}, progress=False)
 
 
