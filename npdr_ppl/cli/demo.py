@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from npdr_ppl.cli.fit import InitialState
+
 __all__ = ["demo"]
 
 
@@ -14,6 +16,9 @@ def demo(
         Path | None,
         typer.Option(help="Your own Furuta recording instead of a synthetic one."),
     ] = None,
+    initial_state: Annotated[
+        InitialState, typer.Option(help="State at a segment's start.")
+    ] = InitialState.ESTIMATED,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
 ) -> None:
@@ -37,7 +42,13 @@ def demo(
         if data is None
         else f"Reading {data} …"
     )
-    outcome = run_demo(out, data=data, seed=seed, progress=False if quiet else None)
+    outcome = run_demo(
+        out,
+        data=data,
+        initial_state=initial_state.value,
+        seed=seed,
+        progress=False if quiet else None,
+    )
     marks = {"truth": outcome.truth} if outcome.truth else None
     paths = write_fit_figures(outcome.posterior, furuta, outcome.test, out, marks=marks, seed=seed)
     if not quiet:

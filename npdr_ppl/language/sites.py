@@ -225,7 +225,7 @@ class SimulatorBlackBox(BlackBox):
         return tuple(sensor.name for sensor in self.simulator.sensors)
 
     def _mask(self) -> Tensor | None:
-        mask = self.inputs.mask
+        mask = self.inputs.mask.to(self.inputs.actions.device)
         return None if bool(mask.all()) else mask[..., None]
 
     def with_effects(self, *effects: Any, parameters: Mapping[str, Tensor]) -> "SimulatorBlackBox":
@@ -239,7 +239,8 @@ class SimulatorBlackBox(BlackBox):
         )
 
     def _run(self, batch_shape: torch.Size) -> Tensor:
-        parameters = self.parameters
+        device = self.inputs.actions.device
+        parameters = {name: value.to(device) for name, value in self.parameters.items()}
         if not self.simulator.is_deterministic:
             # Every element of the batch deserves its own randomness.
             parameters = {name: value.expand(batch_shape) for name, value in parameters.items()}

@@ -69,7 +69,7 @@ def write_fit_figures(
     figure = plot_bands(
         shown.time[0][:-1],
         shown.series(names)[0].numpy(),
-        replayed.series()[0].double().numpy(),
+        replayed.series()[0].double().cpu().numpy(),
         channel_names=names,
         units=[shown.channel_units[shown.channel_names.index(name)] for name in names],
         lines={"most likely": single.series()[0][0].double().numpy()},

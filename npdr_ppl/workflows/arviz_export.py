@@ -50,7 +50,7 @@ def to_arviz(
     members = z.shape[0]
 
     def by_chain(values: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        return {k: v.reshape(members, -1, *v.shape[1:]).numpy() for k, v in values.items()}
+        return {k: _array(v.reshape(members, -1, *v.shape[1:])) for k, v in values.items()}
 
     with seeded(seed, "prior"):
         prior_draws = prior.to_parameters(prior.sample(num_samples))
@@ -70,10 +70,10 @@ def to_arviz(
         dims[name] = _plate_dims(name, observation.value.dim() - 3) + event
         coords[event[2]] = [sensor.name for sensor in box.simulator.sensors]
         inputs = observation.inputs
-        constant[f"{name}_mask"] = inputs.mask.numpy()
-        constant[f"{name}_actions"] = inputs.actions.numpy()
-        constant[f"{name}_rollout"] = inputs.rollout.numpy()
-        constant[f"{name}_start"] = inputs.start.numpy()
+        constant[f"{name}_mask"] = _array(inputs.mask)
+        constant[f"{name}_actions"] = _array(inputs.actions)
+        constant[f"{name}_rollout"] = _array(inputs.rollout)
+        constant[f"{name}_start"] = _array(inputs.start)
         constant[f"{name}_measured"] = np.isin(
             np.arange(len(box.simulator.sensors)), observation.channels or ()
         )
@@ -87,9 +87,9 @@ def to_arviz(
     draws = by_chain(prior.to_parameters(z.flatten(0, 1)))
     data = az.from_dict(
         posterior=draws,
-        prior={k: v[None].numpy() for k, v in prior_draws.items()},
+        prior={k: _array(v[None]) for k, v in prior_draws.items()},
         posterior_predictive=by_chain(predictive),
-        observed_data={n: o.value.numpy() for n, o in observations.items()},
+        observed_data={n: _array(o.value) for n, o in observations.items()},
         constant_data=constant or None,
         sample_stats={
             "lp": posterior.log_prob_reference(z.flatten(0, 1)).reshape(members, -1).numpy()
@@ -125,13 +125,14 @@ def segment_log_likelihood(
         log_prob = -0.5 * (residual.square() / variance + torch.log(2 * torch.pi * variance))
         error_model = "Gaussian, variance estimated"
     if observation.inputs is None or observation.channels is None:
-        return log_prob.flatten(1).sum(-1, keepdim=True), error_model
-    channels = list(observation.channels)
-    log_prob = log_prob[..., channels] * observation.inputs.mask[..., None]
+        return log_prob.flatten(1).sum(-1, keepdim=True).cpu(), error_model
+    channels, mask = list(observation.channels), observation.inputs.mask.cpu()
+    log_prob, residual = log_prob.cpu(), residual.cpu()
+    log_prob = log_prob[..., channels] * mask[..., None]
     log_prob = log_prob.reshape(len(z), -1, *log_prob.shape[-2:])
     # What the mean prediction leaves over tells how far readings of a segment are independent.
     left = residual.mean(0)[..., channels].reshape(log_prob.shape[1:])
-    share = effective_share(left, observation.inputs.mask)
+    share = effective_share(left, mask)
     shown = ", ".join(f"{value:.2g}" for value in share)
     return (log_prob * share).sum((-1, -2)), f"{error_model}, independent readings {shown}"
 
@@ -157,6 +158,10 @@ def effective_share(residual: Tensor, mask: Tensor) -> Tensor:
     sizes = [float(az.ess(values.numpy(), method="mean")) for values in chains.unbind(-1)]
     share = torch.tensor(sizes, dtype=torch.float64) / total
     return share.nan_to_num(1.0).clamp(1 / chains.shape[1], 1.0)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy()
 
 
 def _plate_dims(name: str, num: int) -> list[str]:

@@ -140,7 +140,12 @@ class BoundModel:
         return build
 
 
-def bind(model: Callable[..., Any], data: Data, options: BindingOptions) -> BoundModel:
+def bind(
+    model: Callable[..., Any],
+    data: Data,
+    options: BindingOptions,
+    device: str | torch.device = "cpu",
+) -> BoundModel:
     """Binds a model to measured data.
 
     Args:
@@ -149,6 +154,7 @@ def bind(model: Callable[..., Any], data: Data, options: BindingOptions) -> Boun
             are plain functions.
         data: The observations.
         options: How they are prepared.
+        device: Where trajectories are simulated.
 
     Raises:
         DataError: The data do not fit the model.
@@ -158,7 +164,9 @@ def bind(model: Callable[..., Any], data: Data, options: BindingOptions) -> Boun
     every: list[Rollouts | Tensor] = [data] if not isinstance(data, Mapping) else [*data.values()]
     recorded = [part for part in every if isinstance(part, Rollouts)]
     layout = [
-        part.inputs(options.segment_length, options.initial_state, dtype=options.dtype)
+        part.inputs(options.segment_length, options.initial_state, dtype=options.dtype).to(
+            device=device
+        )
         for part in recorded
     ]
     args: tuple[Any, ...] = ()
@@ -251,7 +259,7 @@ def _observe(
         )
     if embedding is None:
         raise ModelError("Trajectories need an embedding; the default is 'bayessim'.")
-    recorded = data.observation(inputs, channels=measured)
+    recorded = data.observation(inputs, channels=measured).to(inputs.actions.device)
     columns = tuple(names.index(channel) for channel in measured)
     value = recorded.new_zeros((*recorded.shape[:-1], len(names)))
     value[..., list(columns)] = recorded

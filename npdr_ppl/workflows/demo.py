@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -54,13 +54,19 @@ class Demonstration:
 
 
 def run_demo(
-    out: Path, *, data: Path | None = None, seed: int = 0, progress: bool | None = None
+    out: Path,
+    *,
+    data: Path | None = None,
+    initial_state: Literal["estimated", "recorded"] = "estimated",
+    seed: int = 0,
+    progress: bool | None = None,
 ) -> Demonstration:
     """Fits the Furuta pendulum to a recording and holds its last rollout out.
 
     Args:
         out: Folder for results.
         data: A recording of one's own; ``None`` makes one in MuJoCo.
+        initial_state: State at a segment's start.
         seed: Seed of everything random.
         progress: Whether to show progress; ``None`` shows it on a terminal.
     """
@@ -81,7 +87,7 @@ def run_demo(
         rounds=ROUNDS,
         num_simulations=NUM_SIMULATIONS,
         seed=seed,
-        options=BindingOptions(EMBEDDING, SEGMENT_LENGTH, "estimated", "float32"),
+        options=BindingOptions(EMBEDDING, SEGMENT_LENGTH, initial_state, "float32"),
         progress=progress,
     )
     return Demonstration(posterior, result, test, TRUTH if data is None else {})

@@ -56,7 +56,7 @@ def infer(
         segment_length: Steps between re-synchronisations; ``None`` for whole rollouts.
         initial_state: State at a segment's start: ``"estimated"`` or ``"recorded"``.
         precision: Floating-point type of the simulation.
-        device: Where the backend trains.
+        device: Where trajectories are simulated and the backend trains.
         checkpoint: Folder to save every round in; an interrupted run continues from there.
         progress: Whether to show progress; ``None`` shows it on a terminal.
 
@@ -85,7 +85,7 @@ def infer(
         )
     method = backend_by_name(backend) if isinstance(backend, str) else backend
     options = BindingOptions(embedding, segment_length, initial_state, precision)
-    bound = bind(model, data, options)
+    bound = bind(model, data, options, device)
     problem = problem_of(bound, device)
     states = [method.init(problem)]
     infos: list[RoundInfo] = []
@@ -102,7 +102,7 @@ def infer(
             label = f"round {index + 1}/{rounds}"
             started = time.perf_counter()
             with seeded(seed, "propose", index):
-                z = method.ask(problem, states[-1], num_simulations)
+                z = method.ask(problem, states[-1], num_simulations).cpu()
             x = None if store is None else store.simulations(index, z)
             if x is None:
                 x = simulate_features(bound, z, seed, f"round {index}", report, label)
@@ -154,7 +154,7 @@ def simulate_features(
         part = z[start : start + chunk]
         # A stream for each chunk, so that a resumed run simulates the same.
         with seeded(seed, "simulate", purpose, start):
-            features.append(bound.features(bound.prior.execute(part)).float())
+            features.append(bound.features(bound.prior.execute(part)).float().cpu())
         step(min(1.0, (start + chunk) / len(z)), f"{start + len(part)} simulations")
     result = torch.cat(features)
     if not bool(torch.isfinite(result).flatten(1).all(1).any()):

@@ -85,7 +85,7 @@ class Posterior:
         draws = []
         for member, density in enumerate(self.densities):
             with seeded(seed, "posterior", member):
-                draws.append(density.sample(num_samples))
+                draws.append(density.sample(num_samples).cpu())
         return torch.stack(draws)
 
     def sample(self, num_samples: int, *, seed: int = 0) -> dict[str, Tensor]:
@@ -222,7 +222,7 @@ class Posterior:
         options = BindingOptions(**description["binding"])
         if embedding is not None:
             options = replace(options, embedding=embedding)
-        bound = bind(model, folder.data(), options)
+        bound = bind(model, folder.data(), options, device)
         problem = problem_of(bound, device)
         method = backend_by_name(description["backend"], **description["options"])
         state = method.restore(problem, last.tensors, last.values)

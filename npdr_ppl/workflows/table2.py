@@ -6,7 +6,7 @@ with the state re-synchronised to the recording every 200 steps of 2 ms as in th
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -50,7 +50,7 @@ def reproduce_table2(
     backend: str | Backend = "snpe-c",
     rounds: int | None = None,
     num_simulations: int | None = None,
-    initial_state: str = "recorded",
+    initial_state: Literal["estimated", "recorded"] = "recorded",
     seed: int = 0,
     progress: bool | None = None,
 ) -> tuple[Posterior, dict[str, Any]]:
@@ -73,7 +73,7 @@ def reproduce_table2(
     rollouts.check(Furuta.sensors, Furuta.actions)
     train = rollouts[[i for i in range(len(rollouts)) if i not in holdout]]
     test = rollouts[list(holdout)]
-    options = BindingOptions(EMBEDDING, SEGMENT_LENGTH, initial_state, "float32")  # pyright: ignore[reportArgumentType]
+    options = BindingOptions(EMBEDDING, SEGMENT_LENGTH, initial_state, "float32")
     posterior, fitted = fit(
         furuta,
         train,
@@ -86,7 +86,7 @@ def reproduce_table2(
         options=options,
         progress=progress,
     )
-    exact = BindingOptions(EMBEDDING, SEGMENT_LENGTH, initial_state, "float64")  # pyright: ignore[reportArgumentType]
+    exact = BindingOptions(EMBEDDING, SEGMENT_LENGTH, initial_state, "float64")
     nominal = nominal_parameters(furuta, train.inputs(SEGMENT_LENGTH))
     most_likely = {k: torch.tensor(v) for k, v in fitted["most_likely"].items()}
     result = {
