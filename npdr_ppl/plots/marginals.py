@@ -65,7 +65,7 @@ def draw_marginal(
 ) -> None:
     """Draws one marginal density, the prior's in grey behind it."""
     together = posterior if prior is None else np.concatenate([posterior, prior])
-    low, high = np.quantile(together, [0.001, 0.999])
+    low, high = together.min(), together.max()
     grid = np.linspace(low, high, 200)
     if prior is not None and prior.std() > 0:
         axis.fill_between(grid, _density(prior, grid), color=COLORS["prior"], alpha=0.4, lw=0,

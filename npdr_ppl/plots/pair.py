@@ -65,10 +65,10 @@ def plot_pair(
 
 
 def _draw_joint(axis: Axes, posterior: Samples, prior: Samples, x: str, y: str) -> None:
-    bounds = [np.quantile(prior[name], [0.001, 0.999]) for name in (x, y)]
-    density, edges_x, edges_y = np.histogram2d(
-        posterior[x], posterior[y], bins=BINS, range=[tuple(b) for b in bounds]
-    )
+    # The posterior may press against the very edge of the prior.
+    joint = {name: np.concatenate([prior[name], posterior[name]]) for name in (x, y)}
+    bounds = [(values.min(), values.max()) for values in joint.values()]
+    density, edges_x, edges_y = np.histogram2d(posterior[x], posterior[y], bins=BINS, range=bounds)
     axis.pcolormesh(edges_x, edges_y, _smooth(density).T, cmap="Blues", rasterized=True)
     levels = _levels(_smooth(density))
     if len(set(levels)) == len(levels):
