@@ -121,7 +121,8 @@ class FlowNetwork(nn.Module):
             last = [layer for layer in transform.modules() if isinstance(layer, linear)][-1]
             with torch.no_grad():
                 last.weight.mul_(INITIAL_SCALE)
-                last.bias.zero_()
+                if last.bias is not None:
+                    last.bias.zero_()
 
     def context(self, f: Tensor) -> Tensor:
         """Returns h(f), ``(n, num_features)``, at standardised features ``(n, ...)``."""

@@ -90,7 +90,7 @@ class SNPEC(Backend):
         num_atoms: Atoms M of the atomic loss.
         outside: Posterior mass epsilon outside the region of truncated proposals.
         epochs: Passes through the simulations at most.
-        batch_size: Rows of a mini-batch.
+        batch_size: Rows of a mini-batch at most; fewer with few simulations.
         learning_rate: Peak of the one-cycle schedule.
         weight_decay: Decoupled weight decay.
         averaging: Decay of the running average of the weights.
