@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem
 
-__all__ = ["sample_truncated_prior"]
+__all__ = ["log_density_bound", "sample_truncated_prior"]
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ def sample_truncated_prior(
     Returns:
         Draws ``(num_samples, d)``.
     """
-    tau = posterior.log_prob(posterior.sample(NUM_BOUND_SAMPLES)).quantile(outside)
+    tau = log_density_bound(posterior, outside)
     accepted: list[Tensor] = []
     found, tried = 0, 0
     while found < num_samples:
@@ -59,6 +59,11 @@ def sample_truncated_prior(
             logger.info("Resampling: %d of %d prior draws lie in the region.", found, tried)
             return _resample(problem, num_samples, posterior, tau)
     return torch.cat(accepted)[:num_samples]
+
+
+def log_density_bound(posterior: Density, outside: float) -> Tensor:
+    """Returns tau such that a fraction ``outside`` of q's mass has log q below it."""
+    return posterior.log_prob(posterior.sample(NUM_BOUND_SAMPLES)).quantile(outside)
 
 
 def _resample(problem: Problem, num_samples: int, posterior: Density, tau: Tensor) -> Tensor:
