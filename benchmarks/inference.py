@@ -18,12 +18,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from tasks import DATA, TASKS, Task, c2st, load_reference
+from tasks import DATA, TASKS, Task, load_reference
 from torch import Tensor
 
 from npdr_ppl.inference.base import Problem
 from npdr_ppl.inference.mixture import Mixture
 from npdr_ppl.inference.registry import backend
+from npdr_ppl.metrics import c2st
 
 NUM_SAMPLES = 10_000
 
@@ -123,7 +124,7 @@ def run(
         start = time.process_time()
         draws = sample(reference.observation)
         seconds = time.process_time() - start
-        score = c2st(reference.samples, draws)
+        score = c2st(draws, reference.samples)
         rows.append(Row(method, task.name, number, rounds, wall, cpu, seconds, score))
         print(
             f"{method:16} {task.name:17} {number:3} {rounds:6} {wall:8.1f} {cpu:8.1f} "

@@ -7,7 +7,6 @@ which the prior is N(0, I): a uniform prior U(a, b) becomes z = Phi^-1((theta - 
 """
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["DATA", "TASKS", "Reference", "Task", "c2st", "load_reference"]
+__all__ = ["DATA", "TASKS", "Reference", "Task", "load_reference"]
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -128,29 +127,3 @@ def load_reference(task: str, observation: int, data: Path = DATA) -> Reference:
         read("true_parameters.csv")[0],
         read("reference_posterior_samples.csv.bz2"),
     )
-
-
-def c2st(reference: Tensor, samples: Tensor, seed: int = 1) -> float:
-    """Scores samples by how well a classifier tells them from the reference.
-
-    The cross-validated accuracy (5 folds) of a network with two hidden layers of 10 d units on
-    data standardised by the reference; 0.5 is perfect, 1 is useless (Lueckmann et al. 2021, §3.2).
-
-    Args:
-        reference: Draws from the exact posterior, ``(n, d)``.
-        samples: As many draws from the approximation, ``(n, d)``.
-        seed: Seed of the folds and the network.
-    """
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.model_selection import KFold, cross_val_score
-    from sklearn.neural_network import MLPClassifier
-
-    mean, scale = reference.mean(0), reference.std(0)
-    data = ((torch.cat((reference, samples)) - mean) / scale).numpy()
-    label = np.repeat([0, 1], [len(reference), len(samples)])
-    width = 10 * reference.shape[1]
-    network = MLPClassifier((width, width), max_iter=1000, solver="adam", random_state=seed)
-    folds = KFold(5, shuffle=True, random_state=seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        return float(cross_val_score(network, data, label, cv=folds, scoring="accuracy").mean())

@@ -199,3 +199,13 @@ def test_pit_by_hand_and_masked_coverage():
     torch.testing.assert_close(values, torch.tensor([0.1, 0.5, 0.7, 0.9]))
     mask = torch.tensor([True, True, False, False])
     assert metrics.coverage(values, [0.1, 0.8], mask).tolist() == pytest.approx([0.5, 1.0])
+
+
+def test_c2st_is_half_for_equals_and_one_for_strangers():
+    torch.manual_seed(0)
+    first, second = torch.randn(500, 2), torch.randn(500, 2)
+    # The accuracy of a coin over 1000 labels: four standard deviations.
+    assert abs(metrics.c2st(first, second) - 0.5) < 4 * 0.5 / 1_000**0.5
+    assert metrics.c2st(first, second + 10) > 0.99
+    with pytest.raises(ShapeError, match="c2st compares"):
+        metrics.c2st(first, second[:, :1])
