@@ -10,6 +10,7 @@ import io
 import math
 import pickletools
 import struct
+import warnings
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
@@ -102,12 +103,16 @@ def read_pickle(data: bytes, records: Collection[str]) -> Any:
         DataError: The pickle is damaged or asks for anything else than data.
     """
     try:
-        return _Machine(io.BytesIO(data), len(data), frozenset(records)).run()
+        with warnings.catch_warnings():
+            # How the standard library answers a damaged escape sequence in an old string.
+            warnings.simplefilter("error", DeprecationWarning)
+            return _Machine(io.BytesIO(data), len(data), frozenset(records)).run()
     except DataError:
         raise
     # A malformed program ends in whatever its operands provoke; all of it means "damaged".
     except (
         AttributeError,
+        DeprecationWarning,
         EOFError,
         IndexError,
         KeyError,
