@@ -20,6 +20,7 @@ import pyro
 import torch
 from numpy.typing import NDArray
 from pyro.infer import MCMC, NUTS
+from pyro.infer.autoguide.initialization import init_to_value
 from torch import Tensor
 
 from npdr_ppl.inference.base import Backend
@@ -111,16 +112,16 @@ def reproduce_pendulum(
         )
         inputs = rollouts.inputs(initial_state="recorded")
         observed = rollouts.observation(inputs)
-        reference = nuts_samples(inputs, observed, seed=seed)
+        exact = exact_samples(inputs, observed, seed=seed)
+        reference = nuts_samples(inputs, observed, start=exact.mean(0), seed=seed)
         ridge = Ridge(posterior, reference, valley(inputs, observed))
         ridges[duration] = ridge
-        exact = exact_samples(inputs, observed, seed=seed)
-        for method, samples in (
+        for label, samples in (
             (posterior.backend.name, ridge.samples(ROUNDS - 1)),
             ("nuts", reference),
             ("grid", exact),
         ):
-            rows[f"{method}, {duration}"] = {
+            rows[f"{label}, {duration}"] = {
                 name: {"mean": value, "std": 0.0}
                 for name, value in figures(samples, reference, ridge.valley).items()
             }
@@ -219,11 +220,27 @@ def _distances(inputs: Inputs, observed: Tensor) -> tuple[Tensor, Tensor]:
     return axis, torch.cat(parts)
 
 
-def nuts_samples(inputs: Inputs, observed: Tensor, *, seed: int) -> NDArray[np.float64]:
-    """Draws from the posterior by Pyro's NUTS through the differentiable simulator, ``(n, 2)``."""
+def nuts_samples(
+    inputs: Inputs, observed: Tensor, *, start: NDArray[np.float64], seed: int
+) -> NDArray[np.float64]:
+    """Draws from the posterior by Pyro's NUTS through the differentiable simulator, ``(n, 2)``.
+
+    Args:
+        inputs: The segment.
+        observed: The recording, ``(1, K, 2)``.
+        start: Mass and length to start from; far from the posterior a step takes long.
+        seed: Seed of the draws.
+    """
     conditioned = pyro.condition(partial(pendulum, noise=NOISE), data={"trajectory": observed})
+    values = {"mass": torch.tensor(start[0]), "length": torch.tensor(start[1])}
     with seeded(seed, "nuts"):
-        kernel = NUTS(conditioned, max_tree_depth=6)
+        kernel = NUTS(
+            conditioned,
+            step_size=0.01,  # pyright: ignore[reportArgumentType]  # Pyro says int
+            full_mass=True,
+            max_tree_depth=5,
+            init_strategy=init_to_value(values=values),
+        )
         sampler = MCMC(
             kernel, num_samples=NUM_SAMPLES // 2, warmup_steps=200, disable_progbar=True
         )
