@@ -4,18 +4,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
 __all__ = ["show_fit", "show_rows"]
 
+WIDTH = 100
+"""Columns of a table that is written to a file or a pipe."""
+
 
 def show_fit(result: Mapping[str, Any], out: Path) -> None:
     """Prints the content of ``fit.json``."""
-    console = Console()
-    table = Table(title=f"Posterior ({result['backend']})")
+    console = _console()
+    table = Table(title=f"Posterior ({result['backend']})", box=SIMPLE)
     for column in ("parameter", "mean", "sd", "94 % HDI", "most likely", "contraction"):
-        table.add_column(column, justify="left" if column == "parameter" else "right")
+        justify = "left" if column == "parameter" else "right"
+        table.add_column(column, justify=justify, no_wrap=True)
     contraction = result["diagnosis"]["contraction"]
     for name, p in result["parameters"].items():
         table.add_row(
@@ -41,7 +46,7 @@ def show_fit(result: Mapping[str, Any], out: Path) -> None:
 
 def show_rows(title: str, result: Mapping[str, Any]) -> None:
     """Prints the content of a reproduction's JSON: ours beside the paper's."""
-    table = Table(title=title)
+    table = Table(title=title, box=SIMPLE)
     metrics = sorted({m for row in result["rows"].values() for m in row})
     table.add_column("method")
     for metric in metrics:
@@ -53,7 +58,13 @@ def show_rows(title: str, result: Mapping[str, Any]) -> None:
             paper = result["paper"].get(method, {}).get(metric)
             cells += [_figure(row.get(metric)), _figure(paper)]
         table.add_row(*cells)
-    Console().print(table)
+    _console().print(table)
+
+
+def _console() -> Console:
+    console = Console()
+    # Without a terminal rich assumes 80 columns, which would cut numbers in two.
+    return console if console.is_terminal else Console(width=WIDTH)
 
 
 def _figure(value: Mapping[str, float] | None) -> str:

@@ -2,7 +2,10 @@
 
 import json
 import math
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +98,30 @@ def test_fit_takes_a_models_file_and_effects(monkeypatch, capsys, tmp_path, reco
     assert code == 0
     fit = json.loads((out / "fit.json").read_text())
     assert set(fit["parameters"]) == {"mass", "hinge.coulomb_friction.magnitude"}
+
+
+@pytest.mark.slow
+def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path, recording):
+    words = [
+        "fit", "pendulum", "--data", recording, "--rounds", 3, "--simulations", 300,
+        "--segment-length", 25, "--embedding", "all/5", "--quiet", "--out",
+    ]  # fmt: skip
+    killed = tmp_path / "killed"
+    command = [sys.executable, "-m", "npdr_ppl.cli", *map(str, words), str(killed)]
+    process = subprocess.Popen(command)
+    deadline = time.monotonic() + 120
+    while not (killed / "run" / "round_0.json").exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (killed / "fit.json").exists()
+    results = []
+    for out in (killed, tmp_path / "undisturbed"):
+        assert run(monkeypatch, capsys, *words, out)[0] == 0
+        results.append(json.loads((out / "fit.json").read_text()))
+    assert results[0]["parameters"] == results[1]["parameters"]
+    assert results[0]["metrics"] == results[1]["metrics"]
 
 
 @pytest.mark.parametrize(
