@@ -13,6 +13,7 @@ import dataclasses
 import hashlib
 import inspect
 import json
+import math
 import platform
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -173,7 +174,7 @@ class RunFolder:
 def write_json(path: Path, value: Any) -> None:
     """Writes JSON in one step."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(_plain(value), indent=2, allow_nan=True) + "\n")
+        temporary.write_text(json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -226,16 +227,16 @@ def _fingerprint(tensor: Tensor) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Turns tensors, tuples and mappings into what JSON has."""
+    """Turns tensors, tuples and mappings into what JSON has; NaN and infinity become null."""
     if isinstance(value, Tensor):
-        return value.tolist()
+        return _plain(value.tolist())
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
         return [_plain(v) for v in value]
     if hasattr(value, "item") and not isinstance(value, str):
-        return value.item()
-    return value
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
