@@ -47,16 +47,19 @@ def show_fit(result: Mapping[str, Any], out: Path) -> None:
 def show_rows(title: str, result: Mapping[str, Any]) -> None:
     """Prints the content of a reproduction's JSON: ours beside the paper's."""
     table = Table(title=title, box=SIMPLE)
-    metrics = sorted({m for row in result["rows"].values() for m in row})
-    table.add_column("method")
+    metrics = list(dict.fromkeys(m for row in result["rows"].values() for m in row))
+    published = {m for row in result["paper"].values() for m in row}
+    table.add_column("method", no_wrap=True)
     for metric in metrics:
-        table.add_column(f"{metric}, here", justify="right")
-        table.add_column(f"{metric}, paper", justify="right")
+        table.add_column(metric, justify="right", no_wrap=True)
+        if metric in published:
+            table.add_column(f"{metric}, paper", justify="right", no_wrap=True)
     for method, row in result["rows"].items():
         cells = [method]
         for metric in metrics:
-            paper = result["paper"].get(method, {}).get(metric)
-            cells += [_figure(row.get(metric)), _figure(paper)]
+            cells.append(_figure(row.get(metric)))
+            if metric in published:
+                cells.append(_figure(result["paper"].get(method, {}).get(metric)))
         table.add_row(*cells)
     _console().print(table)
 
@@ -68,4 +71,7 @@ def _console() -> Console:
 
 
 def _figure(value: Mapping[str, float] | None) -> str:
-    return "–" if value is None else f"{value['mean']:.4g} ± {value['std']:.2g}"
+    if value is None:
+        return "–"
+    spread = f" ± {value['std']:.2g}" if value["std"] else ""
+    return f"{value['mean']:.4g}{spread}"
