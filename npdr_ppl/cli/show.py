@@ -10,6 +10,9 @@ from rich.table import Table
 
 __all__ = ["show_fit", "show_rows"]
 
+FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
+"""Columns of figures with the width they need."""
+
 WIDTH = 100
 """Columns of a table that is written to a file or a pipe."""
 
@@ -18,9 +21,10 @@ def show_fit(result: Mapping[str, Any], out: Path) -> None:
     """Prints the content of ``fit.json``."""
     console = _console()
     table = Table(title=f"Posterior ({result['backend']})", box=SIMPLE)
-    for column in ("parameter", "mean", "sd", "94 % HDI", "most likely", "contraction"):
-        justify = "left" if column == "parameter" else "right"
-        table.add_column(column, justify=justify, no_wrap=True)
+    # Long names of effects' parameters are folded; figures stay whole.
+    table.add_column("parameter", overflow="fold")
+    for column, width in FIGURES.items():
+        table.add_column(column, justify="right", no_wrap=True, min_width=width)
     contraction = result["diagnosis"]["contraction"]
     for name, p in result["parameters"].items():
         table.add_row(
