@@ -55,10 +55,6 @@ logger = logging.getLogger(__name__)
 MIN_SIMULATIONS = 10
 """Simulations below which there is nothing to hold out and no covariance to estimate."""
 
-NEIGHBOURHOOD = 1e-3
-"""Posterior mass outside the neighbourhood whose simulations are trained on, relative to that
-outside the region of the proposals. The margin shows a flow what lies beyond the region's edge."""
-
 FLOWS = ("nsf", "maf")
 PROPOSALS = ("truncated", "atomic")
 
@@ -315,9 +311,9 @@ class SNPEC(Backend):
             return torch.ones(len(state.z), dtype=torch.bool)
         with torch.no_grad():
             posterior = Mixture(self.densities(problem, state))
-            return posterior.log_prob(state.z) > log_density_bound(
-                posterior, NEIGHBOURHOOD * self.outside
-            )
+            # As wide as the posterior's draws reach: the margin around the region of the
+            # proposals shows a flow what lies beyond that region's edge.
+            return posterior.log_prob(state.z) > log_density_bound(posterior, 0.0)
 
     def _networks(self, problem: Problem) -> list[FlowNetwork]:
         return build_networks(
