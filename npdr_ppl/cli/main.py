@@ -1,5 +1,6 @@
 """Entry point of `npdr`: the commands, and one sentence with exit code 2 for bad input."""
 
+import os
 import sys
 
 import typer
@@ -27,6 +28,9 @@ app.command("effects", rich_help_panel="What there is")(listings.effects)
 
 def main() -> None:
     """Runs the command line."""
+    # Threads of torch that spin while they wait bring a busy machine to a crawl; OpenMP reads
+    # this when torch is first imported, which is after this line.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         app()
     except NpdrError as error:
