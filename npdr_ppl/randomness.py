@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
-__all__ = ["derived_seed", "generator", "seeded"]
+__all__ = ["derived_seed", "seeded"]
 
 
 def derived_seed(seed: int, *purpose: str | int) -> int:
@@ -25,19 +25,11 @@ def derived_seed(seed: int, *purpose: str | int) -> int:
     return (int(state[0]) << 31) ^ int(state[1])
 
 
-def generator(
-    seed: int, *purpose: str | int, device: str | torch.device = "cpu"
-) -> torch.Generator:
-    """Returns a torch generator seeded for one purpose; see :func:`derived_seed`."""
-    return torch.Generator(device=device).manual_seed(derived_seed(seed, *purpose))
-
-
 @contextmanager
 def seeded(seed: int, *purpose: str | int) -> Iterator[None]:
     """Seeds torch's global stream inside the block and restores the caller's stream after it.
 
-    Pyro and zuko draw from torch's global stream; code that owns a generator uses
-    :func:`generator` instead.
+    Pyro and zuko draw from torch's global stream and take no generator.
     """
     devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
     with torch.random.fork_rng(devices=devices):

@@ -36,11 +36,13 @@ def resolve_model(word: str) -> Callable[..., Any]:
 def _load_function(path: Path, function: str) -> Callable[..., Any]:
     if not path.is_file():
         raise ModelError(f"{path} does not exist.")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    # Under a name of its own: a file called json.py must not take the library's place.
+    name = f"_npdr_model_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ModelError(f"{path} is not a Python file.")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
+    sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
     except Exception as error:

@@ -100,13 +100,6 @@ class BoundModel:
     data: Mapping[str, Rollouts | Tensor]
     options: "BindingOptions"
 
-    def conditioned(self) -> Callable[..., Any]:
-        """Returns the model with all black-box sites observed, e.g. for Pyro's NUTS."""
-        import pyro
-
-        data = {name: observation.value for name, observation in self.observations.items()}
-        return pyro.condition(self.model, data=data)
-
     def features(self, outputs: Mapping[str, Tensor]) -> Tensor:
         """Maps the sites' outputs to one feature array per simulation."""
         parts = [o.features(outputs[name]) for name, o in self.observations.items()]

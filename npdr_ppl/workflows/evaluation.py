@@ -17,7 +17,7 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts, stitch
 from npdr_ppl.workflows.binding import BindingOptions
 
-__all__ = ["Replay", "nominal_parameters", "replay", "residual_noise", "score"]
+__all__ = ["Replay", "declares_noise", "nominal_parameters", "replay", "residual_noise", "score"]
 
 
 @dataclass(frozen=True)
@@ -111,6 +111,12 @@ def nominal_parameters(model: Callable[..., Any], inputs: Inputs) -> dict[str, T
     if missing:
         raise DataError(f"The simulator has no nominal value for {', '.join(missing)}.")
     return {site.name: nominal[site.name].expand(site.shape) for site in prior.sites}
+
+
+def declares_noise(model: Callable[..., Any], rollouts: Rollouts, options: BindingOptions) -> bool:
+    """Returns whether a model gives its readings noise of its own."""
+    inputs = rollouts.inputs(options.segment_length, options.initial_state, dtype=options.dtype)
+    return any(box.noise is not None for box in Prior(model, (inputs,)).black_boxes.values())
 
 
 def residual_noise(

@@ -13,7 +13,7 @@ from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.diagnostics import diagnose
-from npdr_ppl.workflows.evaluation import residual_noise, score
+from npdr_ppl.workflows.evaluation import declares_noise, residual_noise, score
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.posterior import Posterior
 from npdr_ppl.workflows.run_folder import write_json
@@ -61,7 +61,9 @@ def fit(
         The posterior and the content of ``fit.json``.
     """
     options = options or BindingOptions()
-    used_noise = residual_noise(model, train, options, seed=seed) if noise == "auto" else None
+    used_noise = None
+    if noise == "auto" and not declares_noise(model, train, options):
+        used_noise = residual_noise(model, train, options, seed=seed)
     noisy = model if used_noise is None else with_noise(model, used_noise)
     posterior = infer(
         noisy,

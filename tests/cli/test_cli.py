@@ -81,14 +81,14 @@ def test_fit_writes_what_the_documentation_promises(monkeypatch, capsys, tmp_pat
 
 
 def test_fit_takes_a_models_file_and_effects(monkeypatch, capsys, tmp_path, recording):
-    file = tmp_path / "mine.py"
+    file = tmp_path / "json.py"  # must not take the standard library's place
     file.write_text(
         "import pyro, pyro.distributions as dist\n"
         "import npdr_ppl as npdr\n"
         "from npdr_ppl.models.pendulum import Pendulum\n\n"
         "def heavy(inputs):\n"
         "    mass = pyro.sample('mass', dist.Uniform(0.3, 1.7))\n"
-        "    return npdr.simulate('trajectory', Pendulum(), {'mass': mass}, inputs)\n"
+        "    return npdr.simulate('trajectory', Pendulum(), {'mass': mass}, inputs, noise=0.1)\n"
     )
     out = tmp_path / "fit"
     code, _, _ = run(
@@ -98,6 +98,8 @@ def test_fit_takes_a_models_file_and_effects(monkeypatch, capsys, tmp_path, reco
     assert code == 0
     fit = json.loads((out / "fit.json").read_text())
     assert set(fit["parameters"]) == {"mass", "hinge.coulomb_friction.magnitude"}
+    assert fit["noise"] is None, "the model's own noise is kept"
+    assert sys.modules["json"] is json
 
 
 @pytest.mark.slow
