@@ -29,6 +29,8 @@ class Problem:
         build_network: Makes an untrained embedding network for arrays of the observation's shape,
             learnt jointly with the estimator; ``None`` if the features are final.
         device: Where to train.
+        log_likelihood: Log density of the recording at points ``(n, d)``, shape ``(n,)``,
+            differentiable, for models that have one; ``None`` for black boxes.
     """
 
     num_parameters: int
@@ -38,6 +40,7 @@ class Problem:
     is_prior_standard_normal: bool = True
     build_network: Callable[[], nn.Module] | None = None
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    log_likelihood: Callable[[Tensor], Tensor] | None = None
 
 
 class Density(ABC):

@@ -29,58 +29,29 @@ Two kinds of proposals do that:
 The flows are trained on preconditioned data, see :mod:`npdr_ppl.inference.features`.
 """
 
-import logging
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from time import perf_counter
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
-from npdr_ppl.errors import BackendError, ShapeError
-from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
-from npdr_ppl.inference.checks import check_problem, finite_rows
-from npdr_ppl.inference.features import Preconditioner, fit_preconditioner
+from npdr_ppl.inference.base import Density, Problem, State
+from npdr_ppl.inference.features import Preconditioner
 from npdr_ppl.inference.flows import FlowDensity, FlowNetwork, build_networks, load_member
 from npdr_ppl.inference.mixture import Mixture
+from npdr_ppl.inference.neural import NeuralBackend, NeuralState, Simulations
 from npdr_ppl.inference.proposals import log_density_bound, sample_truncated_prior
-from npdr_ppl.inference.training import LogProb, Loss, TrainingOptions, train
+from npdr_ppl.inference.training import LogProb, Loss
 
-__all__ = ["SNPEC", "SNPECState", "atomic_loss"]
-
-logger = logging.getLogger(__name__)
-
-MIN_SIMULATIONS = 10
-"""Simulations below which there is nothing to hold out and no covariance to estimate."""
+__all__ = ["SNPEC", "atomic_loss"]
 
 FLOWS = ("nsf", "maf")
 PROPOSALS = ("truncated", "atomic")
 
 
 @dataclass(frozen=True)
-class SNPECState(State):
-    """What the next round needs.
-
-    Attributes:
-        z: Parameters of all successful simulations, ``(n, d)``.
-        x: Their features, ``(n,) + observation.shape``.
-        rounds: The round each came from, ``(n,)``.
-        weights: The networks' parameters and buffers by name, each ``(members, ...)``; empty
-            before the first round.
-        preconditioner: What the networks' data are preconditioned with.
-    """
-
-    z: Tensor
-    x: Tensor
-    rounds: Tensor
-    weights: Mapping[str, Tensor]
-    preconditioner: Preconditioner | None
-
-
-@dataclass(frozen=True)
-class SNPEC(Backend):
+class SNPEC(NeuralBackend):
     """Sequential neural posterior estimation, SNPE-C; see the module's text for the method.
 
     Args:
@@ -88,17 +59,11 @@ class SNPEC(Backend):
         transforms: Transforms of a flow.
         hidden: Widths of the hidden layers of each transform's conditioner.
         bins: Bins of a spline.
-        members: Independently trained flows; the posterior is their mixture.
         proposals: ``"truncated"`` or ``"atomic"``.
         num_atoms: Atoms M of the atomic loss.
         outside: Posterior mass epsilon outside the region of truncated proposals.
-        epochs: Passes through the simulations at most.
-        batch_size: Rows of a mini-batch at most; fewer with few simulations.
-        learning_rate: Peak of the one-cycle schedule.
-        weight_decay: Decoupled weight decay.
-        averaging: Decay of the running average of the weights.
-        validation_fraction: Fraction of the simulations each member holds out.
-        patience: Epochs without improvement after which training stops.
+
+    The other options are those of :class:`~npdr_ppl.inference.neural.NeuralBackend`.
     """
 
     name: ClassVar[str] = "snpe-c"
@@ -108,60 +73,25 @@ class SNPEC(Backend):
     transforms: int = 2
     hidden: tuple[int, ...] = (128, 128)
     bins: int = 8
-    members: int = 2
     proposals: Literal["truncated", "atomic"] = "truncated"
     num_atoms: int = 10
     outside: float = 1e-2
-    epochs: int = 30
-    batch_size: int = 512
-    learning_rate: float = 1e-2
-    weight_decay: float = 0.0
-    averaging: float = 0.99
-    validation_fraction: float = 0.1
-    patience: int = 20
 
     def __post_init__(self) -> None:
         """Validates the options."""
-        for option, allowed in (("flow", FLOWS), ("proposals", PROPOSALS)):
-            if getattr(self, option) not in allowed:
-                raise BackendError(
-                    f"snpe-c: {option} must be one of {', '.join(allowed)}; "
-                    f"got {getattr(self, option)!r}."
-                )
-        object.__setattr__(self, "hidden", tuple(self.hidden))
-        positive = {"transforms", "bins", "members", "epochs", "batch_size", "patience"}
-        bounds = {name: (1, float("inf")) for name in positive} | {
-            "num_atoms": (2, float("inf")),
-            "outside": (0.0, 0.5),
-            "learning_rate": (1e-12, float("inf")),
-            "weight_decay": (0.0, float("inf")),
-            "averaging": (0.0, 1 - 1e-9),
-            "validation_fraction": (1e-9, 0.9),
-        }
-        for option, (low, high) in bounds.items():
-            if not low <= getattr(self, option) <= high:
-                raise BackendError(
-                    f"snpe-c: {option} must lie between {low} and {high}; "
-                    f"got {getattr(self, option)}."
-                )
-        if not self.hidden or min(self.hidden) < 1:
-            raise BackendError(f"snpe-c: hidden must name positive widths; got {self.hidden}.")
-
-    def init(self, problem: Problem) -> SNPECState:
-        """Returns the state before any simulation."""
-        check_problem(problem)
-        return SNPECState(
-            round=0,
-            z=torch.empty(0, problem.num_parameters),
-            x=torch.empty(0, *problem.observation.shape),
-            rounds=torch.empty(0, dtype=torch.long),
-            weights={},
-            preconditioner=None,
+        super().__post_init__()
+        self._check_choice("flow", FLOWS)
+        self._check_choice("proposals", PROPOSALS)
+        self._check_widths("hidden")
+        self._check_ranges(
+            transforms=(1, float("inf")),
+            bins=(1, float("inf")),
+            num_atoms=(2, float("inf")),
+            outside=(0.0, 0.5),
         )
 
     def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
         """Proposes parameters to simulate, ``(num_simulations, d)``."""
-        state = _own(state)
         if state.round == 0:
             return problem.sample_prior(num_simulations)
         posterior = Mixture(self.densities(problem, state))
@@ -170,84 +100,10 @@ class SNPEC(Backend):
         with torch.no_grad():
             return sample_truncated_prior(problem, num_simulations, posterior, self.outside)
 
-    def tell(
-        self,
-        problem: Problem,
-        state: State,
-        z: Tensor,
-        x: Tensor,
-        progress: Callable[[float, str], None] | None = None,
-    ) -> tuple[SNPECState, RoundInfo]:
-        """Trains the ensemble anew on the simulations so far; see :meth:`Backend.tell`.
-
-        Raises:
-            ShapeError: The shapes do not fit the problem.
-            BackendError: Too few simulations succeeded.
-        """
-        start = perf_counter()
-        state = _own(state)
-        num_simulations = len(z)
-        min_rows = MIN_SIMULATIONS if state.round == 0 else 1
-        z, x, num_failed = finite_rows(problem, z.detach().cpu(), x.detach().cpu(), min_rows)
-        if num_failed:
-            logger.warning("%d of %d simulations failed.", num_failed, num_simulations)
-        all_z, all_x = torch.cat((state.z, z)), torch.cat((state.x, x))
-        rounds = torch.full((len(z),), state.round, dtype=torch.long)
-        all_rounds = torch.cat((state.rounds, rounds))
-        near = torch.ones(len(all_z), dtype=torch.bool)
-        near[: len(state.z)] = self._near_posterior(problem, state)
-        z, x, rounds = all_z[near], all_x[near], all_rounds[near]
-        preconditioner = fit_preconditioner(z, x, is_raw=problem.build_network is not None)
-        clipped = preconditioner.outside(problem.observation.cpu())
-        if clipped.any():
-            logger.warning(
-                "%d of %d features of the observation lie outside the simulated range and were "
-                "clipped to it: %s. The model may be wrong or its prior too narrow.",
-                int(clipped.sum()),
-                clipped.numel(),
-                clipped.flatten().nonzero().flatten().tolist()[:10],
-            )
-        device = problem.device
-        f = preconditioner.features(x).to(device)
-        fit = train(
-            self._networks(problem),
-            self._loss(problem, preconditioner.to(device), z, f, rounds),
-            len(z),
-            TrainingOptions(
-                epochs=self.epochs,
-                batch_size=self.batch_size,
-                learning_rate=self.learning_rate,
-                weight_decay=self.weight_decay,
-                averaging=self.averaging,
-                validation_fraction=self.validation_fraction,
-                patience=self.patience,
-            ),
-            device,
-            is_vectorised=problem.build_network is None,
-            progress=progress,
-        )
-        weights = {name: value.cpu() for name, value in fit.weights.items()}
-        state = SNPECState(state.round + 1, all_z, all_x, all_rounds, weights, preconditioner)
-        info = RoundInfo(
-            num_simulations,
-            num_failed,
-            perf_counter() - start,
-            {
-                "validation_log_prob": (fit.validation.cpu() + preconditioner.log_det).tolist(),
-                "best_epoch": fit.best_epochs.tolist(),
-                "epochs": fit.epochs,
-                "trained_on": len(z),
-                "clipped_features": int(clipped.sum()),
-            },
-        )
-        return state, info
-
     def densities(self, problem: Problem, state: State) -> list[Density]:
         """Returns the posterior of every ensemble member."""
-        state = _own(state)
-        if state.preconditioner is None:
-            raise BackendError("There is no posterior yet: tell the backend simulations first.")
-        preconditioner = state.preconditioner.to(problem.device)
+        state, preconditioner = self._trained(state)
+        preconditioner = preconditioner.to(problem.device)
         observation = problem.observation.to(problem.device, torch.float32)
         build = partial(self._networks, problem)
         return [
@@ -259,61 +115,16 @@ class SNPEC(Backend):
             for k in range(self.members)
         ]
 
-    def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Splits a state into tensors and JSON-serialisable values."""
-        state = _own(state)
-        tensors = {"z": state.z, "x": state.x, "rounds": state.rounds}
-        tensors |= {f"weights.{name}": value for name, value in state.weights.items()}
-        if state.preconditioner is not None:
-            parts = state.preconditioner.tensors()
-            tensors |= {f"preconditioner.{name}": value for name, value in parts.items()}
-        return tensors, {"backend": self.name, "round": state.round}
-
-    def restore(
-        self, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
-    ) -> SNPECState:
-        """Rebuilds a state from :meth:`tensors`.
-
-        Raises:
-            ShapeError: It is the state of another problem.
-            BackendError: It is the state of another backend.
-        """
-        if values.get("backend") != self.name:
-            raise BackendError(f"This state is of backend {values.get('backend')!r}, not snpe-c.")
-        z, x = tensors["z"], tensors["x"]
-        if z.shape[1] != problem.num_parameters or x.shape[1:] != problem.observation.shape:
-            raise ShapeError(
-                f"The state holds parameters {tuple(z.shape)} and features {tuple(x.shape)}; the "
-                f"problem has {problem.num_parameters} parameters and features "
-                f"{tuple(problem.observation.shape)}."
-            )
-        parts = {
-            prefix: {
-                name.removeprefix(f"{prefix}."): value
-                for name, value in tensors.items()
-                if name.startswith(f"{prefix}.")
-            }
-            for prefix in ("weights", "preconditioner")
-        }
-        fitted = parts["preconditioner"]
-        return SNPECState(
-            round=int(values["round"]),
-            z=z,
-            x=x,
-            rounds=tensors["rounds"],
-            weights=parts["weights"],
-            preconditioner=Preconditioner.from_tensors(fitted) if fitted else None,
-        )
-
-    def _near_posterior(self, problem: Problem, state: SNPECState) -> Tensor:
+    def _training_rows(self, problem: Problem, state: NeuralState) -> Tensor:
         """Returns which simulations lie in the neighbourhood to train on, ``(n,)``."""
         if self.proposals == "atomic" or state.round == 0:
-            return torch.ones(len(state.z), dtype=torch.bool)
+            return super()._training_rows(problem, state)
         with torch.no_grad():
             posterior = Mixture(self.densities(problem, state))
             # As wide as the posterior's draws reach: the margin around the region of the
             # proposals shows a flow what lies beyond that region's edge.
-            return posterior.log_prob(state.z) > log_density_bound(posterior, 0.0)
+            bound = log_density_bound(posterior, 0.0)
+            return posterior.log_prob(state.simulations.z) > bound
 
     def _networks(self, problem: Problem) -> list[FlowNetwork]:
         return build_networks(
@@ -328,25 +139,21 @@ class SNPEC(Backend):
         )
 
     def _loss(
-        self,
-        problem: Problem,
-        preconditioner: Preconditioner,
-        z: Tensor,
-        f: Tensor,
-        rounds: Tensor,
+        self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
     ) -> Loss:
         """Returns the objective of the present round on the training device."""
-        device = f.device
-        if self.proposals == "truncated" or not rounds.any():
-            u = preconditioner.whiten(z.to(device), f)
+        z, f = simulations.z.to(problem.device), simulations.x.to(problem.device)
+        f = preconditioner.features(f)
+        u = preconditioner.whiten(z, f)
+        if self.proposals == "truncated" or not simulations.rounds.any():
             return lambda log_prob, rows: -log_prob(u[rows], f[rows])
         return partial(
             atomic_loss,
-            preconditioner.whiten(z.to(device), f),
+            u,
             f,
-            preconditioner.spread(z.to(device)),
-            problem.log_prior(z).to(device),
-            (rounds == 0).to(device),
+            preconditioner.spread(z),
+            problem.log_prior(simulations.z).to(problem.device),
+            (simulations.rounds == 0).to(problem.device),
             self.num_atoms,
         )
 
@@ -389,9 +196,3 @@ def atomic_loss(
     ratio = log_q - log_prior[atoms]
     loss = ratio.logsumexp(-1) - ratio[..., 0]
     return loss - torch.where(is_prior[rows], log_q[..., 0], 0.0)
-
-
-def _own(state: State) -> SNPECState:
-    if not isinstance(state, SNPECState):
-        raise BackendError(f"snpe-c cannot continue from a {type(state).__name__}.")
-    return state
