@@ -12,6 +12,7 @@ problems u given f is N(0, I) and nothing is left to learn.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -107,16 +108,16 @@ class Preconditioner:
         """Log determinant of du/dz, a scalar."""
         return -self.factor.diagonal().log().sum()
 
-    def to(self, device: torch.device) -> "Preconditioner":
+    def to(self, device: torch.device) -> Self:
         """Returns a copy on a device."""
-        return Preconditioner(**{k: v.to(device) for k, v in self.tensors().items()})
+        return type(self)(**{k: v.to(device) for k, v in self.tensors().items()})
 
     def tensors(self) -> dict[str, Tensor]:
         """Returns the fields by name, contiguous, as files want them."""
         return {field.name: getattr(self, field.name).contiguous() for field in fields(self)}
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "Preconditioner":
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
         """Rebuilds a preconditioner from :meth:`tensors`."""
         return cls(**{field.name: tensors[field.name] for field in fields(cls)})
 

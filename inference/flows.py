@@ -21,7 +21,10 @@ from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.features import Preconditioner
 from npdr_ppl.randomness import seeded
 
-__all__ = ["FlowDensity", "FlowNetwork", "build_networks", "load_member"]
+__all__ = ["FLOWS", "FlowDensity", "FlowNetwork", "build_networks", "load_member"]
+
+FLOWS = ("nsf", "maf")
+"""Kinds of flows, see :class:`FlowNetwork`."""
 
 INITIAL_SCALE = 0.01
 """Factor on the last layer's initial weights: a flow starts near the identity, that is, at the

@@ -90,6 +90,9 @@ class NeuralBackend(Backend):
     objective: ClassVar[str] = "validation_log_prob"
     """Name of the figure that training maximises."""
 
+    preconditioner_type: ClassVar[type[Preconditioner]] = Preconditioner
+    """What :meth:`_precondition` returns."""
+
     members: int = 2
     epochs: int = 30
     batch_size: int = 512
@@ -243,7 +246,7 @@ class NeuralBackend(Backend):
 
     def _clipped_features(self, problem: Problem, preconditioner: Preconditioner) -> int:
         """Counts the observation's features outside the simulated range, with a warning."""
-        clipped = preconditioner.outside(problem.observation.cpu())
+        clipped = self._outside(problem, preconditioner)
         if clipped.any():
             logger.warning(
                 "%d of %d features of the observation lie outside the simulated range and were "
@@ -253,6 +256,10 @@ class NeuralBackend(Backend):
                 clipped.flatten().nonzero().flatten().tolist()[:10],
             )
         return int(clipped.sum())
+
+    def _outside(self, problem: Problem, preconditioner: Preconditioner) -> Tensor:
+        """Returns which of the observation's features lie outside the simulated range."""
+        return preconditioner.outside(problem.observation.cpu())
 
     def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Splits a state into tensors and JSON-serialisable values."""
@@ -298,7 +305,7 @@ class NeuralBackend(Backend):
             round=int(values["round"]),
             simulations=Simulations(z, x, tensors["rounds"]),
             weights=parts["weights"],
-            preconditioner=Preconditioner.from_tensors(fitted) if fitted else None,
+            preconditioner=self.preconditioner_type.from_tensors(fitted) if fitted else None,
         )
 
     def _own(self, state: State) -> NeuralState:

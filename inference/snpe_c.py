@@ -38,7 +38,7 @@ from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem, State
 from npdr_ppl.inference.features import Preconditioner
-from npdr_ppl.inference.flows import FlowDensity, FlowNetwork, build_networks, load_member
+from npdr_ppl.inference.flows import FLOWS, FlowDensity, FlowNetwork, build_networks, load_member
 from npdr_ppl.inference.mixture import Mixture
 from npdr_ppl.inference.neural import NeuralBackend, NeuralState, Simulations
 from npdr_ppl.inference.proposals import log_density_bound, sample_truncated_prior
@@ -46,7 +46,6 @@ from npdr_ppl.inference.training import LogProb, Loss
 
 __all__ = ["SNPEC", "atomic_loss"]
 
-FLOWS = ("nsf", "maf")
 PROPOSALS = ("truncated", "atomic")
 
 
