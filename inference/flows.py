@@ -23,7 +23,8 @@ from npdr_ppl.randomness import seeded
 
 __all__ = ["FLOWS", "FlowDensity", "FlowNetwork", "build_networks", "load_member"]
 
-FLOWS = ("nsf", "maf")
+Flow = Literal["nsf", "maf", "affine-nsf"]
+FLOWS = ("nsf", "maf", "affine-nsf")
 """Kinds of flows, see :class:`FlowNetwork`."""
 
 INITIAL_SCALE = 0.01
@@ -80,8 +81,9 @@ class FlowNetwork(nn.Module):
         num_parameters: Dimension d of u.
         num_features: Length of h(f).
         embedding: Network h, or ``None`` for the identity.
-        flow: ``"nsf"``, monotonic rational-quadratic splines (Durkan et al. 2019), or ``"maf"``,
-            affine maps (Papamakarios et al. 2017).
+        flow: ``"nsf"``, monotonic rational-quadratic splines (Durkan et al. 2019); ``"maf"``,
+            affine maps (Papamakarios et al. 2017); or ``"affine-nsf"``, splines behind one affine
+            map, which takes over where the conditional scale varies by orders of magnitude.
         transforms: Number of autoregressive transforms.
         hidden: Widths of the conditioners' hidden layers.
         bins: Bins of a spline.
@@ -93,7 +95,7 @@ class FlowNetwork(nn.Module):
         num_parameters: int,
         num_features: int,
         embedding: nn.Module | None,
-        flow: Literal["nsf", "maf"],
+        flow: Flow,
         transforms: int,
         hidden: tuple[int, ...],
         bins: int,
@@ -101,10 +103,6 @@ class FlowNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.embedding = embedding
-        if flow == "nsf":
-            univariate, sizes = Spline, [(2, bins), (bins - 1,)]
-        else:
-            univariate, sizes = MonotonicAffineTransform, [(), ()]
         forwards: Any = torch.arange(num_parameters)
         self.transform = LazyComposedTransform(
             *(
@@ -116,7 +114,7 @@ class FlowNetwork(nn.Module):
                     shapes=[torch.Size(size) for size in sizes],
                     hidden_features=hidden,
                 )
-                for k in range(transforms)
+                for k, (univariate, sizes) in enumerate(_univariate(flow, transforms, bins))
             )
         )
         linear = (nn.Linear, Linear)  # with a single parameter zuko's own
@@ -153,12 +151,21 @@ class FlowNetwork(nn.Module):
         return self.transform(context).inv(base)
 
 
+def _univariate(flow: str, transforms: int, bins: int) -> list[tuple[type[Transform], Any]]:
+    """Returns the univariate map of each transform and the shapes of its parameters."""
+    spline = Spline, [(2, bins), (bins - 1,)]
+    affine = MonotonicAffineTransform, [(), ()]
+    if flow == "affine-nsf":
+        return [affine] + (transforms - 1) * [spline]
+    return transforms * [spline if flow == "nsf" else affine]
+
+
 def build_networks(
     members: int,
     num_parameters: int,
     observation: Tensor,
     build_embedding: Callable[[], nn.Module] | None,
-    flow: Literal["nsf", "maf"],
+    flow: Flow,
     transforms: int,
     hidden: tuple[int, ...],
     bins: int,

@@ -12,14 +12,14 @@ Gaussian noise nothing is left to learn.
 
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Problem, State
 from npdr_ppl.inference.features import Preconditioner, fit_preconditioner
-from npdr_ppl.inference.flows import FLOWS, FlowNetwork, build_networks, load_member
+from npdr_ppl.inference.flows import FLOWS, Flow, FlowNetwork, build_networks, load_member
 from npdr_ppl.inference.likelihood import LearnedLogLikelihood, LikelihoodBackend
 from npdr_ppl.inference.neural import NeuralState, Simulations
 from npdr_ppl.inference.training import Loss
@@ -47,7 +47,7 @@ class NLE(LikelihoodBackend):
     """Neural likelihood estimation; see the module's text for the method.
 
     Args:
-        flow: ``"maf"``, affine maps, ``"nsf"``, splines; both autoregressive.
+        flow: Kind of flow, see :class:`~npdr_ppl.inference.flows.FlowNetwork`.
         transforms: Transforms of a flow.
         hidden: Widths of the hidden layers of each transform's conditioner.
         bins: Bins of a spline.
@@ -60,7 +60,8 @@ class NLE(LikelihoodBackend):
 
     preconditioner_type: ClassVar[type[Preconditioner]] = LikelihoodPreconditioner
 
-    flow: Literal["nsf", "maf"] = "maf"
+    flow: Flow = "affine-nsf"
+    batch_size: int = 256
     transforms: int = 3
     hidden: tuple[int, ...] = (128, 128)
     bins: int = 8

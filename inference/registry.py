@@ -19,6 +19,7 @@ GROUP = "npdr_ppl.backends"
 
 BUILT_IN = {
     "nle": "npdr_ppl.inference.nle:NLE",
+    "nre": "npdr_ppl.inference.nre:NRE",
     "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
 }
 """Backends of this package by name; each is imported when it is asked for."""

@@ -38,7 +38,7 @@ from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem, State
 from npdr_ppl.inference.features import Preconditioner
-from npdr_ppl.inference.flows import FLOWS, FlowDensity, FlowNetwork, build_networks, load_member
+from npdr_ppl.inference.flows import FLOWS, Flow, FlowDensity, FlowNetwork, build_networks, load_member
 from npdr_ppl.inference.mixture import Mixture
 from npdr_ppl.inference.neural import NeuralBackend, NeuralState, Simulations
 from npdr_ppl.inference.proposals import log_density_bound, sample_truncated_prior
@@ -54,7 +54,7 @@ class SNPEC(NeuralBackend):
     """Sequential neural posterior estimation, SNPE-C; see the module's text for the method.
 
     Args:
-        flow: ``"nsf"``, splines, or ``"maf"``, affine maps; both autoregressive.
+        flow: Kind of flow, see :class:`~npdr_ppl.inference.flows.FlowNetwork`.
         transforms: Transforms of a flow.
         hidden: Widths of the hidden layers of each transform's conditioner.
         bins: Bins of a spline.
@@ -68,7 +68,7 @@ class SNPEC(NeuralBackend):
     name: ClassVar[str] = "snpe-c"
     summary: ClassVar[str] = "sequential neural posterior estimation with normalising flows"
 
-    flow: Literal["nsf", "maf"] = "nsf"
+    flow: Flow = "nsf"
     transforms: int = 2
     hidden: tuple[int, ...] = (128, 128)
     bins: int = 8
