@@ -13,6 +13,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from npdr_ppl.inference.regression import LinearRegression
+from npdr_ppl.rollouts.differentiation import Smoothing
+
 __all__ = ["Backend", "Density", "Problem", "RoundInfo", "State"]
 
 
@@ -29,6 +32,8 @@ class Problem:
         build_network: Makes an untrained embedding network for arrays of the observation's shape,
             learnt jointly with the estimator; ``None`` if the features are final.
         device: Where to train.
+        regression: Returns the problem in the form of a linear regression, computed when asked
+            for; ``None`` if no simulator is behind it.
     """
 
     num_parameters: int
@@ -38,6 +43,7 @@ class Problem:
     is_prior_standard_normal: bool = True
     build_network: Callable[[], nn.Module] | None = None
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    regression: Callable[[Smoothing], LinearRegression] | None = None
 
 
 class Density(ABC):
@@ -85,10 +91,13 @@ class Backend(ABC):
     Attributes:
         name: Word that selects it, e.g. ``"snpe-c"``.
         summary: One line for tables.
+        uses_simulations: Whether it learns from simulations. One that does not asks for none, is
+            told none, and has its posterior after one round.
     """
 
     name: ClassVar[str]
     summary: ClassVar[str]
+    uses_simulations: ClassVar[bool] = True
 
     @abstractmethod
     def init(self, problem: Problem) -> State:

@@ -19,6 +19,9 @@ GROUP = "npdr_ppl.backends"
 
 BUILT_IN = {
     "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
+    "bayesian-linear-regression": (
+        "npdr_ppl.inference.bayesian_linear_regression:BayesianLinearRegression"
+    ),
 }
 """Backends of this package by name; each is imported when it is asked for."""
 

@@ -188,6 +188,25 @@ class Prior:
                 self.model(*self.args)
         return torch.cat([messenger.z[site.name].expand(num, -1) for site in self.sites], dim=-1)
 
+    def on_support(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns which values of the latent sites lie on their supports.
+
+        Args:
+            parameters: Values ``(n,) + site.shape`` by site name.
+
+        Returns:
+            Mask ``(n,)``; NaN and infinity are off every support.
+        """
+        num = next(iter(parameters.values())).shape[0]
+        data = self._padded(parameters)
+        with _alone(), SkipSimulation(), _Batch(self, num), poutine.condition(data=data):
+            trace = _trace(self.model, self.args)
+        mask = torch.ones(num, dtype=torch.bool)
+        for name, value in data.items():
+            inside = trace.nodes[name]["fn"].support.check(value).reshape(num, -1)
+            mask = mask & inside.all(-1) & value.reshape(num, -1).isfinite().all(-1)
+        return mask
+
     def log_prob_parameters(self, z: Tensor) -> Tensor:
         """Returns the prior's log density over the parameters at z, ``(n,)``."""
         trace = self._run(_WriteCoordinates(self, z))
