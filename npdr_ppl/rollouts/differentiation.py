@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import signal
 
@@ -36,6 +37,9 @@ GREATEST_CUTOFF = 0.2
 
 FLOOR_RATIO = 4.0
 """How far a motion's spectrum must stand above the floor of reading errors to count."""
+
+NUM_SEGMENTS = 8
+"""Stretches of a rollout, which overlap by half, whose spectra are averaged."""
 
 STENCIL = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
 """Central difference of sixth order."""
@@ -167,16 +171,16 @@ def _low_pass(values: Array, time_step: float, cutoff: float) -> Array:
 
 def _difference(values: Array, time_step: float) -> Array:
     """Differentiates along the first axis; the first and last three rows are one-sided."""
-    inside = np.apply_along_axis(np.convolve, 0, values, STENCIL[::-1], mode="same")
-    edges = np.gradient(values, axis=0)
-    inside[:3], inside[-3:] = edges[:3], edges[-3:]
-    return inside / time_step
+    rates = np.gradient(values, axis=0)
+    rates[3:-3] = np.tensordot(sliding_window_view(values, 7, axis=0), STENCIL, axes=1)
+    return rates / time_step
 
 
 def _bandwidth(channel: Array, time_step: float) -> float:
     """Returns the frequency in Hz at which a channel's spectrum first meets its floor."""
+    size = max(LEAST_ROWS, len(channel) // NUM_SEGMENTS)
     frequencies, power = signal.welch(
-        signal.detrend(channel), fs=1.0 / time_step, nperseg=min(len(channel), 2048)
+        signal.detrend(channel), fs=1.0 / time_step, nperseg=size, detrend="linear"
     )
     floor = np.median(power[len(power) // 2 :])
     below = np.flatnonzero(power[1:] <= FLOOR_RATIO * floor)

@@ -1,6 +1,7 @@
 """A bound model as a linear regression on its simulator's inverse dynamics."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -195,8 +196,9 @@ class LinearForm:
         mean, spread = draws.mean(0), draws.std(0)
         varies = spread > RELATIVE_RANK * mean.abs()
         centred = (draws - mean) / torch.where(varies, spread, 1.0) * varies
-        _, r, order = linalg.qr(centred.numpy(), mode="economic", pivoting=True)
-        size = np.abs(np.diag(r))
+        # QR with pivoting takes the columns in the order of what each adds to those before.
+        decomposition: Any = linalg.qr(centred.numpy(), mode="r", pivoting=True)
+        size, order = np.abs(np.diag(decomposition[0])), decomposition[1]
         rank = int((size > RELATIVE_RANK * size[0]).sum()) if varies.any() else 0
         if rank != len(self.determined_sites):
             raise BackendError(
