@@ -20,7 +20,13 @@ from torch import Tensor
 
 from npdr_ppl.errors import BackendError, ShapeError
 
-__all__ = ["StudentT", "linear_posterior"]
+__all__ = ["StudentT", "linear_posterior", "row_noise"]
+
+REWEIGHTINGS = 10
+"""Iterations between the fit and the noise of each kind of row."""
+
+RELATIVE_NOISE = 1e-9
+"""Least noise of a kind of row, relative to the size of its terms."""
 
 
 @dataclass(frozen=True)
@@ -131,3 +137,33 @@ def linear_posterior(
     factor = torch.linalg.qr((scale @ root).T)[1].T
     factor = factor * factor.diagonal().sign() * variance.sqrt()
     return StudentT(prior_mean + scale @ u, factor.contiguous(), degrees)
+
+
+def row_noise(
+    rows: Tensor, targets: Tensor, prior_mean: Tensor, prior_covariance: Tensor
+) -> Tensor:
+    """Returns the noise of rows of J kinds, ``(J,)``, by iteratively reweighted fits.
+
+    Rows of one joint have one unit and one noise, and joints differ. The start is the size of
+    each kind's largest term under the prior's mean.
+
+    Args:
+        rows: Regressors, ``(N, J, k)``.
+        targets: Right-hand side, ``(N, J)``.
+        prior_mean: Mean of β under the prior, ``(k,)``.
+        prior_covariance: Its covariance, ``(k, k)``.
+    """
+    terms = (rows.square().mean(0) * prior_mean.square()).amax(-1)
+    size = torch.maximum(terms, targets.square().mean(0)).sqrt()
+    size = torch.where(size > 0.0, size, 1.0)
+    noise = size
+    for _ in range(REWEIGHTINGS):
+        fit = linear_posterior(
+            (rows / noise[:, None]).flatten(0, 1),
+            (targets / noise).flatten(),
+            prior_mean,
+            prior_covariance,
+        )
+        left = (targets - rows @ fit.mean).square().mean(0).sqrt()
+        noise = torch.maximum(left, RELATIVE_NOISE * size)
+    return noise

@@ -9,7 +9,7 @@ from scipy import linalg
 from torch import Tensor
 
 from npdr_ppl.errors import BackendError, DataError, ModelError
-from npdr_ppl.inference.conjugate import linear_posterior
+from npdr_ppl.inference.conjugate import row_noise
 from npdr_ppl.inference.regression import LinearRegression
 from npdr_ppl.language.effects import LinearForceEffect
 from npdr_ppl.language.inverse_dynamics import InverseDynamics, Motion
@@ -33,12 +33,6 @@ NUM_PRIOR_DRAWS = 4_096
 
 RELATIVE_RANK = 1e-7
 """Least relative singular value of a direction that counts; what is linear is so to 1e-12."""
-
-REWEIGHTINGS = 10
-"""Iterations between the fit and the noise of each joint's rows."""
-
-RELATIVE_NOISE = 1e-9
-"""Least noise of a joint's rows, relative to the size of its terms."""
 
 
 class LinearForm:
@@ -245,10 +239,10 @@ def regression_of(
     """
     form = LinearForm(prior, box)
     rows, targets = _recorded_rows(form, rollouts, smoothing)
-    weights = _weights(form, rows, targets)
+    noise = row_noise(rows, targets, form.prior_mean, form.prior_covariance)
     return LinearRegression(
-        regressors=(rows / weights[:, None]).flatten(0, 1),
-        targets=(targets / weights).flatten(),
+        regressors=(rows / noise[:, None]).flatten(0, 1),
+        targets=(targets / noise).flatten(),
         names=form.names,
         prior_mean=form.prior_mean,
         prior_covariance=form.prior_covariance,
@@ -303,24 +297,6 @@ def _recorded_rows(
             f"too few for {len(form.names)} base parameters; record longer rollouts."
         )
     return both[..., :-1], both[..., -1]
-
-
-def _weights(form: LinearForm, rows: Tensor, targets: Tensor) -> Tensor:
-    """Returns the noise of each joint's rows, ``(joints,)``, by iteratively reweighted fits."""
-    terms = rows.square().mean(0) * form.prior_mean.square()
-    size = torch.maximum(terms.amax(-1), targets.square().mean(0)).sqrt()
-    size = torch.where(size > 0.0, size, 1.0)
-    weights = size
-    for _ in range(REWEIGHTINGS):
-        fit = linear_posterior(
-            (rows / weights[:, None]).flatten(0, 1),
-            (targets / weights).flatten(),
-            form.prior_mean,
-            form.prior_covariance,
-        )
-        left = (targets - rows @ fit.mean).square().mean(0).sqrt()
-        weights = torch.maximum(left, RELATIVE_NOISE * size)
-    return weights
 
 
 def _declared(simulator: Simulator) -> InverseDynamics:
