@@ -10,8 +10,9 @@ Reference: M. Gautier, Numerical calculation of the base inertial parameters of 
 """
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
-from os import PathLike
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,7 @@ class MjcfPosterior:
         grouping: K with β = K π, ``(r, P)``.
         base: Posterior over β.
         nominal: π of the model as it stands, ``(P,)``.
-        scales: Size of each π in which changes are measured, ``(P,)``.
+        scales: Size of each π in which changes are measured, ``(P,)``; zero for fixed ones.
     """
 
     dynamics: MujocoInverseDynamics
@@ -122,6 +123,7 @@ def regress_mjcf(
     accelerations: Array,
     applied: Array,
     *,
+    fixed: Sequence[str] = (),
     prior_spread: float = 10.0,
 ) -> MjcfPosterior:
     """Regresses an MJCF's parameters on a motion that is known at N instants.
@@ -132,27 +134,31 @@ def regress_mjcf(
         velocities: Its qvel, ``(N, nv)``.
         accelerations: Its qacc, ``(N, nv)``.
         applied: Applied generalised forces, those of actuators included, ``(N, nv)``.
+        fixed: Patterns of the names of parameters that are known to be nominal, e.g.
+            ``"*.armature"``. A joint without damping is best told so: half of what noise makes
+            of it would be negative, hence implausible.
         prior_spread: Standard deviation of the prior about the nominal values, in scales of the
             parameters, where the noise is as great as what the fit leaves.
 
     Raises:
-        ModelError: The model has no joints or equality constraints.
+        ModelError: The model has no joints, or equality constraints, or no such parameter.
         ShapeError: The shapes do not fit the model.
-        DataError: Nothing moves.
+        DataError: Nothing moves, or nothing is left to find.
     """
     dynamics = MujocoInverseDynamics(load_mjcf(source))
     rows = dynamics.regressors(positions, velocities, accelerations)
     targets = dynamics.targets(positions, velocities, applied)
-    return _regress(dynamics, rows, targets, prior_spread)
+    return _regress(dynamics, rows, targets, fixed, prior_spread)
 
 
 def regress_mjcf_recording(
-    source: str | PathLike[str] | Any,
+    source: Any,
     positions: Array,
     controls: Array,
     time_step: float,
     *,
     smoothing: Smoothing | None = None,
+    fixed: Sequence[str] = (),
     prior_spread: float = 10.0,
 ) -> MjcfPosterior:
     """Regresses an MJCF's parameters on one recording of joint positions and controls.
@@ -163,6 +169,7 @@ def regress_mjcf_recording(
         controls: Controls, each held for one step, ``(T, nu)``.
         time_step: Seconds between readings.
         smoothing: Cut-offs of the filters.
+        fixed: See :func:`regress_mjcf`.
         prior_spread: See :func:`regress_mjcf`.
 
     Raises:
@@ -184,14 +191,21 @@ def regress_mjcf_recording(
     targets = dynamics.targets(motion.positions, motion.velocities, forces)
     both = np.concatenate((rows, targets[..., None]), axis=-1)
     both = thin(both, time_step, parallel_cutoff)
-    return _regress(dynamics, both[..., :-1], both[..., -1], prior_spread)
+    return _regress(dynamics, both[..., :-1], both[..., -1], fixed, prior_spread)
 
 
 def _regress(
-    dynamics: MujocoInverseDynamics, rows: Array, targets: Array, prior_spread: float
+    dynamics: MujocoInverseDynamics,
+    rows: Array,
+    targets: Array,
+    fixed: Sequence[str],
+    prior_spread: float,
 ) -> MjcfPosterior:
     nominal, names = dynamics.nominal(), dynamics.names
-    scales = _scales(dynamics, nominal)
+    is_fixed = _matches(names, fixed)
+    targets = targets - rows[..., is_fixed] @ nominal[is_fixed]
+    # What does not change has no size of change.
+    scales = np.where(is_fixed, 0.0, _scales(dynamics, nominal))
     chosen, grouping = _base(rows, scales)
     mean = torch.as_tensor(grouping @ nominal)
     spread = torch.as_tensor(prior_spread * grouping * scales)
@@ -205,6 +219,14 @@ def _regress(
     return MjcfPosterior(dynamics, names, base_names, grouping, posterior, nominal, scales)
 
 
+def _matches(names: Sequence[str], patterns: Sequence[str]) -> NDArray[np.bool_]:
+    """Returns which names some pattern matches, ``(P,)``."""
+    for pattern in patterns:
+        if not any(fnmatchcase(name, pattern) for name in names):
+            raise ModelError(f"No parameter is called {pattern!r}; there are {', '.join(names)}.")
+    return np.array([any(fnmatchcase(name, pattern) for pattern in patterns) for name in names])
+
+
 def _base(rows: Array, scales: Array) -> tuple[NDArray[np.int64], Array]:
     """Returns the independent columns, ``(r,)``, and K, ``(r, P)``.
 
@@ -216,14 +238,14 @@ def _base(rows: Array, scales: Array) -> tuple[NDArray[np.int64], Array]:
     r, order = decomposition
     size = np.abs(np.diag(r))
     if not size.size or size[0] == 0.0:
-        raise DataError("The recording tells no parameter, because nothing moves or pulls.")
+        raise DataError("The recording tells no parameter, because nothing moves or all is fixed.")
     rank = int((size > RELATIVE_RANK * size[0]).sum())
     scaled = linalg.solve_triangular(r[:rank, :rank], r[:rank])
-    grouping = np.zeros((rank, len(scales)))
-    grouping[:, order] = scales[order[:rank], None] * scaled / scales[order]
     # What is zero by structure should not be 1e-17.
-    relative = np.abs(grouping) * scales / scales[order[:rank], None]
-    grouping[relative < 1e-10] = 0.0
+    scaled[np.abs(scaled) < 1e-10] = 0.0
+    inverse = np.divide(1.0, scales, out=np.zeros_like(scales), where=scales > 0.0)
+    grouping = np.zeros((rank, len(scales)))
+    grouping[:, order] = scales[order[:rank], None] * scaled * inverse[order]
     return order[:rank], grouping
 
 
