@@ -20,7 +20,8 @@ class LinearRegression:
         targets: Right-hand side t, ``(N,)``.
         names: Names of the base parameters β, k of them.
         prior_mean: Mean of β under the prior, ``(k,)``.
-        prior_covariance: Its covariance, ``(k, k)``.
+        prior_covariance: Its covariance, ``(k, k)``; where the noise is inferred, at σ = 1, to
+            which the rows should be scaled.
         determined: Mask of the k coordinates of z that β determines, ``(d,)``.
         nominal: Reference coordinates of the nominal parameters, ``(d,)``; NaN where the prior
             does not reach them.

@@ -265,8 +265,9 @@ def is_physical(parameters: Array, num_bodies: int) -> NDArray[np.bool_]:
     pseudo[..., 3, 3] = inertial[..., 0]
     finite = np.isfinite(parameters).all(-1)
     pseudo[~finite] = -1.0
-    positive = (np.linalg.eigvalsh(pseudo) > 0.0).all(-1).all(-1)
-    return finite & positive & (parameters[:, 10 * num_bodies :] >= 0.0).all(-1)
+    positive = (np.linalg.eigvalsh(pseudo) > 0.0).all(axis=(-2, -1))
+    brakes = (parameters[:, 10 * num_bodies :] >= 0.0).all(axis=-1)
+    return np.asarray(finite & positive & brakes)
 
 
 def with_parameters(model: Any, parameters: Array) -> Any:
