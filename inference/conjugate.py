@@ -144,8 +144,10 @@ def row_noise(
 ) -> Tensor:
     """Returns the noise of rows of J kinds, ``(J,)``, by iteratively reweighted fits.
 
-    Rows of one joint have one unit and one noise, and joints differ. The start is the size of
-    each kind's largest term under the prior's mean.
+    Rows of one joint have one unit and one noise, and joints differ. The noise of a kind is what
+    the fit leaves, in units of the kind's largest term under the fit, times that term under the
+    prior's mean. The detour matters where the right-hand side is zero: taken as it is, the rest
+    would vanish along with β, and ever greater weights would drive β there.
 
     Args:
         rows: Regressors, ``(N, J, k)``.
@@ -153,10 +155,14 @@ def row_noise(
         prior_mean: Mean of β under the prior, ``(k,)``.
         prior_covariance: Its covariance, ``(k, k)``.
     """
-    terms = (rows.square().mean(0) * prior_mean.square()).amax(-1)
-    size = torch.maximum(terms, targets.square().mean(0)).sqrt()
-    size = torch.where(size > 0.0, size, 1.0)
-    noise = size
+
+    def size(beta: Tensor) -> Tensor:
+        terms = (rows.square().mean(0) * beta.square()).amax(-1)
+        return torch.maximum(terms, targets.square().mean(0)).sqrt()
+
+    expected = size(prior_mean)
+    expected = torch.where(expected > 0.0, expected, 1.0)
+    noise = expected
     for _ in range(REWEIGHTINGS):
         fit = linear_posterior(
             (rows / noise[:, None]).flatten(0, 1),
@@ -164,6 +170,8 @@ def row_noise(
             prior_mean,
             prior_covariance,
         )
+        found = size(fit.mean)
         left = (targets - rows @ fit.mean).square().mean(0).sqrt()
-        noise = torch.maximum(left, RELATIVE_NOISE * size)
+        share = torch.where(found > 0.0, left / found, 1.0)
+        noise = expected * share.clamp_min(RELATIVE_NOISE)
     return noise

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from npdr_ppl.errors import BackendError, ShapeError
-from npdr_ppl.inference.conjugate import StudentT, linear_posterior
+from npdr_ppl.inference.conjugate import StudentT, linear_posterior, row_noise
 from npdr_ppl.randomness import seeded
 
 
@@ -117,3 +117,41 @@ def test_bad_matrices_are_refused(problem):
         linear_posterior(a, t * torch.nan, m0, v0)
     with pytest.raises(BackendError, match="not positive definite"):
         linear_posterior(a, t, m0, -v0)
+
+
+def two_kinds(noise, error=0.0):
+    """Two kinds of rows of one β, the second with zero on the right, as a free joint's."""
+    generator = torch.Generator().manual_seed(5)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    beta = torch.tensor([2.0, 1.0, 0.5], dtype=torch.float64)
+    rows = draw(2_000, 2, 3)
+    rows[:, 1, 0] = 0.0
+    rows[:, 1, 1] = -(rows[:, 1, 2] * beta[2]) / beta[1]  # satisfies the second equation exactly
+    targets = rows @ beta
+    targets[:, 1] = 0.0
+    targets = targets + torch.tensor(noise, dtype=torch.float64) * draw(2_000, 2)
+    rows = rows + error * draw(*rows.shape)
+    return rows, targets, beta
+
+
+def test_noise_of_each_kind_of_row_is_found():
+    rows, targets, beta = two_kinds((0.3, 0.01))
+    found = row_noise(rows, targets, beta, 100.0 * torch.eye(3, dtype=torch.float64))
+    # Standard error of a standard deviation: 1/√(2 N) of it; three parameters hardly count.
+    limit = 4.5 / (2 * len(rows)) ** 0.5 + 3.0 / len(rows)
+    assert (found / torch.tensor([0.3, 0.01]) - 1.0).abs().max() < limit
+
+
+def test_rows_with_zero_on_the_right_do_not_pull_everything_to_zero():
+    """Errors in the regressors shrink β; weights that grew with it would shrink it to nothing."""
+    rows, targets, beta = two_kinds((0.1, 0.0), error=0.7)
+    covariance = 100.0 * torch.eye(3, dtype=torch.float64)
+    found = row_noise(rows, targets, beta, covariance)
+    assert found.min() > 0.1
+    fit = linear_posterior(
+        (rows / found[:, None]).flatten(0, 1), (targets / found).flatten(), beta, covariance
+    )
+    assert (fit.mean > 0.3 * beta).all()
