@@ -13,6 +13,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from npdr_ppl.inference.regression import LinearRegression
+from npdr_ppl.rollouts.differentiation import Smoothing
+
 __all__ = ["Backend", "Density", "Problem", "RoundInfo", "State"]
 
 
@@ -31,6 +34,8 @@ class Problem:
         device: Where to train.
         log_likelihood: Log density of the recording at points ``(n, d)``, shape ``(n,)``,
             differentiable, for models that have one; ``None`` for black boxes.
+        regression: Returns the problem in the form of a linear regression, computed when asked
+            for; ``None`` if no simulator is behind it.
     """
 
     num_parameters: int
@@ -41,6 +46,7 @@ class Problem:
     build_network: Callable[[], nn.Module] | None = None
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     log_likelihood: Callable[[Tensor], Tensor] | None = None
+    regression: Callable[[Smoothing], LinearRegression] | None = None
 
 
 class Density(ABC):
@@ -88,10 +94,13 @@ class Backend(ABC):
     Attributes:
         name: Word that selects it, e.g. ``"snpe-c"``.
         summary: One line for tables.
+        uses_simulations: Whether it learns from simulations. One that does not asks for none, is
+            told none, and has its posterior after one round.
     """
 
     name: ClassVar[str]
     summary: ClassVar[str]
+    uses_simulations: ClassVar[bool] = True
 
     @abstractmethod
     def init(self, problem: Problem) -> State:

@@ -21,6 +21,9 @@ BUILT_IN = {
     "nle": "npdr_ppl.inference.nle:NLE",
     "nre": "npdr_ppl.inference.nre:NRE",
     "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
+    "bayesian-linear-regression": (
+        "npdr_ppl.inference.bayesian_linear_regression:BayesianLinearRegression"
+    ),
 }
 """Backends of this package by name; each is imported when it is asked for."""
 

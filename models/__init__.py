@@ -62,6 +62,20 @@ _ENTRIES = (
         "furuta_paper",
         "Furuta",
     ),
+    ZooEntry(
+        "cart_pole",
+        "Pole on a cart pushed by a force, with unknown masses, length and dampings",
+        "npdr_ppl.models.cart_pole",
+        "cart_pole",
+        "CartPole",
+    ),
+    ZooEntry(
+        "emps",
+        "Positioning drive (EMPS benchmark) with unknown mass and viscous friction",
+        "npdr_ppl.models.emps",
+        "emps",
+        "Emps",
+    ),
 )
 
 
@@ -70,6 +84,6 @@ def zoo() -> dict[str, ZooEntry]:
 
     Example:
         >>> sorted(zoo())
-        ['furuta', 'furuta_paper', 'pendulum']
+        ['cart_pole', 'emps', 'furuta', 'furuta_paper', 'pendulum']
     """
     return {entry.name: entry for entry in _ENTRIES}

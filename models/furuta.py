@@ -15,6 +15,7 @@ from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.noise import Noise
 from npdr_ppl.language.sites import simulate
+from npdr_ppl.models.furuta_inverse_dynamics import FurutaInverseDynamics
 from npdr_ppl.models.gravity import downward
 
 __all__ = ["Furuta", "SwingUpReward", "furuta", "furuta_paper", "initial_states"]
@@ -96,6 +97,7 @@ class Furuta(ODESimulator):
     )
     time_step = 0.002
     default_integrator = "constant-acceleration"
+    inverse_dynamics = FurutaInverseDynamics()
 
     def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
         """Returns the gravity vector."""

@@ -13,11 +13,57 @@ from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.ode import Forces, ODESimulator
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.inverse_dynamics import BaseParameter, InverseDynamics, Motion
 from npdr_ppl.language.noise import Noise
 from npdr_ppl.language.sites import simulate
 from npdr_ppl.models.gravity import downward
 
-__all__ = ["Pendulum", "pendulum"]
+__all__ = ["Pendulum", "PendulumInverseDynamics", "pendulum"]
+
+
+class PendulumInverseDynamics(InverseDynamics):
+    """The equation of :class:`Pendulum` as it stands; mass and length follow under known g."""
+
+    base = (
+        BaseParameter("inertia", "kg m²", "m l²/3"),
+        BaseParameter("weight", "N m", "m g l/2"),
+        BaseParameter("damping", "N m s/rad", "d"),
+    )
+    determined = ("mass", "length", "damping")
+    positive = ("mass", "length", "gravity")
+    non_negative = ("damping",)
+
+    def regressors(self, motion: Motion) -> Tensor:
+        """Returns Y, ``(N, 1, 3)``."""
+        (angle,), (velocity,), (acceleration,) = (
+            motion.positions,
+            motion.velocities,
+            motion.accelerations,
+        )
+        return torch.stack((acceleration, torch.sin(angle), velocity), dim=-1)[:, None]
+
+    def targets(self, motion: Motion) -> Tensor:
+        """Returns the torque, ``(N, 1)``, in N m."""
+        return motion.actions[0][:, None]
+
+    def to_base(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns the three combinations."""
+        moment = 0.5 * parameters["mass"] * parameters["length"]
+        return torch.stack(
+            (
+                moment * parameters["length"] / 1.5,
+                moment * parameters["gravity"],
+                parameters["damping"],
+            ),
+            dim=-1,
+        )
+
+    def to_physical(self, base: Tensor, given: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Returns mass, length and damping under the given gravity."""
+        inertia, weight, damping = base.unbind(-1)
+        moment = weight / given["gravity"]
+        length = 1.5 * inertia / moment
+        return {"mass": 2.0 * moment / length, "length": length, "damping": damping}
 
 
 class Pendulum(ODESimulator):
@@ -51,6 +97,7 @@ class Pendulum(ODESimulator):
     )
     time_step = 0.02
     default_integrator = "semi-implicit-euler"
+    inverse_dynamics = PendulumInverseDynamics()
 
     def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
         """Returns the gravity vector."""

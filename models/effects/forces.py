@@ -9,12 +9,12 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
-from npdr_ppl.language.effects import ForceEffect
+from npdr_ppl.language.effects import LinearForceEffect
 
 __all__ = ["Bias", "HardeningSpring", "Spring", "Unbalance"]
 
 
-class Bias(ForceEffect):
+class Bias(LinearForceEffect):
     """A constant force c."""
 
     id = "bias"
@@ -30,8 +30,12 @@ class Bias(ForceEffect):
         """Returns c."""
         return parameters["offset"]
 
+    def columns(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
+        """Returns 1."""
+        return (torch.ones_like(position),)
 
-class Spring(ForceEffect):
+
+class Spring(LinearForceEffect):
     """−k (q − q₀): a spring, or a cable that is dragged along."""
 
     id = "spring"
@@ -53,8 +57,21 @@ class Spring(ForceEffect):
         """Returns −k (q − q₀)."""
         return -parameters["stiffness"] * (position - parameters["rest"])
 
+    def columns(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
+        """Returns −q for k, and 1 for k q₀."""
+        return -position, torch.ones_like(position)
 
-class HardeningSpring(ForceEffect):
+    def to_base(self, parameters: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        """Returns k and k q₀."""
+        return parameters["stiffness"], parameters["stiffness"] * parameters["rest"]
+
+    def from_base(self, base: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """Returns k and q₀."""
+        stiffness, preload = base
+        return {"stiffness": stiffness, "rest": preload / stiffness}
+
+
+class HardeningSpring(LinearForceEffect):
     """−k₃ q³."""
 
     id = "hardening_spring"
@@ -70,8 +87,12 @@ class HardeningSpring(ForceEffect):
         """Returns −k₃ q³."""
         return -parameters["stiffness"] * position * position * position
 
+    def columns(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
+        """Returns −q³."""
+        return (-position * position * position,)
 
-class Unbalance(ForceEffect):
+
+class Unbalance(LinearForceEffect):
     """a sin q + b cos q: an eccentric mass m r under gravity, a = m r g cos φ, b = m r g sin φ."""
 
     id = "unbalance"
@@ -91,3 +112,7 @@ class Unbalance(ForceEffect):
         """Returns a sin q + b cos q."""
         sine = parameters["sine"] * torch.sin(position)
         return sine + parameters["cosine"] * torch.cos(position)
+
+    def columns(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
+        """Returns sin q and cos q."""
+        return torch.sin(position), torch.cos(position)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
-from npdr_ppl.language.effects import ForceEffect
+from npdr_ppl.language.effects import ForceEffect, LinearForceEffect
 
 __all__ = [
     "AsymmetricCoulombFriction",
@@ -20,7 +20,7 @@ __all__ = [
 ]
 
 
-class ViscousFriction(ForceEffect):
+class ViscousFriction(LinearForceEffect):
     """−b v with damping b; not to be told from a motor's back-EMF."""
 
     id = "viscous_friction"
@@ -36,8 +36,12 @@ class ViscousFriction(ForceEffect):
         """Returns −b v."""
         return -parameters["damping"] * velocity
 
+    def columns(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
+        """Returns −v."""
+        return (-velocity,)
 
-class CoulombFriction(ForceEffect):
+
+class CoulombFriction(LinearForceEffect):
     """−F sign v in motion, and at rest just what keeps the joint at rest, up to F."""
 
     id = "coulomb_friction"
@@ -53,8 +57,12 @@ class CoulombFriction(ForceEffect):
         """Returns F."""
         return parameters["magnitude"]
 
+    def columns(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
+        """Returns −sign v."""
+        return (-velocity.sign(),)
 
-class AsymmetricCoulombFriction(ForceEffect):
+
+class AsymmetricCoulombFriction(LinearForceEffect):
     """−F₊ in forward and +F₋ in backward motion; not to be told from Coulomb plus a bias."""
 
     id = "asymmetric_coulomb_friction"
@@ -76,6 +84,10 @@ class AsymmetricCoulombFriction(ForceEffect):
         smaller = torch.minimum(forward, backward)
         moving = torch.where(velocity > 0.0, forward, backward)
         return torch.where(velocity == 0.0, smaller, moving)
+
+    def columns(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
+        """Returns −1 in forward motion for F₊, and 1 in backward motion for F₋."""
+        return -velocity.sign().clamp_min(0.0), -velocity.sign().clamp_max(0.0)
 
 
 class StribeckFriction(ForceEffect):
@@ -104,7 +116,7 @@ class StribeckFriction(ForceEffect):
         return parameters["excess"] * torch.exp(-velocity.abs() / parameters["speed"])
 
 
-class QuadraticDrag(ForceEffect):
+class QuadraticDrag(LinearForceEffect):
     """−c v|v| with drag c."""
 
     id = "quadratic_drag"
@@ -119,3 +131,7 @@ class QuadraticDrag(ForceEffect):
     ) -> Tensor:
         """Returns −c v|v|."""
         return -parameters["drag"] * velocity * velocity.abs()
+
+    def columns(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
+        """Returns −v|v|."""
+        return (-velocity * velocity.abs(),)

@@ -21,6 +21,7 @@ __all__ = [
     "Effect",
     "EnvironmentEffect",
     "ForceEffect",
+    "LinearForceEffect",
     "SensorEffect",
 ]
 
@@ -138,6 +139,27 @@ class ForceEffect(Effect):
     ) -> Any:
         """Returns the effect's own state one step later."""
         return memory
+
+
+class LinearForceEffect(ForceEffect):
+    """A force that is linear in base parameters, f = Σ_i φ_i(q, q̇) b_i, once the joint moves.
+
+    By default the base parameters b are the effect's own parameters. Dry friction is linear in
+    its magnitudes while the joint moves; at rest it is whatever holds the joint, and its columns
+    are zero.
+    """
+
+    @abstractmethod
+    def columns(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
+        """Returns φ_i, the force per unit of each base parameter, shaped like the position."""
+
+    def to_base(self, parameters: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+        """Returns the base parameters b that stand for the effect's parameters (short names)."""
+        return tuple(parameters[parameter.name] for parameter in self.parameters)
+
+    def from_base(self, base: tuple[Tensor, ...]) -> dict[str, Tensor]:
+        """Returns the parameters by short name; the inverse of :meth:`to_base`."""
+        return {p.name: value for p, value in zip(self.parameters, base, strict=True)}
 
 
 class Commands(ABC):

@@ -188,6 +188,21 @@ class Prior:
                 self.model(*self.args)
         return torch.cat([messenger.z[site.name].expand(num, -1) for site in self.sites], dim=-1)
 
+    def on_support(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns which values of the latent sites lie on their supports.
+
+        Args:
+            parameters: Values ``(n,) + site.shape`` by site name.
+
+        Returns:
+            Mask ``(n,)``; NaN and infinity are off every support.
+        """
+        num = next(iter(parameters.values())).shape[0]
+        checker = _CheckSupport(self._padded(parameters), num)
+        with _alone(), SkipSimulation(), checker, _Batch(self, num):
+            self.model(*self.args)
+        return checker.mask
+
     def log_prob_parameters(self, z: Tensor) -> Tensor:
         """Returns the prior's log density over the parameters at z, ``(n,)``."""
         trace = self._run(_WriteCoordinates(self, z))
@@ -322,6 +337,31 @@ class _ReadCoordinates(Messenger):
         if msg["name"] in self._sites:
             z = reference_map(msg["fn"]).inverse(msg["value"])
             self.z[msg["name"]] = z.double().reshape(z.shape[0], -1)
+
+
+class _CheckSupport(Messenger):
+    """Gives each latent site a value if that lies on its support, and its median elsewhere.
+
+    Without the median, a site whose distribution depends on an impossible value could not be.
+    """
+
+    def __init__(self, values: Mapping[str, Tensor], num_points: int) -> None:
+        super().__init__()
+        self._values = values
+        self.mask = torch.ones(num_points, dtype=torch.bool)
+
+    def _pyro_sample(self, msg: Any) -> None:
+        if msg["name"] not in self._values:
+            return
+        fn, value = msg["fn"], self._values[msg["name"]]
+        finite = value.isfinite()
+        finite = finite.flatten(-len(fn.event_shape)).all(-1) if fn.event_shape else finite
+        inside = fn.support.check(value) & finite
+        self.mask = self.mask & inside.reshape(len(self.mask), -1).all(-1)
+        to_value = reference_map(fn)
+        median = to_value(value.new_zeros(tuple(fn.batch_shape) + to_value.event_shape))
+        inside = inside.reshape(inside.shape + (1,) * len(fn.event_shape))
+        msg["value"] = torch.where(inside, value, median.to(value.dtype))
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port, find_port
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.inverse_dynamics import InverseDynamics
 
 __all__ = ["Simulator"]
 
@@ -33,6 +34,8 @@ class Simulator(ABC):
         is_deterministic: Whether equal parameters and inputs give equal trajectories.
         is_differentiable: Whether gradients flow from trajectories to parameters.
         effects: The effects attached, in the order of attachment.
+        inverse_dynamics: The equations of motion in the form that linear regression needs, where
+            they have been declared.
     """
 
     states: tuple[Channel, ...]
@@ -44,6 +47,7 @@ class Simulator(ABC):
     is_deterministic: bool = True
     is_differentiable: bool = False
     effects: tuple[Effect, ...] = ()
+    inverse_dynamics: InverseDynamics | None = None
 
     @abstractmethod
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:

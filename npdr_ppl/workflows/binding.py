@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import torch
@@ -10,11 +11,14 @@ from torch import Tensor
 from npdr_ppl.embeddings import Embedding, embedding_by_name
 from npdr_ppl.errors import DataError, ModelError, ShapeError
 from npdr_ppl.inference.base import Problem
+from npdr_ppl.inference.regression import LinearRegression
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.differentiation import Smoothing
+from npdr_ppl.workflows.linear_regression import regression_of
 
 __all__ = ["BindingOptions", "BoundModel", "Data", "bind", "problem_of"]
 
@@ -207,7 +211,24 @@ def problem_of(bound: BoundModel, device: str | torch.device = "cpu") -> Problem
         is_prior_standard_normal=prior.is_standard_normal,
         build_network=bound.network_builder(),
         device=torch.device(device),
+        regression=_regression(bound),
     )
+
+
+def _regression(bound: BoundModel) -> Callable[[Smoothing], LinearRegression] | None:
+    """Returns what computes the model's linear regression, once for each choice of filters."""
+    if len(bound.data) != 1:
+        return None
+    (name, data), *_ = bound.data.items()
+    box = bound.prior.black_boxes[name]
+    if not isinstance(box, SimulatorBlackBox) or not isinstance(data, Rollouts):
+        return None
+
+    @cache
+    def regression(smoothing: Smoothing) -> LinearRegression:
+        return regression_of(bound.prior, box, data, smoothing)
+
+    return regression
 
 
 class _InputsBySite(dict[str, Inputs]):

@@ -49,7 +49,8 @@ def infer(
         data: Measured rollouts, or a tensor for a plain function's output; a dictionary of them
             by site name if the model has several black-box sites.
         backend: Name of a backend, or one with options of its own.
-        rounds: Rounds of proposing, simulating and training.
+        rounds: Rounds of proposing, simulating and training; a backend that does not simulate
+            has its posterior after one.
         num_simulations: Simulations of each round.
         seed: Seed of everything random.
         embedding: Maps trajectories to features; see :mod:`npdr_ppl.embeddings`.
@@ -84,6 +85,8 @@ def infer(
             f"{num_simulations}."
         )
     method = backend_by_name(backend) if isinstance(backend, str) else backend
+    if not method.uses_simulations:
+        rounds = 1
     options = BindingOptions(embedding, segment_length, initial_state, precision)
     bound = bind(model, data, options, device)
     problem = problem_of(bound, device)
@@ -146,6 +149,8 @@ def simulate_features(
     Returns:
         Features, ``(n, ...)`` float32; a simulation that failed has a row that is not finite.
     """
+    if not len(z):
+        return torch.empty(0, *bound.observed_features().shape)
     per_simulation = sum(o.value.numel() for o in bound.observations.values())
     chunk = max(1, min(len(z), MAX_READINGS_PER_CHUNK // max(1, per_simulation)))
     step = report.stage(f"{label}: simulate")

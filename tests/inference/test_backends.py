@@ -10,7 +10,8 @@ import torch
 from npdr_ppl.errors import BackendError, ShapeError
 from npdr_ppl.inference.base import Problem
 from npdr_ppl.inference.mixture import Mixture
-from npdr_ppl.inference.registry import backend, backends
+from npdr_ppl.inference.registry import backend, backend_class, backends
+from npdr_ppl.inference.regression import LinearRegression
 from npdr_ppl.randomness import seeded
 
 GAIN = torch.tensor([[1.0, 0.5], [0.0, 1.0], [0.3, -0.6]])
@@ -32,8 +33,31 @@ def method(request):
     return backend(request.param)
 
 
+@pytest.fixture(
+    params=[name for name in sorted(backends()) if backend_class(name).uses_simulations]
+)
+def simulation_based(request):
+    return backend(request.param)
+
+
 def simulate(z):
     return z @ GAIN.T + NOISE * torch.randn(len(z), 3)
+
+
+def regression_of(observation):
+    """The same problem as a regression: z itself are the base parameters."""
+    return LinearRegression(
+        regressors=GAIN.double(),
+        targets=observation.double(),
+        names=("first", "second"),
+        prior_mean=torch.zeros(2, dtype=torch.float64),
+        prior_covariance=torch.eye(2, dtype=torch.float64),
+        determined=torch.ones(2, dtype=torch.bool),
+        nominal=torch.zeros(2, dtype=torch.float64),
+        to_reference=lambda base, z: (base, torch.ones(len(base), dtype=torch.bool)),
+        from_reference=lambda z: z,
+        noise=NOISE,
+    )
 
 
 def make_problem(device="cpu", observation=OBSERVATION):
@@ -44,6 +68,7 @@ def make_problem(device="cpu", observation=OBSERVATION):
         sample_prior=lambda n: torch.randn(n, 2),
         log_prior=lambda z: normal.log_prob(z).sum(-1),
         device=torch.device(device),
+        regression=lambda smoothing: regression_of(observation),
     )
 
 
@@ -51,7 +76,7 @@ def run_round(method, problem, state, number, fail=0.0, n=NUM_SIMULATIONS):
     with seeded(7, "round", number):
         z = method.ask(problem, state, n)
         x = simulate(z)
-        x[torch.rand(n) < fail] = math.nan
+        x[torch.rand(len(z)) < fail] = math.nan
         return method.tell(problem, state, z, x)
 
 
@@ -82,7 +107,7 @@ def test_recovers_a_linear_gaussian_posterior(method, rounds):
     state = method.init(problem)
     for number in range(rounds):
         state, info = run_round(method, problem, state, number)
-        assert info.num_simulations == NUM_SIMULATIONS
+        assert info.num_simulations == (NUM_SIMULATIONS if method.uses_simulations else 0)
         assert info.num_failed == 0
     assert state.round == rounds
     assert_exact_moments(draws(method, problem, state))
@@ -142,19 +167,22 @@ def test_initial_state_survives_writing(method):
     assert state.round == 1
 
 
-def test_drops_failed_simulations(method):
+def test_drops_failed_simulations(simulation_based):
     problem = make_problem()
-    state, info = run_round(method, problem, method.init(problem), 0, fail=0.2)
+    state, info = run_round(simulation_based, problem, simulation_based.init(problem), 0, fail=0.2)
     error = (0.2 * 0.8 * NUM_SIMULATIONS) ** 0.5
     assert abs(info.num_failed - 0.2 * NUM_SIMULATIONS) < FALSE_ALARM * error
-    assert_exact_moments(draws(method, problem, state))
+    assert_exact_moments(draws(simulation_based, problem, state))
 
 
-def test_refuses_when_all_simulations_failed(method):
+def test_refuses_when_all_simulations_failed(simulation_based):
     problem = make_problem()
     with pytest.raises(BackendError, match="100 of 100 simulations failed"):
-        method.tell(
-            problem, method.init(problem), torch.randn(100, 2), torch.full((100, 3), math.inf)
+        simulation_based.tell(
+            problem,
+            simulation_based.init(problem),
+            torch.randn(100, 2),
+            torch.full((100, 3), math.inf),
         )
 
 
@@ -215,10 +243,10 @@ def test_reports_progress(method):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
-def test_trains_on_the_problems_device(method):
+def test_trains_on_the_problems_device(simulation_based):
     problem = make_problem("cuda")
-    state, _ = run_round(method, problem, method.init(problem), 0)
+    state, _ = run_round(simulation_based, problem, simulation_based.init(problem), 0)
     assert torch.cuda.max_memory_allocated() > 0
-    z = draws(method, problem, state)
+    z = draws(simulation_based, problem, state)
     assert z.device.type == "cpu"
     assert_exact_moments(z)

@@ -131,6 +131,29 @@ def test_no_point_is_implausible():
     assert bool(((parameters["length"] >= 0) & (parameters["length"] <= 1)).all())
 
 
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_draws_lie_on_the_support_and_spoilt_ones_do_not(program):
+    prior = Prior(program)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        values = prior.to_parameters(prior.sample(20))
+    assert prior.on_support(values).all()
+    for site in prior.sites:
+        for spoilt in (torch.nan, torch.inf):
+            changed = {name: value.clone() for name, value in values.items()}
+            changed[site.name].view(20, -1)[3, -1] = spoilt
+            assert prior.on_support(changed).tolist() == [row != 3 for row in range(20)]
+
+
+def test_values_off_the_support_are_told_also_where_others_depend_on_them():
+    prior = Prior(dependent)
+    values = {site.name: torch.ones(4) for site in prior.sites}
+    values["scale"] = torch.tensor([1.0, -1.0, 1.0, 1.0])
+    values["mass"] = torch.tensor([1.0, 1.0, -2.0, 1.0])
+    values["rate"] = torch.tensor([1.0, 1.0, 1.0, -1.0])
+    assert prior.on_support(values).tolist() == [True, False, False, False]
+
+
 def test_execution_is_batched_and_keeps_plates():
     prior = Prior(fleet)
     torch.manual_seed(0)

@@ -6,6 +6,7 @@ import torch
 from npdr_ppl.engines.integrators import INTEGRATORS
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.cart_pole import CartPole
 from npdr_ppl.models.effects import (
     ActuatorGain,
     ActuatorLag,
@@ -17,12 +18,13 @@ from npdr_ppl.models.effects import (
     Tilt,
     effects,
 )
+from npdr_ppl.models.emps import Emps
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.pendulum import Pendulum
 
 CASES = [
     pytest.param(simulator, effect, port, id=f"{simulator.__name__}-{port}-{name}")
-    for simulator in (Pendulum, Furuta)
+    for simulator in (Pendulum, Furuta, CartPole, Emps)
     for name, effect in effects().items()
     for port in (
         *(port.name for port in simulator.ports if port.kind in effect.port_kinds),
@@ -95,7 +97,9 @@ def test_batch_equals_a_loop(simulator, effect, port):
     changed = simulator().with_effects(attached)
     inputs = some_inputs(simulator)
     parameters = draws(attached, changed.port(port), 4)
-    parameters["gravity"] = torch.linspace(9.0, 10.0, 4, dtype=torch.float64)
+    # One of the simulator's own parameters varies along.
+    own = simulator.parameters[0]
+    parameters[own.name] = own.nominal * torch.linspace(0.9, 1.1, 4, dtype=torch.float64)
     batch = changed.simulate(parameters, inputs)
     assert batch.shape == (4, 3, 40, len(simulator.states))
     for i in range(4):
@@ -117,8 +121,10 @@ def test_prior_draws_matter_and_stay_finite(simulator, effect, port):
     assert out.isfinite().all()
     assert (out[..., ~inputs.mask, :] == 0.0).all()
     matters = ((out - base).abs().flatten(1).amax(1) > 1e-12).float().mean()
-    # Nothing depends on where the arm's zero is, and a segment starts from its own reading.
-    is_symmetry = port == "arm_angle" and effect is EncoderBias
+    # Nothing depends on where the arm's, the cart's or the carriage's zero is, and a segment
+    # starts from its own reading.
+    origins = ("arm_angle", "cart_position", "position")
+    is_symmetry = port in origins and effect is EncoderBias
     assert matters == 0.0 if is_symmetry else matters > 0.9
 
 

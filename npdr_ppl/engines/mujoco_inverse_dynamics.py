@@ -1,0 +1,336 @@
+"""Inverse dynamics of any MJCF, linear in its inertial and friction parameters.
+
+A rigid body b with mass m, first moment h = m c and inertia I about its frame's origin needs, for
+the angular velocity ω, angular acceleration α and proper acceleration a (acceleration less
+gravity) of that origin, all in the body's frame, the wrench
+
+    f = m a + α × h + ω × (ω × h),    n = I α + ω × (I ω) + h × a,
+
+which is linear in (m, h, I). Its generalised force is J_bᵀ (f, n) with the body's Jacobian; joints
+add armature · v̇ + damping · v + frictionloss · sign v. Summed over bodies and joints that is
+
+    Y(q, v, v̇) π = τ,
+
+with τ the applied forces less those of springs and the like, which are taken as known.
+
+Reference: C. G. Atkeson, C. H. An, J. M. Hollerbach, Estimation of inertial parameters of
+manipulator loads and links, 1986, Eqs. 2–10; P. M. Wensing, S. Kim, J.-J. E. Slotine, Linear
+matrix inequalities for physically consistent inertial parameter identification, 2018 (pseudo-
+inertia).
+"""
+
+import copy
+import importlib
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.errors import ModelError, ShapeError
+
+__all__ = [
+    "INERTIAL",
+    "JOINT",
+    "MujocoInverseDynamics",
+    "actuator_forces",
+    "is_physical",
+    "load_mjcf",
+    "with_parameters",
+]
+
+Array = NDArray[np.float64]
+
+INERTIAL = ("mass", "hx", "hy", "hz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+"""Inertial parameters of a body, in its frame and about its origin: kg, kg m and kg m²."""
+
+JOINT = ("damping", "frictionloss", "armature")
+"""Parameters of a degree of freedom."""
+
+
+def load_mjcf(source: Any) -> Any:
+    """Returns the ``mujoco.MjModel`` of an MJCF file, or the given one.
+
+    Args:
+        source: Path of an MJCF file, or a ``mujoco.MjModel``.
+
+    Raises:
+        ModelError: The file is not MJCF.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    if not isinstance(source, str | PathLike):
+        return source
+    try:
+        return mujoco.MjModel.from_xml_path(str(source))
+    except ValueError as error:
+        raise ModelError(f"{source} is not a readable MJCF file: {error}") from error
+
+
+@dataclass(frozen=True)
+class MujocoInverseDynamics:
+    """The linear form of a model's inverse dynamics.
+
+    Contacts, joint limits and equality constraints are no part of it: equality constraints are
+    refused, and motions should be free of the others.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+
+    Attributes:
+        bodies: Numbers of the moving bodies, in the order of the parameters.
+
+    Raises:
+        ModelError: The model has equality constraints or no degrees of freedom.
+    """
+
+    model: Any
+
+    def __post_init__(self) -> None:
+        """Checks the model."""
+        if self.model.nv == 0:
+            raise ModelError("The MJCF has no joints, so that no motion tells its parameters.")
+        if self.model.neq:
+            raise ModelError(
+                f"The MJCF has {self.model.neq} equality constraints; inverse dynamics is linear "
+                "only without them."
+            )
+
+    @property
+    def bodies(self) -> tuple[int, ...]:
+        """Numbers of the bodies that some joint moves."""
+        return tuple(b for b in range(1, self.model.nbody) if self.model.body_weldid[b] != 0)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters π: ``<body>.<inertial>``, then ``<joint>.<parameter>``."""
+        names = [f"{self._body_name(b)}.{p}" for b in self.bodies for p in INERTIAL]
+        return (*names, *(f"{joint}.{p}" for joint in self.dof_names for p in JOINT))
+
+    @property
+    def dof_names(self) -> tuple[str, ...]:
+        """Names of the degrees of freedom; a joint that has several numbers them."""
+        names = []
+        for dof in range(self.model.nv):
+            joint = int(self.model.dof_jntid[dof])
+            name = self.model.joint(joint).name or f"joint_{joint}"
+            first = int(self.model.jnt_dofadr[joint])
+            alone = np.count_nonzero(self.model.dof_jntid == joint) == 1
+            names.append(name if alone else f"{name}[{dof - first}]")
+        return tuple(names)
+
+    def nominal(self) -> Array:
+        """Returns π of the model as it stands, ``(P,)``."""
+        model = self.model
+        values = []
+        for body in self.bodies:
+            mass, centre = float(model.body_mass[body]), model.body_ipos[body]
+            axes = _rotation(model.body_iquat[body])
+            inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
+            inertia = inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+            values += [mass, *(mass * centre), *inertia[[0, 1, 2], [0, 1, 2]]]
+            values += [inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+        for dof in range(model.nv):
+            values += [float(getattr(model, f"dof_{name}")[dof]) for name in JOINT]
+        return np.array(values)
+
+    def regressors(self, positions: Array, velocities: Array, accelerations: Array) -> Array:
+        """Returns Y, ``(N, nv, P)``.
+
+        Args:
+            positions: MuJoCo's qpos, ``(N, nq)``.
+            velocities: Its qvel, ``(N, nv)``.
+            accelerations: Its qacc, ``(N, nv)``.
+
+        Raises:
+            ShapeError: The shapes do not fit the model.
+        """
+        return self._evaluate(positions, velocities, accelerations)[0]
+
+    def targets(self, positions: Array, velocities: Array, applied: Array) -> Array:
+        """Returns τ, ``(N, nv)``: applied forces and what springs, tendons and fluids add.
+
+        Args:
+            positions: MuJoCo's qpos, ``(N, nq)``.
+            velocities: Its qvel, ``(N, nv)``.
+            applied: Applied generalised forces, those of actuators included, ``(N, nv)``.
+
+        Raises:
+            ShapeError: The shapes do not fit the model.
+        """
+        if applied.shape != velocities.shape:
+            raise ShapeError(
+                f"Applied forces must have the velocities' shape {velocities.shape}, got "
+                f"{applied.shape}."
+            )
+        return applied + self._evaluate(positions, velocities, np.zeros_like(velocities))[1]
+
+    def _evaluate(self, positions: Array, velocities: Array, accelerations: Array) -> Any:
+        """Returns Y, and the passive forces but the joints' own damping."""
+        mujoco: Any = importlib.import_module("mujoco")
+        model, bodies = self.model, self.bodies
+        self._check_shapes(positions, velocities, accelerations)
+        data = mujoco.MjData(model)
+        rows = np.zeros((len(positions), model.nv, len(self.names)))
+        passive = np.zeros((len(positions), model.nv))
+        linear, angular = np.zeros((2, 3, model.nv))
+        twist, acceleration = np.zeros((2, 6))
+        for n in range(len(positions)):
+            data.qpos[:], data.qvel[:] = positions[n], velocities[n]
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            data.qacc[:] = accelerations[n]
+            mujoco.mj_rnePostConstraint(model, data)
+            passive[n] = data.qfrc_passive + model.dof_damping * data.qvel
+            for k, body in enumerate(bodies):
+                frame = mujoco.mjtObj.mjOBJ_XBODY
+                mujoco.mj_objectVelocity(model, data, frame, body, twist, 1)
+                # Includes minus gravity, as MuJoCo's accelerations do.
+                mujoco.mj_objectAcceleration(model, data, frame, body, acceleration, 1)
+                mujoco.mj_jacBody(model, data, linear, angular, body)
+                axes = data.xmat[body].reshape(3, 3)
+                wrench = _wrench(twist[:3], acceleration[:3], acceleration[3:])
+                forces = (axes.T @ linear).T @ wrench[:3] + (axes.T @ angular).T @ wrench[3:]
+                rows[n, :, 10 * k : 10 * k + 10] = forces
+        start = 10 * len(bodies)
+        for dof in range(model.nv):
+            columns = (velocities[:, dof], np.sign(velocities[:, dof]), accelerations[:, dof])
+            rows[:, dof, start + 3 * dof : start + 3 * dof + 3] = np.stack(columns, axis=-1)
+        return rows, passive
+
+    def _check_shapes(self, *arrays: Array) -> None:
+        wanted = (self.model.nq, self.model.nv, self.model.nv)
+        for name, array, width in zip(
+            ("positions", "velocities", "accelerations"), arrays, wanted, strict=True
+        ):
+            if array.shape != (len(arrays[0]), width):
+                raise ShapeError(
+                    f"{name} must have shape ({len(arrays[0])}, {width}), got {array.shape}."
+                )
+
+    def _body_name(self, body: int) -> str:
+        return self.model.body(body).name or f"body_{body}"
+
+
+def actuator_forces(model: Any, positions: Array, velocities: Array, controls: Array) -> Array:
+    """Returns the generalised forces of a model's actuators, ``(N, nv)``.
+
+    Args:
+        model: A ``mujoco.MjModel`` whose actuators have no state of their own.
+        positions: Its qpos, ``(N, nq)``.
+        velocities: Its qvel, ``(N, nv)``.
+        controls: Its ctrl, ``(N, nu)``.
+
+    Raises:
+        ModelError: An actuator has a state.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    if model.na:
+        raise ModelError("Actuators with states have no force that position and control tell.")
+    data = mujoco.MjData(model)
+    forces = np.zeros((len(positions), model.nv))
+    for n in range(len(positions)):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = positions[n], velocities[n], controls[n]
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_fwdActuation(model, data)
+        forces[n] = data.qfrc_actuator
+    return forces
+
+
+def is_physical(parameters: Array, num_bodies: int) -> NDArray[np.bool_]:
+    """Returns which parameter sets can exist.
+
+    A body can exist if its mass is positive and its pseudo-inertia, the 4 × 4 matrix of its
+    mass distribution's moments, is positive definite: then its principal moments also satisfy
+    the triangle inequality. Damping, dry friction and armature must not be negative.
+
+    Args:
+        parameters: Sets π, ``(n, P)``, in the order of :attr:`MujocoInverseDynamics.names`.
+        num_bodies: Number of moving bodies.
+
+    Returns:
+        Mask ``(n,)``.
+    """
+    inertial = parameters[:, : 10 * num_bodies].reshape(len(parameters), num_bodies, 10)
+    xx, yy, zz, xy, xz, yz = np.moveaxis(inertial[..., 4:], -1, 0)
+    pseudo = np.empty((*inertial.shape[:2], 4, 4))
+    half = 0.5 * (xx + yy + zz)
+    # Second moments: Σ = ½ tr(I) 1 − I.
+    for i, moment in enumerate((xx, yy, zz)):
+        pseudo[..., i, i] = half - moment
+    for (i, j), product in zip(((0, 1), (0, 2), (1, 2)), (xy, xz, yz), strict=True):
+        pseudo[..., i, j] = pseudo[..., j, i] = -product
+    pseudo[..., 3, :3] = pseudo[..., :3, 3] = inertial[..., 1:4]
+    pseudo[..., 3, 3] = inertial[..., 0]
+    finite = np.isfinite(parameters).all(-1)
+    pseudo[~finite] = -1.0
+    positive = (np.linalg.eigvalsh(pseudo) > 0.0).all(axis=(-2, -1))
+    brakes = (parameters[:, 10 * num_bodies :] >= 0.0).all(axis=-1)
+    return np.asarray(finite & positive & brakes)
+
+
+def with_parameters(model: Any, parameters: Array) -> Any:
+    """Returns a copy of a model with other parameters.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        parameters: One physical set π, ``(P,)``; see :func:`is_physical`.
+
+    Raises:
+        ModelError: The set is not physical.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    dynamics = MujocoInverseDynamics(model)
+    bodies = dynamics.bodies
+    if not is_physical(parameters[None], len(bodies))[0]:
+        raise ModelError("A model cannot have these parameters; see is_physical.")
+    changed = copy.copy(model)
+    for body, (mass, *rest) in zip(
+        bodies, parameters[: 10 * len(bodies)].reshape(-1, 10), strict=True
+    ):
+        centre = np.array(rest[:3]) / mass
+        inertia = np.diag(rest[3:6])
+        for (i, j), product in zip(((0, 1), (0, 2), (1, 2)), rest[6:], strict=True):
+            inertia[i, j] = inertia[j, i] = product
+        inertia = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+        moments, axes = np.linalg.eigh(inertia)
+        # Right-handed, or there is no rotation to the principal axes.
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+        changed.body_mass[body], changed.body_ipos[body] = mass, centre
+        changed.body_inertia[body] = moments
+        mujoco.mju_mat2Quat(changed.body_iquat[body], axes.flatten())
+    joints = parameters[10 * len(bodies) :].reshape(-1, len(JOINT))
+    for name, column in zip(JOINT, joints.T, strict=True):
+        getattr(changed, f"dof_{name}")[:] = column
+    mujoco.mj_setConst(changed, mujoco.MjData(changed))
+    return changed
+
+
+def _wrench(spin: Array, turn: Array, acceleration: Array) -> Array:
+    """Returns the wrench (f, n) per unit of each inertial parameter, ``(6, 10)``."""
+    wrench = np.zeros((6, 10))
+    wrench[:3, 0] = acceleration
+    wrench[:3, 1:4] = _cross(turn) + _cross(spin) @ _cross(spin)
+    wrench[3:, 1:4] = -_cross(acceleration)
+    wrench[3:, 4:] = _inertia_times(turn) + _cross(spin) @ _inertia_times(spin)
+    return wrench
+
+
+def _cross(v: Array) -> Array:
+    """Returns the matrix of v ×."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _inertia_times(v: Array) -> Array:
+    """Returns the matrix that takes (ixx, iyy, izz, ixy, ixz, iyz) to I v, ``(3, 6)``."""
+    x, y, z = v
+    return np.array([[x, 0.0, 0.0, y, z, 0.0], [0.0, y, 0.0, x, 0.0, z], [0.0, 0.0, z, 0.0, x, y]])
+
+
+def _rotation(quaternion: Array) -> Array:
+    """Returns the rotation matrix of a unit quaternion (w, x, y, z)."""
+    mujoco: Any = importlib.import_module("mujoco")
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)

@@ -1,0 +1,116 @@
+"""Equations of motion that are linear in base parameters: what linear regression needs.
+
+The inverse dynamics of a rigid mechanism are linear in *base parameters* β, combinations of its
+physical parameters (masses, lengths, dampings):
+
+    Y(q, q̇, q̈, u) β = t(q, q̇, q̈, u)
+
+with one row per joint. A simulator whose equations have this form declares them as an
+:class:`InverseDynamics`, and regression finds β in closed form, without simulating.
+
+References: C. G. Atkeson, C. H. An, J. M. Hollerbach, Estimation of inertial parameters of
+manipulator loads and links, 1986; M. Gautier, W. Khalil, Direct calculation of minimum set of
+inertial parameters of serial robots, 1990.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+__all__ = ["BaseParameter", "InverseDynamics", "Motion"]
+
+
+@dataclass(frozen=True)
+class BaseParameter:
+    """A combination of physical parameters that the equations of motion are linear in.
+
+    Attributes:
+        name: Name for tables, e.g. ``"hinge_inertia"``.
+        unit: Unit of its term's factor, e.g. ``"kg m²"``.
+        description: The combination, in symbols.
+    """
+
+    name: str
+    unit: str
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of a mechanism at N instants; each entry of a tuple has the shape ``(N,)``.
+
+    Attributes:
+        positions: Generalised positions, one tensor per joint.
+        velocities: Their rates.
+        accelerations: Their second rates.
+        actions: Commands in force at each instant, one tensor per action channel.
+    """
+
+    positions: tuple[Tensor, ...]
+    velocities: tuple[Tensor, ...]
+    accelerations: tuple[Tensor, ...]
+    actions: tuple[Tensor, ...]
+
+
+class InverseDynamics(ABC):
+    """Y(q, q̇, q̈, u) β = t, and how β and the physical parameters follow from each other.
+
+    Neither Y nor t may depend on a parameter: one that scales or shifts them, such as a motor's
+    gain, belongs into β.
+
+    Attributes:
+        base: The base parameters β, in the order of Y's columns.
+        determined: Physical parameters that follow from β once all others are given. Those others
+            (a motor's constants, gravity) may appear in β, but no measurement of the motion can
+            tell them.
+        positive: Physical parameters that must be greater than zero to mean anything.
+        non_negative: Those that must not be less than zero.
+    """
+
+    base: tuple[BaseParameter, ...]
+    determined: tuple[str, ...]
+    positive: tuple[str, ...] = ()
+    non_negative: tuple[str, ...] = ()
+
+    @abstractmethod
+    def regressors(self, motion: Motion) -> Tensor:
+        """Returns Y, ``(N, joints, k)``."""
+
+    @abstractmethod
+    def targets(self, motion: Motion) -> Tensor:
+        """Returns t, ``(N, joints)``."""
+
+    @abstractmethod
+    def to_base(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Maps physical parameters, all of a shape B, to base parameters, ``B + (k,)``."""
+
+    @abstractmethod
+    def to_physical(self, base: Tensor, given: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Maps base parameters to the determined ones; the inverse of :meth:`to_base`.
+
+        Args:
+            base: Base parameters, ``B + (k,)``, of any value.
+            given: Physical parameters of the shape B; those determined are not looked at.
+
+        Returns:
+            The determined parameters, which may be implausible: negative, infinite or NaN.
+        """
+
+    def force_scale(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns by how much a row changes per unit of generalised force at its joint, shape B.
+
+        One where t is a force or torque; 1/(gain) where t is a command.
+        """
+        return torch.ones_like(next(iter(parameters.values())))
+
+    def is_physical(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns which parameter sets, of shape B, can exist: a mask of shape B."""
+        possible = torch.stack([parameters[name].isfinite() for name in self.determined]).all(0)
+        for name in self.positive:
+            possible = possible & (parameters[name] > 0.0)
+        for name in self.non_negative:
+            possible = possible & (parameters[name] >= 0.0)
+        return possible
