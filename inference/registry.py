@@ -20,6 +20,7 @@ GROUP = "npdr_ppl.backends"
 BUILT_IN = {
     "nle": "npdr_ppl.inference.nle:NLE",
     "nre": "npdr_ppl.inference.nre:NRE",
+    "nuts": "npdr_ppl.inference.nuts:NUTS",
     "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
     "bayesian-linear-regression": (
         "npdr_ppl.inference.bayesian_linear_regression:BayesianLinearRegression"

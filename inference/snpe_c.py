@@ -38,7 +38,14 @@ from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem, State
 from npdr_ppl.inference.features import Preconditioner
-from npdr_ppl.inference.flows import FLOWS, Flow, FlowDensity, FlowNetwork, build_networks, load_member
+from npdr_ppl.inference.flows import (
+    FLOWS,
+    Flow,
+    FlowDensity,
+    FlowNetwork,
+    build_networks,
+    load_member,
+)
 from npdr_ppl.inference.mixture import Mixture
 from npdr_ppl.inference.neural import NeuralBackend, NeuralState, Simulations
 from npdr_ppl.inference.proposals import log_density_bound, sample_truncated_prior

@@ -215,15 +215,27 @@ class UnnormalisedDensity(Density):
     Args:
         problem: Gives the prior.
         log_likelihood: log L, differentiable.
+        draws: Draws ``(n, d)`` made by other means; without them, particles are tempered for
+            every sample.
     """
 
-    def __init__(self, problem: Problem, log_likelihood: LogDensity) -> None:
+    def __init__(
+        self, problem: Problem, log_likelihood: LogDensity, draws: Tensor | None = None
+    ) -> None:
         self._problem = problem
         self._log_likelihood = log_likelihood
+        self._draws = draws
         self._log_z: float | None = None
 
     def sample(self, num_samples: int) -> Tensor:
-        """Draws ``(num_samples, d)`` from torch's global stream."""
+        """Draws ``(num_samples, d)`` from torch's global stream.
+
+        Of given draws, as few as possible are repeated.
+        """
+        if self._draws is not None:
+            n = len(self._draws)
+            repeats = [torch.randperm(n) for _ in range(-(-num_samples // n))]
+            return self._draws[torch.cat(repeats)[:num_samples]]
         num_particles = max(num_samples, MIN_PARTICLES)
         particles = tempered_particles(self._problem, self._log_likelihood, num_particles)
         return particles.z[torch.randperm(num_particles)[:num_samples]]

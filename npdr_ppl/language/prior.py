@@ -162,8 +162,8 @@ class Prior:
         )
 
     def log_prob(self, z: Tensor) -> Tensor:
-        """Returns the log density of the prior over z, ``(n,)``, at ``(n, d)``."""
-        z = z.detach().double()
+        """Returns the log density of the prior over z, ``(n,)``, at ``(n, d)``; differentiable."""
+        z = z.double()
         if self.is_standard_normal:
             return -0.5 * (z.square() + math.log(2 * math.pi)).sum(-1)
         writer = _WriteCoordinates(self, z)
@@ -171,7 +171,7 @@ class Prior:
         return writer.log_prob
 
     def to_parameters(self, z: Tensor) -> dict[str, Tensor]:
-        """Maps z, ``(n, d)``, to the values of every latent site, ``(n,) + site.shape``."""
+        """Maps z, ``(n, d)``, to values of every latent site, ``(n,) + site.shape``."""
         trace = self._run(_WriteCoordinates(self, z))
         return {
             site.name: self._without_padding(site, trace.nodes[site.name]["value"])
@@ -179,7 +179,7 @@ class Prior:
         }
 
     def to_reference(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Maps values of every latent site, ``(n,) + site.shape``, to z, ``(n, d)``."""
+        """Maps values of every latent site, ``(n,) + site.shape``, to z; differentiable."""
         num = next(iter(parameters.values())).shape[0]
         data = self._padded(parameters)
         messenger = _ReadCoordinates(self)
@@ -261,6 +261,8 @@ class Prior:
     def pointwise_log_prob(self, name: str, value: Tensor, z: Tensor) -> Tensor:
         """Returns the density of every reading at a black-box site, ``(n,) + value.shape``.
 
+        It is differentiable in z where the simulator is.
+
         Args:
             name: The site.
             value: What was observed there.
@@ -270,8 +272,7 @@ class Prior:
             IntractableError: The site has no density.
         """
         trace = self._run(_WriteCoordinates(self, z))
-        with torch.no_grad():
-            log_prob, _ = trace.nodes[name]["fn"].pointwise_log_prob(value)
+        log_prob, _ = trace.nodes[name]["fn"].pointwise_log_prob(value)
         return log_prob.reshape((len(z), *value.shape))
 
     def _run(self, writer: "_WriteCoordinates") -> Any:
@@ -310,7 +311,7 @@ class _WriteCoordinates(Messenger):
     def __init__(self, prior: Prior, z: Tensor) -> None:
         super().__init__()
         self._sites = {site.name: site for site in prior.sites}
-        self._z = z.detach().double()
+        self._z = z.double()
         self.num_points = z.shape[0]
         self.log_prob = torch.zeros(self.num_points, dtype=torch.float64)
 
@@ -366,8 +367,8 @@ class _CheckSupport(Messenger):
 
 @contextmanager
 def _alone() -> Iterator[None]:
-    """Keeps a run of the program to itself: outside handlers do not see it, nor do gradients."""
-    with torch.no_grad(), poutine.block():
+    """Keeps a run of the program to itself: outside handlers do not see it."""
+    with poutine.block():
         yield
 
 

@@ -98,6 +98,11 @@ class BlackBox(TorchDistribution):
         """Whether equal parameters give equal output."""
 
     @property
+    @abstractmethod
+    def is_differentiable(self) -> bool:
+        """Whether the declared noise gives a density with gradients."""
+
+    @property
     def _channel_names(self) -> tuple[str, ...] | None:
         return None
 
@@ -221,6 +226,11 @@ class SimulatorBlackBox(BlackBox):
         return self.simulator.is_deterministic
 
     @property
+    def is_differentiable(self) -> bool:
+        """Whether the declared noise gives a density with gradients."""
+        return self.simulator.is_deterministic and self.simulator.is_differentiable
+
+    @property
     def _channel_names(self) -> tuple[str, ...]:
         return tuple(sensor.name for sensor in self.simulator.sensors)
 
@@ -287,6 +297,18 @@ class FunctionBlackBox(BlackBox):
                 self._run(torch.Size())
         assert self._known_event_shape is not None
         return self._known_event_shape
+
+    @property
+    def is_differentiable(self) -> bool:
+        """Whether the declared noise gives a density with gradients; a function is tried out."""
+        arguments = {
+            name: value.detach().double().requires_grad_()
+            for name, value in self.parameters.items()
+        }
+        probe = FunctionBlackBox(self.site, self.function, arguments, self.noise)
+        probe._event_dims = self._event_dims
+        with torch.random.fork_rng(devices=[]), torch.enable_grad():
+            return bool(probe._run(self.batch_shape).requires_grad)
 
     @property
     def _is_deterministic(self) -> bool:

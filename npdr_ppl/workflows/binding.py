@@ -212,7 +212,27 @@ def problem_of(bound: BoundModel, device: str | torch.device = "cpu") -> Problem
         build_network=bound.network_builder(),
         device=torch.device(device),
         regression=_regression(bound),
+        log_likelihood=_log_likelihood(bound),
     )
+
+
+def _log_likelihood(bound: BoundModel) -> Callable[[Tensor], Tensor] | None:
+    """Returns the log density of all that was measured, if the model has one with gradients."""
+    prior = bound.prior
+    for box in prior.black_boxes.values():
+        if box.noise is None or not box.is_differentiable:
+            return None
+
+    def log_likelihood(z: Tensor) -> Tensor:
+        total = torch.zeros(len(z), dtype=torch.float64)
+        for name, observation in bound.observations.items():
+            log_prob = prior.pointwise_log_prob(name, observation.value, z)
+            if observation.channels is not None:  # absent ones hold zeros
+                log_prob = log_prob[..., list(observation.channels)]
+            total = total + log_prob.flatten(1).sum(-1).cpu()
+        return total.to(z)
+
+    return log_likelihood
 
 
 def _regression(bound: BoundModel) -> Callable[[Smoothing], LinearRegression] | None:

@@ -69,6 +69,9 @@ def make_problem(device="cpu", observation=OBSERVATION):
         log_prior=lambda z: normal.log_prob(z).sum(-1),
         device=torch.device(device),
         regression=lambda smoothing: regression_of(observation),
+        log_likelihood=lambda z: (
+            -0.5 * ((observation - z @ GAIN.T.to(z)) / NOISE).square().sum(-1)
+        ),
     )
 
 

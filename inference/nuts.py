@@ -1,0 +1,186 @@
+"""NUTS: the reference, for models whose recording has a differentiable density.
+
+Hoffman & Gelman (2014), https://arxiv.org/abs/1111.4246, in Pyro's implementation, over the
+reference coordinates z, where the prior is close to N(0, I). It takes no simulations from the
+caller: the density evaluates the simulator itself. Chains become ensemble members, so that ArviZ's
+r-hat across members is that of the chains.
+"""
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, ClassVar
+
+import torch
+from pyro.infer import MCMC
+from pyro.infer import NUTS as PyroNUTS
+from torch import Tensor
+
+from npdr_ppl.errors import BackendError, ShapeError
+from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
+from npdr_ppl.inference.checks import check_problem, finite_rows
+from npdr_ppl.inference.tempering import LogDensity, UnnormalisedDensity, tempered_particles
+
+__all__ = ["NUTS", "NUTSState"]
+
+logger = logging.getLogger(__name__)
+
+NUM_START_PARTICLES = 200
+"""Particles tempered towards the posterior from which chains start: far from it a step of NUTS
+takes as many evaluations as it may."""
+
+
+@dataclass(frozen=True)
+class NUTSState(State):
+    """What NUTS has drawn.
+
+    Attributes:
+        draws: Draws of every chain, ``(chains, num_samples, d)``; empty before the first round.
+    """
+
+    draws: Tensor
+
+
+@dataclass(frozen=True)
+class NUTS(Backend):
+    """The No-U-Turn sampler; see the module's text.
+
+    Args:
+        chains: Number of chains, run one after another.
+        num_samples: Draws kept of each.
+        warmup: Steps before, in which step size and mass matrix adapt.
+        max_tree_depth: Doublings of a trajectory at most.
+    """
+
+    name: ClassVar[str] = "nuts"
+    summary: ClassVar[str] = "Pyro's No-U-Turn sampler, the reference for differentiable models"
+    uses_simulations: ClassVar[bool] = False
+
+    chains: int = 2
+    num_samples: int = 1_000
+    warmup: int = 300
+    max_tree_depth: int = 6
+
+    def __post_init__(self) -> None:
+        """Validates the options."""
+        for option in ("chains", "num_samples", "warmup", "max_tree_depth"):
+            if getattr(self, option) < 1:
+                raise BackendError(
+                    f"nuts: {option} must be at least 1; got {getattr(self, option)}."
+                )
+
+    def init(self, problem: Problem) -> NUTSState:
+        """Returns the state before any draw.
+
+        Raises:
+            BackendError: The recording has no differentiable density under the model.
+        """
+        check_problem(problem)
+        _density(problem)
+        return NUTSState(0, torch.empty(self.chains, 0, problem.num_parameters))
+
+    def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
+        """Returns no parameters, ``(0, d)``: nothing has to be simulated by the caller."""
+        return torch.empty(0, problem.num_parameters)
+
+    def tell(
+        self,
+        problem: Problem,
+        state: State,
+        z: Tensor,
+        x: Tensor,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> tuple[NUTSState, RoundInfo]:
+        """Runs the chains anew; simulations are not looked at. See :meth:`Backend.tell`."""
+        start = perf_counter()
+        finite_rows(problem, z, x, 0)
+        state = _own(state)
+        log_likelihood = _density(problem)
+
+        def potential(values: Mapping[str, Tensor]) -> Tensor:
+            z = values["z"][None]
+            return -(log_likelihood(z) + _differentiable_log_prior(problem, z))[0]
+
+        particles = tempered_particles(problem, log_likelihood, NUM_START_PARTICLES).z
+        total = self.chains * (self.warmup + self.num_samples)
+        done, num_divergent, draws = 0, 0, []
+
+        def report(*_: object) -> None:
+            nonlocal done
+            done += 1
+            if progress is not None:
+                progress(done / total, f"chain {len(draws) + 1}, step {done} of {total}")
+
+        for chain in range(self.chains):
+            kernel = PyroNUTS(
+                potential_fn=potential, full_mass=True, max_tree_depth=self.max_tree_depth
+            )
+            sampler = MCMC(
+                kernel,
+                num_samples=self.num_samples,
+                warmup_steps=self.warmup,
+                initial_params={"z": particles[chain].double()},
+                hook_fn=report,
+                disable_progbar=True,
+            )
+            sampler.run()
+            draws.append(sampler.get_samples()["z"].float())
+            num_divergent += len(sampler.diagnostics()["divergences"]["chain 0"])
+        if num_divergent:
+            logger.warning("nuts: %d of %d draws diverged.", num_divergent, total)
+        info = RoundInfo(len(z), 0, perf_counter() - start, {"divergent": num_divergent})
+        return NUTSState(state.round + 1, torch.stack(draws)), info
+
+    def densities(self, problem: Problem, state: State) -> list[Density]:
+        """Returns the posterior as every chain saw it."""
+        state = _own(state)
+        if not state.draws.shape[1]:
+            raise BackendError("There is no posterior yet: tell the backend simulations first.")
+        log_likelihood = _density(problem)
+        return [UnnormalisedDensity(problem, log_likelihood, chain) for chain in state.draws]
+
+    def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Splits a state into tensors and JSON-serialisable values."""
+        state = _own(state)
+        return {"draws": state.draws}, {"backend": self.name, "round": state.round}
+
+    def restore(
+        self, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
+    ) -> NUTSState:
+        """Rebuilds a state from :meth:`tensors`.
+
+        Raises:
+            ShapeError: It is the state of another problem.
+            BackendError: It is the state of another backend.
+        """
+        if values.get("backend") != self.name:
+            raise BackendError(f"This state is of backend {values.get('backend')!r}, not nuts.")
+        draws = tensors["draws"]
+        if draws.shape[-1] != problem.num_parameters:
+            raise ShapeError(
+                f"The state holds draws of {draws.shape[-1]} parameters; the problem has "
+                f"{problem.num_parameters}."
+            )
+        return NUTSState(int(values["round"]), draws)
+
+
+def _density(problem: Problem) -> LogDensity:
+    if problem.log_likelihood is None:
+        raise BackendError(
+            "nuts needs a model whose recording has a differentiable density: a differentiable, "
+            "deterministic simulator whose readings have noise, simulate(..., noise=...)."
+        )
+    return problem.log_likelihood
+
+
+def _differentiable_log_prior(problem: Problem, z: Tensor) -> Tensor:
+    if problem.is_prior_standard_normal:
+        return -0.5 * z.square().sum(-1)
+    return problem.log_prior(z)
+
+
+def _own(state: State) -> NUTSState:
+    if not isinstance(state, NUTSState):
+        raise BackendError(f"nuts cannot continue from a {type(state).__name__}.")
+    return state
