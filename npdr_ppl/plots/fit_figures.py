@@ -15,7 +15,7 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.evaluation import replay
 from npdr_ppl.workflows.fit import parameter_units
-from npdr_ppl.workflows.posterior import Posterior
+from npdr_ppl.workflows.posterior import PosteriorBase
 
 __all__ = ["write_fit_figures"]
 
@@ -26,7 +26,7 @@ MAX_PAIRS = 12
 
 
 def write_fit_figures(
-    posterior: Posterior,
+    posterior: PosteriorBase,
     model: Any,
     rollouts: Rollouts,
     out: Path,
