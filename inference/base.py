@@ -85,10 +85,13 @@ class Backend(ABC):
     Attributes:
         name: Word that selects it, e.g. ``"snpe-c"``.
         summary: One line for tables.
+        is_sequential: Whether later rounds learn from earlier ones. If not, a caller with a budget
+            spends it in one round.
     """
 
     name: ClassVar[str]
     summary: ClassVar[str]
+    is_sequential: ClassVar[bool] = True
 
     @abstractmethod
     def init(self, problem: Problem) -> State:
