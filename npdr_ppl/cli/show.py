@@ -1,5 +1,6 @@
 """Result tables on the terminal."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-__all__ = ["show_fit", "show_rows"]
+__all__ = ["show_comparison", "show_fit", "show_rows"]
 
 FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
 """Columns of figures with the width they need."""
@@ -48,6 +49,45 @@ def show_fit(result: Mapping[str, Any], out: Path) -> None:
     console.print(f"Results and figures are in {out}/")
 
 
+def show_comparison(result: Mapping[str, Any], out: Path) -> None:
+    """Prints the content of ``comparison.json``, the best backend first."""
+    console = _console()
+    settings, rows = result["settings"], result["backends"]
+    table = Table(
+        title=f"{settings['rounds'] * settings['num_simulations']} simulations each, judged by "
+        f"{settings['evaluated_on']} data",
+        box=SIMPLE,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("backend", overflow="fold")
+    for column in ("elpd", "behind best", "weight", "RMSE", "DTW", "CRPS", "r-hat"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("in 50/80/95 %", justify="right", no_wrap=True)
+    table.add_column("time", justify="right", no_wrap=True)
+    table.add_column("decision", overflow="fold")
+    for label in result["ranking"]:
+        row = rows[label]
+        behind = row["elpd_difference"]
+        table.add_row(
+            label,
+            _number(row["elpd"], ".1f"),
+            "–" if not behind else f"{behind:.1f} ± {row['elpd_difference_se']:.1f}",
+            _number(row["weight"], ".2f"),
+            _number(row["rmse"], ".3f"),
+            _number(row["dtw"], ".0f"),
+            _number(row["crps"], ".4f"),
+            _number(row["r_hat"], ".2f"),
+            " ".join(_number(share, ".0%")[:-1] for share in row["coverage"].values()),
+            f"{sum(row['seconds'].values()):.0f} s",
+            row["decision"],
+        )
+    console.print(table)
+    for label, row in rows.items():
+        if row["error"] is not None:
+            console.print(f"[bold]{label} failed[/bold]: {row['error']}", highlight=False)
+    console.print(f"Results and figures are in {out}/")
+
+
 def show_rows(title: str, result: Mapping[str, Any]) -> None:
     """Prints the content of a reproduction's JSON: ours beside the paper's."""
     table = Table(title=title, box=SIMPLE)
@@ -72,6 +112,10 @@ def _console() -> Console:
     console = Console()
     # Without a terminal rich assumes 80 columns, which would cut numbers in two.
     return console if console.is_terminal else Console(width=WIDTH)
+
+
+def _number(value: float | None, format_spec: str) -> str:
+    return "–" if value is None or not math.isfinite(value) else format(value, format_spec)
 
 
 def _figure(value: Mapping[str, float] | None) -> str:

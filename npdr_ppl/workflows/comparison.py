@@ -186,6 +186,7 @@ class Comparison:
             ),
             "weight": self.weights.get(label),
             "r_hat": row.diagnosis.r_hat,
+            "decision": row.diagnosis.decision.value,
             "diagnosis": row.diagnosis.to_dict(),
             "parameters": row.parameters,
             "rounds": row.rounds,
