@@ -58,17 +58,17 @@ def compare(
     from npdr_ppl.cli.show import show_comparison
     from npdr_ppl.plots.comparison_figures import write_comparison_figures
     from npdr_ppl.workflows.binding import BindingOptions
-    from npdr_ppl.workflows.candidates import parse_candidates
+    from npdr_ppl.workflows.candidates import candidates, split_candidates
     from npdr_ppl.workflows.compare import compare as run_compare
 
     chosen = resolve_effects(resolve_model(model), effect or [])
-    candidates = parse_candidates(backends)
+    named = candidates(split_candidates(backends))
     train, test = resolve_rollouts(data, holdout)
     comparison = run_compare(
         chosen,
         train,
         test,
-        backends=candidates,
+        backends=named,
         rounds=rounds,
         num_simulations=simulations,
         seed=seed,

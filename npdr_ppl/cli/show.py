@@ -105,7 +105,11 @@ def show_rows(title: str, result: Mapping[str, Any]) -> None:
             if metric in published:
                 cells.append(_figure(result["paper"].get(method, {}).get(metric)))
         table.add_row(*cells)
-    _console().print(table)
+    console = _console()
+    console.print(table)
+    for what in ("skipped", "failed"):
+        for method, reason in result.get(what, {}).items():
+            console.print(f"[bold]{method} {what}[/bold]: {reason}", highlight=False)
 
 
 def _console() -> Console:

@@ -119,7 +119,7 @@ def plot_bands_by_backend(
         for c, row in enumerate(axes):
             # The recording sets the scale: a band that leaves it is cut, not the recording.
             low, high = measured[:, c].min(), measured[:, c].max()
-            margin = 0.35 * (high - low) + np.finfo(float).tiny
+            margin = 0.25 * (high - low) + np.finfo(float).tiny
             row[0].set_ylim(low - margin, high + margin)
     return figure
 

@@ -21,6 +21,10 @@ __all__ = ["write_comparison_figures"]
 PANELS = 4
 """Pair panels in a row."""
 
+SMOOTHING = 1.0
+"""Bins over which a pair panel is smoothed: with two thousand draws a broad posterior is speckled
+without."""
+
 
 def write_comparison_figures(
     comparison: Comparison,
@@ -62,6 +66,7 @@ def write_comparison_figures(
             ranges=(_range(x, samples, prior), _range(y, samples, prior)),
             truth=next(iter((marks or {}).values()), None),
             units=(units.get(x, ""), units.get(y, "")),
+            smoothing=SMOOTHING,
         )  # fmt: skip
         paths.append(save_figure(figure, out / "pairs.png"))
     options = some.bound.options

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from npdr_ppl.plots.marginals import Samples
 from npdr_ppl.plots.theme import COLORS, theme
@@ -48,6 +49,7 @@ def plot_heatmaps(
     truth: Mapping[str, float] | None = None,
     curve: NDArray[np.float64] | None = None,
     units: Sequence[str] = ("", ""),
+    smoothing: float = 0.0,
 ) -> Figure:
     """Draws the joint posterior of two parameters, a row of panels for each method.
 
@@ -59,6 +61,7 @@ def plot_heatmaps(
         truth: Values to mark with a cross.
         curve: Points ``(k, 2)`` of a known ridge, drawn as a line.
         units: Units of both parameters.
+        smoothing: Standard deviation of a Gaussian filter, in bins.
     """
     columns = max(len(panels) for panels in rows.values())
     with theme():
@@ -70,6 +73,7 @@ def plot_heatmaps(
                 density, edges_x, edges_y = np.histogram2d(
                     samples[x], samples[y], bins=BINS, range=ranges, density=True
                 )
+                density = gaussian_filter(density, smoothing)
                 axis.pcolormesh(edges_x, edges_y, density.T, cmap="magma_r", rasterized=True)
                 if curve is not None:
                     axis.plot(curve[:, 0], curve[:, 1], color=COLORS["most likely"], lw=0.8)

@@ -21,7 +21,14 @@ from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.inference.registry import backend as backend_by_name
 
-__all__ = ["Backends", "Candidate", "candidates", "folder_name", "parse_candidates"]
+__all__ = [
+    "Backends",
+    "Candidate",
+    "available",
+    "candidates",
+    "folder_name",
+    "split_candidates",
+]
 
 
 @dataclass(frozen=True)
@@ -70,13 +77,32 @@ def candidates(backends: Backends) -> dict[str, Candidate]:
     return found
 
 
-def parse_candidates(text: str) -> dict[str, Candidate]:
-    """Reads candidates separated by commas, as they are written on a command line.
+def split_candidates(text: str) -> list[str]:
+    """Splits the texts of candidates at commas, as they are written on a command line.
 
     Raises:
-        BackendError: The text cannot be read; or see :func:`candidates`.
+        BackendError: Parentheses do not match.
     """
-    return candidates([part for part in _split(text, ",") if part])
+    return [part for part in _split(text, ",") if part]
+
+
+def available(texts: Mapping[str, str]) -> tuple[dict[str, Candidate], dict[str, str]]:
+    """Returns those of a method's usual candidates whose backends there are.
+
+    Args:
+        texts: Candidates' texts by label.
+
+    Returns:
+        The candidates by label, and why the others are left out, a sentence by label.
+    """
+    found: dict[str, Candidate] = {}
+    skipped: dict[str, str] = {}
+    for label, text in texts.items():
+        try:
+            found |= candidates({label: text})
+        except BackendError as error:
+            skipped[label] = str(error)
+    return found, skipped
 
 
 def folder_name(label: str) -> str:
