@@ -100,12 +100,12 @@ def reproduce_pendulum(
     Raises:
         BackendError: Every backend failed.
     """
-    out.mkdir(parents=True, exist_ok=True)
     skipped: dict[str, str] = {}
     if backends is None:
         chosen, skipped = available(METHODS)
     else:
         chosen = candidates([f"{b} = {METHODS[b]}" if b in METHODS else b for b in backends])
+    out.mkdir(parents=True, exist_ok=True)
     ridges: dict[str, Ridge] = {}
     rows: dict[str, dict[str, Any]] = {}
     failed: dict[str, str] = {}
