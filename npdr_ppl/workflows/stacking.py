@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 __all__ = ["StackedPosterior", "Stacking", "mixture_elpd", "stack"]
 
 
+NUM_DRAWS = 100
+"""Equal draws that stand for a density without any; ArviZ's estimates need a few."""
+
+
 class StackedPosterior(PosteriorBase):
     """q(ξ | x_o) = Σ_k w_k q_k(ξ): posteriors of the same model and data, mixed.
 
@@ -120,7 +124,7 @@ def stack(pointwise: Mapping[str, NDArray[np.float64]]) -> Stacking:
     total = sum(found.values())
     return Stacking(
         weights | {label: weight / total for label, weight in found.items()},
-        {label: float(table.loc[label, "elpd_diff"]) for label in finite},
+        {label: abs(float(table.loc[label, "elpd_diff"])) for label in finite},
         {label: float(table.loc[label, "dse"]) for label in finite},
     )
 
@@ -138,32 +142,25 @@ def mixture_elpd(
 def _compared(pointwise: Mapping[str, NDArray[np.float64]]) -> "pd.DataFrame":
     """Returns ArviZ's comparison by given pointwise densities.
 
+    ArviZ compares by leaving out each observation of draws. A predictive density that does not
+    depend on draws is the same whatever is left out, so draws that all have it carry it through.
+
     ArviZ exponentiates the densities, which underflow where segments have many readings. Each
     segment's greatest is therefore taken off first: a factor that all posteriors share changes
     neither the weights nor a difference.
     """
-    import xarray as xr
-
     from npdr_ppl.workflows.arviz_module import az
 
     greatest = np.max(list(pointwise.values()), axis=0)
-    elpds = {}
-    for label, values in pointwise.items():
-        relative = values - greatest
-        # The fields of ArviZ's own result that a comparison reads; "loo" is only their name.
-        elpds[label] = az.ELPDData(
-            {
-                "elpd_loo": relative.sum(),
-                "se": np.sqrt(len(relative) * relative.var()),
-                "p_loo": np.nan,
-                "n_samples": 1,
-                "n_data_points": len(relative),
-                "warning": False,
-                "loo_i": xr.DataArray(relative, dims="segment"),
-                "scale": "log",
-            }
+    data = {
+        label: az.from_dict(
+            posterior={"draw_number": np.arange(NUM_DRAWS)[None]},
+            log_likelihood={"segments": np.tile(values - greatest, (1, NUM_DRAWS, 1))},
         )
+        for label, values in pointwise.items()
+    }
     with warnings.catch_warnings():
-        # Densities that underflow even so weigh nothing, as they should.
+        # Of weights that cannot be smoothed, since they are all equal, and of densities that
+        # underflow even so and weigh nothing, as they should.
         warnings.simplefilter("ignore")
-        return az.compare(elpds, ic="loo", method="stacking", scale="log")
+        return az.compare(data, ic="loo", method="stacking", scale="log")
