@@ -100,11 +100,15 @@ def plot_bands_by_backend(
         )
         for column, (label, predictive) in enumerate(predictives.items()):
             axes[0, column].set_title(label)
+            # Draws whose simulation failed have no band; a quantile of NaN would hide the others.
+            whole = predictive[np.isfinite(predictive).all((1, 2))]
             for c, axis in enumerate(axes[:, column]):
                 for reset in [] if resets is None else resets:
                     axis.axvline(reset, color="0.9", lw=0.6, zorder=0)
                 for low, high, alpha in ((0.05, 0.95, 0.25), (0.25, 0.75, 0.45)):
-                    band = np.quantile(predictive[..., c], [low, high], axis=0)
+                    if not len(whole):
+                        continue
+                    band = np.quantile(whole[..., c], [low, high], axis=0)
                     axis.fill_between(
                         time, band[0], band[1], color=SERIES[column % len(SERIES)], alpha=alpha,
                         lw=0,

@@ -1,14 +1,15 @@
 """The figures of a comparison: posteriors, predictive bands and seconds side by side."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from npdr_ppl.plots.comparison import plot_bands_by_backend, plot_overlaid_marginals, plot_seconds
 from npdr_ppl.plots.fit_figures import NUM_DRAWS, NUM_PREDICTIVE, scalar_columns
 from npdr_ppl.plots.heatmap import plot_heatmaps
+from npdr_ppl.plots.marginals import Samples
 from npdr_ppl.plots.theme import save_figure
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
@@ -19,7 +20,7 @@ from npdr_ppl.workflows.fit import parameter_units
 __all__ = ["write_comparison_figures"]
 
 PANELS = 4
-"""Pair panels in a row."""
+"""Pair panels in a row at most."""
 
 SMOOTHING = 1.0
 """Bins over which a pair panel is smoothed: with two thousand draws a broad posterior is speckled
@@ -56,11 +57,7 @@ def write_comparison_figures(
     paths = [save_figure(figure, out / "marginals.png")]
     if len(prior) > 1:
         x, y = most_informative(samples, prior)
-        panels = [(label, values) for label, values in samples.items()]
-        rows = {"": dict(panels[:PANELS])} | {
-            " " * start: dict(panels[start : start + PANELS])
-            for start in range(PANELS, len(panels), PANELS)
-        }
+        rows = _wrapped(samples)
         figure = plot_heatmaps(
             rows, x, y,
             ranges=(_range(x, samples, prior), _range(y, samples, prior)),
@@ -91,9 +88,7 @@ def write_comparison_figures(
     return paths
 
 
-def most_informative(
-    samples: dict[str, dict[str, NDArray[np.float64]]], prior: dict[str, NDArray[np.float64]]
-) -> tuple[str, str]:
+def most_informative(samples: Mapping[str, Samples], prior: Samples) -> tuple[str, str]:
     """Returns the two parameters that the posteriors contract most, on average."""
     contraction = {
         name: np.mean([1 - values[name].std() / prior[name].std() for values in samples.values()])
@@ -106,10 +101,21 @@ def most_informative(
     )  # fmt: skip
 
 
+def _wrapped(panels: Mapping[str, Samples]) -> dict[str, dict[str, Samples]]:
+    """Returns panels in rows of about equal length, under titles that show nothing."""
+    count = -(-len(panels) // PANELS)
+    length = -(-len(panels) // count)
+    labels = list(panels)
+    return {
+        " " * row: {label: panels[label] for label in labels[row * length : (row + 1) * length]}
+        for row in range(count)
+    }
+
+
 def _range(
     name: str,
-    samples: dict[str, dict[str, NDArray[np.float64]]],
-    prior: dict[str, NDArray[np.float64]],
+    samples: Mapping[str, Samples],
+    prior: Samples,
 ) -> tuple[float, float]:
     """Returns limits that hold every posterior, but no more of the prior than is of use.
 

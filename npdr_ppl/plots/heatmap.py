@@ -86,7 +86,7 @@ def plot_heatmaps(
             for axis in line[len(panels) :]:
                 axis.set_visible(False)
             label = f"{y} [{units[1]}]" if units[1] else y
-            line[0].set_ylabel(f"{name}\n{label}" if name else label)
+            line[0].set_ylabel(f"{name}\n{label}" if name.strip() else label)
         for axis, below in zip(axes.T.ravel(), [*axes.T.ravel()[1:], None], strict=True):
             is_last = below is None or axis in axes[-1] or not below.get_visible()
             if is_last and axis.get_visible():

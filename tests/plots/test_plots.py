@@ -88,11 +88,15 @@ def test_bands_have_a_column_for_each_backend():
     time = np.linspace(0, 1, 50)
     measured = np.stack([np.sin(time), np.cos(time)], -1)
     draws = measured + 0.1 * rng.standard_normal((20, 50, 2))
+    draws[3, 10] = np.nan
+    predictives = {"a": draws, "b": draws + 100.0, "c": np.full_like(draws, np.nan)}
     figure = plot_bands_by_backend(
-        time, measured, {"a": draws, "b": draws + 100.0}, channel_names=("x", "y"), units=("m", "")
+        time, measured, predictives, channel_names=("x", "y"), units=("m", "")
     )
-    assert [axis.get_title() for axis in figure.axes] == ["a", "b", "", ""]
-    assert [axis.get_ylabel() for axis in figure.axes] == ["x\n[m]", "", "y", ""]
+    assert [axis.get_title() for axis in figure.axes] == ["a", "b", "c", "", "", ""]
+    assert [axis.get_ylabel() for axis in figure.axes] == ["x\n[m]", "", "", "y", "", ""]
+    # Two bands; failed draws are left out, and where all failed there is nothing to draw.
+    assert [len(axis.collections) for axis in figure.axes[:3]] == [2, 2, 0]
     # A prediction that is far off does not squeeze the recording.
     assert figure.axes[0].get_ylim()[1] < 2
 
