@@ -1,6 +1,7 @@
 """Posteriors of several backends side by side: marginals, predictive bands, seconds."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -13,6 +14,15 @@ __all__ = ["plot_bands_by_backend", "plot_overlaid_marginals", "plot_seconds"]
 
 STAGES = {"simulate": "#56B4E9", "train": "#0072B2", "sample": "#E69F00"}
 """Where a backend's time goes, with a colour each."""
+
+PEAK_RATIO = 6.0
+"""A sharp posterior's peak is cut at this many times the lowest one's, which stays visible so."""
+
+SHARPEST = 1e-6
+"""A posterior narrower than this part of the axis is drawn as a line."""
+
+NUM_POINTS = 300
+"""Points of a density's curve."""
 
 STYLES = ("-", "--", "-.", ":")
 """Line styles, so that the ninth posterior is not drawn like the first."""
@@ -43,25 +53,34 @@ def plot_overlaid_marginals(
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         for axis, name in zip(axes, names, strict=False):
             together = np.concatenate([prior[name], *[p[name] for p in posteriors.values()]])
-            grid = np.linspace(together.min(), together.max(), 400)
-            if prior[name].std() > 0:
+            low, high = together.min(), together.max()
+            if np.ptp(prior[name]) > 0:
+                grid = np.linspace(low, high, NUM_POINTS)
                 axis.fill_between(grid, density(prior[name], grid), color=COLORS["prior"],
                                   alpha=0.4, lw=0, label="prior")  # fmt: skip
+            peaks = []
             for index, (label, samples) in enumerate(posteriors.items()):
-                style = STYLES[index // len(SERIES) % len(STYLES)]
-                color = SERIES[index % len(SERIES)]
-                if samples[name].std() > 0:
-                    shape = density(samples[name], grid)
-                    axis.plot(grid, shape, color=color, ls=style, label=label)
-                else:
-                    axis.axvline(samples[name][0], color=color, ls=style, label=label)
+                values = samples[name]
+                look: Any = {
+                    "color": SERIES[index % len(SERIES)],
+                    "ls": STYLES[index // len(SERIES) % len(STYLES)],
+                    "label": label,
+                }
+                if np.ptp(values) <= SHARPEST * (high - low):
+                    axis.axvline(values[0], **look)
+                    continue
+                # On its own range: a sharp posterior falls between the points of a common grid.
+                grid = np.linspace(values.min(), values.max(), NUM_POINTS)
+                shape = density(values, grid)
+                peaks.append(float(shape.max()))
+                axis.plot([low, grid[0], *grid, grid[-1], high], [0, 0, *shape, 0, 0], **look)
             for label, values in (marks or {}).items():
                 if name in values:
                     axis.axvline(values[name], color="k", lw=1, ls=":", label=label)
             unit = (units or {}).get(name, "")
             axis.set_xlabel(f"{name} [{unit}]" if unit and unit != "1" else name)
-            axis.set_xlim(grid[0], grid[-1])
-            axis.set_ylim(bottom=0)
+            axis.set_xlim(low, high)
+            axis.set_ylim(0, 1.05 * min(max(peaks), PEAK_RATIO * min(peaks)) if peaks else None)
             axis.set_yticks([])
             axis.ticklabel_format(axis="x", scilimits=(-2, 3))
         for axis in axes[len(names) :]:
@@ -100,6 +119,7 @@ def plot_bands_by_backend(
         )
         for column, (label, predictive) in enumerate(predictives.items()):
             axes[0, column].set_title(label)
+            color = SERIES[column % len(SERIES)]
             # Draws whose simulation failed have no band; a quantile of NaN would hide the others.
             whole = predictive[np.isfinite(predictive).all((1, 2))]
             for c, axis in enumerate(axes[:, column]):
@@ -109,10 +129,12 @@ def plot_bands_by_backend(
                     if not len(whole):
                         continue
                     band = np.quantile(whole[..., c], [low, high], axis=0)
-                    axis.fill_between(
-                        time, band[0], band[1], color=SERIES[column % len(SERIES)], alpha=alpha,
-                        lw=0,
-                    )  # fmt: skip
+                    axis.fill_between(time, band[0], band[1], color=color, alpha=alpha, lw=0)
+                if len(whole):
+                    # The band of a sharp posterior is too thin to be seen.
+                    middle = np.median(whole[..., c], axis=0)
+                    for start, stop in _stretches(time, resets):
+                        axis.plot(time[start:stop], middle[start:stop], color=color, lw=0.8)
                 axis.plot(time, measured[:, c], color=COLORS["measured"], lw=0.8)
                 if column == 0:
                     unit = units[c] if c < len(units) else ""
@@ -126,6 +148,15 @@ def plot_bands_by_backend(
             margin = 0.25 * (high - low) + np.finfo(float).tiny
             row[0].set_ylim(low - margin, high + margin)
     return figure
+
+
+def _stretches(
+    time: NDArray[np.float64], resets: NDArray[np.float64] | None
+) -> list[tuple[int, int]]:
+    """Returns where a line is to be drawn in one piece: from one reset to the next."""
+    starts = [] if resets is None else np.searchsorted(time, resets - 1e-9).tolist()
+    bounds = sorted({0, len(time), *starts})
+    return list(zip(bounds[:-1], bounds[1:], strict=True))
 
 
 def plot_seconds(seconds: Mapping[str, Mapping[str, float]]) -> Figure:
