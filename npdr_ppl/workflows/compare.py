@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from torch import Tensor
+
 from npdr_ppl.errors import BackendError, DataError, NpdrError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data, bind
@@ -103,17 +105,18 @@ def compare(
         "evaluated_on": "fitted" if test is None else "held-out",
         "elpd": "PSIS-LOO" if test is None else "held-out segments",
     }
-    if out is not None:
-        _claim(out, settings)
     error_model = find_error_model(model, train, options, noise=noise, seed=seed)
+    exact = dataclasses.replace(options, precision="float64")
     judge = _Judge(
         error_model,
         judged_by,
-        bind(error_model.judged, judged_by, options, device),
-        dataclasses.replace(options, precision="float64"),
+        bind(error_model.judged, judged_by, exact, device),
+        exact,
         is_held_out=test is not None,
         seed=seed,
     )
+    if out is not None:
+        _claim(out, settings)
     rows: dict[str, Row] = {}
     posteriors: dict[str, Posterior] = {}
     with reporter(progress) as report:
@@ -145,7 +148,7 @@ def compare(
 
 @dataclasses.dataclass(frozen=True)
 class _Judge:
-    """Judges posteriors by a recording; scores are computed in float64 whatever was fitted in."""
+    """Judges posteriors by a recording, in float64 whatever they were fitted in."""
 
     error_model: ErrorModel
     data: Data
@@ -154,13 +157,12 @@ class _Judge:
     is_held_out: bool
     seed: int
 
-    def figures(self, posterior: PosteriorBase) -> Figures:
+    def figures(self, posterior: PosteriorBase, most_likely: dict[str, Tensor]) -> Figures:
         if posterior.prior.num_parameters != self.bound.prior.num_parameters:
             raise DataError(
                 f"The model has {posterior.prior.num_parameters} parameters on the fitted data, "
                 f"but {self.bound.prior.num_parameters} on those it is judged by."
             )
-        most_likely = posterior.most_likely(seed=self.seed)
         scores = {}
         if isinstance(self.data, Rollouts):
             scores = score(self.error_model.judged, self.data, most_likely, self.options)
@@ -229,16 +231,21 @@ class _Run:
         return peak
 
     def row(self, posterior: Posterior, peak: float | None, judge: _Judge) -> Row:
+        """Samples the posterior, has it judged, and saves it."""
+        step = self.report.stage("judge")
         started = time.perf_counter()
-        posterior.most_likely(seed=judge.seed)
+        most_likely = posterior.most_likely(seed=judge.seed)
         sampled = time.perf_counter() - started
         data = posterior.to_arviz(seed=judge.seed)
         if self.folder is not None:
             data.to_netcdf(str(self.folder / "posterior.nc"), engine="h5netcdf")
+        step(0.3, "sampled")
+        figures = judge.figures(posterior, most_likely)
+        step(1.0, "")
         infos = posterior.provenance.rounds
         return Row(
             posterior.backend.name,
-            figures=judge.figures(posterior),
+            figures=figures,
             diagnosis=diagnose(data),
             parameters=describe(data)["parameters"],
             rounds=len(infos),
@@ -264,7 +271,8 @@ def _mix(
         return None, None
     used = {label: weight for label, weight in stacking.weights.items() if weight > 0}
     members = {label: posteriors[label] for label in used}
-    figures = judge.figures(StackedPosterior(members, used))
+    mixture = StackedPosterior(members, used)
+    figures = judge.figures(mixture, mixture.most_likely(seed=judge.seed))
     # Exactly that of the mixture, instead of one more Monte-Carlo estimate.
     return stacking, dataclasses.replace(figures, elpd=mixture_elpd(pointwise, used))
 

@@ -114,7 +114,7 @@ def reproduce_pendulum(
         posteriors: dict[str, Posterior] = {}
         for label, candidate in chosen.items():
             try:
-                posteriors[label] = _infer(candidate, rollouts, seed, progress)
+                posteriors[label] = infer_mass_and_length(candidate, rollouts, seed, progress)
             except NpdrError as error:
                 failed[f"{label}, {duration}"] = str(error)
         if not posteriors:
@@ -146,8 +146,8 @@ def reproduce_pendulum(
     return ridges, result
 
 
-def _infer(
-    candidate: Candidate, rollouts: Rollouts, seed: int, progress: bool | None
+def infer_mass_and_length(
+    candidate: Candidate, rollouts: Rollouts, seed: int, progress: bool | None = None
 ) -> Posterior:
     """Infers with the budget of all: in one round if the backend is not sequential."""
     rounds = ROUNDS if candidate.is_sequential else 1
