@@ -125,7 +125,7 @@ def segment_log_likelihood(
         log_prob = -0.5 * (residual.square() / variance + torch.log(2 * torch.pi * variance))
         error_model = "Gaussian, variance estimated"
     if observation.inputs is None or observation.channels is None:
-        return log_prob.flatten(1).sum(-1, keepdim=True).cpu(), error_model
+        return log_prob.reshape(len(z), -1).sum(-1, keepdim=True).cpu(), error_model
     channels, mask = list(observation.channels), observation.inputs.mask.cpu()
     log_prob, residual = log_prob.cpu(), residual.cpu()
     log_prob = log_prob[..., channels] * mask[..., None]

@@ -126,7 +126,7 @@ def _of_site(bound: BoundModel, name: str, z: Tensor, share: Mapping[str, float]
     observation, prior = bound.observations[name], bound.prior
     density = _density(prior, name, observation.value, z)
     if observation.inputs is None or observation.channels is None:
-        return density.flatten(1).sum(-1, keepdim=True)
+        return density.reshape(len(z), -1).sum(-1, keepdim=True)
     channels = list(observation.channels)
     mask = observation.inputs.mask.cpu()[..., None]
     # Steps after a segment's end are made up and may be anything, infinite included.

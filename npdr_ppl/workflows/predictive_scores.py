@@ -133,7 +133,7 @@ def _of_readings(
 ) -> tuple[float, dict[float, float], int]:
     """Returns mean scaled CRPS, coverage by level, and how many draws failed."""
     valid = torch.stack(
-        [output.flatten(1).isfinite().all(1).cpu() for output in predictive.values()]
+        [output.reshape(len(output), -1).isfinite().all(1).cpu() for output in predictive.values()]
     ).all(0)
     num_failed = int((~valid).sum())
     if not bool(valid.any()):
@@ -143,6 +143,7 @@ def _of_readings(
         samples = predictive[name].double().cpu()[valid]
         observed = observation.value.double().cpu()
         if observation.inputs is None or observation.channels is None:
+            samples, observed = samples.reshape(len(samples), -1), observed.reshape(-1)
             counted = torch.ones(observed.shape, dtype=torch.bool)
             largest = observed.abs().amax()
             scale = torch.where(largest > 0, largest, 1.0).expand(observed.shape)
