@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.box import SIMPLE
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 __all__ = ["show_comparison", "show_fit", "show_rows"]
@@ -69,7 +70,7 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
         row = rows[label]
         behind = row["elpd_difference"]
         table.add_row(
-            label,
+            escape(label),
             _number(row["elpd"], ".1f"),
             "–" if not behind else f"{behind:.1f} ± {row['elpd_difference_se']:.1f}",
             _number(row["weight"], ".2f"),
@@ -84,7 +85,7 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
     console.print(table)
     for label, row in rows.items():
         if row["error"] is not None:
-            console.print(f"[bold]{label} failed[/bold]: {row['error']}", highlight=False)
+            _print_reason(console, f"{label} failed", row["error"])
     console.print(f"Results and figures are in {out}/")
 
 
@@ -99,7 +100,7 @@ def show_rows(title: str, result: Mapping[str, Any]) -> None:
         if metric in published:
             table.add_column(f"{metric}, paper", justify="right", no_wrap=True)
     for method, row in result["rows"].items():
-        cells = [method]
+        cells = [escape(method)]
         for metric in metrics:
             cells.append(_figure(row.get(metric)))
             if metric in published:
@@ -109,13 +110,17 @@ def show_rows(title: str, result: Mapping[str, Any]) -> None:
     console.print(table)
     for what in ("skipped", "failed"):
         for method, reason in result.get(what, {}).items():
-            console.print(f"[bold]{method} {what}[/bold]: {reason}", highlight=False)
+            _print_reason(console, f"{method} {what}", reason)
 
 
 def _console() -> Console:
     console = Console()
     # Without a terminal rich assumes 80 columns, which would cut numbers in two.
     return console if console.is_terminal else Console(width=WIDTH)
+
+
+def _print_reason(console: Console, what: str, reason: str) -> None:
+    console.print(f"[bold]{escape(what)}[/bold]: {escape(reason)}", highlight=False)
 
 
 def _number(value: float | None, format_spec: str) -> str:
