@@ -61,9 +61,9 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
         padding=(0, 1, 0, 0),
     )
     table.add_column("backend", overflow="fold")
-    for column in ("elpd", "behind best", "weight", "RMSE", "DTW", "CRPS", "r-hat"):
+    for column in ("elpd", "behind", "weight", "RMSE", "DTW", "CRPS", "r-hat"):
         table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("in 50/80/95 %", justify="right", no_wrap=True)
+    table.add_column("50/80/95 %", justify="right", no_wrap=True)
     table.add_column("time", justify="right", no_wrap=True)
     table.add_column("decision", overflow="fold")
     for label in result["ranking"]:
