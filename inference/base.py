@@ -96,11 +96,14 @@ class Backend(ABC):
         summary: One line for tables.
         uses_simulations: Whether it learns from simulations. One that does not asks for none, is
             told none, and has its posterior after one round.
+        is_sequential: Whether later rounds learn from earlier ones. If not, a caller with a budget
+            spends it in one round.
     """
 
     name: ClassVar[str]
     summary: ClassVar[str]
     uses_simulations: ClassVar[bool] = True
+    is_sequential: ClassVar[bool] = True
 
     @abstractmethod
     def init(self, problem: Problem) -> State:

@@ -22,6 +22,7 @@ __all__ = [
     "Rollouts",
     "Simulator",
     "add_effect",
+    "compare",
     "diagnose",
     "infer",
     "remove_effect",
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from npdr_ppl.language.simulator import Simulator
     from npdr_ppl.language.sites import simulate
     from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.workflows.compare import compare
     from npdr_ppl.workflows.diagnostics import diagnose
     from npdr_ppl.workflows.infer import infer
     from npdr_ppl.workflows.posterior import Posterior
@@ -54,6 +56,7 @@ _HOMES = {
     "Rollouts": "rollouts",
     "Simulator": "language.simulator",
     "add_effect": "language.handlers",
+    "compare": "workflows.compare",
     "diagnose": "workflows.diagnostics",
     "infer": "workflows.infer",
     "remove_effect": "language.handlers",

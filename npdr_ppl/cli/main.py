@@ -5,7 +5,7 @@ import sys
 
 import typer
 
-from npdr_ppl.cli import demo, fit, listings, reproduce
+from npdr_ppl.cli import compare, demo, fit, listings, reproduce
 from npdr_ppl.errors import NpdrError
 
 __all__ = ["app", "main"]
@@ -20,6 +20,7 @@ app = typer.Typer(
 )
 app.command(rich_help_panel="See it work")(demo.demo)
 app.command(rich_help_panel="Infer parameters")(fit.fit)
+app.command(rich_help_panel="Infer parameters")(compare.compare)
 app.command(rich_help_panel="See it work")(reproduce.reproduce)
 app.command("models", rich_help_panel="What there is")(listings.models)
 app.command("backends", rich_help_panel="What there is")(listings.backends)

@@ -24,7 +24,14 @@ def reproduce(
         Path | None, typer.Option(help="The paper's recordings; needed for table2.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("reproduction"),
-    backend: Annotated[str, typer.Option(help="Backend of NPDR's column.")] = "snpe-c",
+    backends: Annotated[
+        str,
+        typer.Option(
+            "--backends",
+            "--backend",
+            help="Some of the paper's methods, or others; all if not given.",
+        ),
+    ] = "",
     initial_state: Annotated[
         InitialState, typer.Option(help="State at a segment's start; the paper took recorded.")
     ] = InitialState.RECORDED,
@@ -37,32 +44,35 @@ def reproduce(
     """
     from npdr_ppl.cli.show import show_rows
     from npdr_ppl.errors import DataError
+    from npdr_ppl.workflows.candidates import split_candidates
 
     progress = False if quiet else None
     out = out / experiment.value
+    chosen = split_candidates(backends) if backends else None
     if experiment is Experiment.PENDULUM:
         from npdr_ppl.plots.pendulum import write_pendulum_figures
         from npdr_ppl.workflows.pendulum_ridge import reproduce_pendulum
 
-        ridges, result = reproduce_pendulum(out, backend=backend, seed=seed, progress=progress)
+        ridges, result = reproduce_pendulum(out, backends=chosen, seed=seed, progress=progress)
         write_pendulum_figures(ridges, out)
     else:
         from npdr_ppl.models.furuta import furuta
-        from npdr_ppl.plots.fit_figures import write_fit_figures
+        from npdr_ppl.plots.comparison_figures import write_comparison_figures
         from npdr_ppl.rollouts import Rollouts
         from npdr_ppl.workflows.table2 import reproduce_table2
 
         if data is None:
             raise DataError("table2 needs the paper's recordings: pass --data FILE.")
         rollouts = Rollouts.load(data)
-        posterior, result = reproduce_table2(
+        comparison, result = reproduce_table2(
             rollouts,
             out,
-            backend=backend,
+            backends=chosen,
             initial_state=initial_state.value,
             seed=seed,
             progress=progress,
         )
-        write_fit_figures(posterior, furuta, rollouts[result["held_out"]], out, seed=seed)
+        held_out = rollouts[result["held_out"]]
+        write_comparison_figures(comparison, furuta, held_out, out, seed=seed)
     if not quiet:
         show_rows(experiment.value, result)

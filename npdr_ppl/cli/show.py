@@ -1,14 +1,16 @@
 """Result tables on the terminal."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rich.box import SIMPLE
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["show_fit", "show_rows"]
+__all__ = ["show_comparison", "show_fit", "show_rows"]
 
 FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
 """Columns of figures with the width they need."""
@@ -48,6 +50,45 @@ def show_fit(result: Mapping[str, Any], out: Path) -> None:
     console.print(f"Results and figures are in {out}/")
 
 
+def show_comparison(result: Mapping[str, Any], out: Path) -> None:
+    """Prints the content of ``comparison.json``, the best backend first."""
+    console = _console()
+    settings, rows = result["settings"], result["backends"]
+    table = Table(
+        title=f"{settings['rounds'] * settings['num_simulations']} simulations each, judged by "
+        f"{settings['evaluated_on']} data",
+        box=SIMPLE,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("backend", overflow="fold")
+    for column in ("elpd", "behind", "weight", "RMSE", "DTW", "CRPS", "r-hat"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("50/80/95 %", justify="right", no_wrap=True)
+    table.add_column("time", justify="right", no_wrap=True)
+    table.add_column("decision", overflow="fold")
+    for label in result["ranking"]:
+        row = rows[label]
+        behind = row["elpd_difference"]
+        table.add_row(
+            escape(label),
+            _number(row["elpd"], ".1f"),
+            "–" if not behind else f"{behind:.1f} ± {row['elpd_difference_se']:.1f}",
+            _number(row["weight"], ".2f"),
+            _number(row["rmse"], ".3f"),
+            _number(row["dtw"], ".0f"),
+            _number(row["crps"], ".4f"),
+            _number(row["r_hat"], ".2f"),
+            " ".join(_number(share, ".0%")[:-1] for share in row["coverage"].values()),
+            f"{sum(row['seconds'].values()):.0f} s",
+            row["decision"],
+        )
+    console.print(table)
+    for label, row in rows.items():
+        if row["error"] is not None:
+            _print_reason(console, f"{label} failed", row["error"])
+    console.print(f"Results and figures are in {out}/")
+
+
 def show_rows(title: str, result: Mapping[str, Any]) -> None:
     """Prints the content of a reproduction's JSON: ours beside the paper's."""
     table = Table(title=title, box=SIMPLE)
@@ -59,19 +100,31 @@ def show_rows(title: str, result: Mapping[str, Any]) -> None:
         if metric in published:
             table.add_column(f"{metric}, paper", justify="right", no_wrap=True)
     for method, row in result["rows"].items():
-        cells = [method]
+        cells = [escape(method)]
         for metric in metrics:
             cells.append(_figure(row.get(metric)))
             if metric in published:
                 cells.append(_figure(result["paper"].get(method, {}).get(metric)))
         table.add_row(*cells)
-    _console().print(table)
+    console = _console()
+    console.print(table)
+    for what in ("skipped", "failed"):
+        for method, reason in result.get(what, {}).items():
+            _print_reason(console, f"{method} {what}", reason)
 
 
 def _console() -> Console:
     console = Console()
     # Without a terminal rich assumes 80 columns, which would cut numbers in two.
     return console if console.is_terminal else Console(width=WIDTH)
+
+
+def _print_reason(console: Console, what: str, reason: str) -> None:
+    console.print(f"[bold]{escape(what)}[/bold]: {escape(reason)}", highlight=False)
+
+
+def _number(value: float | None, format_spec: str) -> str:
+    return "–" if value is None or not math.isfinite(value) else format(value, format_spec)
 
 
 def _figure(value: Mapping[str, float] | None) -> str:

@@ -1,9 +1,20 @@
 """Figures: each function draws on matplotlib axes and returns the figure."""
 
 from npdr_ppl.plots.bands import plot_bands
-from npdr_ppl.plots.heatmap import plot_rounds
+from npdr_ppl.plots.comparison import plot_bands_by_backend, plot_overlaid_marginals, plot_seconds
+from npdr_ppl.plots.heatmap import plot_heatmaps, plot_rounds
 from npdr_ppl.plots.marginals import plot_marginals
 from npdr_ppl.plots.pair import plot_pair
 from npdr_ppl.plots.theme import save_figure
 
-__all__ = ["plot_bands", "plot_marginals", "plot_pair", "plot_rounds", "save_figure"]
+__all__ = [
+    "plot_bands",
+    "plot_bands_by_backend",
+    "plot_heatmaps",
+    "plot_marginals",
+    "plot_overlaid_marginals",
+    "plot_pair",
+    "plot_rounds",
+    "plot_seconds",
+    "save_figure",
+]

@@ -15,9 +15,9 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.evaluation import replay
 from npdr_ppl.workflows.fit import parameter_units
-from npdr_ppl.workflows.posterior import Posterior
+from npdr_ppl.workflows.posterior import PosteriorBase
 
-__all__ = ["write_fit_figures"]
+__all__ = ["scalar_columns", "write_fit_figures"]
 
 NUM_DRAWS = 2_000
 NUM_PREDICTIVE = 100
@@ -26,7 +26,7 @@ MAX_PAIRS = 12
 
 
 def write_fit_figures(
-    posterior: Posterior,
+    posterior: PosteriorBase,
     model: Any,
     rollouts: Rollouts,
     out: Path,
@@ -46,9 +46,9 @@ def write_fit_figures(
     """
     draws = posterior.sample(NUM_DRAWS, seed=seed)
     prior = posterior.prior
-    samples = _columns(draws)
+    samples = scalar_columns(draws)
     with seeded(seed, "figures"):
-        prior_samples = _columns(prior.to_parameters(prior.sample(NUM_DRAWS)))
+        prior_samples = scalar_columns(prior.to_parameters(prior.sample(NUM_DRAWS)))
     most_likely = posterior.most_likely(seed=seed)
     marks = {"most likely": _values(most_likely)} | (marks or {})
     paths = [
@@ -79,7 +79,7 @@ def write_fit_figures(
     return paths
 
 
-def _columns(parameters: dict[str, Tensor]) -> dict[str, NDArray[np.float64]]:
+def scalar_columns(parameters: dict[str, Tensor]) -> dict[str, NDArray[np.float64]]:
     """Returns one column per scalar parameter."""
     columns: dict[str, NDArray[np.float64]] = {}
     for name, value in parameters.items():
@@ -92,5 +92,5 @@ def _columns(parameters: dict[str, Tensor]) -> dict[str, NDArray[np.float64]]:
 
 
 def _values(parameters: dict[str, Tensor]) -> dict[str, float]:
-    columns = _columns({name: value[None] for name, value in parameters.items()})
+    columns = scalar_columns({name: value[None] for name, value in parameters.items()})
     return {name: float(value[0]) for name, value in columns.items()}

@@ -11,7 +11,7 @@ from scipy.stats import gaussian_kde
 
 from npdr_ppl.plots.theme import COLORS, theme
 
-__all__ = ["add_legend", "draw_marginal", "plot_marginals"]
+__all__ = ["add_legend", "density", "draw_marginal", "plot_marginals"]
 
 Samples = Mapping[str, NDArray[np.float64]]
 MAX_COLUMNS = 4
@@ -68,20 +68,20 @@ def draw_marginal(
     low, high = together.min(), together.max()
     grid = np.linspace(low, high, 200)
     if prior is not None and prior.std() > 0:
-        axis.fill_between(grid, _density(prior, grid), color=COLORS["prior"], alpha=0.4, lw=0,
+        axis.fill_between(grid, density(prior, grid), color=COLORS["prior"], alpha=0.4, lw=0,
                           label="prior")  # fmt: skip
     if posterior.std() > 0:
-        axis.plot(grid, _density(posterior, grid), color=COLORS["posterior"], label="posterior")
-        axis.fill_between(grid, _density(posterior, grid), color=COLORS["posterior"], alpha=0.2)
+        axis.plot(grid, density(posterior, grid), color=COLORS["posterior"], label="posterior")
+        axis.fill_between(grid, density(posterior, grid), color=COLORS["posterior"], alpha=0.2)
     axis.set_xlim(low, high)
     axis.set_ylim(bottom=0)
     axis.set_yticks([])
     axis.ticklabel_format(axis="x", scilimits=(-2, 3))
 
 
-def _density(samples: NDArray[np.float64], grid: NDArray[np.float64]) -> NDArray[np.float64]:
+def density(samples: NDArray[np.float64], grid: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns a kernel density, reflected at the samples' ends so that edges stay visible."""
     low, high = samples.min(), samples.max()
     kernel = gaussian_kde(samples)
-    density = kernel(grid) + kernel(2 * low - grid) + kernel(2 * high - grid)
-    return np.where((grid >= low) & (grid <= high), density, 0.0)
+    values = kernel(grid) + kernel(2 * low - grid) + kernel(2 * high - grid)
+    return np.where((grid >= low) & (grid <= high), values, 0.0)

@@ -3,7 +3,10 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from npdr_ppl.plots.heatmap import plot_rounds
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.plots.heatmap import plot_heatmaps
 from npdr_ppl.plots.theme import save_figure
 from npdr_ppl.workflows.pendulum_ridge import RANGE, ROUNDS, Ridge
 
@@ -13,7 +16,7 @@ SHOWN_ROUNDS = (0, 2, ROUNDS - 1)
 
 
 def write_pendulum_figures(ridges: Mapping[str, Ridge], out: Path) -> list[Path]:
-    """Draws the posterior after rounds 1, 3 and 8 beside NUTS, one figure per duration.
+    """Draws every method's posterior after rounds 1, 3 and 8 beside NUTS, by duration.
 
     Args:
         ridges: The posteriors by duration, e.g. ``"8 s"``.
@@ -21,13 +24,14 @@ def write_pendulum_figures(ridges: Mapping[str, Ridge], out: Path) -> list[Path]
     """
     paths = []
     for duration, ridge in ridges.items():
-        panels = {f"round {i + 1}": ridge.samples(i) for i in SHOWN_ROUNDS}
-        panels["NUTS"] = ridge.reference
-        figure = plot_rounds(
-            {
-                title: {"mass": samples[:, 0], "length": samples[:, 1]}
-                for title, samples in panels.items()
-            },
+        rows = {}
+        for label, posterior in ridge.posteriors.items():
+            last = len(posterior.states) - 1
+            shown = [index for index in SHOWN_ROUNDS if index < last] + [last]
+            panels = {f"round {i + 1}": _columns(ridge.samples(label, i)) for i in shown}
+            rows[label] = panels | {"NUTS": _columns(ridge.reference)}
+        figure = plot_heatmaps(
+            rows,
             "mass",
             "length",
             ranges=(RANGE, RANGE),
@@ -38,3 +42,7 @@ def write_pendulum_figures(ridges: Mapping[str, Ridge], out: Path) -> list[Path]
         name = f"pendulum_{duration.replace(' ', '_')}.png"
         paths.append(save_figure(figure, out / name))
     return paths
+
+
+def _columns(samples: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    return {"mass": samples[:, 0], "length": samples[:, 1]}

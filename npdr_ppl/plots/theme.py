@@ -8,7 +8,7 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-__all__ = ["COLORS", "save_figure", "theme"]
+__all__ = ["COLORS", "SERIES", "save_figure", "theme"]
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 COLORS = {
@@ -19,6 +19,9 @@ COLORS = {
     "most likely": "#009E73",
     "truth": "#CC79A7",
 }
+
+SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
+"""The same palette for several posteriors in one panel, in this order, over and over."""
 
 _STYLE: Any = {
     "figure.dpi": 120,

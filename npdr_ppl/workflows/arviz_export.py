@@ -11,7 +11,7 @@ from npdr_ppl.randomness import seeded
 
 if TYPE_CHECKING:
     from npdr_ppl.workflows.arviz_module import az
-    from npdr_ppl.workflows.posterior import Posterior
+    from npdr_ppl.workflows.posterior import PosteriorBase
 
 __all__ = ["effective_share", "segment_log_likelihood", "to_arviz"]
 
@@ -23,7 +23,7 @@ MAX_PREDICTIVE_DRAWS = 100
 
 
 def to_arviz(
-    posterior: "Posterior", num_samples: int = 1_000, *, seed: int = 0
+    posterior: "PosteriorBase", num_samples: int = 1_000, *, seed: int = 0
 ) -> "az.InferenceData":
     """Exports a posterior.
 
@@ -97,14 +97,14 @@ def to_arviz(
         log_likelihood=by_chain({n: v for n, (v, _) in likelihood.items()}),
         coords=coords,
         dims=dims,
-        attrs={"inference_library": "npdr_ppl", "backend": posterior.backend.name},
+        attrs={"inference_library": "npdr_ppl", "backend": posterior.backend_name},
     )
     data["log_likelihood"].attrs["error_model"] = ", ".join(m for _, m in likelihood.values())
     return data
 
 
 def segment_log_likelihood(
-    posterior: "Posterior", name: str, predictive: Tensor, z: Tensor
+    posterior: "PosteriorBase", name: str, predictive: Tensor, z: Tensor
 ) -> tuple[Tensor, str]:
     """Returns log p(segment | draw), ``(n, segments)``, and what error model it stands on.
 
@@ -125,7 +125,7 @@ def segment_log_likelihood(
         log_prob = -0.5 * (residual.square() / variance + torch.log(2 * torch.pi * variance))
         error_model = "Gaussian, variance estimated"
     if observation.inputs is None or observation.channels is None:
-        return log_prob.flatten(1).sum(-1, keepdim=True).cpu(), error_model
+        return log_prob.reshape(len(z), -1).sum(-1, keepdim=True).cpu(), error_model
     channels, mask = list(observation.channels), observation.inputs.mask.cpu()
     log_prob, residual = log_prob.cpu(), residual.cpu()
     log_prob = log_prob[..., channels] * mask[..., None]

@@ -48,7 +48,7 @@ class Observation:
     def features(self, output: Tensor) -> Tensor:
         """Maps simulator output, ``(n,) + value.shape``, to features ``(n, ...)``."""
         if self.embedding is None or self.inputs is None or self.channels is None:
-            return output.flatten(1)
+            return output.reshape(len(output), -1)
         measured = output[..., list(self.channels)]
         plates = measured.shape[1:-3]
         if not plates:

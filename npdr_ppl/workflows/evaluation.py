@@ -17,7 +17,16 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts, stitch
 from npdr_ppl.workflows.binding import BindingOptions
 
-__all__ = ["Replay", "declares_noise", "nominal_parameters", "replay", "residual_noise", "score"]
+__all__ = [
+    "ClosestFit",
+    "Replay",
+    "closest_fit",
+    "declares_noise",
+    "nominal_parameters",
+    "replay",
+    "residual_noise",
+    "score",
+]
 
 
 @dataclass(frozen=True)
@@ -130,6 +139,38 @@ def residual_noise(
 ) -> dict[str, float]:
     """Returns a noise scale per channel at which the model can explain the recording.
 
+    It is the ``scale`` of :func:`closest_fit`, which has the arguments and errors.
+    """
+    fitted = closest_fit(
+        model, rollouts, options, iterations=iterations, population=population, seed=seed
+    )
+    return fitted.scale
+
+
+@dataclass(frozen=True)
+class ClosestFit:
+    """How near a model can come to a recording.
+
+    Attributes:
+        scale: Root-mean-square residual by channel, in the channel's unit.
+        parameters: The parameters that leave it, ``(1,) + site.shape`` by latent site.
+    """
+
+    scale: dict[str, float]
+    parameters: dict[str, Tensor]
+
+
+def closest_fit(
+    model: Callable[..., Any],
+    rollouts: Rollouts,
+    options: BindingOptions,
+    *,
+    iterations: int = 6,
+    population: int = 200,
+    seed: int = 0,
+) -> ClosestFit:
+    """Searches for the parameters of least residual along a recording.
+
     A simulator that lacks an effect never reproduces a recording exactly; without noise of the
     size of what is left, the recording is unlike every simulation and a likelihood-free posterior
     is extrapolation. The scale is the root-mean-square residual of the best parameters that a
@@ -150,7 +191,7 @@ def residual_noise(
     prior = Prior(model, (inputs,))
     centre = torch.zeros(prior.num_parameters, dtype=torch.float64)
     spread = torch.ones_like(centre)
-    best_error, best = float("inf"), torch.empty(0)
+    best_error, best, best_z = float("inf"), torch.empty(0), centre
     names: tuple[str, ...] = ()
     for iteration in range(iterations):
         with seeded(seed, "residual noise", iteration):
@@ -163,10 +204,11 @@ def residual_noise(
         elite = error.argsort()[: max(2, population // 10)]
         centre, spread = z[elite].mean(0), z[elite].std(0)
         if float(error[elite[0]]) < best_error:
-            best_error, best = float(error[elite[0]]), residual[elite[0]]
+            best_error, best, best_z = float(error[elite[0]]), residual[elite[0]], z[elite[0]]
     if not torch.isfinite(torch.tensor(best_error)):
         raise DataError("No parameters of the prior could be simulated along the recording.")
-    return {name: max(float(v), 1e-9) for name, v in zip(names, best, strict=True)}
+    scale = {name: max(float(v), 1e-9) for name, v in zip(names, best, strict=True)}
+    return ClosestFit(scale, prior.to_parameters(best_z[None]))
 
 
 def _residuals(replayed: Replay, rollouts: Rollouts) -> tuple[Tensor, Tensor]:

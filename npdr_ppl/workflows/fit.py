@@ -15,7 +15,7 @@ from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.diagnostics import diagnose
 from npdr_ppl.workflows.evaluation import declares_noise, residual_noise, score
 from npdr_ppl.workflows.infer import infer
-from npdr_ppl.workflows.posterior import Posterior
+from npdr_ppl.workflows.posterior import Posterior, PosteriorBase
 from npdr_ppl.workflows.run_folder import write_json
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def describe(data: "az.InferenceData") -> dict[str, Any]:
     return {"parameters": parameters}
 
 
-def parameter_units(posterior: Posterior) -> dict[str, str]:
+def parameter_units(posterior: PosteriorBase) -> dict[str, str]:
     """Returns the units of the latent sites that carry a parameter's name."""
     known: dict[str, str] = {}
     for box in posterior.prior.black_boxes.values():

@@ -40,7 +40,7 @@ def infer(
     precision: Literal["float64", "float32"] = "float64",
     device: str | torch.device = "cpu",
     checkpoint: str | PathLike[str] | None = None,
-    progress: bool | None = None,
+    progress: bool | Reporter | None = None,
 ) -> Posterior:
     """Infers the posterior over a model's domain parameters from measured data.
 
@@ -59,7 +59,7 @@ def infer(
         precision: Floating-point type of the simulation.
         device: Where trajectories are simulated and the backend trains.
         checkpoint: Folder to save every round in; an interrupted run continues from there.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Returns:
         The posterior.

@@ -4,12 +4,12 @@ The torque reaches the pendulum through 3/(m l²) alone, so parameters along m l
 long as gravity has not had its say; gravity's term is 1.5 g/l. In the first second from rest a
 noisy recording cannot tell them apart and the posterior is a ridge along that curve. Over the
 paper's eight seconds gravity resolves mass and length: the exact posterior, by a grid and by NUTS,
-shrinks to a spot at the truth. Both are computed here, and the posterior of a likelihood-free
-backend is compared with NUTS on the same model.
+shrinks to a spot at the truth. Both are computed here, and the posteriors of likelihood-free
+backends are compared with NUTS on the same model.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,8 +23,7 @@ from pyro.infer import MCMC, NUTS
 from pyro.infer.autoguide.initialization import init_to_value
 from torch import Tensor
 
-from npdr_ppl.inference.base import Backend
-from npdr_ppl.inference.registry import backend as backend_by_name
+from npdr_ppl.errors import BackendError, NpdrError
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
@@ -32,6 +31,7 @@ from npdr_ppl.metrics import c2st
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.candidates import Candidate, available, candidates
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.posterior import Posterior
 from npdr_ppl.workflows.run_folder import write_json
@@ -45,9 +45,9 @@ ROUNDS = 8
 NUM_SIMULATIONS = 100
 NUM_SAMPLES = 2_000
 EMBEDDING = "all~10"
-OPTIONS: Mapping[str, Mapping[str, Any]] = {"snpe-c": {"outside": 3e-3}}
-"""Backend options that differ from the defaults: with a hundred simulations per round it pays to
-cut the proposals less tightly."""
+METHODS: Mapping[str, str] = {"snpe-c": "snpe-c(outside=3e-3)", "snpe-a": "snpe-a"}
+"""The paper's methods by label, in the words of :mod:`npdr_ppl.workflows.candidates`. With a
+hundred simulations per round it pays to cut SNPE-C's proposals less tightly than by default."""
 DURATIONS = {"1 s": 50, "8 s": 400}
 """Steps of 20 ms; the paper's recording lasts eight seconds."""
 
@@ -60,76 +60,108 @@ class Ridge:
     """One recording's posteriors.
 
     Attributes:
-        posterior: That of the backend, with all its rounds.
+        posteriors: Those of the backends by label, with all their rounds.
         reference: NUTS draws, ``(n, 2)``: mass in kg, length in m.
         valley: Points ``(k, 2)`` of the curve of least difference from the recording.
     """
 
-    posterior: Posterior
+    posteriors: Mapping[str, Posterior]
     reference: NDArray[np.float64]
     valley: NDArray[np.float64]
 
-    def samples(self, round_index: int) -> NDArray[np.float64]:
-        """Returns the backend's draws after a round, ``(n, 2)``."""
-        draws = self.posterior.after_round(round_index).sample(NUM_SAMPLES)
+    def samples(self, label: str, round_index: int = -1) -> NDArray[np.float64]:
+        """Returns a backend's draws after a round, its last one if not given, ``(n, 2)``."""
+        posterior = self.posteriors[label]
+        if round_index >= 0:
+            posterior = posterior.after_round(round_index)
+        draws = posterior.sample(NUM_SAMPLES)
         return torch.stack([draws["mass"], draws["length"]], -1).double().numpy()
 
 
 def reproduce_pendulum(
-    out: Path, *, backend: str | Backend = "snpe-c", seed: int = 0, progress: bool | None = None
+    out: Path,
+    *,
+    backends: Sequence[str] | None = None,
+    seed: int = 0,
+    progress: bool | None = None,
 ) -> tuple[dict[str, Ridge], dict[str, Any]]:
     """Infers mass and length from one second and from eight, and compares with NUTS.
 
     Args:
         out: Folder for ``pendulum.json``.
-        backend: The likelihood-free backend.
+        backends: Labels of :data:`METHODS`, or other backends; ``None`` for all methods whose
+            backend there is, the others being noted as skipped.
         seed: Seed of everything random.
         progress: Whether to show progress; ``None`` shows it on a terminal.
 
     Returns:
         The posteriors by duration, and the content of ``pendulum.json``.
+
+    Raises:
+        BackendError: Every backend failed.
     """
+    skipped: dict[str, str] = {}
+    if backends is None:
+        chosen, skipped = available(METHODS)
+    else:
+        chosen = candidates([f"{b} = {METHODS[b]}" if b in METHODS else b for b in backends])
     out.mkdir(parents=True, exist_ok=True)
-    method = (
-        backend_by_name(backend, **OPTIONS.get(backend, {}))
-        if isinstance(backend, str)
-        else backend
-    )
     ridges: dict[str, Ridge] = {}
     rows: dict[str, dict[str, Any]] = {}
+    failed: dict[str, str] = {}
     for duration, num_steps in DURATIONS.items():
         rollouts = record(num_steps)
-        posterior = infer(
-            partial(pendulum, noise=NOISE),
-            rollouts,
-            backend=method,
-            rounds=ROUNDS,
-            num_simulations=NUM_SIMULATIONS,
-            seed=seed,
-            embedding=EMBEDDING,
-            initial_state="recorded",
-            progress=progress,
-        )
+        posteriors: dict[str, Posterior] = {}
+        for label, candidate in chosen.items():
+            try:
+                posteriors[label] = infer_mass_and_length(candidate, rollouts, seed, progress)
+            except NpdrError as error:
+                failed[f"{label}, {duration}"] = str(error)
+        if not posteriors:
+            raise BackendError(f"Every backend failed. {'; '.join(failed.values())}")
         inputs = rollouts.inputs(initial_state="recorded")
         observed = rollouts.observation(inputs)
         exact = exact_samples(inputs, observed, seed=seed)
         reference = nuts_samples(inputs, observed, start=exact.mean(0), seed=seed)
-        ridge = Ridge(posterior, reference, valley(inputs, observed))
+        ridge = Ridge(posteriors, reference, valley(inputs, observed))
         ridges[duration] = ridge
-        for label, samples in (
-            (posterior.backend.name, ridge.samples(ROUNDS - 1)),
-            ("nuts", reference),
-            ("grid", exact),
-        ):
-            found = figures(samples, reference, ridge.valley)
+        found = {label: ridge.samples(label) for label in posteriors}
+        for label, samples in (found | {"nuts": reference, "grid": exact}).items():
+            values = figures(samples, reference, ridge.valley)
             if samples is reference:
-                del found["c2st"]
+                del values["c2st"]
             rows[f"{label}, {duration}"] = {
-                name: {"mean": value, "std": 0.0} for name, value in found.items()
+                name: {"mean": value, "std": 0.0} for name, value in values.items()
             }
-    result = {"rows": rows, "paper": {}, "noise": NOISE, "rounds": ROUNDS, "seed": seed}
+    result = {
+        "rows": rows,
+        "paper": {},
+        "skipped": skipped,
+        "failed": failed,
+        "noise": NOISE,
+        "rounds": ROUNDS,
+        "seed": seed,
+    }
     write_json(out / "pendulum.json", result)
     return ridges, result
+
+
+def infer_mass_and_length(
+    candidate: Candidate, rollouts: Rollouts, seed: int, progress: bool | None = None
+) -> Posterior:
+    """Infers with the budget of all: in one round if the backend is not sequential."""
+    rounds = ROUNDS if candidate.is_sequential else 1
+    return infer(
+        partial(pendulum, noise=NOISE),
+        rollouts,
+        backend=candidate.backend,
+        rounds=rounds,
+        num_simulations=ROUNDS * NUM_SIMULATIONS // rounds,
+        seed=seed,
+        embedding=candidate.embedding or EMBEDDING,
+        initial_state="recorded",
+        progress=progress,
+    )
 
 
 def record(num_steps: int) -> Rollouts:

@@ -1,5 +1,7 @@
 """The posterior over domain parameters: samples, density, most likely sample, Pyro guide."""
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -16,7 +18,7 @@ from torch.distributions import constraints
 
 from npdr_ppl.embeddings import Embedding
 from npdr_ppl.errors import BackendError, DataError, ShapeError
-from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
+from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.randomness import seeded
@@ -26,9 +28,12 @@ from npdr_ppl.workflows.run_folder import RunFolder
 if TYPE_CHECKING:
     from npdr_ppl.workflows.arviz_module import az
 
-__all__ = ["Posterior", "Provenance"]
+__all__ = ["Posterior", "PosteriorBase", "Provenance"]
 
 REFERENCE_SITE = "_reference"
+
+ROUNDING = 1e-9
+"""What a number of draws may exceed an integer by and still be that integer."""
 
 
 @dataclass(frozen=True)
@@ -48,48 +53,41 @@ class Provenance:
     seconds: Mapping[str, float] = field(default_factory=dict)
 
 
-class Posterior:
-    """q(ξ | x_o): an equal mixture of independently trained ensemble members.
+class PosteriorBase(ABC):
+    """q(ξ | x_o) = Σ_m w_m q_m(ξ): a weighted mixture of densities.
 
     Attributes:
         bound: The model and its data.
-        backend: The backend that learnt it.
-        problem: What the backend knew.
-        states: The backend's state after each round known, the last one being this posterior's.
-        densities: The members, in reference coordinates.
-        provenance: How they came about.
+        densities: The components q_m, in reference coordinates.
+        weights: Their weights w_m, ``(components,)`` float64 with sum 1.
     """
 
     def __init__(
-        self,
-        bound: BoundModel,
-        backend: Backend,
-        problem: Problem,
-        states: Sequence[State],
-        provenance: Provenance,
+        self, bound: BoundModel, densities: Sequence[Density], weights: Tensor | None = None
     ) -> None:
+        """Makes the mixture; equal weights if none are given."""
         self.bound = bound
-        self.backend = backend
-        self.problem = problem
-        self.states = tuple(states)
-        self.densities = tuple(backend.densities(problem, self.states[-1]))
-        self.provenance = provenance
+        self.densities = tuple(densities)
+        if weights is None:
+            weights = torch.ones(len(self.densities), dtype=torch.float64) / len(self.densities)
+        self.weights = weights
+
+    @property
+    @abstractmethod
+    def backend_name(self) -> str:
+        """Which backend, or which mixture of backends, it comes from."""
+
+    @abstractmethod
+    def sample_reference(self, num_samples: int, *, seed: int = 0) -> Tensor:
+        """Draws ``(chains, num_samples, d)``: what ArviZ takes for chains."""
 
     @property
     def prior(self) -> Prior:
         """The prior of the model."""
         return self.bound.prior
 
-    def sample_reference(self, num_samples: int, *, seed: int = 0) -> Tensor:
-        """Draws ``num_samples`` of each member, ``(members, num_samples, d)``."""
-        draws = []
-        for member, density in enumerate(self.densities):
-            with seeded(seed, "posterior", member):
-                draws.append(density.sample(num_samples).cpu())
-        return torch.stack(draws)
-
     def sample(self, num_samples: int, *, seed: int = 0) -> dict[str, Tensor]:
-        """Draws domain parameters from the mixture of all members.
+        """Draws domain parameters.
 
         Args:
             num_samples: Number of draws n.
@@ -99,13 +97,26 @@ class Posterior:
             Values ``(n,) + site.shape`` by site name, in the model's units; all lie on the
             prior's support.
         """
-        return self.prior.to_parameters(self._mixture_draws(num_samples, seed))
+        return self.prior.to_parameters(self.sample_mixture(num_samples, seed=seed))
 
-    def _mixture_draws(self, num_samples: int, seed: int) -> Tensor:
-        per_member = -(-num_samples // len(self.densities))
-        draws = self.sample_reference(per_member, seed=seed)
-        # Interleaved, so that any leading part of the draws is balanced over the members.
-        return draws.transpose(0, 1).flatten(0, 1)[:num_samples]
+    def sample_mixture(self, num_samples: int, *, seed: int = 0) -> Tensor:
+        """Draws from the mixture in reference coordinates, ``(num_samples, d)``.
+
+        Interleaved, so that any leading part of the draws has the components in proportion to
+        their weights: the j-th draw of component m is due at (j + 1/2) / w_m.
+        """
+        draws, due = [], []
+        for member, (density, weight) in enumerate(
+            zip(self.densities, self.weights.tolist(), strict=True)
+        ):
+            share = math.ceil(num_samples * weight - ROUNDING)
+            if share < 1:
+                continue
+            with seeded(seed, "posterior", member):
+                draws.append(density.sample(share).cpu())
+            due.append((torch.arange(share, dtype=torch.float64) + 0.5) / weight)
+        order = torch.cat(due).argsort(stable=True)
+        return torch.cat(draws)[order[:num_samples]]
 
     def log_prob(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Returns log q(ξ | x_o), ``(n,)``, at values ``(n,) + site.shape`` by site name.
@@ -126,12 +137,13 @@ class Posterior:
         """Returns log q(ξ(z) | x_o), ``(n,)``, the density over ξ, at points ``(n, d)``."""
         with torch.no_grad():
             members = torch.stack([member.log_prob(z).double().cpu() for member in self.densities])
-        mixture = members.logsumexp(0) - torch.log(torch.tensor(float(len(self.densities))))
-        return mixture - self.prior.log_jacobian(z)
+        # A component whose density is not a number contributes none to the mixture.
+        members = members.where(~members.isnan(), -torch.inf) + self.weights.log()[:, None]
+        return members.logsumexp(0) - self.prior.log_jacobian(z)
 
     def most_likely(self, num_samples: int = 10_000, *, seed: int = 0) -> dict[str, Tensor]:
         """Returns the draw of greatest density, of ``num_samples`` (``argmax`` in Algorithm 1)."""
-        z = self._mixture_draws(num_samples, seed)
+        z = self.sample_mixture(num_samples, seed=seed)
         best = z[self.log_prob_reference(z).argmax()][None]
         return {name: value[0] for name, value in self.prior.to_parameters(best).items()}
 
@@ -170,9 +182,55 @@ class Posterior:
         Returns:
             Outputs ``(num_samples,) + plates + event``.
         """
-        z = self._mixture_draws(num_samples, seed)
+        z = self.sample_mixture(num_samples, seed=seed)
         with seeded(seed, "predict"):
             return self.prior.execute(z)
+
+    def to_arviz(self, num_samples: int = 1_000, *, seed: int = 0) -> "az.InferenceData":
+        """Returns an ArviZ object; see :func:`npdr_ppl.workflows.arviz_export.to_arviz`."""
+        from npdr_ppl.workflows.arviz_export import to_arviz
+
+        return to_arviz(self, num_samples, seed=seed)
+
+
+class Posterior(PosteriorBase):
+    """What a backend has learnt: an equal mixture of independently trained ensemble members.
+
+    Attributes:
+        bound: The model and its data.
+        backend: The backend that learnt it.
+        problem: What the backend knew.
+        states: The backend's state after each round known, the last one being this posterior's.
+        densities: The members, in reference coordinates.
+        provenance: How they came about.
+    """
+
+    def __init__(
+        self,
+        bound: BoundModel,
+        backend: Backend,
+        problem: Problem,
+        states: Sequence[State],
+        provenance: Provenance,
+    ) -> None:
+        super().__init__(bound, backend.densities(problem, states[-1]))
+        self.backend = backend
+        self.problem = problem
+        self.states = tuple(states)
+        self.provenance = provenance
+
+    @property
+    def backend_name(self) -> str:
+        """The backend's name."""
+        return self.backend.name
+
+    def sample_reference(self, num_samples: int, *, seed: int = 0) -> Tensor:
+        """Draws ``num_samples`` of each member, ``(members, num_samples, d)``."""
+        draws = []
+        for member, density in enumerate(self.densities):
+            with seeded(seed, "posterior", member):
+                draws.append(density.sample(num_samples).cpu())
+        return torch.stack(draws)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Writes the posterior and its data to a folder; see :mod:`npdr_ppl.workflows.run_folder`.
@@ -245,12 +303,6 @@ class Posterior:
         states = self.states[: index + 1]
         return Posterior(self.bound, self.backend, self.problem, states, provenance)
 
-    def to_arviz(self, num_samples: int = 1_000, *, seed: int = 0) -> "az.InferenceData":
-        """Returns an ArviZ object; see :func:`npdr_ppl.workflows.arviz_export.to_arviz`."""
-        from npdr_ppl.workflows.arviz_export import to_arviz
-
-        return to_arviz(self, num_samples, seed=seed)
-
 
 class _ReferencePosterior(TorchDistribution):
     """The posterior as a distribution over z whose density is that over ξ."""
@@ -259,7 +311,7 @@ class _ReferencePosterior(TorchDistribution):
     has_rsample = False
 
     def __init__(
-        self, posterior: Posterior, batch_shape: torch.Size | tuple[int, ...] = ()
+        self, posterior: PosteriorBase, batch_shape: torch.Size | tuple[int, ...] = ()
     ) -> None:
         self.posterior = posterior
         super().__init__(
@@ -277,11 +329,15 @@ class _ReferencePosterior(TorchDistribution):
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         shape = torch.Size(sample_shape) + self.batch_shape
-        # From torch's global stream, as every Pyro statement.
-        seed = int(torch.randint(2**31 - 1, ()))
-        z = self.posterior._mixture_draws(shape.numel(), seed)
-        z = z[torch.randperm(len(z))] if len(z) > 1 else z
-        return z.reshape(shape + self.event_shape).double()
+        # From torch's global stream, as every Pyro statement, and with the component drawn as
+        # well: a single draw must be able to come from any of them.
+        posterior = self.posterior
+        component = torch.multinomial(posterior.weights, shape.numel(), replacement=True)
+        z = torch.empty(shape.numel(), posterior.prior.num_parameters, dtype=torch.float64)
+        for index in component.unique().tolist():
+            own = component == index
+            z[own] = posterior.densities[index].sample(int(own.sum())).double().cpu()
+        return z.reshape(shape + self.event_shape)
 
     def log_prob(self, value: Tensor) -> Tensor:
         flat = value.reshape(-1, value.shape[-1])

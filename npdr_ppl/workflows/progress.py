@@ -16,6 +16,19 @@ class Reporter:
         """Returns a callback for a stage: fraction done and a short status."""
         return lambda fraction, status: None
 
+    def under(self, label: str) -> "Reporter":
+        """Returns a reporter whose stages have a label in front."""
+        return _Labelled(self, label)
+
+
+class _Labelled(Reporter):
+    def __init__(self, parent: Reporter, label: str) -> None:
+        self.parent = parent
+        self.label = label
+
+    def stage(self, label: str) -> Step:
+        return self.parent.stage(f"{self.label}: {label}")
+
 
 class _RichReporter(Reporter):
     def __init__(self) -> None:
@@ -40,12 +53,16 @@ class _RichReporter(Reporter):
 
 
 @contextmanager
-def reporter(show: bool | None = None) -> Iterator[Reporter]:
+def reporter(show: bool | Reporter | None = None) -> Iterator[Reporter]:
     """Shows progress bars inside the block.
 
     Args:
-        show: Whether to show them; ``None`` shows them if standard error is a terminal.
+        show: Whether to show them; ``None`` shows them if standard error is a terminal; a reporter
+            is that of a larger workflow, and used as it is.
     """
+    if isinstance(show, Reporter):
+        yield show
+        return
     if not (sys.stderr.isatty() if show is None else show):
         yield Reporter()
         return

@@ -32,7 +32,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.atomic import replacing
 from npdr_ppl.workflows.binding import BoundModel
 
-__all__ = ["RunFolder", "source_text", "versions", "write_json"]
+__all__ = ["RunFolder", "read_json", "source_text", "versions", "write_json"]
 
 FORMAT = 1
 _PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")

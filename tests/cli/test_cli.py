@@ -102,6 +102,34 @@ def test_fit_takes_a_models_file_and_effects(monkeypatch, capsys, tmp_path, reco
     assert sys.modules["json"] is json
 
 
+def test_compare_writes_what_the_documentation_promises(monkeypatch, capsys, tmp_path, recording):
+    out = tmp_path / "comparison"
+    words = [
+        "compare", "pendulum", "--data", recording, "--holdout", 1, "--out", out, "--rounds", 1,
+        "--simulations", 60, "--segment-length", 25, "--embedding", "all/5", "--backends",
+        "snpe-c(epochs=2), maf = snpe-c(flow=maf, members=1, epochs=2)",
+    ]  # fmt: skip
+    code, text, _ = run(monkeypatch, capsys, *words)
+    assert code == 0
+    assert "60 simulations each" in text
+    assert max(map(len, text.splitlines())) <= 100
+    comparison = json.loads((out / "comparison.json").read_text())
+    assert set(comparison["backends"]) == set(comparison["ranking"]) == set(comparison["weights"])
+    assert set(comparison["ranking"]) == {"snpe-c(epochs=2)", "maf"}
+    for row in comparison["backends"].values():
+        assert {"rmse", "dtw", "crps", "elpd", "r_hat", "seconds", "decision"} <= set(row)
+        assert row["num_simulations"] == 60
+    for name in ("marginals.png", "pairs.png", "bands.png", "seconds.png"):
+        assert (out / name).stat().st_size > 1_000
+    # The same command again continues, finds everything done, and says the same.
+    code, text, _ = run(monkeypatch, capsys, *words, "--quiet")
+    again = json.loads((out / "comparison.json").read_text())
+    assert (code, text) == (0, "")
+    assert again["weights"] == comparison["weights"]
+    code, _, err = run(monkeypatch, capsys, *words, "--seed", 1)
+    assert code == 2 and "differs in seed" in err
+
+
 @pytest.mark.slow
 def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path, recording):
     words = [
@@ -140,7 +168,14 @@ def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path
          "did you mean 'coulomb_friction'"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--effect", "knee.bias"],
          "no port 'knee'"),
+        (["compare", "pendulum", "--data", "DATA", "--out", "OUT", "--backends", "snpec"],
+         "did you mean 'snpe-c'"),
+        (["compare", "pendulum", "--data", "DATA", "--out", "OUT", "--backends", "snpe-c(flow"],
+         "parenthesis open"),
+        (["compare", "pendulum", "--data", "DATA", "--out", "OUT", "--backends", "snpe-c,snpe-c"],
+         "cannot be told apart"),
         (["reproduce", "table2"], "pass --data"),
+        (["reproduce", "pendulum", "--backends", "mcmc"], "mcmc"),
     ],
 )  # fmt: skip
 def test_bad_input_gets_one_sentence(monkeypatch, capsys, tmp_path, recording, words, sentence):
@@ -175,6 +210,11 @@ def test_table2_has_both_columns_beside_the_papers(monkeypatch, capsys, tmp_path
     )
     assert code == 0
     result = json.loads((tmp_path / "table2/table2.json").read_text())
+    # A column is computed, or the output says why not.
+    for method in table2.COLUMNS:
+        reason = result["skipped"].get(method) or result["failed"].get(method)
+        assert (method in result["rows"]) != (reason is not None)
+        assert reason is None or f"{method} " in text
     # The paper's own figures, which its recipe reproduces.
     assert abs(result["rows"]["nominal"]["rmse"]["mean"] - 0.384) < 0.002
     assert abs(result["rows"]["nominal"]["dtw"]["mean"] - 1431) < 15

@@ -3,7 +3,18 @@
 import numpy as np
 import pytest
 
-from npdr_ppl.plots import plot_bands, plot_marginals, plot_pair, plot_rounds, save_figure
+from npdr_ppl.plots import (
+    plot_bands,
+    plot_bands_by_backend,
+    plot_heatmaps,
+    plot_marginals,
+    plot_overlaid_marginals,
+    plot_pair,
+    plot_rounds,
+    plot_seconds,
+    save_figure,
+)
+from npdr_ppl.plots.comparison_figures import most_informative
 
 rng = np.random.default_rng(0)
 PRIOR = {"mass": rng.uniform(0, 1, 500), "length": rng.uniform(1, 2, 500)}
@@ -48,3 +59,60 @@ def test_rounds_share_their_axes():
     )  # fmt: skip
     assert [axis.get_title() for axis in figure.axes] == ["round 1", "round 2"]
     assert {axis.get_xlim() for axis in figure.axes} == {(0.0, 1.0)}
+
+
+def test_posteriors_lie_over_each_other(tmp_path):
+    figure = plot_overlaid_marginals(
+        POSTERIORS, PRIOR, marks={"truth": {"mass": 0.5}}, units={"mass": "kg"}
+    )
+    assert legend(figure) == {"prior", "truth", *POSTERIORS}
+    assert [axis.get_xlabel() for axis in figure.axes] == ["mass [kg]", "length"]
+    assert save_figure(figure, tmp_path / "figure.png").stat().st_size > 5_000
+
+
+def test_heatmaps_have_a_row_for_each_method():
+    figure = plot_heatmaps(
+        {"snpe-c": {"round 1": PRIOR, "NUTS": PRIOR}, "snpe-a": {"round 1": PRIOR}},
+        "mass", "length", ranges=((0, 1), (1, 2)), units=("kg", "m"), smoothing=1.0,
+    )  # fmt: skip
+    shown = [axis for axis in figure.axes if axis.get_visible()]
+    assert [axis.get_title() for axis in shown] == ["round 1", "NUTS", "round 1"]
+    assert [axis.get_ylabel() for axis in shown] == [
+        "snpe-c\nlength [m]", "", "snpe-a\nlength [m]"
+    ]  # fmt: skip
+    # The lowest panel of every column names the axis, also where another row is longer.
+    assert [axis.get_xlabel() for axis in shown] == ["", "mass [kg]", "mass [kg]"]
+
+
+def test_bands_have_a_column_for_each_backend():
+    time = np.linspace(0, 1, 50)
+    measured = np.stack([np.sin(time), np.cos(time)], -1)
+    draws = measured + 0.1 * rng.standard_normal((20, 50, 2))
+    draws[3, 10] = np.nan
+    predictives = {"a": draws, "b": draws + 100.0, "c": np.full_like(draws, np.nan)}
+    figure = plot_bands_by_backend(
+        time, measured, predictives, channel_names=("x", "y"), units=("m", "")
+    )
+    assert [axis.get_title() for axis in figure.axes] == ["a", "b", "c", "", "", ""]
+    assert [axis.get_ylabel() for axis in figure.axes] == ["x\n[m]", "", "", "y", "", ""]
+    # Two bands; failed draws are left out, and where all failed there is nothing to draw.
+    assert [len(axis.collections) for axis in figure.axes[:3]] == [2, 2, 0]
+    # A prediction that is far off does not squeeze the recording.
+    assert figure.axes[0].get_ylim()[1] < 2
+
+
+def test_seconds_have_a_bar_for_each_backend():
+    figure = plot_seconds({
+        "a": {"simulate": 1.0, "train": 2.0, "sample": 0.5}, "b": {"train": 0.25}
+    })  # fmt: skip
+    (axis,) = figure.axes
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["a", "b"]
+    assert [text.get_text().strip() for text in axis.texts] == ["3.5 s", "0.25 s"]
+    assert legend(figure) == {"simulate", "train", "sample"}
+
+
+def test_the_most_contracted_parameters_are_chosen_in_the_models_order():
+    prior = {name: rng.normal(0, 1, 500) for name in "abc"}
+    spread = {"a": 0.5, "b": 0.9, "c": 0.1}
+    posterior = {name: rng.normal(0, spread[name], 500) for name in prior}
+    assert most_informative({"q": posterior}, prior) == ("a", "c")

@@ -1,0 +1,86 @@
+"""`npdr compare`: several backends on one model and recording."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from npdr_ppl.cli.fit import InitialState, Noise, Precision
+
+__all__ = ["compare"]
+
+
+def compare(
+    model: Annotated[str, typer.Argument(help="Zoo name, or path/to/file.py:function.")],
+    data: Annotated[Path, typer.Option(help="Rollouts: CSV, Parquet, NPZ or NetCDF.")],
+    backends: Annotated[
+        str,
+        typer.Option(
+            help="Backends, e.g. 'snpe-c, small = snpe-c(flow=maf, members=1)'; see npdr backends."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for results.")],
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of simulating and training.")] = 2,
+    simulations: Annotated[int, typer.Option(min=10, help="Simulations per round.")] = 2_000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    holdout: Annotated[str, typer.Option(help="Rollouts to judge by, e.g. 3,4.")] = "",
+    effect: Annotated[
+        list[str] | None, typer.Option(help="Effect to attach, port.effect; may be repeated.")
+    ] = None,
+    embedding: Annotated[
+        str, typer.Option(help="Trajectory features: bayessim, all/50, gru/10, ...")
+    ] = "bayessim",
+    segment_length: Annotated[
+        int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")
+    ] = 0,
+    initial_state: Annotated[
+        InitialState, typer.Option(help="State at a segment's start.")
+    ] = InitialState.ESTIMATED,
+    precision: Annotated[
+        Precision, typer.Option(help="Floating-point type of the simulation.")
+    ] = Precision.FLOAT64,
+    noise: Annotated[
+        Noise, typer.Option(help="Noise of readings: auto estimates it, model takes the model's.")
+    ] = Noise.AUTO,
+    device: Annotated[str, typer.Option(help="Where to train: cpu or cuda.")] = "cpu",
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+) -> None:
+    """Compare inference backends with the same budget of simulations and the same seed.
+
+    A backend may be given options, features of its own (embedding=...) and a label. An
+    interrupted comparison continues when the same command is given again; backends may then be
+    added.
+
+    Example: npdr compare furuta --data measured.csv --backends "snpe-c, maf = snpe-c(flow=maf)"
+    --segment-length 200 --holdout 3,4 --out comparison
+    """
+    from npdr_ppl.cli.resolve import resolve_effects, resolve_model, resolve_rollouts
+    from npdr_ppl.cli.show import show_comparison
+    from npdr_ppl.plots.comparison_figures import write_comparison_figures
+    from npdr_ppl.workflows.binding import BindingOptions
+    from npdr_ppl.workflows.candidates import candidates, split_candidates
+    from npdr_ppl.workflows.compare import compare as run_compare
+
+    chosen = resolve_effects(resolve_model(model), effect or [])
+    named = candidates(split_candidates(backends))
+    train, test = resolve_rollouts(data, holdout)
+    comparison = run_compare(
+        chosen,
+        train,
+        test,
+        backends=named,
+        rounds=rounds,
+        num_simulations=simulations,
+        seed=seed,
+        options=BindingOptions(
+            embedding, segment_length or None, initial_state.value, precision.value
+        ),
+        noise=noise.value,
+        device=device,
+        out=out,
+        progress=False if quiet else None,
+    )
+    shown = train if test is None else test
+    write_comparison_figures(comparison, chosen, shown, out, seed=seed)
+    if not quiet:
+        show_comparison(comparison.to_dict(), out)

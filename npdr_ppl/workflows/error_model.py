@@ -1,0 +1,146 @@
+"""The error model that posteriors of several backends are compared under.
+
+A segment's log likelihood depends on how large the readings' errors are and on how many of them
+are independent. Were either estimated from each posterior's own residuals, a posterior that
+misses the recording would earn itself a wide error and few independent readings, and its elpd
+would not be comparable. Both are therefore found once, from the recording that is fitted and
+before any backend has seen it:
+
+* the *scale* is the noise that the model declares; without any, the root-mean-square residual of
+  the closest parameters a short search of the prior finds, which is also what the backends'
+  simulations carry;
+* the *share* of independent readings per channel is that of the residuals which these parameters
+  leave (see :func:`npdr_ppl.workflows.arviz_export.effective_share`). Readings weighted by it make
+  a composite likelihood of the right magnitude (Ribatet, Cooley & Davison 2012).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.language.handlers import with_noise
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.arviz_export import effective_share
+from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data
+from npdr_ppl.workflows.evaluation import closest_fit, declares_noise, replay
+
+__all__ = ["ErrorModel", "find_error_model", "segment_log_likelihood"]
+
+MAX_READINGS = 2_000_000
+"""Readings of a chunk of simulations, 16 MiB in float64."""
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """What the backends' simulations and their comparison have in common.
+
+    Attributes:
+        fitted: The model the backends get.
+        judged: The model with the error that likelihoods are computed under; another one only
+            where a model without noise is fitted as it is.
+        noise: Estimated standard deviation by channel, in its unit; ``None`` if the model declares
+            its own.
+        share: Share of independent readings by channel; empty counts every reading.
+    """
+
+    fitted: Callable[..., Any]
+    judged: Callable[..., Any]
+    noise: Mapping[str, float] | None
+    share: Mapping[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns JSON-serialisable values."""
+        return {
+            "scale": "declared by the model" if self.noise is None else dict(self.noise),
+            "independent_share": dict(self.share),
+        }
+
+
+def find_error_model(
+    model: Callable[..., Any],
+    train: Data,
+    options: BindingOptions,
+    *,
+    noise: Literal["auto", "model"] = "auto",
+    seed: int = 0,
+) -> ErrorModel:
+    """Finds the common error model on the recording to be fitted.
+
+    Args:
+        model: The Pyro model.
+        train: What is fitted; never the held-out recording. Observations of a plain function, and
+            those of several sites, keep the model's own noise, and all their readings count.
+        options: Segments, initial states and precision.
+        noise: ``"auto"`` gives a model without noise the estimated scale; ``"model"`` fits it as
+            it is and estimates the scale for the comparison alone.
+        seed: Seed of the search.
+
+    Raises:
+        DataError: No parameters could be simulated along the recording.
+    """
+    if not isinstance(train, Rollouts):
+        return ErrorModel(model, model, None, {})
+    declared = declares_noise(model, train, options)
+    closest = closest_fit(model, train, options, seed=seed)
+    replayed = replay(model, train, closest.parameters, options)
+    observed = train.observation(replayed.inputs, channels=replayed.channel_names)
+    residual = (replayed.trajectory[0] - observed).double().cpu()
+    share = effective_share(residual, replayed.inputs.mask.cpu())
+    noisy = model if declared else with_noise(model, closest.scale)
+    return ErrorModel(
+        noisy if noise == "auto" else model,
+        noisy,
+        None if declared else closest.scale,
+        dict(zip(replayed.channel_names, share.tolist(), strict=True)),
+    )
+
+
+def segment_log_likelihood(bound: BoundModel, z: Tensor, share: Mapping[str, float]) -> Tensor:
+    """Returns log p(segment | draw), ``(n, segments)`` float64; minus infinity for failed draws.
+
+    An observation of a plain function, which has no segments, counts as one.
+
+    Args:
+        bound: The model with its error, and the recording to judge by.
+        z: Draws in reference coordinates, ``(n, d)``.
+        share: Share of independent readings by channel; empty counts every reading.
+
+    Raises:
+        IntractableError: The model declares no noise, so there is no density.
+    """
+    readings = sum(o.value.numel() for o in bound.observations.values())
+    chunk = max(1, MAX_READINGS // max(1, readings))
+    parts = [
+        torch.cat([_of_site(bound, name, part, share) for name in bound.observations], dim=1)
+        for part in z.split(chunk)
+    ]
+    result = torch.cat(parts)
+    return result.where(result.isfinite(), -torch.inf)
+
+
+def _of_site(bound: BoundModel, name: str, z: Tensor, share: Mapping[str, float]) -> Tensor:
+    observation, prior = bound.observations[name], bound.prior
+    density = _density(prior, name, observation.value, z)
+    if observation.inputs is None or observation.channels is None:
+        return density.reshape(len(z), -1).sum(-1, keepdim=True)
+    channels = list(observation.channels)
+    mask = observation.inputs.mask.cpu()[..., None]
+    # Steps after a segment's end are made up and may be anything, infinite included.
+    density = density[..., channels].where(mask, 0.0)
+    weights = torch.tensor(
+        [share.get(_channel(prior, name, c), 1.0) for c in channels], dtype=torch.float64
+    )
+    return (density * weights).sum((-1, -2)).flatten(1)
+
+
+def _density(prior: Prior, name: str, value: Tensor, z: Tensor) -> Tensor:
+    return prior.pointwise_log_prob(name, value, z).double().cpu()
+
+
+def _channel(prior: Prior, name: str, index: int) -> str:
+    box: Any = prior.black_boxes[name]
+    return box.simulator.sensors[index].name

@@ -1,0 +1,62 @@
+"""Figure 2's machinery: every method gets the budget of all, and its own row of panels."""
+
+import numpy as np
+import pytest
+import torch
+
+from npdr_ppl.inference.registry import backend
+from npdr_ppl.plots.pendulum import write_pendulum_figures
+from npdr_ppl.workflows import pendulum_ridge
+from npdr_ppl.workflows.candidates import Candidate, available
+from npdr_ppl.workflows.pendulum_ridge import METHODS, Ridge, exact_samples, record, valley
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Two rounds of thirty simulations on a coarse grid: the machinery, not the figure."""
+    monkeypatch.setattr(pendulum_ridge, "ROUNDS", 2)
+    monkeypatch.setattr(pendulum_ridge, "NUM_SIMULATIONS", 30)
+    monkeypatch.setattr(pendulum_ridge, "GRID", 60)
+
+
+def test_every_method_has_a_row_of_its_rounds_beside_nuts(short, tmp_path):
+    rollouts = record(50)
+    inputs = rollouts.inputs(initial_state="recorded")
+    observed = rollouts.observation(inputs)
+    quick = {"transforms": 1, "hidden": (16,), "epochs": 2, "members": 1}
+    posteriors = {
+        label: pendulum_ridge.infer_mass_and_length(
+            Candidate(backend("snpe-c", flow=flow, **quick)), rollouts, 0, False
+        )
+        for label, flow in (("splines", "nsf"), ("affine", "maf"))
+    }
+    assert {len(p.states) for p in posteriors.values()} == {2}
+    assert {r.num_simulations for p in posteriors.values() for r in p.provenance.rounds} == {30}
+    exact = exact_samples(inputs, observed, seed=0)
+    ridge = Ridge(posteriors, exact, valley(inputs, observed))
+    # Without a round it is the last one; the first is another posterior.
+    np.testing.assert_array_equal(ridge.samples("affine"), ridge.samples("affine", 1))
+    assert not np.array_equal(ridge.samples("affine"), ridge.samples("affine", 0))
+    (figure,) = write_pendulum_figures({"1 s": ridge}, tmp_path)
+    assert figure.name == "pendulum_1_s.png"
+    assert figure.stat().st_size > 10_000
+
+
+def test_the_exact_posterior_lies_on_the_valley(short):
+    rollouts = record(50)
+    inputs = rollouts.inputs(initial_state="recorded")
+    observed = rollouts.observation(inputs)
+    found = pendulum_ridge.figures(
+        exact_samples(inputs, observed, seed=0),
+        exact_samples(inputs, observed, seed=1),
+        valley(inputs, observed),
+    )
+    assert found["on_curve"] > 0.95
+    assert abs(found["c2st"] - 0.5) < 0.05
+    assert torch.isfinite(torch.tensor(list(found.values()))).all()
+
+
+def test_the_papers_methods_run_or_say_why_not():
+    found, skipped = available(METHODS)
+    assert "snpe-c" in found
+    assert set(found) | set(skipped) == set(METHODS)
