@@ -30,7 +30,7 @@ The flows are trained on preconditioned data, see :mod:`npdr_ppl.inference.featu
 """
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
@@ -103,6 +103,7 @@ class SNPEC(Backend):
 
     name: ClassVar[str] = "snpe-c"
     summary: ClassVar[str] = "sequential neural posterior estimation with normalising flows"
+    amortises: ClassVar[bool] = True
 
     flow: Literal["nsf", "maf"] = "nsf"
     transforms: int = 2
@@ -244,20 +245,22 @@ class SNPEC(Backend):
 
     def densities(self, problem: Problem, state: State) -> list[Density]:
         """Returns the posterior of every ensemble member."""
+        return next(self.densities_given(problem, state, problem.observation[None]))
+
+    def densities_given(
+        self, problem: Problem, state: State, observations: Tensor
+    ) -> Iterator[list[Density]]:
+        """Yields the members' posteriors by observation; see :meth:`Backend.densities_given`."""
         state = _own(state)
         if state.preconditioner is None:
             raise BackendError("There is no posterior yet: tell the backend simulations first.")
         preconditioner = state.preconditioner.to(problem.device)
-        observation = problem.observation.to(problem.device, torch.float32)
         build = partial(self._networks, problem)
-        return [
-            FlowDensity(
-                load_member(build, state.weights, k).to(problem.device),
-                preconditioner,
-                observation,
-            )
-            for k in range(self.members)
+        networks = [
+            load_member(build, state.weights, k).to(problem.device) for k in range(self.members)
         ]
+        for x in observations.to(problem.device, torch.float32):
+            yield [FlowDensity(network, preconditioner, x) for network in networks]
 
     def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Splits a state into tensors and JSON-serialisable values."""

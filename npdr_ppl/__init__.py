@@ -12,6 +12,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 __all__ = [
+    "Calibration",
     "Channel",
     "Effect",
     "Inputs",
@@ -22,6 +23,7 @@ __all__ = [
     "Rollouts",
     "Simulator",
     "add_effect",
+    "calibrate",
     "diagnose",
     "infer",
     "remove_effect",
@@ -38,12 +40,15 @@ if TYPE_CHECKING:
     from npdr_ppl.language.simulator import Simulator
     from npdr_ppl.language.sites import simulate
     from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.workflows.calibration import calibrate
+    from npdr_ppl.workflows.calibration_result import Calibration
     from npdr_ppl.workflows.diagnostics import diagnose
     from npdr_ppl.workflows.infer import infer
     from npdr_ppl.workflows.posterior import Posterior
 
 # Loaded when first used, so that importing the package stays quick.
 _HOMES = {
+    "Calibration": "workflows.calibration_result",
     "Channel": "language.channels",
     "Effect": "language.effects",
     "Inputs": "language.inputs",
@@ -54,6 +59,7 @@ _HOMES = {
     "Rollouts": "rollouts",
     "Simulator": "language.simulator",
     "add_effect": "language.handlers",
+    "calibrate": "workflows.calibration",
     "diagnose": "workflows.diagnostics",
     "infer": "workflows.infer",
     "remove_effect": "language.handlers",
