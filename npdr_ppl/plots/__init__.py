@@ -1,9 +1,18 @@
 """Figures: each function draws on matplotlib axes and returns the figure."""
 
 from npdr_ppl.plots.bands import plot_bands
+from npdr_ppl.plots.calibration import plot_coverage, plot_ranks
 from npdr_ppl.plots.heatmap import plot_rounds
 from npdr_ppl.plots.marginals import plot_marginals
 from npdr_ppl.plots.pair import plot_pair
 from npdr_ppl.plots.theme import save_figure
 
-__all__ = ["plot_bands", "plot_marginals", "plot_pair", "plot_rounds", "save_figure"]
+__all__ = [
+    "plot_bands",
+    "plot_coverage",
+    "plot_marginals",
+    "plot_pair",
+    "plot_ranks",
+    "plot_rounds",
+    "save_figure",
+]

@@ -192,7 +192,8 @@ def loo(data: Data, *, var_name: str | None = None) -> Loo:
         data: An ArviZ object with a ``log_likelihood``.
         var_name: Variable of that group; needed if it has several.
     """
-    found = _az.loo(data, pointwise=True, var_name=var_name)
+    with _pareto_k_is_a_figure():
+        found = _az.loo(data, pointwise=True, var_name=var_name)
     names = ("elpd", "p", "elpd_i") if HAS_DATATREE else ("elpd_loo", "p_loo", "loo_i")
     elpd, p, elpd_i = (getattr(found, name) for name in names)
     return Loo(
@@ -208,17 +209,21 @@ def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.Da
         var_name: Variable of ``log_likelihood``; needed if there are several.
 
     Returns:
-        Columns rank, elpd, p, elpd_diff (to the best, so at most 0), weight, se, dse; unrounded.
+        Columns rank, elpd, p, elpd_diff (to the best, so at most 0), weight, se, dse, unrounded,
+        and warning: whether a Pareto k is too large to trust the row.
     """
-    if HAS_DATATREE:
-        table = _az.compare(dict(models), method="stacking", var_name=var_name, round_to="none")
-    else:
-        table = _az.compare(
-            dict(models), ic="loo", method="stacking", scale="log", var_name=var_name
-        )
-        table = table.rename(columns={"elpd_loo": "elpd", "p_loo": "p"})
-        table["elpd_diff"] = -table["elpd_diff"]
-    columns = ("rank", "elpd", "p", "elpd_diff", "weight", "se", "dse")
+    names: dict[str, Any] = {"var_name": var_name, "method": "stacking"}
+    with _pareto_k_is_a_figure():
+        # ArviZ 0.23 calls pandas in ways that pandas 3 deprecates.
+        warnings.filterwarnings("ignore", category=DeprecationWarning, module="arviz")
+        if HAS_DATATREE:
+            table = _az.compare(dict(models), round_to="none", **names)
+            table["warning"] = table["diag_elpd"].fillna("").ne("")
+        else:
+            table = _az.compare(dict(models), ic="loo", scale="log", **names)
+            table = table.rename(columns={"elpd_loo": "elpd", "p_loo": "p"})
+            table["elpd_diff"] = -table["elpd_diff"]
+    columns = ("rank", "elpd", "p", "elpd_diff", "weight", "se", "dse", "warning")
     return pd.DataFrame({column: table[column] for column in columns})
 
 
@@ -241,4 +246,12 @@ def _any_group() -> Iterator[None]:
     """Lets groups pass that are not in ArviZ 0.x's scheme, such as ArviZ 1's ``prior_sbc``."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*not defined in the InferenceData scheme")
+        yield
+
+
+@contextmanager
+def _pareto_k_is_a_figure() -> Iterator[None]:
+    """Silences ArviZ's warning about large Pareto k: the caller gets them, or a flag."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*shape parameter of Pareto distribution")
         yield

@@ -8,7 +8,6 @@ probability integral transform (PIT) of the recording under the posterior predic
 p-value of the worst segment's error; PSIS-LOO over segments with Pareto k.
 """
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -280,8 +279,5 @@ def _loo(data: "Data") -> tuple[tuple[float, float], float]:
         return unknown
     if len(group(data, "log_likelihood").data_vars) != 1:
         return unknown
-    with warnings.catch_warnings():
-        # A large Pareto k is reported as a figure.
-        warnings.simplefilter("ignore")
-        found = loo(data)
+    found = loo(data)
     return (found.elpd, found.se), float(np.max(found.pareto_k))
