@@ -196,9 +196,10 @@ def loo(data: Data, *, var_name: str | None = None) -> Loo:
         found = _az.loo(data, pointwise=True, var_name=var_name)
     names = ("elpd", "p", "elpd_i") if HAS_DATATREE else ("elpd_loo", "p_loo", "loo_i")
     elpd, p, elpd_i = (getattr(found, name) for name in names)
-    return Loo(
-        float(elpd), float(found.se), float(p), np.asarray(found.pareto_k), np.asarray(elpd_i)
-    )
+    elpd_i = np.asarray(elpd_i)
+    # ArviZ 1 divides by n - 1 where earlier releases divide by n; with few segments that shows.
+    se = float(np.sqrt(elpd_i.size * elpd_i.var(ddof=1))) if elpd_i.size > 1 else float("nan")
+    return Loo(float(elpd), se, float(p), np.asarray(found.pareto_k), elpd_i)
 
 
 def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.DataFrame:
@@ -222,7 +223,10 @@ def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.Da
         else:
             table = _az.compare(dict(models), ic="loo", scale="log", **names)
             table = table.rename(columns={"elpd_loo": "elpd", "p_loo": "p"})
-            table["elpd_diff"] = -table["elpd_diff"]
+            table["elpd_diff"] = 0.0 - table["elpd_diff"]
+            n = loo(next(iter(models.values())), var_name=var_name).elpd_i.size
+            for column in ("se", "dse"):  # as in loo
+                table[column] *= np.sqrt(n / (n - 1)) if n > 1 else np.nan
     columns = ("rank", "elpd", "p", "elpd_diff", "weight", "se", "dse", "warning")
     return pd.DataFrame({column: table[column] for column in columns})
 

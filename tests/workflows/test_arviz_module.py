@@ -128,7 +128,7 @@ def test_cross_validation_has_its_closed_form():
     # Monte-Carlo error of a log mean over 8000 draws with weights of order one: some 1e-2.
     assert found.elpd_i == pytest.approx(exact, abs=0.05)
     assert found.elpd == pytest.approx(exact.sum(), abs=0.1)
-    assert found.se == pytest.approx((len(exact) * exact.var()) ** 0.5, rel=0.1)
+    assert found.se == pytest.approx((len(exact) * exact.var(ddof=1)) ** 0.5, rel=0.05)
     assert 0.3 < found.p < 1.5
     assert found.pareto_k.shape == OBSERVED.shape and found.pareto_k.max() < 0.7
 
@@ -142,6 +142,10 @@ def test_comparison_ranks_by_closed_form():
     assert table.loc["near", "elpd_diff"] == 0
     assert table["weight"].sum() == pytest.approx(1)
     assert table.loc["near", "elpd"] == pytest.approx(loo(models["near"]).elpd)
+    assert table.loc["near", "se"] == pytest.approx(loo(models["near"]).se)
+    pointwise = exact_elpd() - exact_elpd(-3.0)
+    expected = (len(pointwise) * pointwise.var(ddof=1)) ** 0.5
+    assert table.loc["far", "dse"] == pytest.approx(expected, rel=0.1)
     assert list(table.columns) == [
         "rank", "elpd", "p", "elpd_diff", "weight", "se", "dse", "warning",
     ]  # fmt: skip
