@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from npdr_ppl.plots.marginals import add_legend
 from npdr_ppl.plots.theme import COLORS, save_figure, theme
 from npdr_ppl.workflows.calibration_result import HIGHEST_DENSITY, TARP, Calibration
-from npdr_ppl.workflows.uniformity import simultaneous_band
+from npdr_ppl.workflows.uniformity import Band, simultaneous_band
 
 __all__ = ["plot_coverage", "plot_ranks", "write_calibration_figures"]
 
@@ -31,16 +31,19 @@ def plot_ranks(calibration: Calibration) -> Figure:
         calibration: The ranks.
     """
     names = calibration.parameters
+    band = simultaneous_band(calibration.num_datasets, calibration.num_draws, BAND)
     columns = min(MAX_COLUMNS, len(names))
     rows = -(-len(names) // columns)
     with theme():
         figure = Figure(figsize=(2.6 * columns, 1.9 * rows + 0.3), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
         for axis, name in zip(axes.ravel(), names, strict=False):
-            _draw_difference(axis, calibration, name)
+            _draw_difference(axis, calibration, name, band)
             axis.set_title(name)
         for axis in axes.ravel()[len(names) :]:
             axis.set_visible(False)
+        for axis in axes.ravel()[: len(names)][-columns:]:
+            axis.tick_params(labelbottom=True)
         for axis in axes[:, 0]:
             axis.set_ylabel("ECDF difference")
         figure.supxlabel("rank of the truth / draws", fontsize=9)
@@ -60,12 +63,13 @@ def plot_coverage(
         calibration: The ranks.
         quantities: ``"highest_density"``, ``"tarp"``: one panel each.
     """
+    band = simultaneous_band(calibration.num_datasets, calibration.num_draws, BAND)
     titles = {HIGHEST_DENSITY: "highest-density regions", TARP: "random balls (TARP)"}
     with theme():
         figure = Figure(figsize=(3.0 * len(quantities), 3.2), layout="constrained")
         axes = figure.subplots(1, len(quantities), squeeze=False, sharey=True).ravel()
         for axis, quantity in zip(axes, quantities, strict=True):
-            _draw_coverage(axis, calibration, quantity)
+            _draw_coverage(axis, calibration, quantity, band)
             axis.set_title(f"{titles.get(quantity, quantity)}, {_p_value(calibration, quantity)}")
             axis.set_xlabel("nominal coverage")
         axes[0].set_ylabel("expected coverage")
@@ -81,8 +85,7 @@ def write_calibration_figures(calibration: Calibration, out: Path) -> list[Path]
     ]
 
 
-def _draw_difference(axis: Axes, calibration: Calibration, name: str) -> None:
-    band = simultaneous_band(calibration.num_datasets, calibration.num_draws, BAND)
+def _draw_difference(axis: Axes, calibration: Calibration, name: str, band: Band) -> None:
     t = band.positions
     axis.fill_between(
         t, band.low - t, band.high - t, color=COLORS["prior"], alpha=0.3, lw=0,
@@ -97,8 +100,7 @@ def _draw_difference(axis: Axes, calibration: Calibration, name: str) -> None:
     )  # fmt: skip
 
 
-def _draw_coverage(axis: Axes, calibration: Calibration, quantity: str) -> None:
-    band = simultaneous_band(calibration.num_datasets, calibration.num_draws, BAND)
+def _draw_coverage(axis: Axes, calibration: Calibration, quantity: str, band: Band) -> None:
     t = band.positions
     axis.fill_between(
         t, band.low, band.high, color=COLORS["prior"], alpha=0.3, lw=0, label=f"{BAND:.0%} band"
