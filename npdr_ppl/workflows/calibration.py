@@ -2,17 +2,16 @@
 
 A posterior q(z | x) is calibrated if, for parameters z* from the prior and data x from the
 simulator at z*, the truth z* is distributed as a draw of q(z | x). Then the rank of any quantity
-at z* among its values at L draws of q is uniform on 0 … L. Four quantities are ranked:
+at z* among its values at L draws of q is uniform on 0 … L. Three kinds are ranked:
 
 * each parameter: simulation-based calibration (Talts et al. 2018,
-  https://arxiv.org/abs/1804.06788, Algorithm 1);
+  https://arxiv.org/abs/1804.06788);
 * the density q itself, which gives the expected coverage of highest-density regions (Hermans et
   al. 2022, https://arxiv.org/abs/2110.06581; Deistler et al. 2022,
   https://arxiv.org/abs/2210.04815);
 * the distance to a random reference point, TARP (Lemos et al. 2023,
-  https://arxiv.org/abs/2302.03026, Algorithm 2). The reference points depend on the data, as their
-  §3 asks for: otherwise the prior in place of the posterior would look calibrated, as it does to
-  the two above.
+  https://arxiv.org/abs/2302.03026). The reference points depend on the data: otherwise the prior
+  in place of the posterior would look calibrated, as it does to the two above.
 """
 
 from collections.abc import Iterator, Sequence
@@ -69,7 +68,7 @@ def calibrate(
         num_draws: Posterior draws L for each. With L + 1 a multiple of 200 the usual levels of
             coverage fall between two ranks.
         thin: Keeps every ``thin``-th draw, for backends whose draws are autocorrelated: ranks
-            are uniform only among independent ones (Talts et al. 2018, Algorithm 2).
+            are uniform only among independent ones (Talts et al. 2018).
         refit: Repeats the whole inference, all rounds, for every data set. Posteriors that hold
             for one observation only, sequential ones among them, need it.
         seed: Seed of everything random.

@@ -39,7 +39,7 @@ class Coverage:
     high: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Calibration:
     """Ranks of true parameters among posterior draws, over simulated data sets.
 
