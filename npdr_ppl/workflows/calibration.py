@@ -82,7 +82,8 @@ def calibrate(
             an argument is out of range.
         SimulationError: Too few simulations succeeded.
     """
-    num_datasets = num_datasets or (NUM_REFITS if refit else NUM_DATASETS)
+    if num_datasets is None:
+        num_datasets = NUM_REFITS if refit else NUM_DATASETS
     if num_datasets < MIN_DATASETS or num_draws < 1 or thin < 1:
         raise BackendError(
             f"calibrate needs at least {MIN_DATASETS} data sets, one draw and thin=1; got "

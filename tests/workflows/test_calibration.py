@@ -243,5 +243,6 @@ def test_results_go_to_json_and_arviz():
 
 
 def test_arguments_out_of_range_are_refused():
-    with pytest.raises(BackendError, match="at least 20 data sets"):
-        calibrated(Exact(), num_datasets=5)
+    for wrong in ({"num_datasets": 0}, {"num_datasets": 5}, {"num_draws": 0}, {"thin": 0}):
+        with pytest.raises(BackendError, match="at least 20 data sets"):
+            calibrated(Exact(), **wrong)
