@@ -64,7 +64,7 @@ class Loo:
 
     Attributes:
         elpd: Expected log pointwise predictive density.
-        se: Its standard error.
+        se: Its standard error; NaN with a single observation.
         p: Effective number of parameters.
         pareto_k: Tail index of every observation's weights.
         elpd_i: Every observation's part of ``elpd``.
@@ -192,7 +192,7 @@ def loo(data: Data, *, var_name: str | None = None) -> Loo:
         data: An ArviZ object with a ``log_likelihood``.
         var_name: Variable of that group; needed if it has several.
     """
-    with _pareto_k_is_a_figure():
+    with _quiet_loo():
         found = _az.loo(data, pointwise=True, var_name=var_name)
     names = ("elpd", "p", "elpd_i") if HAS_DATATREE else ("elpd_loo", "p_loo", "loo_i")
     elpd, p, elpd_i = (getattr(found, name) for name in names)
@@ -214,7 +214,7 @@ def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.Da
         and warning: whether a Pareto k is too large to trust the row.
     """
     names: dict[str, Any] = {"var_name": var_name, "method": "stacking"}
-    with _pareto_k_is_a_figure():
+    with _quiet_loo():
         # ArviZ 0.23 calls pandas in ways that pandas 3 deprecates.
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="arviz")
         if HAS_DATATREE:
@@ -224,9 +224,12 @@ def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.Da
             table = _az.compare(dict(models), ic="loo", scale="log", **names)
             table = table.rename(columns={"elpd_loo": "elpd", "p_loo": "p"})
             table["elpd_diff"] = 0.0 - table["elpd_diff"]
-            n = loo(next(iter(models.values())), var_name=var_name).elpd_i.size
-            for column in ("se", "dse"):  # as in loo
-                table[column] *= np.sqrt(n / (n - 1)) if n > 1 else np.nan
+    n = loo(next(iter(models.values())), var_name=var_name).elpd_i.size
+    for column in ("se", "dse"):  # as in loo
+        if n == 1:
+            table[column] = np.nan
+        elif not HAS_DATATREE:
+            table[column] *= np.sqrt(n / (n - 1))
     columns = ("rank", "elpd", "p", "elpd_diff", "weight", "se", "dse", "warning")
     return pd.DataFrame({column: table[column] for column in columns})
 
@@ -254,8 +257,10 @@ def _any_group() -> Iterator[None]:
 
 
 @contextmanager
-def _pareto_k_is_a_figure() -> Iterator[None]:
-    """Silences ArviZ's warning about large Pareto k: the caller gets them, or a flag."""
+def _quiet_loo() -> Iterator[None]:
+    """Silences ArviZ about large Pareto k, which the caller gets as figures or a flag."""
     with warnings.catch_warnings():
+        # ArviZ finds it suspicious that a single observation's part is the whole sum.
+        warnings.filterwarnings("ignore", message="The point-wise LOO is the same with the sum")
         warnings.filterwarnings("ignore", message=".*shape parameter of Pareto distribution")
         yield

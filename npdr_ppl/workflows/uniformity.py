@@ -9,8 +9,9 @@ R_k ~ Bin(N, t_k) with t_k = m_k / (L + 1). Its pointwise tail probability is
 
     g_k(R) = 2 min(F_k(R), 1 - F_k(R - 1)),
 
-with F_k the binomial distribution function, and the statistic is the least of them, min_k g_k. From one threshold to the next R_k moves as a Markov chain with binomial steps, so
-that P(min_k g_k > g) is a product of matrices (the optimisation-based variant of their method):
+with F_k the binomial distribution function, and the statistic is the least of them, min_k g_k.
+From one threshold to the next R_k moves as a Markov chain with binomial steps, so that
+P(min_k g_k > g) is a product of matrices (the optimisation-based variant of their method):
 p-values and bands are exact, without simulation and without large-sample approximation.
 """
 

@@ -133,6 +133,14 @@ def test_cross_validation_has_its_closed_form():
     assert found.pareto_k.shape == OBSERVED.shape and found.pareto_k.max() < 0.7
 
 
+def test_a_single_observation_has_no_standard_error():
+    mu = np.random.default_rng(4).standard_normal((4, 500)) / 2
+    likelihood = norm.logpdf(0.3, mu)[..., None]
+    data = from_dict({"posterior": {"mu": mu}, "log_likelihood": {"x": likelihood}})
+    assert np.isfinite(loo(data).elpd) and np.isnan(loo(data).se)
+    assert np.isnan(compare({"one": data, "other": data})["se"]).all()
+
+
 def test_comparison_ranks_by_closed_form():
     models = {"far": normal_mean(prior_mean=-3.0), "near": normal_mean()}
     table = compare(models)
