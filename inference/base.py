@@ -6,8 +6,8 @@ caller owns parallelism, checkpoints and resumption.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
@@ -98,12 +98,15 @@ class Backend(ABC):
             told none, and has its posterior after one round.
         is_sequential: Whether later rounds learn from earlier ones. If not, a caller with a budget
             spends it in one round.
+        amortises: Whether a state after one round from the prior holds the posterior given any
+            observation, and not only the problem's.
     """
 
     name: ClassVar[str]
     summary: ClassVar[str]
     uses_simulations: ClassVar[bool] = True
     is_sequential: ClassVar[bool] = True
+    amortises: ClassVar[bool] = False
 
     @abstractmethod
     def init(self, problem: Problem) -> State:
@@ -138,6 +141,22 @@ class Backend(ABC):
     @abstractmethod
     def densities(self, problem: Problem, state: State) -> list[Density]:
         """Returns the posterior of every ensemble member."""
+
+    def densities_given(
+        self, problem: Problem, state: State, observations: Tensor
+    ) -> Iterator[list[Density]]:
+        """Yields the posterior of every ensemble member given each of several observations.
+
+        Only a backend that :attr:`amortises` can do so. One that can share work between
+        observations overrides this.
+
+        Args:
+            problem: The problem given to :meth:`init`.
+            state: A state after one round.
+            observations: Observations, ``(n,) + observation.shape``.
+        """
+        for x in observations:
+            yield self.densities(replace(problem, observation=x), state)
 
     @abstractmethod
     def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:

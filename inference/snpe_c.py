@@ -29,6 +29,7 @@ Two kinds of proposals do that:
 The flows are trained on preconditioned data, see :mod:`npdr_ppl.inference.features`.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Literal
@@ -74,6 +75,7 @@ class SNPEC(NeuralBackend):
 
     name: ClassVar[str] = "snpe-c"
     summary: ClassVar[str] = "sequential neural posterior estimation with normalising flows"
+    amortises: ClassVar[bool] = True
 
     flow: Flow = "nsf"
     transforms: int = 2
@@ -108,18 +110,20 @@ class SNPEC(NeuralBackend):
 
     def densities(self, problem: Problem, state: State) -> list[Density]:
         """Returns the posterior of every ensemble member."""
+        return next(self.densities_given(problem, state, problem.observation[None]))
+
+    def densities_given(
+        self, problem: Problem, state: State, observations: Tensor
+    ) -> Iterator[list[Density]]:
+        """Yields the members' posteriors by observation; see :meth:`Backend.densities_given`."""
         state, preconditioner = self._trained(state)
         preconditioner = preconditioner.to(problem.device)
-        observation = problem.observation.to(problem.device, torch.float32)
         build = partial(self._networks, problem)
-        return [
-            FlowDensity(
-                load_member(build, state.weights, k).to(problem.device),
-                preconditioner,
-                observation,
-            )
-            for k in range(self.members)
+        networks = [
+            load_member(build, state.weights, k).to(problem.device) for k in range(self.members)
         ]
+        for x in observations.to(problem.device, torch.float32):
+            yield [FlowDensity(network, preconditioner, x) for network in networks]
 
     def _training_rows(self, problem: Problem, state: NeuralState) -> Tensor:
         """Returns which simulations lie in the neighbourhood to train on, ``(n,)``."""

@@ -12,6 +12,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 __all__ = [
+    "Calibration",
     "Channel",
     "Effect",
     "Inputs",
@@ -23,6 +24,7 @@ __all__ = [
     "Simulator",
     "add_effect",
     "compare",
+    "calibrate",
     "diagnose",
     "infer",
     "remove_effect",
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
     from npdr_ppl.language.simulator import Simulator
     from npdr_ppl.language.sites import simulate
     from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.workflows.calibration import calibrate
+    from npdr_ppl.workflows.calibration_result import Calibration
     from npdr_ppl.workflows.compare import compare
     from npdr_ppl.workflows.diagnostics import diagnose
     from npdr_ppl.workflows.infer import infer
@@ -46,6 +50,7 @@ if TYPE_CHECKING:
 
 # Loaded when first used, so that importing the package stays quick.
 _HOMES = {
+    "Calibration": "workflows.calibration_result",
     "Channel": "language.channels",
     "Effect": "language.effects",
     "Inputs": "language.inputs",
@@ -57,6 +62,7 @@ _HOMES = {
     "Simulator": "language.simulator",
     "add_effect": "language.handlers",
     "compare": "workflows.compare",
+    "calibrate": "workflows.calibration",
     "diagnose": "workflows.diagnostics",
     "infer": "workflows.infer",
     "remove_effect": "language.handlers",

@@ -15,7 +15,7 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.comparison import Comparison
 from npdr_ppl.workflows.evaluation import replay
-from npdr_ppl.workflows.fit import parameter_units
+from npdr_ppl.workflows.units import parameter_units
 
 __all__ = ["write_comparison_figures"]
 

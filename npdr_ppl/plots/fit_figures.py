@@ -14,8 +14,8 @@ from npdr_ppl.plots.theme import save_figure
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.evaluation import replay
-from npdr_ppl.workflows.fit import parameter_units
 from npdr_ppl.workflows.posterior import PosteriorBase
+from npdr_ppl.workflows.units import parameter_units
 
 __all__ = ["scalar_columns", "write_fit_figures"]
 

@@ -8,9 +8,10 @@ from torch import Tensor
 
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.randomness import seeded
+from npdr_ppl.workflows.units import parameter_units
 
 if TYPE_CHECKING:
-    from npdr_ppl.workflows.arviz_module import az
+    from npdr_ppl.workflows.arviz_module import Data
     from npdr_ppl.workflows.posterior import PosteriorBase
 
 __all__ = ["effective_share", "segment_log_likelihood", "to_arviz"]
@@ -21,29 +22,31 @@ MIN_STEPS = 8
 MAX_PREDICTIVE_DRAWS = 100
 """Posterior predictive draws of each member; trajectories are large."""
 
+MAX_PRIOR_PREDICTIVE_DRAWS = 50
+"""Prior predictive draws, those of the first prior draws; enough to see what the prior allows."""
 
-def to_arviz(
-    posterior: "PosteriorBase", num_samples: int = 1_000, *, seed: int = 0
-) -> "az.InferenceData":
+
+def to_arviz(posterior: "PosteriorBase", num_samples: int = 1_000, *, seed: int = 0) -> "Data":
     """Exports a posterior.
 
-    Groups: ``prior``; ``posterior`` with one chain per independently trained member;
-    ``posterior_predictive``; ``observed_data``; ``constant_data`` (the inputs);
+    Groups: ``prior`` and ``prior_predictive``; ``posterior`` with one chain per independently
+    trained member; ``posterior_predictive``; ``observed_data``; ``constant_data`` (the inputs);
     ``log_likelihood`` with one value per *segment*; ``sample_stats`` with the log density of
     every draw. Readings of one segment are strongly correlated, which is why single time steps
-    never count as observations.
+    never count as observations. Parameters carry their ``units`` as an attribute where they are
+    known.
 
     Where the model declares no noise, the log likelihood is that of a Gaussian error per channel
     whose variance is estimated from the posterior predictive. Either is weighted by the share of
-    independent readings; see :func:`effective_share`. The group's attribute ``error_model`` says
-    what was used.
+    independent readings; see :func:`effective_share`. The attribute ``error_model`` of the
+    log likelihood says what was used.
 
     Args:
         posterior: The posterior.
         num_samples: Draws per member.
         seed: Seed of the draws.
     """
-    from npdr_ppl.workflows.arviz_module import az
+    from npdr_ppl.workflows.arviz_module import from_dict
 
     prior = posterior.prior
     z = posterior.sample_reference(num_samples, seed=seed)
@@ -53,13 +56,14 @@ def to_arviz(
         return {k: _array(v.reshape(members, -1, *v.shape[1:])) for k, v in values.items()}
 
     with seeded(seed, "prior"):
-        prior_draws = prior.to_parameters(prior.sample(num_samples))
+        prior_z = prior.sample(num_samples)
+        prior_predictive = prior.execute(prior_z[:MAX_PRIOR_PREDICTIVE_DRAWS])
     few = min(num_samples, MAX_PREDICTIVE_DRAWS)
     predictive_z = z[:, :few].flatten(0, 1)
     with seeded(seed, "predictive"):
         predictive = prior.execute(predictive_z)
     observations = posterior.bound.observations
-    coords: dict[str, object] = {}
+    coords: dict[str, list[str]] = {}
     dims: dict[str, list[str]] = {}
     constant: dict[str, np.ndarray] = {}
     for name, observation in observations.items():
@@ -84,23 +88,29 @@ def to_arviz(
         name: segment_log_likelihood(posterior, name, predictive[name], predictive_z)
         for name in observations
     }
-    draws = by_chain(prior.to_parameters(z.flatten(0, 1)))
-    data = az.from_dict(
-        posterior=draws,
-        prior={k: _array(v[None]) for k, v in prior_draws.items()},
-        posterior_predictive=by_chain(predictive),
-        observed_data={n: _array(o.value) for n, o in observations.items()},
-        constant_data=constant or None,
-        sample_stats={
-            "lp": posterior.log_prob_reference(z.flatten(0, 1)).reshape(members, -1).numpy()
-        },
-        log_likelihood=by_chain({n: v for n, (v, _) in likelihood.items()}),
+    log_density = posterior.log_prob_reference(z.flatten(0, 1)).reshape(members, -1)
+    groups = {
+        "posterior": by_chain(prior.to_parameters(z.flatten(0, 1))),
+        "prior": {k: _array(v[None]) for k, v in prior.to_parameters(prior_z).items()},
+        "prior_predictive": {k: _array(v[None]) for k, v in prior_predictive.items()},
+        "posterior_predictive": by_chain(predictive),
+        "observed_data": {n: _array(o.value) for n, o in observations.items()},
+        "sample_stats": {"lp": _array(log_density)},
+        "log_likelihood": by_chain({n: v for n, (v, _) in likelihood.items()}),
+    }
+    if constant:
+        groups["constant_data"] = constant
+    return from_dict(
+        groups,
         coords=coords,
         dims=dims,
         attrs={"inference_library": "npdr_ppl", "backend": posterior.backend_name},
+        variable_attrs={
+            "posterior": {n: {"units": u} for n, u in parameter_units(posterior).items()},
+            "prior": {n: {"units": u} for n, u in parameter_units(posterior).items()},
+            "log_likelihood": {n: {"error_model": m} for n, (_, m) in likelihood.items()},
+        },
     )
-    data["log_likelihood"].attrs["error_model"] = ", ".join(m for _, m in likelihood.values())
-    return data
 
 
 def segment_log_likelihood(
@@ -148,14 +158,14 @@ def effective_share(residual: Tensor, mask: Tensor) -> Tensor:
         residual: Residuals, ``(plates × segments, steps, channels)``.
         mask: Which steps exist, ``(segments, steps)``.
     """
-    from npdr_ppl.workflows.arviz_module import az
+    from npdr_ppl.workflows.arviz_module import ess_of_array
 
     whole = mask.all(-1).repeat(len(residual) // len(mask))
     chains = residual[whole] if bool(whole.any()) else residual
     total = chains.shape[0] * chains.shape[1]
     if chains.shape[1] < MIN_STEPS:
         return torch.ones(residual.shape[-1], dtype=torch.float64)
-    sizes = [float(az.ess(values.numpy(), method="mean")) for values in chains.unbind(-1)]
+    sizes = [ess_of_array(values.numpy(), method="mean") for values in chains.unbind(-1)]
     share = torch.tensor(sizes, dtype=torch.float64) / total
     return share.nan_to_num(1.0).clamp(1 / chains.shape[1], 1.0)
 

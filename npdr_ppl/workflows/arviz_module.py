@@ -1,10 +1,268 @@
-"""ArviZ, imported in one place, which knows the differences between its releases."""
+"""ArviZ, imported in one place, which knows the differences between its releases.
+
+Up to 0.23 ArviZ keeps its groups in an ``InferenceData``, from 1.0 on in xarray's ``DataTree``;
+functions took other arguments then, and tables had other columns. The functions here have one
+signature and one meaning for both, and every other module uses these alone. What they return is
+named as in ArviZ 1. Defaults that differ between the releases (the kind and probability of
+intervals, the rounding of tables) are always given explicitly.
+"""
 
 import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from os import PathLike, fspath
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
 
 with warnings.catch_warnings():
     # ArviZ 0.23 announces its next major release on every import.
     warnings.simplefilter("ignore", FutureWarning)
     import arviz as az
 
-__all__ = ["az"]
+from npdr_ppl.errors import DataError
+
+__all__ = [
+    "HAS_DATATREE",
+    "Data",
+    "Loo",
+    "az",
+    "compare",
+    "ess",
+    "ess_of_array",
+    "from_dict",
+    "from_netcdf",
+    "group",
+    "group_names",
+    "hdi",
+    "loo",
+    "rhat",
+    "summary",
+    "to_netcdf",
+]
+
+HAS_DATATREE: bool = int(az.__version__.split(".")[0]) >= 1
+"""Whether this ArviZ keeps groups in a ``DataTree``."""
+
+# The other release's names are unknown to a type checker that sees one of them installed.
+_az: Any = az
+
+Data = Any
+"""What ArviZ calls a collection of groups: its ``InferenceData``, from 1.0 on a ``DataTree``."""
+
+_SUMMARY = ["mean", "sd", "hdi_lb", "hdi_ub"]
+_SUMMARY += ["mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
+
+
+@dataclass(frozen=True)
+class Loo:
+    """Leave-one-out cross-validation by Pareto-smoothed importance sampling.
+
+    Attributes:
+        elpd: Expected log pointwise predictive density.
+        se: Its standard error; NaN with a single observation.
+        p: Effective number of parameters.
+        pareto_k: Tail index of every observation's weights.
+        elpd_i: Every observation's part of ``elpd``.
+    """
+
+    elpd: float
+    se: float
+    p: float
+    pareto_k: NDArray[np.float64]
+    elpd_i: NDArray[np.float64]
+
+
+def from_dict(
+    groups: Mapping[str, Mapping[str, ArrayLike]],
+    *,
+    coords: Mapping[str, Sequence[Any] | NDArray[Any]] | None = None,
+    dims: Mapping[str, Sequence[str]] | None = None,
+    attrs: Mapping[str, Any] | None = None,
+    variable_attrs: Mapping[str, Mapping[str, Mapping[str, Any]]] | None = None,
+) -> Data:
+    """Makes an ArviZ object.
+
+    Args:
+        groups: Arrays by group and variable. Those of groups with ``data`` in their name have no
+            sample dimensions; all others are ``(chain, draw, ...)``.
+        coords: Labels by dimension.
+        dims: Names of the dimensions behind the samples', by variable.
+        attrs: Attributes of the whole object.
+        variable_attrs: Attributes by group and variable, e.g. its unit.
+    """
+    datasets = {}
+    for name, values in groups.items():
+        arguments: dict[str, Any] = {
+            "coords": dict(coords or {}),
+            "dims": {k: list(v) for k, v in (dims or {}).items()},
+            "skip_event_dims": name == "log_likelihood",
+        }
+        if "data" in name:
+            arguments["sample_dims" if HAS_DATATREE else "default_dims"] = []
+        dataset = _az.dict_to_dataset(dict(values), **arguments)
+        for variable, own in (variable_attrs or {}).get(name, {}).items():
+            dataset[variable].attrs.update(own)
+        datasets[name] = dataset
+    if HAS_DATATREE:
+        tree = xr.DataTree.from_dict(datasets)
+        tree.attrs = dict(attrs or {})
+        return tree
+    with _any_group():
+        return _az.InferenceData(attrs=dict(attrs or {}), **datasets)
+
+
+def group_names(data: Data) -> list[str]:
+    """Returns the names of the groups."""
+    return list(data.children) if HAS_DATATREE else list(data.groups())
+
+
+def group(data: Data, name: str) -> xr.Dataset:
+    """Returns a group.
+
+    Raises:
+        DataError: There is none of that name.
+    """
+    if name not in group_names(data):
+        raise DataError(f"The ArviZ object has no group {name!r}; it has {group_names(data)}.")
+    return data[name].to_dataset() if HAS_DATATREE else data[name]
+
+
+def hdi(data: Data, prob: float, *, group_name: str = "posterior") -> xr.Dataset:
+    """Returns highest-density intervals, along the dimension ``ci_bound`` (lower, upper).
+
+    Args:
+        data: An ArviZ object.
+        prob: Probability of the intervals.
+        group_name: The group.
+    """
+    samples = group(data, group_name)
+    if HAS_DATATREE:
+        return _az.hdi(samples, prob=prob)
+    intervals = _az.hdi(samples, hdi_prob=prob).rename(hdi="ci_bound")
+    return intervals.assign_coords(ci_bound=["lower", "upper"])
+
+
+def rhat(data: Data) -> xr.Dataset:
+    """Returns rank-normalised split r̂ of the posterior's variables; NaN with a single chain."""
+    samples = group(data, "posterior")
+    if samples.sizes["chain"] < 2:
+        return xr.full_like(samples.isel(chain=0, draw=0, drop=True), np.nan, dtype=float)
+    return _az.rhat(samples)
+
+
+def ess(data: Data, *, method: Literal["bulk", "tail", "mean"] = "bulk") -> xr.Dataset:
+    """Returns the effective sample size of the posterior's variables."""
+    return _az.ess(group(data, "posterior"), method=method)
+
+
+def ess_of_array(chains: NDArray[np.floating[Any]], *, method: Literal["bulk", "mean"]) -> float:
+    """Returns the effective sample size of one quantity, ``(chains, draws)``."""
+    return float(_az.ess(chains, method=method))
+
+
+def summary(data: Data, *, prob: float = 0.94) -> pd.DataFrame:
+    """Returns a table of the posterior's scalar parameters, unrounded.
+
+    Args:
+        data: An ArviZ object.
+        prob: Probability of the highest-density intervals.
+
+    Returns:
+        Columns mean, sd, hdi_lb, hdi_ub, mcse_mean, mcse_sd, ess_bulk, ess_tail, r_hat.
+    """
+    samples = group(data, "posterior")
+    if HAS_DATATREE:
+        table = _az.summary(samples, ci_prob=prob, ci_kind="hdi", round_to="none")
+    else:
+        table = _az.summary(samples, hdi_prob=prob, round_to="none")
+    bounds = [c for c in table.columns if str(c).startswith("hdi")]
+    table = table.rename(columns=dict(zip(bounds, ("hdi_lb", "hdi_ub"), strict=True)))
+    return pd.DataFrame({column: table[column].astype(float) for column in _SUMMARY})
+
+
+def loo(data: Data, *, var_name: str | None = None) -> Loo:
+    """Estimates the expected log predictive density by PSIS-LOO.
+
+    Args:
+        data: An ArviZ object with a ``log_likelihood``.
+        var_name: Variable of that group; needed if it has several.
+    """
+    with _quiet_loo():
+        found = _az.loo(data, pointwise=True, var_name=var_name)
+    names = ("elpd", "p", "elpd_i") if HAS_DATATREE else ("elpd_loo", "p_loo", "loo_i")
+    elpd, p, elpd_i = (getattr(found, name) for name in names)
+    elpd_i = np.asarray(elpd_i)
+    # ArviZ 1 divides by n - 1 where earlier releases divide by n; with few segments that shows.
+    se = float(np.sqrt(elpd_i.size * elpd_i.var(ddof=1))) if elpd_i.size > 1 else float("nan")
+    return Loo(float(elpd), se, float(p), np.asarray(found.pareto_k), elpd_i)
+
+
+def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.DataFrame:
+    """Compares models by PSIS-LOO, best first, with stacking weights.
+
+    Args:
+        models: ArviZ objects by name.
+        var_name: Variable of ``log_likelihood``; needed if there are several.
+
+    Returns:
+        Columns rank, elpd, p, elpd_diff (to the best, so at most 0), weight, se, dse, unrounded,
+        and warning: whether a Pareto k is too large to trust the row.
+    """
+    names: dict[str, Any] = {"var_name": var_name, "method": "stacking"}
+    with _quiet_loo():
+        # ArviZ 0.23 calls pandas in ways that pandas 3 deprecates.
+        warnings.filterwarnings("ignore", category=DeprecationWarning, module="arviz")
+        if HAS_DATATREE:
+            table = _az.compare(dict(models), round_to="none", **names)
+            table["warning"] = table["diag_elpd"].fillna("").ne("")
+        else:
+            table = _az.compare(dict(models), ic="loo", scale="log", **names)
+            table = table.rename(columns={"elpd_loo": "elpd", "p_loo": "p"})
+            table["elpd_diff"] = 0.0 - table["elpd_diff"]
+    n = loo(next(iter(models.values())), var_name=var_name).elpd_i.size
+    for column in ("se", "dse"):  # as in loo
+        if n == 1:
+            table[column] = np.nan
+        elif not HAS_DATATREE:
+            table[column] *= np.sqrt(n / (n - 1))
+    columns = ("rank", "elpd", "p", "elpd_diff", "weight", "se", "dse", "warning")
+    return pd.DataFrame({column: table[column] for column in columns})
+
+
+def to_netcdf(data: Data, path: str | PathLike[str]) -> None:
+    """Writes an ArviZ object as NetCDF; either release reads the other's files."""
+    data.to_netcdf(fspath(path), engine="h5netcdf")
+
+
+def from_netcdf(path: str | PathLike[str]) -> Data:
+    """Reads an ArviZ object into memory and closes the file."""
+    if HAS_DATATREE:
+        with xr.open_datatree(fspath(path), engine="h5netcdf") as tree:
+            return tree.load()
+    with _any_group(), _az.rc_context({"data.load": "eager"}):
+        return _az.from_netcdf(fspath(path), engine="h5netcdf")
+
+
+@contextmanager
+def _any_group() -> Iterator[None]:
+    """Lets groups pass that are not in ArviZ 0.x's scheme, such as ArviZ 1's ``prior_sbc``."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*not defined in the InferenceData scheme")
+        yield
+
+
+@contextmanager
+def _quiet_loo() -> Iterator[None]:
+    """Silences ArviZ about large Pareto k, which the caller gets as figures or a flag."""
+    with warnings.catch_warnings():
+        # ArviZ finds it suspicious that a single observation's part is the whole sum.
+        warnings.filterwarnings("ignore", message="The point-wise LOO is the same with the sum")
+        warnings.filterwarnings("ignore", message=".*shape parameter of Pareto distribution")
+        # A plain function's output counts as one observation.
+        warnings.filterwarnings("ignore", message="The point-wise LOO is the same")
+        yield

@@ -238,7 +238,9 @@ class _Run:
         sampled = time.perf_counter() - started
         data = posterior.to_arviz(seed=judge.seed)
         if self.folder is not None:
-            data.to_netcdf(str(self.folder / "posterior.nc"), engine="h5netcdf")
+            from npdr_ppl.workflows.arviz_module import to_netcdf
+
+            to_netcdf(data, self.folder / "posterior.nc")
         step(0.3, "sampled")
         figures = judge.figures(posterior, most_likely)
         step(1.0, "")

@@ -8,7 +8,6 @@ probability integral transform (PIT) of the recording under the posterior predic
 p-value of the worst segment's error; PSIS-LOO over segments with Pareto k.
 """
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -20,7 +19,9 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 
 if TYPE_CHECKING:
-    from npdr_ppl.workflows.arviz_module import az
+    import xarray as xr
+
+    from npdr_ppl.workflows.arviz_module import Data
 
 __all__ = ["Decision", "Diagnosis", "Thresholds", "diagnose"]
 
@@ -94,7 +95,7 @@ class Diagnosis:
 
 
 def diagnose(
-    data: "az.InferenceData", thresholds: Thresholds | None = None, *, rounds_left: int = 0
+    data: "Data", thresholds: Thresholds | None = None, *, rounds_left: int = 0
 ) -> Diagnosis:
     """Diagnoses a posterior and decides what to do next.
 
@@ -106,21 +107,18 @@ def diagnose(
     Raises:
         DataError: A needed group is missing.
     """
-    from npdr_ppl.workflows.arviz_module import az
+    from npdr_ppl.workflows.arviz_module import ess, group, group_names, rhat
 
     limits = thresholds or Thresholds()
-    groups = set(data.groups())
-    missing = {"posterior", "prior", "posterior_predictive", "observed_data"} - groups
+    missing = {"posterior", "prior", "posterior_predictive", "observed_data"}
+    missing -= set(group_names(data))
     if missing:
         raise DataError(f"The ArviZ object lacks the groups {', '.join(sorted(missing))}.")
-    with warnings.catch_warnings():
-        # ArviZ warns about too few chains; a single member gets NaN here and no more.
-        warnings.simplefilter("ignore")
-        ess = _extreme(az.ess(data), np.nanmin)
-        several = data["posterior"].sizes["chain"] > 1
-        r_hat = _extreme(az.rhat(data), np.nanmax) if several else float("nan")
-    contraction, edge_mass = _against_prior(data)
-    coverage, pit_deviation, p_value = _predictive_checks(data)
+    groups = {name: group(data, name) for name in group_names(data)}
+    least_ess = _extreme(ess(data), np.nanmin)
+    r_hat = _extreme(rhat(data), np.nanmax)
+    contraction, edge_mass = _against_prior(groups)
+    coverage, pit_deviation, p_value = _predictive_checks(groups)
     elpd, k = _loo(data)
     decision, reason = _decide(
         limits, rounds_left, r_hat, contraction, edge_mass, coverage, p_value
@@ -129,7 +127,7 @@ def diagnose(
         decision,
         reason,
         r_hat,
-        ess,
+        least_ess,
         contraction,
         edge_mass,
         coverage,
@@ -194,7 +192,9 @@ def _extreme(dataset: Any, reduce: Any) -> float:
     return float(reduce(joined)) if np.isfinite(joined).any() else float("nan")
 
 
-def _against_prior(data: "az.InferenceData") -> tuple[dict[str, float], dict[str, float]]:
+def _against_prior(
+    data: Mapping[str, "xr.Dataset"],
+) -> tuple[dict[str, float], dict[str, float]]:
     contraction, edge_mass = {}, {}
     for name in data["posterior"].data_vars:
         posterior = np.asarray(data["posterior"][name]).reshape(
@@ -221,7 +221,7 @@ def _against_prior(data: "az.InferenceData") -> tuple[dict[str, float], dict[str
     return contraction, edge_mass
 
 
-def _predictive_checks(data: "az.InferenceData") -> tuple[float, float, float]:
+def _predictive_checks(data: Mapping[str, "xr.Dataset"]) -> tuple[float, float, float]:
     coverages, deviations, p_values = [], [], []
     for name in data["observed_data"].data_vars:
         observed = np.asarray(data["observed_data"][name])
@@ -239,9 +239,11 @@ def _predictive_checks(data: "az.InferenceData") -> tuple[float, float, float]:
     return min(coverages), max(deviations), min(p_values)
 
 
-def _counted(data: "az.InferenceData", name: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _counted(
+    data: Mapping[str, "xr.Dataset"], name: str, shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
     """Returns which readings exist and were measured."""
-    if "constant_data" not in data.groups() or f"{name}_mask" not in data["constant_data"]:
+    if "constant_data" not in data or f"{name}_mask" not in data["constant_data"]:
         return np.ones(shape, dtype=bool)
     mask = np.asarray(data["constant_data"][f"{name}_mask"])[..., None]
     measured = np.asarray(data["constant_data"][f"{name}_measured"])
@@ -269,13 +271,13 @@ def _worst_segment_p_value(
     return float(np.mean(replicated >= discrepancy(observed)))
 
 
-def _loo(data: "az.InferenceData") -> tuple[tuple[float, float], float]:
-    from npdr_ppl.workflows.arviz_module import az
+def _loo(data: "Data") -> tuple[tuple[float, float], float]:
+    from npdr_ppl.workflows.arviz_module import group, group_names, loo
 
-    if "log_likelihood" not in data.groups() or len(data["log_likelihood"].data_vars) != 1:
-        return (float("nan"), float("nan")), float("nan")
-    with warnings.catch_warnings():
-        # A large Pareto k is reported as a figure.
-        warnings.simplefilter("ignore")
-        loo = az.loo(data, pointwise=True)
-    return (float(loo.elpd_loo), float(loo.se)), float(np.max(np.asarray(loo.pareto_k)))
+    unknown = (float("nan"), float("nan")), float("nan")
+    if "log_likelihood" not in group_names(data):
+        return unknown
+    if len(group(data, "log_likelihood").data_vars) != 1:
+        return unknown
+    found = loo(data)
+    return (found.elpd, found.se), float(np.max(found.pareto_k))

@@ -9,19 +9,19 @@ import numpy as np
 
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.language.handlers import with_noise
-from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.diagnostics import diagnose
 from npdr_ppl.workflows.evaluation import declares_noise, residual_noise, score
 from npdr_ppl.workflows.infer import infer
-from npdr_ppl.workflows.posterior import Posterior, PosteriorBase
+from npdr_ppl.workflows.posterior import Posterior
 from npdr_ppl.workflows.run_folder import write_json
+from npdr_ppl.workflows.units import parameter_units
 
 if TYPE_CHECKING:
-    from npdr_ppl.workflows.arviz_module import az
+    from npdr_ppl.workflows.arviz_module import Data
 
-__all__ = ["describe", "fit", "parameter_units"]
+__all__ = ["describe", "fit"]
 
 
 def fit(
@@ -103,38 +103,28 @@ def fit(
         "units": parameter_units(posterior),
     }
     if out is not None:
+        from npdr_ppl.workflows.arviz_module import to_netcdf
+
         out.mkdir(parents=True, exist_ok=True)
-        data.to_netcdf(str(out / "posterior.nc"), engine="h5netcdf")
+        to_netcdf(data, out / "posterior.nc")
         write_json(out / "fit.json", result)
     return posterior, result
 
 
-def describe(data: "az.InferenceData") -> dict[str, Any]:
+def describe(data: "Data") -> dict[str, Any]:
     """Returns mean, standard deviation and 94 % highest-density interval of every parameter."""
-    from npdr_ppl.workflows.arviz_module import az
+    from npdr_ppl.workflows.arviz_module import group, hdi
 
     parameters: dict[str, Mapping[str, Any]] = {}
-    intervals: Any = az.hdi(data, hdi_prob=0.94, group="posterior")
-    for name in data["posterior"].data_vars:
-        values = data["posterior"][name]
+    posterior, intervals = group(data, "posterior"), hdi(data, 0.94)
+    for name in posterior.data_vars:
+        values = posterior[name]
         parameters[str(name)] = {
             "mean": _plain(values.mean(("chain", "draw"))),
             "sd": _plain(values.std(("chain", "draw"))),
             "hdi_94": _plain(intervals[name]),
         }
     return {"parameters": parameters}
-
-
-def parameter_units(posterior: PosteriorBase) -> dict[str, str]:
-    """Returns the units of the latent sites that carry a parameter's name."""
-    known: dict[str, str] = {}
-    for box in posterior.prior.black_boxes.values():
-        if isinstance(box, SimulatorBlackBox):
-            known |= {p.name: p.unit for p in box.simulator.parameters}
-            for effect in box.simulator.effects:
-                units = effect.units(box.simulator.port(effect.port))
-                known |= {f"{effect.name}.{name}": unit for name, unit in units.items()}
-    return {site.name: known[site.name] for site in posterior.prior.sites if site.name in known}
 
 
 def _plain(value: Any) -> Any:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npdr_ppl.embeddings import Embedding
 from npdr_ppl.errors import BackendError, NpdrError
-from npdr_ppl.inference.base import Backend, RoundInfo
+from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.randomness import seeded
 from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data, bind, problem_of
@@ -19,7 +19,7 @@ from npdr_ppl.workflows.posterior import Posterior, Provenance
 from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.run_folder import RunFolder
 
-__all__ = ["infer", "simulate_features"]
+__all__ = ["infer", "run_round", "simulate_features"]
 
 # Readings that one chunk of simulations may hold, 16 MiB in float64: larger arrays leave the cache
 # and are mapped afresh by the allocator every time, smaller ones pay the overhead of many calls.
@@ -103,26 +103,64 @@ def infer(
     with reporter(progress) as report:
         for index in range(len(infos), rounds):
             label = f"round {index + 1}/{rounds}"
-            started = time.perf_counter()
-            with seeded(seed, "propose", index):
-                z = method.ask(problem, states[-1], num_simulations).cpu()
-            x = None if store is None else store.simulations(index, z)
-            if x is None:
-                x = simulate_features(bound, z, seed, f"round {index}", report, label)
-                if store is not None:
-                    store.save_simulations(index, z, x)
-            simulated = time.perf_counter()
-            with seeded(seed, "train", index):
-                step = report.stage(f"{label}: train")
-                state, info = method.tell(problem, states[-1], z, x, step)
+            state, info, spent = run_round(
+                bound, method, problem, states[-1], index,
+                num_simulations=num_simulations, seed=seed, report=report, label=label,
+                store=store,
+            )  # fmt: skip
             states.append(state)
-            seconds["simulate"] += simulated - started
-            seconds["train"] += time.perf_counter() - simulated
+            seconds = {stage: seconds[stage] + spent[stage] for stage in seconds}
             infos.append(info)
             if store is not None:
                 store.save_round(index, *method.tensors(state), infos, seconds)
     provenance = Provenance(seed, num_simulations, tuple(infos), seconds)
     return Posterior(bound, method, problem, states[1:], provenance)
+
+
+def run_round(
+    bound: BoundModel,
+    method: Backend,
+    problem: Problem,
+    state: State,
+    index: int,
+    *,
+    num_simulations: int,
+    seed: int,
+    report: Reporter,
+    label: str = "",
+    store: RunFolder | None = None,
+) -> tuple[State, RoundInfo, dict[str, float]]:
+    """Proposes, simulates and trains once.
+
+    Args:
+        bound: The model and its data.
+        method: The backend.
+        problem: What it knows; its observation need not be that of ``bound``.
+        state: Its state before the round.
+        index: Number of the round, from 0.
+        num_simulations: Simulations of the round.
+        seed: Seed of the run.
+        report: Where to report progress.
+        label: Words for the progress bar.
+        store: Where the round's simulations are kept, if anywhere.
+
+    Returns:
+        The state after the round, its figures, and the seconds spent to ``simulate`` and
+        ``train``.
+    """
+    started = time.perf_counter()
+    with seeded(seed, "propose", index):
+        z = method.ask(problem, state, num_simulations).cpu()
+    x = None if store is None else store.simulations(index, z)
+    if x is None:
+        x = simulate_features(bound, z, seed, f"round {index}", report, label)
+        if store is not None:
+            store.save_simulations(index, z, x)
+    simulated = time.perf_counter()
+    with seeded(seed, "train", index):
+        state, info = method.tell(problem, state, z, x, report.stage(f"{label}: train"))
+    spent = {"simulate": simulated - started, "train": time.perf_counter() - simulated}
+    return state, info, spent
 
 
 def simulate_features(

@@ -26,7 +26,7 @@ from npdr_ppl.workflows.binding import BindingOptions, BoundModel, bind, problem
 from npdr_ppl.workflows.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from npdr_ppl.workflows.arviz_module import az
+    from npdr_ppl.workflows.arviz_module import Data
 
 __all__ = ["Posterior", "PosteriorBase", "Provenance"]
 
@@ -186,7 +186,7 @@ class PosteriorBase(ABC):
         with seeded(seed, "predict"):
             return self.prior.execute(z)
 
-    def to_arviz(self, num_samples: int = 1_000, *, seed: int = 0) -> "az.InferenceData":
+    def to_arviz(self, num_samples: int = 1_000, *, seed: int = 0) -> "Data":
         """Returns an ArviZ object; see :func:`npdr_ppl.workflows.arviz_export.to_arviz`."""
         from npdr_ppl.workflows.arviz_export import to_arviz
 

@@ -105,20 +105,22 @@ def loo_elpd(log_likelihood: Tensor) -> NDArray[np.float64]:
     Args:
         log_likelihood: log p(y_i | ξ_j), ``(n, segments)``; minus infinity for failed draws.
     """
-    from npdr_ppl.workflows.arviz_module import az
+    from npdr_ppl.workflows.arviz_module import from_dict, loo
 
     # Failed draws have no likelihood to weigh by; those left are draws of the posterior still.
     whole = log_likelihood[log_likelihood.isfinite().all(1)]
     if not len(whole):
         return np.full(log_likelihood.shape[1], -np.inf)
-    data = az.from_dict(
-        posterior={"draw_number": np.arange(len(whole))[None]},
-        log_likelihood={"y": whole[None].numpy()},
+    data = from_dict(
+        {
+            "posterior": {"draw_number": np.arange(len(whole))[None]},
+            "log_likelihood": {"y": whole[None].numpy()},
+        }
     )
     with warnings.catch_warnings():
         # Of large Pareto k, and of a single segment.
         warnings.simplefilter("ignore")
-        return np.asarray(az.loo(data, pointwise=True, reff=1.0).loo_i).reshape(-1)
+        return loo(data).elpd_i.reshape(-1)
 
 
 def _effective_draws(log_likelihood: Tensor) -> float:

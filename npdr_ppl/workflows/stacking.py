@@ -149,13 +149,15 @@ def _compared(pointwise: Mapping[str, NDArray[np.float64]]) -> "pd.DataFrame":
     segment's greatest is therefore taken off first: a factor that all posteriors share changes
     neither the weights nor a difference.
     """
-    from npdr_ppl.workflows.arviz_module import az
+    from npdr_ppl.workflows.arviz_module import compare, from_dict
 
     greatest = np.max(list(pointwise.values()), axis=0)
     data = {
-        label: az.from_dict(
-            posterior={"draw_number": np.arange(NUM_DRAWS)[None]},
-            log_likelihood={"segments": np.tile(values - greatest, (1, NUM_DRAWS, 1))},
+        label: from_dict(
+            {
+                "posterior": {"draw_number": np.arange(NUM_DRAWS)[None]},
+                "log_likelihood": {"segments": np.tile(values - greatest, (1, NUM_DRAWS, 1))},
+            }
         )
         for label, values in pointwise.items()
     }
@@ -163,4 +165,4 @@ def _compared(pointwise: Mapping[str, NDArray[np.float64]]) -> "pd.DataFrame":
         # Of weights that cannot be smoothed, since they are all equal, and of densities that
         # underflow even so and weigh nothing, as they should.
         warnings.simplefilter("ignore")
-        return az.compare(data, ic="loo", method="stacking", scale="log")
+        return compare(data)

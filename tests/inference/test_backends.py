@@ -170,6 +170,27 @@ def test_initial_state_survives_writing(method):
     assert state.round == 1
 
 
+def test_amortised_states_hold_at_every_observation(method):
+    if not method.amortises:
+        pytest.skip(f"{method.name} learns the posterior of one observation")
+    problem = make_problem()
+    state, _ = run_round(method, problem, method.init(problem), 0, n=300)
+    observations = torch.stack((OBSERVATION, -OBSERVATION, torch.zeros(3)))
+    z = torch.linspace(-1, 1, 10).reshape(5, 2)
+    given = list(method.densities_given(problem, state, observations))
+    assert len(given) == len(observations)
+    for x, members in zip(observations, given, strict=True):
+        alone = method.densities(make_problem(observation=x), state)
+        assert len(members) == len(alone)
+        for one, other in zip(members, alone, strict=True):
+            with torch.no_grad():
+                assert torch.equal(one.log_prob(z), other.log_prob(z))
+            with seeded(1):
+                draws = one.sample(5)
+            with seeded(1):
+                assert torch.equal(other.sample(5), draws)
+
+
 def test_drops_failed_simulations(simulation_based):
     problem = make_problem()
     state, info = run_round(simulation_based, problem, simulation_based.init(problem), 0, fail=0.2)

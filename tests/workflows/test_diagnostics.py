@@ -5,7 +5,7 @@ import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.errors import DataError
-from npdr_ppl.workflows.arviz_module import az
+from npdr_ppl.workflows.arviz_module import from_dict, group, group_names
 from npdr_ppl.workflows.diagnostics import Decision, Thresholds
 
 SEGMENTS, STEPS = 4, 25
@@ -22,16 +22,18 @@ def exported(*, sd=0.1, centre=1.0, prior=(0.0, 2.0), members_differ=0.0, misfit
     observed[1] += misfit * np.linspace(0, 1, STEPS)[:, None]
     predictive = level[..., None, None, None] + noise
     likelihood = -0.5 * ((observed - level[..., None, None, None]) / 0.05) ** 2
-    return az.from_dict(
-        posterior={"level": level},
-        prior={"level": rng.uniform(*prior, (1, 400))},
-        posterior_predictive={"x": predictive},
-        observed_data={"x": observed},
-        constant_data={
-            "x_mask": np.ones((SEGMENTS, STEPS), dtype=bool),
-            "x_measured": np.array([True]),
-        },
-        log_likelihood={"x": likelihood.mean((-1, -2))},
+    return from_dict(
+        {
+            "posterior": {"level": level},
+            "prior": {"level": rng.uniform(*prior, (1, 400))},
+            "posterior_predictive": {"x": predictive},
+            "observed_data": {"x": observed},
+            "constant_data": {
+                "x_mask": np.ones((SEGMENTS, STEPS), dtype=bool),
+                "x_measured": np.array([True]),
+            },
+            "log_likelihood": {"x": likelihood.mean((-1, -2))},
+        }
     )
 
 
@@ -80,7 +82,13 @@ def test_figures_are_json():
 
 
 def test_missing_groups_are_named():
-    data = exported()
-    del data.posterior_predictive
+    whole = exported()
+    data = from_dict(
+        {
+            name: {k: v.values for k, v in group(whole, name).data_vars.items()}
+            for name in group_names(whole)
+            if name != "posterior_predictive"
+        }
+    )
     with pytest.raises(DataError, match="posterior_predictive"):
         npdr.diagnose(data)

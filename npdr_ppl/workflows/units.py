@@ -1,0 +1,22 @@
+"""Units of domain parameters, from what their simulators declare."""
+
+from typing import TYPE_CHECKING
+
+from npdr_ppl.language.sites import SimulatorBlackBox
+
+if TYPE_CHECKING:
+    from npdr_ppl.workflows.posterior import PosteriorBase
+
+__all__ = ["parameter_units"]
+
+
+def parameter_units(posterior: "PosteriorBase") -> dict[str, str]:
+    """Returns the units of the latent sites that carry a parameter's name."""
+    known: dict[str, str] = {}
+    for box in posterior.prior.black_boxes.values():
+        if isinstance(box, SimulatorBlackBox):
+            known |= {p.name: p.unit for p in box.simulator.parameters}
+            for effect in box.simulator.effects:
+                units = effect.units(box.simulator.port(effect.port))
+                known |= {f"{effect.name}.{name}": unit for name, unit in units.items()}
+    return {site.name: known[site.name] for site in posterior.prior.sites if site.name in known}
