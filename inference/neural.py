@@ -158,6 +158,12 @@ class NeuralBackend(Backend):
     ) -> Loss:
         """Returns the objective of the present round on the problem's device."""
 
+    def _validation_loss(
+        self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
+    ) -> Loss | None:
+        """Returns the objective at held-out rows where :meth:`_loss` is random, else ``None``."""
+        return None
+
     def _training_rows(self, problem: Problem, state: NeuralState) -> Tensor:
         """Returns which of the earlier rounds' simulations to train on, ``(n,)``."""
         return torch.ones(len(state.simulations), dtype=torch.bool)
@@ -221,6 +227,7 @@ class NeuralBackend(Backend):
             device,
             is_vectorised=problem.build_network is None,
             progress=progress,
+            validation_loss=self._validation_loss(problem, preconditioner.to(device), rows),
         )
         weights = {name: value.cpu() for name, value in fit.weights.items()}
         info = RoundInfo(
