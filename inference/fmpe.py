@@ -73,14 +73,15 @@ class FMPE(TruncatedBackend):
     objective: ClassVar[str] = "validation_flow_matching"
 
     members: int = 1
-    epochs: int = 60
-    learning_rate: float = 5e-3
-    hidden: int = 64
-    blocks: int = 3
-    context: int = 128
-    draws: int = 2
+    epochs: int = 12
+    batch_size: int = 256
+    learning_rate: float = 1e-2
+    hidden: int = 48
+    blocks: int = 2
+    context: int = 96
+    draws: int = 4
     sigma: float = 0.01
-    steps: int = 20
+    steps: int = 10
 
     def __post_init__(self) -> None:
         """Validates the options."""

@@ -1,12 +1,10 @@
 """Velocity networks, and the posterior density that an equation with such a velocity gives."""
 
 import math
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor, nn
-from torch.func import jvp, vmap
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density
@@ -110,13 +108,33 @@ class VelocityNetwork(nn.Module):
 
     def velocity(self, y: Tensor, modulation: Tensor) -> Tensor:
         """Returns velocities at positions ``(..., d)``."""
-        scale, shift = modulation.chunk(2, dim=-1)
-        scales, shifts = scale.chunk(self.blocks, -1), shift.chunk(self.blocks, -1)
         h = self.first(y)
-        for k in range(self.blocks):
-            inner = (1 + scales[k]) * self.inner[k](h) + shifts[k]
-            h = h + self.outer[k](nn.functional.silu(inner))
+        for inner, outer, scale, shift in self._modulated(modulation):
+            h = h + outer(nn.functional.silu(scale * inner(h) + shift))
         return self.last(h)
+
+    def velocity_and_divergence(self, y: Tensor, modulation: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns velocities ``(n, d)`` at positions ``(n, d)`` and their divergence, ``(n,)``.
+
+        The derivatives dh/dy_k of the hidden units are carried along, ``(n, d, hidden)``.
+        """
+        h, jacobian = self.first(y), self.first.weight.T
+        for inner, outer, scale, shift in self._modulated(modulation):
+            at = scale * inner(h) + shift
+            gate = at.sigmoid()
+            slope = scale * gate * (1 + at * (1 - gate))  # of silu(at) by inner(h)
+            jacobian = jacobian + (jacobian @ inner.weight.T * slope[:, None]) @ outer.weight.T
+            h = h + outer(at * gate)
+        return self.last(h), (jacobian * self.last.weight).sum((-1, -2))
+
+    def _modulated(
+        self, modulation: Tensor
+    ) -> Iterator[tuple[nn.Linear, nn.Linear, Tensor, Tensor]]:
+        """Yields both layers, scale and shift of every block."""
+        parts = modulation.chunk(2 * self.blocks, dim=-1)
+        for k, (inner, outer) in enumerate(zip(self.inner, self.outer, strict=True)):
+            assert isinstance(inner, nn.Linear) and isinstance(outer, nn.Linear)
+            yield inner, outer, 1 + parts[2 * k], parts[2 * k + 1]
 
 
 class VelocityDensity(Density):
@@ -194,17 +212,8 @@ class VelocityDensity(Density):
 
     def _velocity_and_divergence(self, state: Tensor, modulation: Tensor) -> Tensor:
         """Returns the velocity of y and, as the last column, its divergence, ``(n, d + 1)``."""
-        y = state[:, :-1]
-        basis = torch.eye(y.shape[1], dtype=y.dtype, device=y.device)
-
-        def along(direction: Tensor) -> tuple[Tensor, Tensor]:
-            tangent = direction.expand_as(y)
-            velocity = partial(self._network.velocity, modulation=modulation)
-            value, change = jvp(velocity, (y,), (tangent,))
-            return value, (change * direction).sum(-1)
-
-        value, divergence = vmap(along, out_dims=(None, 0))(basis)
-        return torch.cat((value, divergence.sum(0)[:, None]), -1)
+        value, divergence = self._network.velocity_and_divergence(state[:, :-1], modulation)
+        return torch.cat((value, divergence[:, None]), -1)
 
     def _advance(
         self, derivative: Callable[[Tensor, Tensor], Tensor], y: Tensor, step: int, sign: int
