@@ -57,8 +57,7 @@ class FMPE(TruncatedBackend):
     """Flow-matching posterior estimation; see the module's text for the method.
 
     Args:
-        hidden: Width of the velocity network's residual blocks.
-        blocks: Their number.
+        hidden: Width of the velocity network's two residual blocks.
         context: Width of the network that turns features and time into the blocks' modulation.
         draws: Noise draws and angles per row and step of the training.
         sigma: Standard deviation sigma of the noise that is left at the end of the path, in units
@@ -77,7 +76,6 @@ class FMPE(TruncatedBackend):
     batch_size: int = 256
     learning_rate: float = 1e-2
     hidden: int = 48
-    blocks: int = 2
     context: int = 96
     draws: int = 4
     sigma: float = 0.01
@@ -88,7 +86,6 @@ class FMPE(TruncatedBackend):
         super().__post_init__()
         self._check_ranges(
             hidden=(1, float("inf")),
-            blocks=(1, float("inf")),
             context=(1, float("inf")),
             draws=(1, float("inf")),
             sigma=(1e-4, 0.5),
@@ -123,7 +120,6 @@ class FMPE(TruncatedBackend):
                     num_features,
                     embedding,
                     self.hidden,
-                    self.blocks,
                     self.context,
                 )
             )
