@@ -72,7 +72,7 @@ class FMPE(TruncatedBackend):
     objective: ClassVar[str] = "validation_flow_matching"
 
     members: int = 1
-    epochs: int = 12
+    epochs: int = 10
     batch_size: int = 256
     learning_rate: float = 1e-2
     hidden: int = 48

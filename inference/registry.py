@@ -18,6 +18,7 @@ __all__ = ["backend", "backend_class", "backends"]
 GROUP = "npdr_ppl.backends"
 
 BUILT_IN = {
+    "abc": "npdr_ppl.inference.abc:ABC",
     "fmpe": "npdr_ppl.inference.fmpe:FMPE",
     "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
 }

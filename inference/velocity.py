@@ -249,8 +249,8 @@ class VelocityDensity(Density):
 def _grid(sigma: float, steps: int) -> Tensor:
     """Returns the angles between the solver's steps, ``(steps + 1,)``, in float64.
 
-    They are evenly spaced in g(phi) = phi + kappa asinh(tan(phi)): in the angle at first and, since
-    asinh(tan) tends to -log(cos), in the logarithm of the remaining noise in the end.
+    They are evenly spaced in g(phi) = phi + kappa asinh(tan(phi)): in the angle at first and in
+    the logarithm of the remaining noise, -log(cos(phi)), in the end.
     """
     end = end_angle(sigma)
     fine = torch.linspace(0.0, end, 4097, dtype=torch.float64)
