@@ -36,12 +36,11 @@ def end_angle(sigma: float) -> float:
 def time_features(angle: Tensor) -> Tensor:
     """Returns smooth functions of the angle, ``(..., 7)``.
 
-    Besides waves there is log(tan(phi)), the logarithm of the ratio of signal to noise, because
-    near the end of the path the velocity changes on the scale of the noise that is left.
+    Besides waves there is asinh(tan(phi)), which near the end of the path is the logarithm of the
+    ratio of signal to noise: the velocity then changes on the scale of the noise that is left.
     """
-    ratio = (angle.sin().clamp(min=1e-6) / angle.cos().clamp(min=1e-6)).log().clamp(-5.0, 5.0)
     waves = [wave(k * angle) for k in (1, 2, 4) for wave in (torch.cos, torch.sin)]
-    return torch.stack((ratio / 3, *waves), dim=-1)
+    return torch.stack((angle.tan().asinh() / 3, *waves), dim=-1)
 
 
 class VelocityNetwork(nn.Module):
