@@ -48,7 +48,7 @@ from npdr_ppl.randomness import seeded
 
 __all__ = ["FMPE", "flow_matching_loss"]
 
-VALIDATION_DRAWS = 16
+VALIDATION_DRAWS = 8
 """Noise draws and angles at which a held-out row is judged, the same ones in every epoch."""
 
 
