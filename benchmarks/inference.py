@@ -122,6 +122,14 @@ class Clock:
         return time.perf_counter() - self._wall, time.process_time() - self._cpu
 
 
+def warm_up() -> None:
+    """Makes a step of an optimiser: the first one loads a large part of torch, for everybody."""
+    weight = torch.nn.Parameter(torch.ones(1))
+    optimizer = torch.optim.AdamW([weight])
+    weight.square().sum().backward()
+    optimizer.step()
+
+
 def seed_all(seed: int) -> None:
     """Seeds torch and NumPy, from which sbi's slice sampler draws."""
     torch.manual_seed(seed)
@@ -263,6 +271,7 @@ def main() -> None:
         find_method(method)  # a misspelt name stops here
     if any(method.startswith("sbi:") for method in methods):
         import sbi.inference  # noqa: F401 - so that no fit's seconds contain the import
+    warm_up()
     torch.set_num_threads(1)
     logging.getLogger("sbi").setLevel(logging.ERROR)
     warnings.simplefilter("ignore")  # sbi's, about its own dependencies
