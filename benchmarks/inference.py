@@ -1,204 +1,291 @@
-"""Compares snpe-c with sbi's NPE-C on public tasks, in one run and on one thread.
+"""Compares this package's backends with sbi's methods on public tasks, on one thread.
 
-    python benchmarks/inference.py --tasks two_moons,slcp --observations 1,2,3 --out result.json
-    python benchmarks/inference.py --tasks slcp --observations 1 --rounds 5 --out sequential.json
+    python benchmarks/inference.py --out single.json
+    python benchmarks/inference.py --methods ours:snpe-c,sbi:npe-c --tasks slcp \
+        --observations 1 --rounds 5 --out sequential.json
+    python benchmarks/inference.py --methods ours:snpe-a --rounds 3 --seeds 50 --out seeds.json
 
-Both get the same number of simulations, their own defaults and seed 0. Seconds are those of the
-whole fit, simulations included, by the wall and by the process's CPU; the latter is what the
-ratio uses, because it does not depend on what else the machine does.
+All get the same number of simulations and their own defaults. With one round a fit serves all
+observations; with several there is a fit per observation. Seconds of the fit, simulations
+included, and those of drawing the samples are kept apart, by the wall and by the process's CPU;
+ratios use the latter, which depends less on what else the machine does. A fit that fails is a
+row with its message.
+
+With ``--out`` every row is written as soon as it is there, and a run given again continues.
 """
 
 import argparse
 import json
 import logging
+import os
 import time
 import warnings
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
-from tasks import DATA, TASKS, Task, load_reference
-from torch import Tensor
+from methods import PEERS, Sampler, default_methods, find_method
+from tasks import DATA, TASKS, load_reference
 
-from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.mixture import Mixture
-from npdr_ppl.inference.registry import backend
 from npdr_ppl.metrics import c2st
 
 NUM_SAMPLES = 10_000
 
-Sampler = Callable[[Tensor], Tensor]
-
 
 @dataclass(frozen=True)
-class Row:
-    """A fit of one observation and its score."""
+class Key:
+    """What identifies a row."""
 
     method: str
     task: str
     observation: int
     rounds: int
-    wall_seconds: float
-    cpu_seconds: float
-    sample_seconds: float
-    c2st: float
+    simulations: int
+    seed: int
 
 
-def standard_normal_problem(task: Task, observation: Tensor) -> Problem:
-    """States a task in reference coordinates."""
-    normal = torch.distributions.Normal(0.0, 1.0)
-    d = task.num_parameters
-    return Problem(
-        num_parameters=d,
-        observation=observation,
-        sample_prior=lambda n: torch.randn(n, d),
-        log_prior=lambda z: normal.log_prob(z).sum(-1),
-    )
+@dataclass(frozen=True)
+class Row(Key):
+    """A fit of one observation and its score; what a failure kept from being measured is null.
 
+    Attributes:
+        fit_wall: Seconds of the whole fit, simulations included.
+        fit_cpu: The same by the process's CPU.
+        sample_wall: Seconds of drawing the samples.
+        sample_cpu: The same by the process's CPU.
+        c2st: Score against the reference posterior; 0.5 is perfect.
+        error: Why the fit failed, or ``None``.
+    """
 
-def fit_ours(task: Task, observation: Tensor, rounds: int, simulations: int) -> Sampler:
-    """Fits snpe-c with its defaults; returns draws of theta given an observation's features."""
-    method = backend("snpe-c")
-    problem = standard_normal_problem(task, observation)
-    state = method.init(problem)
-    for _ in range(rounds):
-        z = method.ask(problem, state, simulations // rounds)
-        state, _ = method.tell(problem, state, z, task.simulate(task.to_theta(z)))
+    fit_wall: float | None = None
+    fit_cpu: float | None = None
+    sample_wall: float | None = None
+    sample_cpu: float | None = None
+    c2st: float | None = None
+    error: str | None = None
 
-    def sample(x: Tensor) -> Tensor:
-        posterior = Mixture(method.densities(standard_normal_problem(task, x), state))
-        return task.to_theta(posterior.sample(NUM_SAMPLES))
-
-    return sample
-
-
-def fit_sbi(task: Task, observation: Tensor, rounds: int, simulations: int) -> Sampler:
-    """Fits sbi's NPE-C with a neural spline flow and its defaults."""
-    from sbi.inference import NPE_C
-    from sbi.utils import BoxUniform
-
-    bound = task.scale * torch.ones(task.num_parameters)
-    if task.is_uniform:
-        prior = BoxUniform(-bound, bound)
-    else:
-        prior = torch.distributions.MultivariateNormal(0 * bound, torch.diag(bound**2))
-    method = NPE_C(prior, density_estimator="nsf", show_progress_bars=False)
-    proposal = prior
-    posterior = None
-    for number in range(rounds):
-        theta = proposal.sample((simulations // rounds,))
-        method.append_simulations(
-            theta, task.simulate(theta), proposal=None if number == 0 else proposal
-        ).train()
-        posterior = method.build_posterior()
-        if number < rounds - 1:
-            proposal = posterior.set_default_x(observation)
-    assert posterior is not None
-    return lambda x: posterior.sample((NUM_SAMPLES,), x=x, show_progress_bars=False)
-
-
-METHODS = {"npdr_ppl snpe-c": fit_ours, "sbi NPE-C NSF": fit_sbi}
-
-
-def run(
-    method: str,
-    task: Task,
-    observations: list[int],
-    rounds: int,
-    simulations: int,
-    data: Path,
-    seed: int,
-) -> list[Row]:
-    """Fits and scores; with one round, one amortised fit serves all observations."""
-    rows = []
-    sample, wall, cpu = None, 0.0, 0.0
-    for number in observations:
-        reference = load_reference(task.name, number, data)
-        if sample is None or rounds > 1:
-            torch.manual_seed(seed)
-            wall, cpu = time.perf_counter(), time.process_time()
-            sample = METHODS[method](task, reference.observation, rounds, simulations)
-            wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        torch.manual_seed(seed + 1)
-        start = time.process_time()
-        draws = sample(reference.observation)
-        seconds = time.process_time() - start
-        score = c2st(draws, reference.samples)
-        rows.append(Row(method, task.name, number, rounds, wall, cpu, seconds, score))
-        print(
-            f"{method:16} {task.name:17} {number:3} {rounds:6} {wall:8.1f} {cpu:8.1f} "
-            f"{seconds:8.1f} {score:7.4f}",
-            flush=True,
+    @property
+    def key(self) -> Key:
+        """What identifies the row."""
+        return Key(
+            self.method, self.task, self.observation, self.rounds, self.simulations, self.seed
         )
-    return rows
+
+    @property
+    def total_cpu(self) -> float | None:
+        """CPU seconds of fit and samples."""
+        if self.fit_cpu is None or self.sample_cpu is None:
+            return None
+        return self.fit_cpu + self.sample_cpu
 
 
-def compare(rows: list[Row]) -> list[dict[str, float | int | str]]:
-    """Sets every fit of sbi beside ours: how many times faster, and both scores."""
-    ours, theirs = (
-        {(row.task, row.observation): row for row in rows if row.method == method}
-        for method in METHODS
-    )
-    return [
-        {
-            "task": task,
-            "observation": observation,
-            "rounds": row.rounds,
-            "times_faster": theirs[task, observation].cpu_seconds / row.cpu_seconds,
-            "c2st": row.c2st,
-            "c2st_sbi": theirs[task, observation].c2st,
+class Results:
+    """Rows measured so far, kept in a file if there is one.
+
+    Args:
+        path: The file, or ``None``. Rows that it already holds are kept.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self.rows: dict[Key, Row] = {}
+        if path is not None and path.exists():
+            for values in json.loads(path.read_text())["rows"]:
+                row = Row(**values)
+                self.rows[row.key] = row
+
+    def add(self, row: Row) -> None:
+        """Adds a row, prints it and writes the file."""
+        self.rows[row.key] = row
+        print(describe(row), flush=True)
+        if self._path is None:
+            return
+        result = {
+            "rows": [asdict(row) for row in self.rows.values()],
+            "comparison": compare(self.rows),
+            "failures": sum(row.error is not None for row in self.rows.values()),
         }
-        for (task, observation), row in ours.items()
-        if (task, observation) in theirs
+        part = self._path.with_suffix(".part")
+        part.write_text(json.dumps(result, indent=1) + "\n")
+        os.replace(part, self._path)
+
+
+class Clock:
+    """Seconds since it was made, by the wall and by the process's CPU."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def read(self) -> tuple[float, float]:
+        """Returns both."""
+        return time.perf_counter() - self._wall, time.process_time() - self._cpu
+
+
+def warm_up() -> None:
+    """Makes a step of an optimiser: the first one loads a large part of torch, for everybody."""
+    weight = torch.nn.Parameter(torch.ones(1))
+    optimizer = torch.optim.AdamW([weight])
+    weight.square().sum().backward()
+    optimizer.step()
+
+
+def seed_all(seed: int) -> None:
+    """Seeds torch and NumPy, from which sbi's slice sampler draws."""
+    torch.manual_seed(seed)
+    np.random.seed(seed)
+
+
+def measure(keys: list[Key], data: Path, results: Results) -> None:
+    """Fits one method with one seed to one task and adds a row for every observation.
+
+    Args:
+        keys: Rows to measure; they differ in the observation only.
+        data: Folder of the reference posteriors.
+        results: Where rows go.
+    """
+    sample: Sampler | None = None
+    error, wall, cpu = None, 0.0, 0.0
+    for key in keys:
+        task = TASKS[key.task]
+        reference = load_reference(task.name, key.observation, data)
+        if (sample is None and error is None) or key.rounds > 1:
+            seed_all(key.seed)
+            clock = Clock()
+            sample, error = None, None
+            try:
+                fit = find_method(key.method)
+                sample = fit(task, reference.observation, key.rounds, key.simulations)
+            except Exception as failure:  # whatever a peer raises is a result
+                error = f"{type(failure).__name__}: {failure}"
+            wall, cpu = clock.read()
+        if sample is None:
+            results.add(Row(**asdict(key), fit_wall=wall, fit_cpu=cpu, error=error))
+            continue
+        seed_all(key.seed + 1)
+        clock = Clock()
+        try:
+            draws = sample(reference.observation, NUM_SAMPLES)
+            seconds = clock.read()
+            score = c2st(draws, reference.samples)
+        except Exception as failure:
+            sentence = f"{type(failure).__name__}: {failure}"
+            results.add(Row(**asdict(key), fit_wall=wall, fit_cpu=cpu, error=sentence))
+            continue
+        results.add(Row(**asdict(key), fit_wall=wall, fit_cpu=cpu, sample_wall=seconds[0],
+                        sample_cpu=seconds[1], c2st=score))  # fmt: skip
+
+
+def compare(rows: dict[Key, Row]) -> list[dict[str, float | int | str | bool | None]]:
+    """Sets every row of ours beside its peers': times faster, both scores, which is lower."""
+    lines = []
+    for key, ours in rows.items():
+        source, _, name = key.method.partition(":")
+        for peer in PEERS.get(name, ()) if source == "ours" else ():
+            theirs = rows.get(Key(**asdict(key) | {"method": f"sbi:{peer}"}))
+            if theirs is None:
+                continue
+            is_scored = ours.c2st is not None and theirs.c2st is not None
+            lines.append(
+                asdict(key)
+                | {
+                    "peer": theirs.method,
+                    "times_faster_fit": ratio(theirs.fit_cpu, ours.fit_cpu),
+                    "times_faster_in_all": ratio(theirs.total_cpu, ours.total_cpu),
+                    "c2st": ours.c2st,
+                    "c2st_peer": theirs.c2st,
+                    "is_lower_or_equal": ours.c2st <= theirs.c2st if is_scored else None,
+                    "error": ours.error,
+                    "error_peer": theirs.error,
+                }
+            )
+    return lines
+
+
+def ratio(theirs: float | None, ours: float | None) -> float | None:
+    """Returns how many times longer theirs took."""
+    return None if theirs is None or ours is None else theirs / ours
+
+
+def number(value: float | None, width: int, digits: int) -> str:
+    """Prints a figure, or a dash for one that is missing."""
+    return f"{'–':>{width}}" if value is None else f"{value:{width}.{digits}f}"
+
+
+HEADER = (
+    f"{'method':14} {'task':17} {'obs':>3} {'rounds':>6} {'seed':>4} {'fit wall':>9} "
+    f"{'fit cpu':>8} {'draw wall':>9} {'draw cpu':>8} {'C2ST':>7}"
+)
+
+
+def describe(row: Row) -> str:
+    """Prints a row of the table."""
+    return (
+        f"{row.method:14} {row.task:17} {row.observation:3} {row.rounds:6} {row.seed:4} "
+        f"{number(row.fit_wall, 9, 1)} {number(row.fit_cpu, 8, 1)} "
+        f"{number(row.sample_wall, 9, 1)} {number(row.sample_cpu, 8, 1)} "
+        f"{number(row.c2st, 7, 4)} {(row.error or '').splitlines()[0][:80] if row.error else ''}"
+    ).rstrip()
+
+
+def summarise(rows: dict[Key, Row]) -> str:
+    """Prints the comparison and how many fits failed."""
+    lines = [
+        f"{'ours':14} {'peer':13} {'task':17} {'obs':>3} {'rounds':>6} {'seed':>4} "
+        f"{'fit ×':>7} {'in all ×':>8} {'C2ST':>7} {'peer':>7}"
     ]
+    for line in compare(rows):
+        verdict = {True: "lower or equal", False: "higher", None: "failed"}
+        lines.append(
+            f"{line['method']:14} {line['peer']:13} {line['task']:17} {line['observation']:3} "
+            f"{line['rounds']:6} {line['seed']:4} {number(line['times_faster_fit'], 7, 1)} "
+            f"{number(line['times_faster_in_all'], 8, 1)} {number(line['c2st'], 7, 4)} "
+            f"{number(line['c2st_peer'], 7, 4)} {verdict[line['is_lower_or_equal']]}"
+        )
+    for method in dict.fromkeys(key.method for key in rows):
+        own = [row for key, row in rows.items() if key.method == method]
+        failed = sum(row.error is not None for row in own)
+        lines.append(f"{method}: {failed} failures in {len(own)} rows")
+    return "\n".join(lines)
 
 
 def main() -> None:
     """Runs the comparison that the arguments choose."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--methods", default=",".join(default_methods()))
     parser.add_argument("--tasks", default=",".join(TASKS))
     parser.add_argument("--observations", default="1,2,3")
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--simulations", type=int, default=10_000, help="in all rounds together")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, default=1, help="how many seeds, from 0")
     parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--methods", default="ours,sbi", help="ours, sbi or both")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--out", type=Path, help="JSON; rows that it holds are not measured again")
     arguments = parser.parse_args()
     if not (arguments.data / "sbibm").is_dir():
         print(f"Skipped: there are no reference posteriors in {arguments.data / 'sbibm'}.")
         return
+    methods = arguments.methods.split(",")
+    for method in methods:
+        find_method(method)  # a misspelt name stops here
+    if any(method.startswith("sbi:") for method in methods):
+        import sbi.inference  # noqa: F401 - so that no fit's seconds contain the import
+    warm_up()
     torch.set_num_threads(1)
     logging.getLogger("sbi").setLevel(logging.ERROR)
     warnings.simplefilter("ignore")  # sbi's, about its own dependencies
-    keys = dict(zip(("ours", "sbi"), METHODS, strict=True))
-    print(
-        f"{'method':16} {'task':17} {'obs':>3} {'rounds':>6} {'wall s':>8} {'cpu s':>8} "
-        f"{'sample s':>8} {'C2ST':>7}"
-    )
-    rows: list[Row] = []
-    for task in arguments.tasks.split(","):
-        for method in arguments.methods.split(","):
-            rows += run(
-                keys[method],
-                TASKS[task],
-                [int(number) for number in arguments.observations.split(",")],
-                arguments.rounds,
-                arguments.simulations,
-                arguments.data,
-                arguments.seed,
-            )
-    comparison = compare(rows)
-    for line in comparison:
-        print(
-            f"{line['task']:17} observation {line['observation']}: "
-            f"{line['times_faster']:.1f} times faster, C2ST {line['c2st']:.4f} "
-            f"against {line['c2st_sbi']:.4f}"
-        )
-    if arguments.out:
-        result = {"rows": [asdict(row) for row in rows], "comparison": comparison}
-        arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+    results = Results(arguments.out)
+    print(HEADER)
+    for seed in range(arguments.seeds):
+        for task in arguments.tasks.split(","):
+            for method in methods:
+                keys = [
+                    Key(method, task, int(k), arguments.rounds, arguments.simulations, seed)
+                    for k in arguments.observations.split(",")
+                ]
+                measure([key for key in keys if key not in results.rows], arguments.data, results)
+    print(summarise(results.rows))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,15 @@
 """What every backend checks of the simulations it is told."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from npdr_ppl.errors import BackendError, ShapeError
 from npdr_ppl.inference.base import Problem
 
-__all__ = ["check_problem", "finite_rows"]
+__all__ = ["check_problem", "check_restored", "finite_rows"]
 
 
 def check_problem(problem: Problem) -> None:
@@ -67,3 +70,29 @@ def finite_rows(
             f"least {min_rows} must succeed. Check the simulator over the whole prior."
         )
     return z[finite].to(torch.float32), x[finite], num_failed
+
+
+def check_restored(
+    name: str, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
+) -> None:
+    """Checks that a state read from disk is a backend's own and of the problem at hand.
+
+    Args:
+        name: The backend's name.
+        problem: The problem to continue with.
+        tensors: The state's tensors, simulated parameters ``z`` and features ``x`` among them.
+        values: The state's other values, the name of its ``backend`` among them.
+
+    Raises:
+        ShapeError: It is the state of another problem.
+        BackendError: It is the state of another backend.
+    """
+    if values.get("backend") != name:
+        raise BackendError(f"This state is of backend {values.get('backend')!r}, not {name}.")
+    z, x = tensors["z"], tensors["x"]
+    if z.shape[1] != problem.num_parameters or x.shape[1:] != problem.observation.shape:
+        raise ShapeError(
+            f"The state holds parameters {tuple(z.shape)} and features {tuple(x.shape)}; the "
+            f"problem has {problem.num_parameters} parameters and features "
+            f"{tuple(problem.observation.shape)}."
+        )

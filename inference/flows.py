@@ -5,8 +5,8 @@ stack of weights, and read off one by one as a :class:`FlowDensity`.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -21,11 +21,21 @@ from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.features import Preconditioner
 from npdr_ppl.randomness import seeded
 
-__all__ = ["FLOWS", "FlowDensity", "FlowNetwork", "build_networks", "load_member"]
+__all__ = [
+    "FLOWS",
+    "Flow",
+    "FlowDensity",
+    "FlowNetwork",
+    "build_networks",
+    "load_member",
+    "make_embedding",
+]
 
 Flow = Literal["nsf", "maf", "affine-nsf"]
 FLOWS = ("nsf", "maf", "affine-nsf")
 """Kinds of flows, see :class:`FlowNetwork`."""
+
+Network = TypeVar("Network", bound=nn.Module)
 
 INITIAL_SCALE = 0.01
 """Factor on the last layer's initial weights: a flow starts near the identity, that is, at the
@@ -187,19 +197,7 @@ def build_networks(
     """
     networks = []
     for member in range(members):
-        embedding, num_features = None, observation.numel()
-        if build_embedding is not None:
-            embedding = build_embedding()
-            with torch.no_grad():
-                embedded = embedding.to(observation.device)(
-                    observation.expand(2, *observation.shape)
-                )
-            if embedded.ndim != 2 or len(embedded) != 2:
-                raise BackendError(
-                    "The embedding network must map a batch of arrays to (batch, features); two "
-                    f"arrays of shape {tuple(observation.shape)} gave {tuple(embedded.shape)}."
-                )
-            num_features = embedded.shape[1]
+        embedding, num_features = make_embedding(observation, build_embedding)
         networks.append(
             FlowNetwork(
                 num_parameters,
@@ -215,9 +213,34 @@ def build_networks(
     return networks
 
 
+def make_embedding(
+    observation: Tensor, build_embedding: Callable[[], nn.Module] | None
+) -> tuple[nn.Module | None, int]:
+    """Makes an untrained embedding network, if there is one, and counts its features.
+
+    Args:
+        observation: An observation, ``(F,)`` or of the shape the embedding network takes.
+        build_embedding: Makes an untrained embedding network, or ``None``.
+
+    Raises:
+        BackendError: The embedding network does not map a batch to ``(n, features)``.
+    """
+    if build_embedding is None:
+        return None, observation.numel()
+    embedding = build_embedding()
+    with torch.no_grad():
+        embedded = embedding.to(observation.device)(observation.expand(2, *observation.shape))
+    if embedded.ndim != 2 or len(embedded) != 2:
+        raise BackendError(
+            "The embedding network must map a batch of arrays to (batch, features); two "
+            f"arrays of shape {tuple(observation.shape)} gave {tuple(embedded.shape)}."
+        )
+    return embedding, embedded.shape[1]
+
+
 def load_member(
-    build: Callable[[], list[FlowNetwork]], weights: Mapping[str, Tensor], member: int
-) -> FlowNetwork:
+    build: Callable[[], Sequence[Network]], weights: Mapping[str, Tensor], member: int
+) -> Network:
     """Builds a network and loads one member of a stack of weights, ready for evaluation.
 
     Args:

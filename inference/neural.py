@@ -14,9 +14,9 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from npdr_ppl.errors import BackendError, ShapeError
+from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
-from npdr_ppl.inference.checks import check_problem, finite_rows
+from npdr_ppl.inference.checks import check_problem, check_restored, finite_rows
 from npdr_ppl.inference.features import Preconditioner, fit_preconditioner
 from npdr_ppl.inference.training import Loss, TrainingOptions, train
 
@@ -161,6 +161,12 @@ class NeuralBackend(Backend):
     ) -> Loss:
         """Returns the objective of the present round on the problem's device."""
 
+    def _validation_loss(
+        self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
+    ) -> Loss | None:
+        """Returns the objective at held-out rows where :meth:`_loss` is random, else ``None``."""
+        return None
+
     def _training_rows(self, problem: Problem, state: NeuralState) -> Tensor:
         """Returns which of the earlier rounds' simulations to train on, ``(n,)``."""
         return torch.ones(len(state.simulations), dtype=torch.bool)
@@ -224,6 +230,7 @@ class NeuralBackend(Backend):
             device,
             is_vectorised=problem.build_network is None,
             progress=progress,
+            validation_loss=self._validation_loss(problem, preconditioner.to(device), rows),
         )
         weights = {name: value.cpu() for name, value in fit.weights.items()}
         info = RoundInfo(
@@ -275,23 +282,9 @@ class NeuralBackend(Backend):
     def restore(
         self, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
     ) -> NeuralState:
-        """Rebuilds a state from :meth:`tensors`.
-
-        Raises:
-            ShapeError: It is the state of another problem.
-            BackendError: It is the state of another backend.
-        """
-        if values.get("backend") != self.name:
-            raise BackendError(
-                f"This state is of backend {values.get('backend')!r}, not {self.name}."
-            )
+        """Rebuilds a state from :meth:`tensors`; see :func:`check_restored` for errors."""
+        check_restored(self.name, problem, tensors, values)
         z, x = tensors["z"], tensors["x"]
-        if z.shape[1] != problem.num_parameters or x.shape[1:] != problem.observation.shape:
-            raise ShapeError(
-                f"The state holds parameters {tuple(z.shape)} and features {tuple(x.shape)}; the "
-                f"problem has {problem.num_parameters} parameters and features "
-                f"{tuple(problem.observation.shape)}."
-            )
         parts = {
             prefix: {
                 name.removeprefix(f"{prefix}."): value

@@ -21,6 +21,8 @@ BUILT_IN = {
     "nle": "npdr_ppl.inference.nle:NLE",
     "nre": "npdr_ppl.inference.nre:NRE",
     "nuts": "npdr_ppl.inference.nuts:NUTS",
+    "abc": "npdr_ppl.inference.abc:ABC",
+    "fmpe": "npdr_ppl.inference.fmpe:FMPE",
     "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
     "bayesian-linear-regression": (
         "npdr_ppl.inference.bayesian_linear_regression:BayesianLinearRegression"

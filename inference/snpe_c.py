@@ -12,12 +12,9 @@ Lueckmann et al. (2017). Each round r of Algorithm 1
 Two kinds of proposals do that:
 
 * ``"truncated"`` (Deistler et al. 2022, https://arxiv.org/abs/2210.04815): the prior restricted to
-  the region that holds all but a fraction epsilon of the present posterior's mass. Wherever the
-  posterior has mass the proposal is proportional to the prior, and plain maximum likelihood,
-  max sum_n log q(z_n | x_n), needs no correction. We depart from the paper in training on the
-  simulations near that region only, those of earlier rounds included: the rest says nothing about
-  the posterior, and without it a flow and a regression need to describe a small neighbourhood
-  only, in which the simulator is nearly linear.
+  the region that holds all but a fraction epsilon of the present posterior's mass, where plain
+  maximum likelihood, max sum_n log q(z_n | x_n), needs no correction; see
+  :mod:`npdr_ppl.inference.truncated`.
 * ``"atomic"`` (Greenberg et al. 2019, Eqs. 4 and 6): the present posterior itself. A row's
   parameters z_n must be told from M - 1 others of the batch,
 
@@ -49,8 +46,8 @@ from npdr_ppl.inference.flows import (
 )
 from npdr_ppl.inference.mixture import Mixture
 from npdr_ppl.inference.neural import NeuralBackend, NeuralState, Simulations
-from npdr_ppl.inference.proposals import log_density_bound, sample_truncated_prior
 from npdr_ppl.inference.training import LogProb, Loss
+from npdr_ppl.inference.truncated import TruncatedBackend
 
 __all__ = ["SNPEC", "atomic_loss"]
 
@@ -58,7 +55,7 @@ PROPOSALS = ("truncated", "atomic")
 
 
 @dataclass(frozen=True)
-class SNPEC(NeuralBackend):
+class SNPEC(TruncatedBackend):
     """Sequential neural posterior estimation, SNPE-C; see the module's text for the method.
 
     Args:
@@ -68,9 +65,8 @@ class SNPEC(NeuralBackend):
         bins: Bins of a spline.
         proposals: ``"truncated"`` or ``"atomic"``.
         num_atoms: Atoms M of the atomic loss.
-        outside: Posterior mass epsilon outside the region of truncated proposals.
 
-    The other options are those of :class:`~npdr_ppl.inference.neural.NeuralBackend`.
+    The other options are those of :class:`~npdr_ppl.inference.truncated.TruncatedBackend`.
     """
 
     name: ClassVar[str] = "snpe-c"
@@ -83,7 +79,6 @@ class SNPEC(NeuralBackend):
     bins: int = 8
     proposals: Literal["truncated", "atomic"] = "truncated"
     num_atoms: int = 10
-    outside: float = 1e-2
 
     def __post_init__(self) -> None:
         """Validates the options."""
@@ -95,18 +90,13 @@ class SNPEC(NeuralBackend):
             transforms=(1, float("inf")),
             bins=(1, float("inf")),
             num_atoms=(2, float("inf")),
-            outside=(0.0, 0.5),
         )
 
     def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
         """Proposes parameters to simulate, ``(num_simulations, d)``."""
-        if state.round == 0:
-            return problem.sample_prior(num_simulations)
-        posterior = Mixture(self.densities(problem, state))
-        if self.proposals == "atomic":
-            return posterior.sample(num_simulations)
-        with torch.no_grad():
-            return sample_truncated_prior(problem, num_simulations, posterior, self.outside)
+        if self.proposals == "atomic" and state.round > 0:
+            return Mixture(self.densities(problem, state)).sample(num_simulations)
+        return super().ask(problem, state, num_simulations)
 
     def densities(self, problem: Problem, state: State) -> list[Density]:
         """Returns the posterior of every ensemble member."""
@@ -126,15 +116,10 @@ class SNPEC(NeuralBackend):
             yield [FlowDensity(network, preconditioner, x) for network in networks]
 
     def _training_rows(self, problem: Problem, state: NeuralState) -> Tensor:
-        """Returns which simulations lie in the neighbourhood to train on, ``(n,)``."""
-        if self.proposals == "atomic" or state.round == 0:
-            return super()._training_rows(problem, state)
-        with torch.no_grad():
-            posterior = Mixture(self.densities(problem, state))
-            # As wide as the posterior's draws reach: the margin around the region of the
-            # proposals shows a flow what lies beyond that region's edge.
-            bound = log_density_bound(posterior, 0.0)
-            return posterior.log_prob(state.simulations.z) > bound
+        """Returns which simulations to train on, ``(n,)``; the atomic loss corrects for all."""
+        if self.proposals == "atomic":
+            return NeuralBackend._training_rows(self, problem, state)
+        return super()._training_rows(problem, state)
 
     def _networks(self, problem: Problem) -> list[FlowNetwork]:
         return build_networks(

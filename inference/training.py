@@ -110,6 +110,7 @@ def train(
     device: torch.device,
     is_vectorised: bool = True,
     progress: Callable[[float, str], None] | None = None,
+    validation_loss: Loss | None = None,
 ) -> Fit:
     """Trains an ensemble; every member has its own held-out rows and mini-batches.
 
@@ -124,6 +125,8 @@ def train(
         is_vectorised: Whether the networks consist of operations that vmap knows; otherwise the
             members are evaluated in turn.
         progress: Called after every epoch with the fraction done and a short status.
+        validation_loss: The objective at held-out rows, where it is another one: the best epoch
+            is found by it, and it must not be random.
     """
     members = len(networks)
     networks = [network.to(device).train() for network in networks]
@@ -169,7 +172,7 @@ def train(
                     for mean, new in zip(average, weights, strict=True):
                         mean.lerp_(new, 1 - decay)
         networks[0].eval()
-        value = _validate(evaluate, loss, held_out, weights, average)
+        value = _validate(evaluate, validation_loss or loss, held_out, weights, average)
         networks[0].train()
         improved = value > best_value
         best_value = torch.where(improved, value, best_value)

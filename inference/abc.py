@@ -1,0 +1,265 @@
+"""ABC: rejection with a local-linear regression adjustment, the floor for every other method.
+
+The simulations nearest to the observation are kept, and their parameters moved to where a linear
+regression on the features says that they would be at the observation (Beaumont, Zhang & Balding
+2002, *Approximate Bayesian computation in population genetics*, Eqs. 3-5). With the distance rho_i
+of a simulation and the largest accepted one, delta,
+
+    w_i = 1 - (rho_i / delta)^2,        z_i* = z_i - A (f_i - f_o),
+
+where A minimises sum_i w_i ||z_i - a - A (f_i - f_o)||^2. The posterior is a mixture of Gaussian
+kernels around the z_i* that are drawn towards their mean, so that the mixture has their mean and
+covariance instead of a wider one (Liu & West 2001, *Combined parameter and state estimation in
+simulation-based filtering*),
+
+    q(z) = sum_i w_i N(z; c z_i* + (1 - c) mean, h^2 Cov[z*]),        c^2 + h^2 = 1.
+
+Parameters of every round come from the prior, and a later round only adds simulations: no
+importance weights are needed, none can degenerate, and the accepted ones get nearer.
+
+Distances are Euclidean in the normal scores of the features, see
+:mod:`npdr_ppl.inference.features`: a scale as robust as the median absolute deviation, and
+bounded.
+"""
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.errors import BackendError
+from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
+from npdr_ppl.inference.checks import check_problem, check_restored, finite_rows
+from npdr_ppl.inference.features import Preconditioner, fit_preconditioner
+
+__all__ = ["ABC", "ABCState", "KernelDensity"]
+
+logger = logging.getLogger(__name__)
+
+MIN_SIMULATIONS = 10
+"""Simulations below which there is no covariance to estimate."""
+
+RIDGE = 1e-3
+"""Penalty of the regression on features of unit variance, relative to the sum of the weights."""
+
+JITTER = 1e-6
+"""Added to the correlation of the adjusted parameters: they may coincide."""
+
+CHUNK = 1024
+"""Points whose density is evaluated at once: each has a term for every accepted simulation."""
+
+
+@dataclass(frozen=True)
+class ABCState(State):
+    """What the next round needs.
+
+    Attributes:
+        z: Parameters of all successful simulations, ``(n, d)``.
+        x: Their features, ``(n, F)``.
+    """
+
+    z: Tensor
+    x: Tensor
+
+
+@dataclass(frozen=True)
+class ABC(Backend):
+    """Rejection ABC; see the module's text for the method.
+
+    Args:
+        accept: Fraction of the simulations that is accepted.
+        min_accepted: Simulations accepted at least, as far as there are so many.
+        is_adjusted: Whether the accepted parameters are adjusted by regression.
+    """
+
+    name: ClassVar[str] = "abc"
+    summary: ClassVar[str] = "rejection ABC with local-linear regression adjustment"
+
+    accept: float = 0.1
+    min_accepted: int = 1000
+    is_adjusted: bool = True
+
+    def __post_init__(self) -> None:
+        """Validates the options.
+
+        Raises:
+            BackendError: One is out of range.
+        """
+        if not 0 < self.accept <= 1:
+            raise BackendError(f"{self.name}: accept must lie in (0, 1]; got {self.accept}.")
+        if self.min_accepted < 2:
+            raise BackendError(
+                f"{self.name}: min_accepted must be at least 2; got {self.min_accepted}."
+            )
+
+    def init(self, problem: Problem) -> ABCState:
+        """Returns the state before any simulation.
+
+        Raises:
+            BackendError: The problem wants a network trained on raw arrays.
+        """
+        check_problem(problem)
+        if problem.build_network is not None:
+            raise BackendError(
+                f"{self.name} trains no network; choose an embedding with fixed features."
+            )
+        return ABCState(
+            0, torch.empty(0, problem.num_parameters), torch.empty(0, *problem.observation.shape)
+        )
+
+    def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
+        """Draws parameters to simulate from the prior, ``(num_simulations, d)``."""
+        return problem.sample_prior(num_simulations)
+
+    def tell(
+        self,
+        problem: Problem,
+        state: State,
+        z: Tensor,
+        x: Tensor,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> tuple[ABCState, RoundInfo]:
+        """Adds a round of simulations; see :meth:`Backend.tell`.
+
+        Raises:
+            ShapeError: The shapes do not fit the problem.
+            BackendError: Too few simulations succeeded.
+        """
+        start = perf_counter()
+        state = self._own(state)
+        num_simulations = len(z)
+        min_rows = MIN_SIMULATIONS if state.round == 0 else 1
+        z, x, num_failed = finite_rows(problem, z.detach().cpu(), x.detach().cpu(), min_rows)
+        if num_failed:
+            logger.warning("%d of %d simulations failed.", num_failed, num_simulations)
+        state = ABCState(state.round + 1, torch.cat((state.z, z)), torch.cat((state.x, x)))
+        preconditioner = fit_preconditioner(state.z, state.x)
+        rows, distance = self._nearest(problem, state, preconditioner)
+        figures = {
+            "accepted": len(rows),
+            "largest_distance": distance.max().item(),
+            "clipped_features": int(preconditioner.outside(problem.observation.cpu()).sum()),
+        }
+        if progress is not None:
+            progress(1.0, f"accepted {len(rows)} of {len(state.z)} simulations")
+        return state, RoundInfo(num_simulations, num_failed, perf_counter() - start, figures)
+
+    def densities(self, problem: Problem, state: State) -> list[Density]:
+        """Returns the one posterior."""
+        state = self._own(state)
+        if not len(state.z):
+            raise BackendError("There is no posterior yet: tell the backend simulations first.")
+        preconditioner = fit_preconditioner(state.z, state.x)
+        rows, distance = self._nearest(problem, state, preconditioner)
+        weight = 1 - (distance / distance.max().clamp(min=torch.finfo().tiny)) ** 2
+        # Where all are equally far, as all features may be constant, all count the same.
+        weight = weight if weight.sum() > 0 else torch.ones_like(weight)
+        z = state.z[rows].double()
+        if self.is_adjusted:
+            f = preconditioner.features(state.x[rows])
+            offset = f - preconditioner.features(problem.observation.cpu().float()[None])
+            z = _adjust(z, offset.double(), weight.double())
+        return [KernelDensity(z, weight.double())]
+
+    def _nearest(
+        self, problem: Problem, state: ABCState, preconditioner: Preconditioner
+    ) -> tuple[Tensor, Tensor]:
+        """Returns which simulations are accepted and their distances, both ``(k,)``."""
+        observed = preconditioner.features(problem.observation.cpu().float()[None])
+        distance = (preconditioner.features(state.x) - observed).norm(dim=-1)
+        count = max(round(self.accept * len(distance)), self.min_accepted)
+        nearest = distance.topk(min(count, len(distance)), largest=False)
+        return nearest.indices, nearest.values
+
+    def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Splits a state into tensors and JSON-serialisable values."""
+        state = self._own(state)
+        return {"z": state.z, "x": state.x}, {"backend": self.name, "round": state.round}
+
+    def restore(
+        self, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
+    ) -> ABCState:
+        """Rebuilds a state from :meth:`tensors`; see :func:`check_restored` for errors."""
+        check_restored(self.name, problem, tensors, values)
+        return ABCState(int(values["round"]), tensors["z"], tensors["x"])
+
+    def _own(self, state: State) -> ABCState:
+        """Returns the state as this backend's.
+
+        Raises:
+            BackendError: It is not.
+        """
+        if not isinstance(state, ABCState):
+            raise BackendError(f"{self.name} cannot continue from a {type(state).__name__}.")
+        return state
+
+
+def _adjust(z: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
+    """Moves parameters to the observation along a weighted ridge regression.
+
+    Args:
+        z: Accepted parameters, ``(k, d)``.
+        offset: Their features minus the observation's, ``(k, F)``.
+        weight: Weights w, ``(k,)``.
+    """
+    share = (weight / weight.sum())[:, None]
+    f, target = offset - (share * offset).sum(0), z - (share * z).sum(0)
+    scale = (share * f**2).sum(0).sqrt()
+    scale = torch.where(scale > 0, scale, 1.0)
+    f = f / scale
+    gram = f.T @ (share * f) + RIDGE * torch.eye(f.shape[1], dtype=f.dtype)
+    gain = torch.linalg.solve(gram, f.T @ (share * target))
+    return z - offset / scale @ gain
+
+
+class KernelDensity(Density):
+    """A mixture of Gaussian kernels with the mean and covariance of the points it is made of.
+
+    The bandwidth h is Silverman's (1986, Eq. 4.14) for the effective number of points.
+
+    Args:
+        points: Points z*, ``(k, d)``, in float64.
+        weight: Their weights, ``(k,)``, up to a factor.
+    """
+
+    def __init__(self, points: Tensor, weight: Tensor) -> None:
+        share = weight / weight.sum()
+        d = points.shape[1]
+        mean = (share[:, None] * points).sum(0)
+        centred = points - mean
+        covariance = centred.T @ (share[:, None] * centred)
+        scale = covariance.diagonal().sqrt()
+        scale = torch.where(scale > 0, scale, JITTER)
+        correlation = covariance / scale[:, None] / scale
+        correlation = correlation + JITTER * torch.eye(d, dtype=points.dtype)
+        self._factor = scale[:, None] * torch.linalg.cholesky(correlation)
+        effective = float(1 / (share**2).sum())
+        self._width = min(1.0, (4 / ((d + 2) * effective)) ** (1 / (d + 4)))
+        self._share = share
+        self._centres = mean + math.sqrt(1 - self._width**2) * centred
+
+    def sample(self, num_samples: int) -> Tensor:
+        """Draws ``(num_samples, d)`` from torch's global stream."""
+        chosen = torch.multinomial(self._share, num_samples, replacement=True)
+        noise = torch.randn(num_samples, len(self._factor), dtype=self._factor.dtype)
+        return (self._centres[chosen] + self._width * noise @ self._factor.T).float()
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        """Returns the log density at ``(n, d)``, shape ``(n,)``; differentiable in z."""
+        factor = self._width * self._factor
+
+        def whiten(points: Tensor) -> Tensor:
+            return torch.linalg.solve_triangular(factor, points.T, upper=False).T
+
+        centres, log_share = whiten(self._centres), self._share.log()
+        constant = factor.diagonal().log().sum() + 0.5 * len(factor) * math.log(2 * math.pi)
+        values = [
+            (log_share - 0.5 * (u[:, None] - centres).square().sum(-1)).logsumexp(-1)
+            for u in whiten(z.cpu().double()).split(CHUNK)
+        ]
+        return (torch.cat(values) - constant).to(z)
