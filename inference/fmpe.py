@@ -70,6 +70,7 @@ class FMPE(TruncatedBackend):
     name: ClassVar[str] = "fmpe"
     summary: ClassVar[str] = "flow-matching posterior estimation"
     objective: ClassVar[str] = "validation_flow_matching"
+    amortises: ClassVar[bool] = True
 
     members: int = 1
     epochs: int = 10

@@ -9,6 +9,7 @@ likelihood serves any other prior, hierarchical ones included.
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -28,6 +29,8 @@ LearnedLogLikelihood = Callable[[Tensor, Tensor], Tensor]
 @dataclass(frozen=True)
 class LikelihoodBackend(NeuralBackend):
     """A backend that learns log L(z; x); options are those of the parent class."""
+
+    amortises: ClassVar[bool] = True
 
     @abstractmethod
     def log_likelihoods(self, problem: Problem, state: State) -> list[LearnedLogLikelihood]:

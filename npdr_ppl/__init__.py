@@ -29,6 +29,7 @@ __all__ = [
     "infer",
     "remove_effect",
     "simulate",
+    "with_likelihood",
     "with_noise",
 ]
 
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from npdr_ppl.workflows.compare import compare
     from npdr_ppl.workflows.diagnostics import diagnose
     from npdr_ppl.workflows.infer import infer
+    from npdr_ppl.workflows.learned_likelihood import with_likelihood
     from npdr_ppl.workflows.posterior import Posterior
 
 # Loaded when first used, so that importing the package stays quick.
@@ -67,6 +69,7 @@ _HOMES = {
     "infer": "workflows.infer",
     "remove_effect": "language.handlers",
     "simulate": "language.sites",
+    "with_likelihood": "workflows.learned_likelihood",
     "with_noise": "language.handlers",
 }
 

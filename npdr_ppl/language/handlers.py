@@ -10,10 +10,11 @@ from pyro.poutine.messenger import Messenger
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.noise import Noise
-from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
+from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox, SiteLikelihood
 
 __all__ = [
     "EffectMessenger",
+    "LikelihoodMessenger",
     "ModelWithEffects",
     "NoiseMessenger",
     "SkipSimulation",
@@ -159,6 +160,38 @@ class NoiseMessenger(Messenger):
 def with_noise(model: Model, noise: Noise | None) -> Model:
     """Returns the model with another noise of the readings; see :func:`npdr_ppl.simulate`."""
     return NoiseMessenger(noise)(model)
+
+
+class LikelihoodMessenger(Messenger):
+    """Gives a program's black-box sites a learnt density while it runs.
+
+    Args:
+        likelihood: The density.
+        site: Name of the only site to give it to; ``None`` for all.
+    """
+
+    def __init__(self, likelihood: SiteLikelihood, site: str | None = None) -> None:
+        super().__init__()
+        self.likelihood = likelihood
+        self.site = site
+        self._given = False
+
+    def __enter__(self) -> Any:
+        self._given = False
+        return super().__enter__()
+
+    def __exit__(self, exc_type: Any, exc_value: Any, traceback: Any) -> Any:
+        if exc_type is None and not self._given:
+            raise ModelError(
+                "The learnt likelihood found no black-box site"
+                + (f" {self.site!r}." if self.site else ".")
+            )
+        return super().__exit__(exc_type, exc_value, traceback)
+
+    def _pyro_sample(self, msg: Any) -> None:
+        if isinstance(msg["fn"], BlackBox) and self.site in (None, msg["name"]):
+            msg["fn"] = msg["fn"].with_likelihood(self.likelihood)
+            self._given = True
 
 
 class SkipSimulation(Messenger):

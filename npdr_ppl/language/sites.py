@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import pyro
 import torch
@@ -16,7 +16,7 @@ from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.noise import Noise, noise_batch_shape, reading_distribution
 from npdr_ppl.language.simulator import Simulator
 
-__all__ = ["BlackBox", "FunctionBlackBox", "SimulatorBlackBox", "simulate"]
+__all__ = ["BlackBox", "FunctionBlackBox", "SimulatorBlackBox", "SiteLikelihood", "simulate"]
 
 PlainFunction = Callable[..., Tensor]
 
@@ -72,13 +72,34 @@ def simulate(
     return pyro.sample(name, black_box)
 
 
+class SiteLikelihood(Protocol):
+    """A density for a black-box site, learnt from simulations of it."""
+
+    def log_prob(self, box: "BlackBox", value: Tensor) -> Tensor:
+        """Returns the log density of a value, up to a function of the value.
+
+        Args:
+            box: The site, with its parameters and inputs.
+            value: Batch shape plus event shape.
+
+        Returns:
+            Log densities of the batch shape, differentiable in the parameters.
+        """
+        ...
+
+
 class BlackBox(TorchDistribution):
     """Distribution of a simulator's output: it can be sampled, its density may be unknown.
 
     Attributes:
         site: Name of the sample site.
+        parameters: Domain parameters by name.
         noise: Noise of the readings, ``None`` if the simulator's output is the observation.
+        likelihood: A learnt density that takes the place of the site's own, ``None`` for none.
     """
+
+    parameters: Mapping[str, Tensor]
+    likelihood: SiteLikelihood | None = None
 
     has_rsample = False
     arg_constraints: dict[str, Any] = {}
@@ -129,6 +150,12 @@ class BlackBox(TorchDistribution):
         changed.noise = noise
         return changed
 
+    def with_likelihood(self, likelihood: SiteLikelihood | None) -> "BlackBox":
+        """Returns the same site with a learnt density, ``None`` for its own."""
+        changed = self.expand(self.batch_shape)
+        changed.likelihood = likelihood
+        return changed
+
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
         """Simulates the whole batch, and adds the noise where there is one."""
         with torch.no_grad():
@@ -145,11 +172,14 @@ class BlackBox(TorchDistribution):
             return output
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Returns the density of noisy readings, where the simulator has one.
+        """Returns the learnt density, or that of noisy readings where the simulator has one.
 
         Raises:
-            IntractableError: No noise was declared, or the simulator is itself random.
+            IntractableError: None was learnt, and no noise was declared or the simulator is
+                itself random.
         """
+        if self.likelihood is not None:
+            return self.likelihood.log_prob(self, value)
         pointwise, event_dim = self.pointwise_log_prob(value)
         return pointwise.flatten(-event_dim).sum(-1) if event_dim else pointwise
 
@@ -163,7 +193,8 @@ class BlackBox(TorchDistribution):
             raise IntractableError(
                 f"The density of site {self.site!r} is intractable, because its simulator is a "
                 "black box that can only be sampled; use a likelihood-free backend "
-                "(npdr.infer), or declare the readings' noise with simulate(..., noise=...)."
+                "(npdr.infer), declare the readings' noise with simulate(..., noise=...), or "
+                "give it a learnt density (npdr.with_likelihood)."
             )
         if not self._is_deterministic:
             raise IntractableError(
@@ -240,13 +271,15 @@ class SimulatorBlackBox(BlackBox):
 
     def with_effects(self, *effects: Any, parameters: Mapping[str, Tensor]) -> "SimulatorBlackBox":
         """Returns the site with effects attached and their parameters added."""
-        return SimulatorBlackBox(
+        changed = SimulatorBlackBox(
             self.site,
             self.simulator.with_effects(*effects),
             {**self.parameters, **parameters},
             self.inputs,
             self.noise,
         )
+        changed.likelihood = self.likelihood
+        return changed
 
     def _run(self, batch_shape: torch.Size) -> Tensor:
         device = self.inputs.actions.device
