@@ -18,6 +18,7 @@ from zuko.transforms import MonotonicAffineTransform, MonotonicRQSTransform
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density
+from npdr_ppl.inference.embedding_network import build_embedding
 from npdr_ppl.inference.features import Preconditioner
 from npdr_ppl.randomness import seeded
 
@@ -154,7 +155,7 @@ def build_networks(
     members: int,
     num_parameters: int,
     observation: Tensor,
-    build_embedding: Callable[[], nn.Module] | None,
+    build: Callable[[], nn.Module] | None,
     flow: Literal["nsf", "maf"],
     transforms: int,
     hidden: tuple[int, ...],
@@ -166,7 +167,7 @@ def build_networks(
         members: Number of networks.
         num_parameters: Dimension d.
         observation: An observation, ``(F,)`` or of the shape the embedding network takes.
-        build_embedding: Makes an untrained embedding network, or ``None``.
+        build: Makes an untrained embedding network, or ``None``.
         flow: See :class:`FlowNetwork`, as for the rest.
         transforms: Number of transforms.
         hidden: Widths of hidden layers.
@@ -177,19 +178,7 @@ def build_networks(
     """
     networks = []
     for member in range(members):
-        embedding, num_features = None, observation.numel()
-        if build_embedding is not None:
-            embedding = build_embedding()
-            with torch.no_grad():
-                embedded = embedding.to(observation.device)(
-                    observation.expand(2, *observation.shape)
-                )
-            if embedded.ndim != 2 or len(embedded) != 2:
-                raise BackendError(
-                    "The embedding network must map a batch of arrays to (batch, features); two "
-                    f"arrays of shape {tuple(observation.shape)} gave {tuple(embedded.shape)}."
-                )
-            num_features = embedded.shape[1]
+        embedding, num_features = build_embedding(build, observation)
         networks.append(
             FlowNetwork(
                 num_parameters,

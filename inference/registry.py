@@ -18,6 +18,7 @@ __all__ = ["backend", "backend_class", "backends"]
 GROUP = "npdr_ppl.backends"
 
 BUILT_IN = {
+    "snpe-a": "npdr_ppl.inference.snpe_a:SNPEA",
     "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
 }
 """Backends of this package by name; each is imported when it is asked for."""
