@@ -88,10 +88,13 @@ class Backend(ABC):
     Attributes:
         name: Word that selects it, e.g. ``"snpe-c"``.
         summary: One line for tables.
+        continues: Whether a loop over policies and real rollouts starts an iteration from the
+            posterior of the one before, as NPDR does, or, like BayesSim, from the prior.
     """
 
     name: ClassVar[str]
     summary: ClassVar[str]
+    continues: ClassVar[bool] = True
 
     @abstractmethod
     def init(self, problem: Problem) -> State:

@@ -14,7 +14,6 @@ mixtures whose quotient is a density: it cannot fail, and the simulations of all
 used together.
 """
 
-from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
@@ -24,9 +23,10 @@ from torch import Tensor, nn
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density, Problem, RoundInfo, State
+from npdr_ppl.inference.embedding_network import build_embedding
 from npdr_ppl.inference.features import Preconditioner, refit_regression
 from npdr_ppl.inference.gaussian_mixture import GaussianMixture
-from npdr_ppl.inference.mixture_density import MixtureDensityNetwork, mixture_at
+from npdr_ppl.inference.mixture_density import MixtureDensityNetwork, mixture_at, perceptron
 from npdr_ppl.inference.neural import MIN_SIMULATIONS, NeuralBackend, NeuralState, Simulations
 from npdr_ppl.inference.proposal_correction import (
     PROPOSALS,
@@ -67,6 +67,7 @@ class MixtureBackend(NeuralBackend):
 
     Args:
         components: Components of every member's mixture.
+        hidden: Widths of the hidden layers.
         proposals: What later rounds draw from: ``"gaussian"``, with the posterior's moments, or
             the posterior itself, ``"mixture"``.
 
@@ -74,17 +75,15 @@ class MixtureBackend(NeuralBackend):
     """
 
     components: int = 5
+    hidden: tuple[int, ...] = (64, 64)
     proposals: Literal["gaussian", "mixture"] = "gaussian"
 
     def __post_init__(self) -> None:
         """Validates the options that all have; a method adds its own."""
         super().__post_init__()
         self._check_ranges(components=(1, float("inf")))
+        self._check_widths("hidden")
         self._check_choice("proposals", PROPOSALS)
-
-    @abstractmethod
-    def _networks(self, problem: Problem) -> list[MixtureDensityNetwork]:
-        """Returns the ensemble's untrained networks, drawing from torch's global stream."""
 
     def init(self, problem: Problem) -> NeuralState:
         """Returns the state before any simulation."""
@@ -139,6 +138,24 @@ class MixtureBackend(NeuralBackend):
         proposals = tuple(GaussianMixture(*parts) for parts in zip(*stacks, strict=True))
         return replace(state, simulations=_proposed(state.simulations, proposals))
 
+    def _hidden(self, num_features: int) -> tuple[nn.Module, int]:
+        """Returns the hidden layers of one network and their number of outputs."""
+        return perceptron(num_features, self.hidden), self.hidden[-1]
+
+    def _networks(self, problem: Problem) -> list[MixtureDensityNetwork]:
+        networks = []
+        for _ in range(self.members):
+            embedding, num_features = build_embedding(
+                problem.build_network, problem.observation.to("cpu", torch.float32)
+            )
+            hidden, num_hidden = self._hidden(num_features)
+            networks.append(
+                MixtureDensityNetwork(
+                    problem.num_parameters, num_hidden, self.components, hidden, embedding
+                )
+            )
+        return networks
+
     def _seen(self, state: NeuralState) -> ProposedSimulations:
         """Returns a state's simulations and their proposals.
 
@@ -149,18 +166,26 @@ class MixtureBackend(NeuralBackend):
             raise BackendError(f"{self.name} cannot continue from another backend's state.")
         return state.simulations
 
+    def _trained_networks(
+        self, problem: Problem, state: NeuralState
+    ) -> list[MixtureDensityNetwork]:
+        """Returns the ensemble with a state's weights."""
+        with seeded(0, "untrained networks"):  # the caller's stream must not notice
+            networks = self._networks(problem)
+        for k, network in enumerate(networks):
+            network.load_state_dict({name: value[k] for name, value in state.weights.items()})
+        return networks
+
     def _posteriors(self, problem: Problem, state: State) -> list[GaussianMixture]:
+        """Returns the posterior of every ensemble member."""
         state, preconditioner = self._trained(state)
         preconditioner = preconditioner.to(problem.device)
         observation = problem.observation.to(problem.device, torch.float32)
-        posteriors = []
-        for k in range(self.members):
-            with seeded(0, "untrained networks"):  # the caller's stream must not notice
-                network = self._networks(problem)[k]
-            network.load_state_dict({name: value[k] for name, value in state.weights.items()})
-            network = network.requires_grad_(False).eval().to(problem.device)
-            posteriors.append(mixture_at(network, preconditioner, observation))
-        return posteriors
+        networks = self._trained_networks(problem, state)
+        return [
+            mixture_at(network.eval().to(problem.device), preconditioner, observation)
+            for network in networks
+        ]
 
     def _proposal(self, problem: Problem, state: State) -> GaussianMixture:
         """Returns the proposal of the round after a state."""
@@ -190,7 +215,6 @@ class MixtureBackend(NeuralBackend):
         f = preconditioner.features(simulations.x.to(problem.device))
         z = simulations.z.to(problem.device)
         points = preconditioner.whiten(z, f)
-        proposals = _proposals(simulations)
         if simulations.rounds.any():
             points = torch.cat((points, self._tilts(preconditioner, simulations, f)), -1)
         return lambda log_prob, rows: -log_prob(points[rows], f[rows])

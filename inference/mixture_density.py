@@ -17,7 +17,7 @@ __all__ = ["MixtureDensityNetwork", "mixture_at", "perceptron"]
 INITIAL_SCALE = 0.01
 """Factor on the head's initial weights, so that features hardly matter before training."""
 
-INITIAL_SPREAD = 0.5
+INITIAL_SPREAD = 0.05
 """Root mean square of the components' initial means, in standard deviations of the whole: equal
 components would receive equal gradients and stay equal."""
 
@@ -27,7 +27,7 @@ thousandth and a thousand of the linear regression's residuals wide."""
 
 
 class MixtureDensityNetwork(nn.Module):
-    """A conditional mixture of Gaussians in the whitened parameters u,
+    """A conditional mixture of Gaussians in the whitened parameters u.
 
         q(u | f) = sum_k w_k N(u; U_k^-1 v_k, (U_k^T U_k)^-1),
 
@@ -155,7 +155,7 @@ def perceptron(num_features: int, widths: tuple[int, ...]) -> nn.Sequential:
     """Returns fully connected layers of given widths."""
     layers: list[nn.Module] = []
     for width in widths:
-        layers += [nn.Linear(num_features, width), nn.SiLU()]
+        layers += [nn.Linear(num_features, width), nn.ReLU()]
         num_features = width
     return nn.Sequential(*layers)
 

@@ -26,7 +26,14 @@ from torch import Tensor
 from npdr_ppl.inference.features import Preconditioner
 from npdr_ppl.inference.gaussian_mixture import GaussianMixture, triangular_factors
 
-__all__ = ["PROPOSALS", "correct_regression", "proposal_of", "tilt_forms", "tilted", "whiten_forms"]
+__all__ = [
+    "PROPOSALS",
+    "correct_regression",
+    "proposal_of",
+    "tilt_forms",
+    "tilted",
+    "whiten_forms",
+]
 
 PROPOSALS = ("gaussian", "mixture")
 

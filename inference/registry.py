@@ -18,6 +18,8 @@ __all__ = ["backend", "backend_class", "backends"]
 GROUP = "npdr_ppl.backends"
 
 BUILT_IN = {
+    "bayessim": "npdr_ppl.inference.bayessim:BayesSim",
+    "online-bayessim": "npdr_ppl.inference.online_bayessim:OnlineBayesSim",
     "snpe-a": "npdr_ppl.inference.snpe_a:SNPEA",
     "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
 }
