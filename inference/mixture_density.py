@@ -5,6 +5,7 @@ standard normal, that is, to the preconditioner's linear-Gaussian posterior.
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,12 +19,30 @@ INITIAL_SCALE = 0.01
 """Factor on the head's initial weights, so that features hardly matter before training."""
 
 INITIAL_SPREAD = 0.05
-"""Root mean square of the components' initial means, in standard deviations of the whole: equal
+"""Standard deviation of the components' initial means, in standard deviations of the whole: equal
 components would receive equal gradients and stay equal."""
 
 LOG_SCALE_LIMIT = 7.0
 """Largest logarithm of a precision factor's diagonal element, either way: components between a
 thousandth and a thousand of the linear regression's residuals wide."""
+
+
+class MixtureParameters(NamedTuple):
+    """Mixtures of n rows, which the last dimension numbers.
+
+    The many small operations on matrices then run along contiguous memory.
+
+    Attributes:
+        log_weights: Log weights log w_k, ``(K, n)``.
+        log_scales: Log diagonals of U_k, ``(d, K, n)``.
+        shifts: Whitened means v_k, ``(d, K, n)``.
+        upper: Elements of U_k above the diagonal, row by row, ``(d (d - 1) / 2, K, n)``.
+    """
+
+    log_weights: Tensor
+    log_scales: Tensor
+    shifts: Tensor
+    upper: Tensor
 
 
 class MixtureDensityNetwork(nn.Module):
@@ -56,44 +75,25 @@ class MixtureDensityNetwork(nn.Module):
         super().__init__()
         self.num_parameters, self.components = num_parameters, components
         self.embedding, self.hidden = embedding, hidden
-        # Per component a weight and the rows of the matrix [U, v], of which U's are triangular.
-        self.sizes = [components * (num_parameters - i + 1) for i in range(num_parameters)]
-        self.head = nn.Linear(num_hidden, components + sum(self.sizes))
-        means = torch.randn(components, num_parameters)
-        means = means - means.mean(0)
-        means = means * (INITIAL_SPREAD / means.square().mean(0).sqrt().clamp(min=1e-6))
-        spread = INITIAL_SPREAD if components > 1 else 0.0
-        scale = 1 / math.sqrt(1 - spread**2)
+        row, column = torch.triu_indices(num_parameters, num_parameters, offset=1)
+        self.sizes = [components * n for n in (1, num_parameters, num_parameters, len(row))]
+        self.head = nn.Linear(num_hidden, sum(self.sizes))
+        self.register_buffer("columns", column, persistent=False)
+        in_row = (row == torch.arange(num_parameters)[:, None]).to(torch.float32)
+        self.register_buffer("in_row", in_row, persistent=False)
         with torch.no_grad():
             self.head.weight.mul_(INITIAL_SCALE)
             self.head.bias.zero_()
-            rows = self.head.bias[components:].split(self.sizes)
-            for i, row in enumerate(rows):
-                by_component = row.view(-1, components)
-                by_component[0] = _inverse_bound(math.log(scale))
-                if components > 1:
-                    by_component[-1] = scale * means[:, i]
+            means = self.head.bias.split(self.sizes)[2]
+            means.copy_(INITIAL_SPREAD * torch.randn_like(means) * (components > 1))
 
-    def parameters_at(self, f: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Returns the mixtures' parameters at standardised features ``(n, ...)``.
-
-        The rows are numbered by the last dimension, so that the many small operations on
-        matrices run along contiguous memory.
-
-        Returns:
-            Log weights ``(K, n)``, log diagonals of U ``(d, K, n)``, and the rows of [U, -v] from
-            the diagonal on, each ``(d - i + 1, K, n)``.
-        """
+    def parameters_at(self, f: Tensor) -> MixtureParameters:
+        """Returns the mixtures at standardised features ``(n, ...)``."""
         h = self.hidden(f if self.embedding is None else self.embedding(f))
         raw = self.head.weight @ h.mT + self.head.bias[:, None]
-        logits, rest = raw[: self.components], raw[self.components :]
-        rows, log_scales = [], []
-        for i, flat in enumerate(rest.split(self.sizes)):
-            row = flat.view(self.num_parameters - i + 1, self.components, -1)
-            log_scale = row[:1] / (1 + row[:1].abs() / LOG_SCALE_LIMIT)
-            log_scales.append(log_scale)
-            rows.append(torch.cat((log_scale.exp(), row[1:-1], -row[-1:])))
-        return logits.log_softmax(0), torch.cat(log_scales), rows
+        parts = [part.view(-1, self.components, len(h)) for part in raw.split(self.sizes)]
+        log_scales = parts[1] / (1 + parts[1].abs() / LOG_SCALE_LIMIT)
+        return MixtureParameters(parts[0][0].log_softmax(0), log_scales, parts[2], parts[3])
 
     def forward(self, u: Tensor, f: Tensor) -> Tensor:
         """Returns log q(u | f), or that of the proposal posterior, ``(n,)``.
@@ -104,20 +104,34 @@ class MixtureDensityNetwork(nn.Module):
             f: Standardised features, ``(n, ...)``.
         """
         d = self.num_parameters
-        log_weights, log_scales, rows = self.parameters_at(f)
-        log_volume = log_weights + log_scales.sum(0)
-        point = torch.cat((u[:, :d].mT, torch.ones_like(u[:, :1]).mT))
-        square: Tensor | float = 0.0
-        for i, row in enumerate(rows):
-            square = square + (row * point[i:, None]).sum(0) ** 2
-        log_q = (log_volume - 0.5 * square).logsumexp(0) - 0.5 * d * math.log(2 * math.pi)
+        mixtures = self.parameters_at(f)
+        scales = mixtures.log_scales.exp()
+        log_volume = mixtures.log_weights + mixtures.log_scales.sum(0)
+        point = u[:, :d].mT
+        white = scales * point[:, None] - mixtures.shifts
+        if d > 1:
+            products = mixtures.upper * point[self.columns][:, None]
+            white = white + (self.in_row @ products.flatten(1)).view(white.shape)
+        log_q = (log_volume - 0.5 * white.square().sum(0)).logsumexp(0)
+        log_q = log_q - 0.5 * d * math.log(2 * math.pi)
         if u.shape[1] == d:
             return log_q
+        point = torch.cat((point, torch.ones_like(point[:1])))
         forms = u[:, d:].mT.reshape(-1, d + 1, d + 1, len(u)).permute(1, 2, 0, 3)
         exponent = ((forms * point[:, None, None]).sum(0) * point[:, None]).sum(0)
         log_tilt = (-0.5 * exponent).logsumexp(0)
+        rows = _factor_rows(scales, mixtures)
         log_normaliser = log_volume[None] + _log_integral(forms[:, :, :, None], rows)
         return log_q + log_tilt - log_normaliser.flatten(0, 1).logsumexp(0)
+
+
+def _factor_rows(scales: Tensor, mixtures: MixtureParameters) -> list[Tensor]:
+    """Returns the rows of [U, -v] from the diagonal on, each ``(d - i + 1, K, n)``."""
+    d = len(scales)
+    upper = mixtures.upper.split([d - 1 - i for i in range(d)])
+    return [
+        torch.cat((scales[i : i + 1], upper[i], -mixtures.shifts[i : i + 1])) for i in range(d)
+    ]
 
 
 def _log_integral(forms: Tensor, rows: list[Tensor]) -> Tensor:
@@ -134,21 +148,17 @@ def _log_integral(forms: Tensor, rows: list[Tensor]) -> Tensor:
         log int exp(-1/2 (u, 1)^T (form + [U, -v]^T [U, -v]) (u, 1)) du / (2 pi)^(d / 2),
         ``(J, K, n)``.
     """
-    log_det: Tensor | float = 0.0
+    pivots = []
     left = forms
     for row in rows:
-        left = left + (row[:, None] * row[None])[:, :, None]
+        first = left[0] + (row[0] * row)[:, None]
         # Not smaller than the square of U's diagonal but for rounding: the form is nonnegative.
-        pivot = torch.maximum(left[0, 0], (row[0] ** 2)[None])
-        log_det = log_det + pivot.log()
-        column = left[1:, 0]
-        left = left[1:, 1:] - column[:, None] * (column / pivot)[None]
-    return -0.5 * (log_det + left[0, 0])
-
-
-def _inverse_bound(log_scale: float) -> float:
-    """Returns what the bound on log scales maps to a value."""
-    return log_scale / (1 - abs(log_scale) / LOG_SCALE_LIMIT)
+        pivot = torch.maximum(first[0], (row[0] ** 2)[None])
+        column = first[1:]
+        fresh = (row[1:, None] * row[None, 1:])[:, :, None]
+        left = left[1:, 1:] + fresh - column[:, None] * (column / pivot)[None]
+        pivots.append(pivot)
+    return -0.5 * (torch.stack(pivots).log().sum(0) + left[0, 0])
 
 
 def perceptron(num_features: int, widths: tuple[int, ...]) -> nn.Sequential:
@@ -173,7 +183,8 @@ def mixture_at(
     d = network.num_parameters
     features = preconditioner.features(observation[None])
     with torch.no_grad():
-        log_weights, _, rows = network.parameters_at(features)
+        mixtures = network.parameters_at(features)
+        rows = _factor_rows(mixtures.log_scales.exp(), mixtures)
     joint = torch.zeros(network.components, d, d + 1, dtype=torch.float64)
     for i, row in enumerate(rows):
         joint[:, i, i:] = row[..., 0].mT.cpu().double()
@@ -183,5 +194,5 @@ def mixture_at(
     shift = preconditioner.shift(features)[0].cpu().double()
     roots = torch.linalg.solve_triangular(scale, factors, upper=False, left=False)
     return GaussianMixture(
-        log_weights[:, 0].cpu(), means @ scale.T + shift, triangular_factors(roots)
+        mixtures.log_weights[:, 0].cpu(), means @ scale.T + shift, triangular_factors(roots)
     )
