@@ -9,7 +9,7 @@ likelihood, and read off at the observation (their Eqs. 4 to 8). The functions a
 * ``features="fourier"``: linear in fixed Fourier features of a kernel
   (Rahimi & Recht 2007, *Random features for large-scale kernel machines*),
 
-      h(f) = (cos(w_1^T f / s), sin(w_1^T f / s), ..., sin(w_m^T f / s)),
+      h(f) = (cos(w_1^T f / s), sin(w_1^T f / s), ..., sin(w_m^T f / s)) / sqrt(m),
 
   whose frequencies w_i follow the kernel's spectral density, here as a scrambled Sobol sequence,
   and whose bandwidth s is the median distance between simulations. Only the linear head is

@@ -19,7 +19,7 @@ NUM_DISTANCES = 10_000
 class FourierFeatures(nn.Module):
     """Features whose inner products approximate a kernel of unit bandwidth.
 
-        k(f, f') ~ (1 / m) h(f)^T h(f'),      h(f) = (cos w_i^T f, sin w_i^T f)_i=1..m.
+        k(f, f') ~ h(f)^T h(f'),      h(f) = (cos w_i^T f, sin w_i^T f)_i=1..m / sqrt(m).
 
     The spectral density of the Gaussian kernel exp(-|r|^2 / 2) is N(0, I), that of a Matern
     kernel Student's t with 2 nu degrees of freedom. Its draws are a scrambled Sobol sequence (Yang
@@ -53,7 +53,7 @@ class FourierFeatures(nn.Module):
     def forward(self, f: Tensor) -> Tensor:
         """Returns features ``(n, 2 m)`` of rows ``(n, F)``."""
         phase = f @ self.frequencies.mT
-        return torch.cat((phase.cos(), phase.sin()), -1)
+        return torch.cat((phase.cos(), phase.sin()), -1) / math.sqrt(len(self.frequencies))
 
 
 def median_distance(f: Tensor) -> float:

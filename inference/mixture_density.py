@@ -18,7 +18,7 @@ __all__ = ["MixtureDensityNetwork", "mixture_at", "perceptron"]
 INITIAL_SCALE = 0.01
 """Factor on the head's initial weights, so that features hardly matter before training."""
 
-INITIAL_SPREAD = 0.05
+INITIAL_SPREAD = 0.3
 """Standard deviation of the components' initial means, in standard deviations of the whole: equal
 components would receive equal gradients and stay equal."""
 
@@ -75,12 +75,9 @@ class MixtureDensityNetwork(nn.Module):
         super().__init__()
         self.num_parameters, self.components = num_parameters, components
         self.embedding, self.hidden = embedding, hidden
-        row, column = torch.triu_indices(num_parameters, num_parameters, offset=1)
-        self.sizes = [components * n for n in (1, num_parameters, num_parameters, len(row))]
+        num_upper = num_parameters * (num_parameters - 1) // 2
+        self.sizes = [components * n for n in (1, num_parameters, num_parameters, num_upper)]
         self.head = nn.Linear(num_hidden, sum(self.sizes))
-        self.register_buffer("columns", column, persistent=False)
-        in_row = (row == torch.arange(num_parameters)[:, None]).to(torch.float32)
-        self.register_buffer("in_row", in_row, persistent=False)
         with torch.no_grad():
             self.head.weight.mul_(INITIAL_SCALE)
             self.head.bias.zero_()
@@ -110,8 +107,10 @@ class MixtureDensityNetwork(nn.Module):
         point = u[:, :d].mT
         white = scales * point[:, None] - mixtures.shifts
         if d > 1:
-            products = mixtures.upper * point[self.columns][:, None]
-            white = white + (self.in_row @ products.flatten(1)).view(white.shape)
+            row, column = torch.triu_indices(d, d, offset=1, device=u.device)
+            products = mixtures.upper * point[column][:, None]
+            in_row = (row == torch.arange(d, device=u.device)[:, None]).to(u)
+            white = white + (in_row @ products.flatten(1)).view(white.shape)
         log_q = (log_volume - 0.5 * white.square().sum(0)).logsumexp(0)
         log_q = log_q - 0.5 * d * math.log(2 * math.pi)
         if u.shape[1] == d:
