@@ -1,17 +1,18 @@
 """What the methods with mixture density networks share: proposals and their correction.
 
-The first round's simulations come from the prior N(0, I), those of a later round from a proposal,
-the present posterior or a Gaussian with its moments. Every row enters the likelihood with the
-proposal posterior of its own round,
+The first round's simulations come from the prior N(0, I), those of a later round r from a
+proposal, the present posterior or the Gaussian with its moments. The mixture q(z | x) is fitted to
+all simulations so far, each through the proposal posterior of its own round r(n),
 
     max sum_n log [q(z_n | x_n) t_r(n)(z_n) / Z_r(n)(x_n)],        t_r = p~_r / p,
 
-which is known in closed form, see :mod:`npdr_ppl.inference.proposal_correction`. Papamakarios &
-Murray (2016, Algorithms 1 and 2) fit the left-hand side as a free mixture and divide by t once it
-is fitted; the quotient of two Gaussians need not be one, and then there is no posterior. Fitting
-q through its product with t is the same estimator, with the same correction, restricted to those
-mixtures whose quotient is a density: it cannot fail, and the simulations of all rounds can be
-used together.
+which is known in closed form, see :mod:`npdr_ppl.inference.proposal_correction`. We depart from
+Papamakarios & Murray (2016, Algorithm 2) in two points. They fit what stands in the brackets as a
+free mixture and divide it by t_r once it is fitted; the quotient of two Gaussians need not be one,
+and then there is no posterior. Fitting q through its product with t_r is the same likelihood,
+restricted to those mixtures whose quotient by t_r is a density: there always is a posterior. And
+they fit the last round only; the earlier rounds tie down q where the last proposal does not go,
+most of all between the modes of a mixture.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -108,7 +109,12 @@ class MixtureBackend(NeuralBackend):
         x: Tensor,
         progress: Callable[[float, str], None] | None = None,
     ) -> tuple[NeuralState, RoundInfo]:
-        """Trains the ensemble; see :meth:`NeuralBackend.tell`."""
+        """Trains the ensemble anew on the simulations so far; see :meth:`Backend.tell`.
+
+        Raises:
+            ShapeError: The shapes do not fit the problem.
+            BackendError: Too few simulations succeeded.
+        """
         state = self._own(state)
         if state.round:
             seen = self._seen(state)
@@ -199,14 +205,14 @@ class MixtureBackend(NeuralBackend):
     def _precondition(self, problem: Problem, simulations: Simulations) -> Preconditioner:
         """Fits the regression to the last round and corrects it for that round's proposal."""
         preconditioner = super()._precondition(problem, simulations)
-        proposals = _proposals(simulations)
+        # A round of which nearly all simulations failed is too small for a regression.
         sizes = torch.bincount(simulations.rounds).tolist()
         last = max(number for number, size in enumerate(sizes) if size >= MIN_SIMULATIONS)
         if last == 0 or problem.build_network is not None:
             return preconditioner
         rows = simulations[simulations.rounds == last]
         preconditioner = refit_regression(preconditioner, rows.z, rows.x)
-        return correct_regression(preconditioner, proposals[last - 1])
+        return correct_regression(preconditioner, _proposals(simulations)[last - 1])
 
     def _loss(
         self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
