@@ -10,6 +10,10 @@ from npdr_ppl.inference.base import Density
 __all__ = ["GaussianMixture", "triangular_factors"]
 
 
+ROUNDING = 1e-12
+"""Error of a sum of normalised weights in float64."""
+
+
 class GaussianMixture(Density):
     """The mixture q(z) = sum_k w_k N(z; m_k, (T_k^T T_k)^-1).
 
@@ -24,7 +28,11 @@ class GaussianMixture(Density):
     """
 
     def __init__(self, log_weights: Tensor, means: Tensor, precision_factors: Tensor) -> None:
-        self.log_weights = log_weights.double().log_softmax(0)
+        log_weights = log_weights.double()
+        total = log_weights.logsumexp(0)
+        # Weights that are normalised keep their bits: a mixture read from a file is the one that
+        # was written.
+        self.log_weights = log_weights - torch.where(total.abs() < ROUNDING, 0.0, total)
         self.means = means.double()
         self.precision_factors = precision_factors.double()
 

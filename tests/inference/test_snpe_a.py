@@ -83,6 +83,25 @@ def test_never_fails_with_few_simulations_of_a_rough_simulator():
         assert z.isfinite().all() and q.log_prob(z).isfinite().all()
 
 
+def test_resumes_with_several_mixture_proposals():
+    problem = make_problem(1, torch.tensor([0.5]))
+    method = SNPEA(proposals="mixture", components=3, epochs=2)
+
+    def run(state, number):
+        with seeded(7, number):
+            z = method.ask(problem, state, 100)
+            return method.tell(problem, state, z, z + 0.3 * torch.randn_like(z))[0]
+
+    state = restored = method.init(problem)
+    for number in range(3):
+        state, restored = run(state, number), run(restored, number)
+        restored = method.restore(problem, *method.tensors(restored))
+    points = torch.linspace(-2, 2, 9)[:, None]
+    pairs = zip(method.densities(problem, state), method.densities(problem, restored), strict=True)
+    for ours, theirs in pairs:
+        assert torch.equal(ours.log_prob(points), theirs.log_prob(points))
+
+
 def test_embedding_network_is_trained_in_rounds():
     time = torch.linspace(0, 1, 20)[:, None]
     problem = make_problem(
