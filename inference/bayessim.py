@@ -3,7 +3,7 @@
 Ramos, Possas & Fox (2019), *BayesSim: adaptive domain randomization via probabilistic inference
 for robotics simulators*, https://arxiv.org/abs/1906.01728. A mixture of Gaussians whose
 parameters are functions of the features is fitted to simulations from the prior by maximum
-likelihood, and read off at the observation (their Eqs. 4 to 8). The functions are
+likelihood, and read off at the observation. The functions are
 
 * ``features="neural"``: a fully connected network, or
 * ``features="fourier"``: linear in fixed Fourier features of a kernel
@@ -17,7 +17,7 @@ likelihood, and read off at the observation (their Eqs. 4 to 8). The functions a
 
 Further rounds, with which Muratore et al. (2021) ran it, draw from the posterior and are corrected
 as in :mod:`npdr_ppl.inference.snpe_a`. The paper does so after training; see
-:mod:`npdr_ppl.inference.mixture_backend` for where we depart from that.
+:mod:`npdr_ppl.inference.mixture_backend` for why we do it within.
 """
 
 from collections.abc import Sequence

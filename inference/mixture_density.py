@@ -81,8 +81,11 @@ class MixtureDensityNetwork(nn.Module):
         with torch.no_grad():
             self.head.weight.mul_(INITIAL_SCALE)
             self.head.bias.zero_()
-            means = self.head.bias.split(self.sizes)[2]
-            means.copy_(INITIAL_SPREAD * torch.randn_like(means) * (components > 1))
+            if components > 1:
+                _, log_scales, shifts, _ = self.head.bias.split(self.sizes)
+                # Narrower components make up for the spread of their means.
+                log_scales.fill_(-0.5 * math.log(1 - INITIAL_SPREAD**2))
+                shifts.copy_(INITIAL_SPREAD * torch.randn_like(shifts))
 
     def parameters_at(self, f: Tensor) -> MixtureParameters:
         """Returns the mixtures at standardised features ``(n, ...)``."""

@@ -5,7 +5,7 @@ the *proposal posterior*
 
     q~(z | x) = q(z | x) t(z) / Z(x),      t(z) = p~(z) / p(z),      Z(x) = int q(z | x) t(z) dz
 
-(Papamakarios & Murray 2016, Eq. 3). For a mixture p~ = sum_j b_j N(m_j, S_j) the tilt t is a sum
+(Papamakarios & Murray 2016, Proposition 1). For a mixture p~ = sum_j b_j N(m_j, S_j) the tilt t is a sum
 of exponentials of quadratic forms,
 
     t(z) = sum_j exp(-1/2 (z, 1)^T T_j (z, 1)),
