@@ -5,8 +5,8 @@ the *proposal posterior*
 
     q~(z | x) = q(z | x) t(z) / Z(x),      t(z) = p~(z) / p(z),      Z(x) = int q(z | x) t(z) dz
 
-(Papamakarios & Murray 2016, Proposition 1). For a mixture p~ = sum_j b_j N(m_j, S_j) the tilt t is a sum
-of exponentials of quadratic forms,
+(Papamakarios & Murray 2016, Proposition 1). For a mixture p~ = sum_j b_j N(m_j, S_j) the
+tilt t is a sum of exponentials of quadratic forms,
 
     t(z) = sum_j exp(-1/2 (z, 1)^T T_j (z, 1)),
     T_j = [[S_j^-1 - I, -S_j^-1 m_j], [., m_j^T S_j^-1 m_j + log det S_j - 2 log b_j]],

@@ -14,8 +14,9 @@ conditional density estimation*, https://arxiv.org/abs/1605.06376. Each round r
 The prior is N(0, I), so that the quotient of Gaussians is known for every model. The division
 takes place inside the likelihood rather than after training, which makes it exact and proper
 whatever the network, and lets all rounds' simulations count: see
-:mod:`npdr_ppl.inference.mixture_backend`, also for how this differs from the paper. It is also the form in
-which Greenberg et al. (2019, https://arxiv.org/abs/1905.07488) train mixtures without atoms.
+:mod:`npdr_ppl.inference.mixture_backend`, also for how this differs from the paper. It is the
+form in which Greenberg et al. (2019, https://arxiv.org/abs/1905.07488) train mixtures without
+atoms.
 """
 
 from dataclasses import dataclass
