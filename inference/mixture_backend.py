@@ -75,6 +75,7 @@ class MixtureBackend(NeuralBackend):
     The other options are those of :class:`~npdr_ppl.inference.neural.NeuralBackend`.
     """
 
+    batch_size: int = 128
     components: int = 5
     hidden: tuple[int, ...] = (64, 64)
     proposals: Literal["gaussian", "mixture"] = "gaussian"

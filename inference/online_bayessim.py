@@ -6,7 +6,7 @@ improving the controller: every time, simulations are drawn from the present pos
 network is trained further on them. Here a round
 
 1. draws from the present posterior, the prior at first,
-2. goes on from the networks of the round before, in small batches and for few epochs, with the
+2. goes on from the networks of the round before, for few epochs, with the
    first round's preconditioner, without which their weights would lose their meaning,
 3. corrects for the proposals as :mod:`npdr_ppl.inference.mixture_backend` describes; by keeping
    the earlier simulations, each with its own proposal, we depart from the paper.
@@ -41,7 +41,6 @@ class OnlineBayesSim(BayesSim):
     continues: ClassVar[bool] = True
 
     epochs: int = 10
-    batch_size: int = 128
     learning_rate: float = 3e-3
 
     def _precondition(self, problem: Problem, simulations: Simulations) -> Preconditioner:
