@@ -79,6 +79,7 @@ class ABC(Backend):
 
     name: ClassVar[str] = "abc"
     summary: ClassVar[str] = "rejection ABC with local-linear regression adjustment"
+    amortises: ClassVar[bool] = True
 
     accept: float = 0.1
     min_accepted: int = 1000

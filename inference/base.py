@@ -100,6 +100,8 @@ class Backend(ABC):
             spends it in one round.
         amortises: Whether a state after one round from the prior holds the posterior given any
             observation, and not only the problem's.
+        continues: Whether a loop over policies and real rollouts starts an iteration from the
+            posterior of the one before, as NPDR does, or, like BayesSim, from the prior.
     """
 
     name: ClassVar[str]
@@ -107,6 +109,7 @@ class Backend(ABC):
     uses_simulations: ClassVar[bool] = True
     is_sequential: ClassVar[bool] = True
     amortises: ClassVar[bool] = False
+    continues: ClassVar[bool] = True
 
     @abstractmethod
     def init(self, problem: Problem) -> State:

@@ -11,13 +11,13 @@ problems u given f is N(0, I) and nothing is left to learn.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import torch
 from torch import Tensor
 
-__all__ = ["Preconditioner", "fit_preconditioner"]
+__all__ = ["Preconditioner", "fit_preconditioner", "refit_regression"]
 
 MAX_KNOTS = 65
 """Knots of a quantile map: a step of about 0.12 standard deviations with 10 000 simulations."""
@@ -154,6 +154,19 @@ def fit_preconditioner(z: Tensor, x: Tensor, is_raw: bool = False) -> Preconditi
     )
     gain, offset, residuals = _ridge(marginal.features(x), z)
     return Preconditioner(marginal.knots, marginal.scores, gain, offset, _factor(residuals, z))
+
+
+def refit_regression(preconditioner: Preconditioner, z: Tensor, x: Tensor) -> Preconditioner:
+    """Repeats the regression of parameters on features with other simulations.
+
+    Args:
+        preconditioner: A preconditioner of features, not of raw arrays; its quantile maps stay.
+        z: Parameters, ``(n, d)``.
+        x: Features, ``(n, F)``.
+    """
+    gain, offset, residuals = _ridge(preconditioner.features(x), z)
+    factor = _factor(residuals, z)
+    return replace(preconditioner, gain=gain, offset=offset, factor=factor)
 
 
 def _centre_and_scale(x: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from zuko.transforms import MonotonicAffineTransform, MonotonicRQSTransform
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density
+from npdr_ppl.inference.embedding_network import build_embedding
 from npdr_ppl.inference.features import Preconditioner
 from npdr_ppl.randomness import seeded
 
@@ -28,7 +29,6 @@ __all__ = [
     "FlowNetwork",
     "build_networks",
     "load_member",
-    "make_embedding",
 ]
 
 Flow = Literal["nsf", "maf", "affine-nsf"]
@@ -161,7 +161,7 @@ class FlowNetwork(nn.Module):
         return self.transform(context).inv(base)
 
 
-def _univariate(flow: str, transforms: int, bins: int) -> list[tuple[type[Transform], Any]]:
+def _univariate(flow: str, transforms: int, bins: int) -> Sequence[Any]:
     """Returns the univariate map of each transform and the shapes of its parameters."""
     spline = Spline, [(2, bins), (bins - 1,)]
     affine = MonotonicAffineTransform, [(), ()]
@@ -174,7 +174,7 @@ def build_networks(
     members: int,
     num_parameters: int,
     observation: Tensor,
-    build_embedding: Callable[[], nn.Module] | None,
+    build: Callable[[], nn.Module] | None,
     flow: Flow,
     transforms: int,
     hidden: tuple[int, ...],
@@ -186,7 +186,7 @@ def build_networks(
         members: Number of networks.
         num_parameters: Dimension d.
         observation: An observation, ``(F,)`` or of the shape the embedding network takes.
-        build_embedding: Makes an untrained embedding network, or ``None``.
+        build: Makes an untrained embedding network, or ``None``.
         flow: See :class:`FlowNetwork`, as for the rest.
         transforms: Number of transforms.
         hidden: Widths of hidden layers.
@@ -197,7 +197,7 @@ def build_networks(
     """
     networks = []
     for member in range(members):
-        embedding, num_features = make_embedding(observation, build_embedding)
+        embedding, num_features = build_embedding(build, observation)
         networks.append(
             FlowNetwork(
                 num_parameters,
@@ -211,31 +211,6 @@ def build_networks(
             )
         )
     return networks
-
-
-def make_embedding(
-    observation: Tensor, build_embedding: Callable[[], nn.Module] | None
-) -> tuple[nn.Module | None, int]:
-    """Makes an untrained embedding network, if there is one, and counts its features.
-
-    Args:
-        observation: An observation, ``(F,)`` or of the shape the embedding network takes.
-        build_embedding: Makes an untrained embedding network, or ``None``.
-
-    Raises:
-        BackendError: The embedding network does not map a batch to ``(n, features)``.
-    """
-    if build_embedding is None:
-        return None, observation.numel()
-    embedding = build_embedding()
-    with torch.no_grad():
-        embedded = embedding.to(observation.device)(observation.expand(2, *observation.shape))
-    if embedded.ndim != 2 or len(embedded) != 2:
-        raise BackendError(
-            "The embedding network must map a batch of arrays to (batch, features); two "
-            f"arrays of shape {tuple(observation.shape)} gave {tuple(embedded.shape)}."
-        )
-    return embedding, embedded.shape[1]
 
 
 def load_member(

@@ -38,8 +38,9 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem, State
+from npdr_ppl.inference.embedding_network import build_embedding
 from npdr_ppl.inference.features import Preconditioner
-from npdr_ppl.inference.flows import load_member, make_embedding
+from npdr_ppl.inference.flows import load_member
 from npdr_ppl.inference.neural import Simulations
 from npdr_ppl.inference.training import LogProb, Loss
 from npdr_ppl.inference.truncated import TruncatedBackend
@@ -114,7 +115,7 @@ class FMPE(TruncatedBackend):
         observation = problem.observation.to("cpu", torch.float32)
         networks = []
         for _ in range(self.members):
-            embedding, num_features = make_embedding(observation, problem.build_network)
+            embedding, num_features = build_embedding(problem.build_network, observation)
             networks.append(
                 VelocityNetwork(
                     problem.num_parameters,

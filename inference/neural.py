@@ -155,6 +155,23 @@ class NeuralBackend(Backend):
     def _networks(self, problem: Problem) -> Sequence[nn.Module]:
         """Returns the ensemble's untrained networks, drawing from torch's global stream."""
 
+    def _starting_networks(
+        self,
+        problem: Problem,
+        state: NeuralState,
+        preconditioner: Preconditioner,
+        simulations: Simulations,
+    ) -> Sequence[nn.Module]:
+        """Returns the networks that a round's training starts from: untrained ones.
+
+        Args:
+            problem: The problem.
+            state: The state before the round.
+            preconditioner: That of the round.
+            simulations: What the round trains on.
+        """
+        return self._networks(problem)
+
     @abstractmethod
     def _loss(
         self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
@@ -215,7 +232,7 @@ class NeuralBackend(Backend):
         clipped = self._clipped_features(problem, preconditioner)
         device = problem.device
         fit = train(
-            self._networks(problem),
+            self._starting_networks(problem, state, preconditioner, rows),
             self._loss(problem, preconditioner.to(device), rows),
             len(rows),
             TrainingOptions(

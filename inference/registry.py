@@ -18,15 +18,18 @@ __all__ = ["backend", "backend_class", "backends"]
 GROUP = "npdr_ppl.backends"
 
 BUILT_IN = {
-    "nle": "npdr_ppl.inference.nle:NLE",
-    "nre": "npdr_ppl.inference.nre:NRE",
-    "nuts": "npdr_ppl.inference.nuts:NUTS",
     "abc": "npdr_ppl.inference.abc:ABC",
-    "fmpe": "npdr_ppl.inference.fmpe:FMPE",
-    "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
     "bayesian-linear-regression": (
         "npdr_ppl.inference.bayesian_linear_regression:BayesianLinearRegression"
     ),
+    "bayessim": "npdr_ppl.inference.bayessim:BayesSim",
+    "fmpe": "npdr_ppl.inference.fmpe:FMPE",
+    "nle": "npdr_ppl.inference.nle:NLE",
+    "nre": "npdr_ppl.inference.nre:NRE",
+    "nuts": "npdr_ppl.inference.nuts:NUTS",
+    "online-bayessim": "npdr_ppl.inference.online_bayessim:OnlineBayesSim",
+    "snpe-a": "npdr_ppl.inference.snpe_a:SNPEA",
+    "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
 }
 """Backends of this package by name; each is imported when it is asked for."""
 
