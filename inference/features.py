@@ -17,7 +17,13 @@ from typing import Self
 import torch
 from torch import Tensor
 
-__all__ = ["Preconditioner", "fit_preconditioner", "refit_regression"]
+__all__ = [
+    "Preconditioner",
+    "fit_preconditioner",
+    "refit_regression",
+    "residual_factor",
+    "ridge_regression",
+]
 
 MAX_KNOTS = 65
 """Knots of a quantile map: a step of about 0.12 standard deviations with 10 000 simulations."""
@@ -134,7 +140,7 @@ def fit_preconditioner(z: Tensor, x: Tensor, is_raw: bool = False) -> Preconditi
     if is_raw:
         knots, scores = _centre_and_scale(x), z.new_zeros(0)
         return Preconditioner(
-            knots, scores, z.new_zeros(z.shape[1], 0), z.mean(0), _factor(z - z.mean(0), z)
+            knots, scores, z.new_zeros(z.shape[1], 0), z.mean(0), residual_factor(z - z.mean(0), z)
         )
     num_knots = min(MAX_KNOTS, max(5, len(x) // SIMULATIONS_PER_KNOT))
     edge = -torch.special.ndtri(torch.tensor(0.5 / len(x), dtype=torch.float64)).item()
@@ -152,8 +158,10 @@ def fit_preconditioner(z: Tensor, x: Tensor, is_raw: bool = False) -> Preconditi
         z.mean(0),
         torch.eye(z.shape[1], dtype=z.dtype, device=z.device),
     )
-    gain, offset, residuals = _ridge(marginal.features(x), z)
-    return Preconditioner(marginal.knots, marginal.scores, gain, offset, _factor(residuals, z))
+    gain, offset, residuals = ridge_regression(marginal.features(x), z)
+    return Preconditioner(
+        marginal.knots, marginal.scores, gain, offset, residual_factor(residuals, z)
+    )
 
 
 def refit_regression(preconditioner: Preconditioner, z: Tensor, x: Tensor) -> Preconditioner:
@@ -164,8 +172,8 @@ def refit_regression(preconditioner: Preconditioner, z: Tensor, x: Tensor) -> Pr
         z: Parameters, ``(n, d)``.
         x: Features, ``(n, F)``.
     """
-    gain, offset, residuals = _ridge(preconditioner.features(x), z)
-    factor = _factor(residuals, z)
+    gain, offset, residuals = ridge_regression(preconditioner.features(x), z)
+    factor = residual_factor(residuals, z)
     return replace(preconditioner, gain=gain, offset=offset, factor=factor)
 
 
@@ -180,7 +188,7 @@ def _centre_and_scale(x: Tensor) -> Tensor:
     return torch.stack((centre, torch.where(scale > 0, scale, 1.0)))
 
 
-def _ridge(f: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def ridge_regression(f: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Regresses z on f with the penalty of least leave-one-out error.
 
     With the eigendecomposition F^T F = V diag(s) V^T of the centred features, the leverages are
@@ -216,7 +224,7 @@ def _ridge(f: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
-def _factor(residuals: Tensor, z: Tensor) -> Tensor:
+def residual_factor(residuals: Tensor, z: Tensor) -> Tensor:
     """Returns the Cholesky factor of the residuals' covariance with a floor, ``(d, d)``."""
     r, floor = residuals.double(), MIN_SCALE * z.double().std(0).clamp(min=MIN_SCALE)
     covariance = r.T @ r / len(r) + torch.diag(floor**2)

@@ -5,9 +5,15 @@ https://arxiv.org/abs/1805.07226, Algorithm 1. A conditional flow learns the den
 features, max sum_n log q(x_n | z_n), over all rounds' simulations, whatever proposal they came
 from; each round proposes draws of the present posterior, proportional to p(z) q(x_o | z).
 
-The flow sees features as residuals of their ridge regression on the parameters' normal scores,
-:mod:`npdr_ppl.inference.features` with the roles swapped: where x depends linearly on z with
-Gaussian noise nothing is left to learn.
+The flow sees features as whitened residuals u = L^-1 (x - m(z)) of their regression on a
+polynomial m of the parameters, whose degree the leave-one-out error chooses. Where x is a smooth
+function of z with Gaussian noise, as readings of a deterministic simulator are, little is left to
+learn.
+
+Of many features, such as the readings of a trajectory, the flow sees the few combinations that
+vary most with the parameters, in units of their scatter at given parameters (Fisher's linear
+discriminants). With noise that is Gaussian and the same for all
+parameters, combinations that span E[x | z] are a sufficient statistic.
 """
 
 from dataclasses import dataclass
@@ -18,28 +24,17 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Problem, State
-from npdr_ppl.inference.features import Preconditioner, fit_preconditioner
+from npdr_ppl.inference.features import Preconditioner
 from npdr_ppl.inference.flows import FLOWS, Flow, FlowNetwork, build_networks, load_member
 from npdr_ppl.inference.likelihood import LearnedLogLikelihood, LikelihoodBackend
+from npdr_ppl.inference.likelihood_features import (
+    LikelihoodPreconditioner,
+    fit_likelihood_preconditioner,
+)
 from npdr_ppl.inference.neural import NeuralState, Simulations
 from npdr_ppl.inference.training import Loss
 
-__all__ = ["NLE", "LikelihoodPreconditioner"]
-
-
-@dataclass(frozen=True)
-class LikelihoodPreconditioner(Preconditioner):
-    """The preconditioner of features given parameters.
-
-    Attributes:
-        lowest: Least simulated value of each feature, ``(F,)``.
-        highest: Greatest one.
-
-    Beyond this range a flow extrapolates; features are clipped to it.
-    """
-
-    lowest: Tensor
-    highest: Tensor
+__all__ = ["NLE"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +46,7 @@ class NLE(LikelihoodBackend):
         transforms: Transforms of a flow.
         hidden: Widths of the hidden layers of each transform's conditioner.
         bins: Bins of a spline.
+        max_features: Combinations of the features that the flow sees at most.
 
     The other options are those of :class:`~npdr_ppl.inference.neural.NeuralBackend`.
     """
@@ -65,13 +61,16 @@ class NLE(LikelihoodBackend):
     transforms: int = 3
     hidden: tuple[int, ...] = (128, 128)
     bins: int = 8
+    max_features: int = 16
 
     def __post_init__(self) -> None:
         """Validates the options."""
         super().__post_init__()
         self._check_choice("flow", FLOWS)
         self._check_widths("hidden")
-        self._check_ranges(transforms=(1, float("inf")), bins=(1, float("inf")))
+        self._check_ranges(
+            transforms=(1, float("inf")), bins=(1, float("inf")), max_features=(1, float("inf"))
+        )
 
     def init(self, problem: Problem) -> NeuralState:
         """Returns the state before any simulation.
@@ -91,8 +90,7 @@ class NLE(LikelihoodBackend):
 
         def log_likelihood(network: FlowNetwork, z: Tensor, x: Tensor) -> Tensor:
             f = preconditioner.features(z.to(problem.device, torch.float32))
-            x = x.to(problem.device).clamp(preconditioner.lowest, preconditioner.highest)
-            u = preconditioner.whiten(x, f)
+            u = preconditioner.whiten(preconditioner.statistics(x.to(problem.device)), f)
             return (network(u, f) + preconditioner.log_det).to(z)
 
         networks = [
@@ -101,9 +99,7 @@ class NLE(LikelihoodBackend):
         return [partial(log_likelihood, network) for network in networks]
 
     def _precondition(self, problem: Problem, simulations: Simulations) -> Preconditioner:
-        swapped = fit_preconditioner(simulations.x, simulations.z)
-        x = simulations.x
-        return LikelihoodPreconditioner(**swapped.tensors(), lowest=x.amin(0), highest=x.amax(0))
+        return fit_likelihood_preconditioner(simulations.z, simulations.x, self.max_features)
 
     def _outside(self, problem: Problem, preconditioner: Preconditioner) -> Tensor:
         assert isinstance(preconditioner, LikelihoodPreconditioner)
@@ -113,7 +109,7 @@ class NLE(LikelihoodBackend):
     def _networks(self, problem: Problem) -> list[FlowNetwork]:
         return build_networks(
             self.members,
-            problem.observation.numel(),
+            min(problem.observation.numel(), self.max_features),
             torch.zeros(problem.num_parameters),
             None,
             self.flow,
@@ -125,6 +121,8 @@ class NLE(LikelihoodBackend):
     def _loss(
         self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
     ) -> Loss:
+        assert isinstance(preconditioner, LikelihoodPreconditioner)
         f = preconditioner.features(simulations.z.to(problem.device))
-        u = preconditioner.whiten(simulations.x.to(problem.device), f)
+        x = preconditioner.statistics(simulations.x.to(problem.device))
+        u = preconditioner.whiten(x, f)
         return lambda log_prob, rows: -log_prob(u[rows], f[rows])

@@ -120,9 +120,9 @@ class NRE(LikelihoodBackend):
     objective: ClassVar[str] = "validation_contrast"
     preconditioner_type: ClassVar[type[Preconditioner]] = RatioPreconditioner
 
-    width: int = 96
+    width: int = 64
     blocks: int = 2
-    num_atoms: int = 32
+    num_atoms: int = 5
     gamma: float = 1.0
     learning_rate: float = 5e-3
     batch_size: int = 256
