@@ -135,7 +135,7 @@ def run_nuts(
 ) -> Mapping[str, Tensor]:
     """Returns NUTS draws of a conditioned model by site."""
     with seeded(seed, "nuts"):
-        kernel = NUTS(model, max_tree_depth=6, target_accept_prob=0.85)
+        kernel = NUTS(model, max_tree_depth=6, full_mass=[("coordinates",)])
         sampler = MCMC(
             kernel, num_samples=num_samples, warmup_steps=num_samples // 2, disable_progbar=True
         )

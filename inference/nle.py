@@ -56,8 +56,9 @@ class NLE(LikelihoodBackend):
 
     preconditioner_type: ClassVar[type[Preconditioner]] = LikelihoodPreconditioner
 
+    members: int = 1
+    epochs: int = 20
     flow: Flow = "affine-nsf"
-    batch_size: int = 256
     transforms: int = 3
     hidden: tuple[int, ...] = (128, 128)
     bins: int = 8

@@ -120,6 +120,7 @@ class NRE(LikelihoodBackend):
     objective: ClassVar[str] = "validation_contrast"
     preconditioner_type: ClassVar[type[Preconditioner]] = RatioPreconditioner
 
+    members: int = 1
     width: int = 64
     blocks: int = 2
     num_atoms: int = 5
