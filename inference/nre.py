@@ -12,8 +12,14 @@ whose optimum is h(z, x) = log p(x | z) - log p~(x), with p~ the marginal under 
 the parameters came from: a likelihood up to a function of x, in every round (Durkan, Murray &
 Papamakarios 2020).
 
-We depart from the paper in starting at a closed form: h is the ratio of a linear-Gaussian model of
-parameters and features, plus a network that starts at zero.
+We depart from the paper in the form of the classifier,
+
+    h(z, x) = log N(z; A f + b, L L^T) / N(z; m, S) + a(z)^T b(f) + c(z).
+
+The first term is the ratio of a linear-Gaussian model, where training starts; the networks a and b
+enter by their inner product, which is the form that the likelihood of any exponential family has.
+With it all pairs of a mini-batch cost little more than the pairs that belong together, and every
+simulation is shown a hundred parameters instead of a few.
 """
 
 import math
@@ -64,42 +70,44 @@ class RatioPreconditioner(Preconditioner):
 
 
 class RatioNetwork(nn.Module):
-    """The correction to the linear-Gaussian ratio: a residual network that starts at zero.
+    """The correction to the linear-Gaussian ratio, a(z)^T b(f) + c(z), which starts at zero.
 
     Args:
         num_parameters: Dimension d.
         num_features: Number of features F.
-        width: Width of the hidden layers.
-        blocks: Residual blocks of two layers.
+        hidden: Widths of the hidden layers of a, with c, and of b.
+        rank: Length of a and b.
     """
 
-    def __init__(self, num_parameters: int, num_features: int, width: int, blocks: int) -> None:
+    def __init__(
+        self, num_parameters: int, num_features: int, hidden: tuple[int, ...], rank: int
+    ) -> None:
         super().__init__()
-        self.first = nn.Linear(2 * num_parameters + num_features, width)
-        self.blocks = nn.ModuleList(
-            nn.Sequential(nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
-            for _ in range(blocks)
-        )
-        self.last = nn.Linear(width, 1)
+        self.of_parameters = _perceptron(num_parameters, hidden, rank + 1)
+        self.of_features = _perceptron(num_features, hidden, rank)
+        last = self.of_parameters[-1]
+        assert isinstance(last, nn.Linear)
         with torch.no_grad():
-            self.last.weight.zero_()
-            self.last.bias.zero_()
+            last.weight.zero_()
+            last.bias.zero_()
 
-    def forward(self, vu: Tensor, f: Tensor) -> Tensor:
-        """Returns the correction in the leading shape of ``vu``.
+    def forward(self, v: Tensor, f: Tensor) -> Tensor:
+        """Returns the correction of all pairs, ``(..., n, k)``.
 
         Args:
-            vu: Standardised parameters and whitened residuals, ``(n, 2 d)`` or ``(n, K, 2 d)``.
-            f: Standardised features, ``(n, F)``.
+            v: Standardised parameters, ``(..., k, d)``.
+            f: Standardised features, ``(..., n, F)``.
         """
-        # What depends on the features only is computed once for all K parameters of a row.
-        from_f = f @ self.first.weight[:, vu.shape[-1] :].T + self.first.bias
-        if vu.ndim == 3:
-            from_f = from_f[:, None]
-        hidden = from_f + vu @ self.first.weight[:, : vu.shape[-1]].T
-        for block in self.blocks:
-            hidden = hidden + block(hidden)
-        return self.last(hidden)[..., 0]
+        a, b = self.of_parameters(v), self.of_features(f)
+        return b @ a[..., :-1].transpose(-1, -2) + a[..., None, :, -1]
+
+
+def _perceptron(num_inputs: int, hidden: tuple[int, ...], num_outputs: int) -> nn.Sequential:
+    widths = (num_inputs, *hidden)
+    layers: list[nn.Module] = []
+    for before, after in zip(widths[:-1], widths[1:], strict=True):
+        layers += [nn.Linear(before, after), nn.SiLU()]
+    return nn.Sequential(*layers, nn.Linear(widths[-1], num_outputs))
 
 
 @dataclass(frozen=True)
@@ -107,8 +115,8 @@ class NRE(LikelihoodBackend):
     """Neural ratio estimation; see the module's text for the method.
 
     Args:
-        width: Width of the classifier's hidden layers.
-        blocks: Its residual blocks.
+        hidden: Widths of the hidden layers of both networks.
+        rank: Length of their inner product.
         num_atoms: Parameters K that a simulation is shown.
         gamma: Odds of the right one being among them.
 
@@ -121,21 +129,18 @@ class NRE(LikelihoodBackend):
     preconditioner_type: ClassVar[type[Preconditioner]] = RatioPreconditioner
 
     members: int = 1
-    width: int = 64
-    blocks: int = 2
-    num_atoms: int = 5
-    gamma: float = 1.0
-    learning_rate: float = 5e-3
     batch_size: int = 256
+    hidden: tuple[int, ...] = (128, 128, 128)
+    rank: int = 64
+    num_atoms: int = 127
+    gamma: float = 50.0
 
     def __post_init__(self) -> None:
         """Validates the options."""
         super().__post_init__()
+        self._check_widths("hidden")
         self._check_ranges(
-            width=(1, float("inf")),
-            blocks=(0, float("inf")),
-            num_atoms=(1, float("inf")),
-            gamma=(1e-9, float("inf")),
+            rank=(1, float("inf")), num_atoms=(2, float("inf")), gamma=(1e-9, float("inf"))
         )
 
     def init(self, problem: Problem) -> NeuralState:
@@ -157,7 +162,7 @@ class NRE(LikelihoodBackend):
             f = preconditioner.features(x.to(problem.device))
             points = z.to(problem.device, torch.float32)
             v, u = preconditioner.standardise(points), preconditioner.whiten(points, f)
-            correction = network(torch.cat((v, u), -1), f)
+            correction = network(v[:, None], f[:, None])[:, 0, 0]
             return (preconditioner.log_ratio(v, u) + correction).to(z)
 
         members = []
@@ -184,7 +189,7 @@ class NRE(LikelihoodBackend):
     def _networks(self, problem: Problem) -> list[RatioNetwork]:
         num_features = problem.observation.numel()
         return [
-            RatioNetwork(problem.num_parameters, num_features, self.width, self.blocks)
+            RatioNetwork(problem.num_parameters, num_features, self.hidden, self.rank)
             for _ in range(self.members)
         ]
 
@@ -219,9 +224,8 @@ def contrastive_loss(
 ) -> Tensor:
     """Returns the loss of Miller et al. (2022, Eqs. 8 and 9) for each row.
 
-    A row's K independent parameters are those of the next K rows, which are a random sample
-    because rows come in random order; for the second term the row's own take the first one's
-    place.
+    Rows come in random order and are taken in groups of K + 1. A row's K independent parameters
+    are those of the others of its group; in the second term its own take the place of one.
 
     Args:
         v: Standardised parameters, ``(N, d)``.
@@ -229,21 +233,51 @@ def contrastive_loss(
         spread: Parameters times the whitening matrix, ``(N, d)``.
         f: Standardised features, ``(N, F)``.
         log_ratio: The linear-Gaussian part of h, from v and u.
-        num_atoms: Parameters K.
+        num_atoms: Parameters K at most.
         gamma: Odds of the row's own being among them.
-        correction: The networks' part of h, of all members.
+        correction: The networks' part of h, of all members and pairs.
         rows: Numbers of the rows, ``(members, n)``.
 
     Returns:
         The loss, ``(members, n)``.
     """
-    num_atoms = min(num_atoms, rows.shape[1] - 1)
-    atoms = torch.stack([rows.roll(-k, dims=1) for k in range(num_atoms + 1)], dim=-1)
-    u_atoms = u[rows][:, :, None] + spread[atoms] - spread[rows][:, :, None]
-    v_atoms = v[atoms]
-    h = log_ratio(v_atoms, u_atoms) + correction(torch.cat((v_atoms, u_atoms), -1), f[rows])
-    log_odds = math.log(gamma / num_atoms)
-    independent = torch.nn.functional.softplus(log_odds + h[..., 1:].logsumexp(-1))
-    joint = h[..., :-1]  # the row's own and K - 1 of the others
-    right = torch.nn.functional.softplus(log_odds + joint.logsumexp(-1)) - log_odds - h[..., 0]
-    return (independent + gamma * right) / (1 + gamma)
+    n = rows.shape[1]
+    size = min(num_atoms + 1, n)
+    starts = list(range(0, n - size + 1, size))
+    losses = [
+        _group_loss(v, u, spread, f, log_ratio, gamma, correction, rows[:, start : start + size])
+        for start in starts
+    ]
+    rest = n - len(starts) * size
+    if rest:  # in a group with rows of the last one
+        last = _group_loss(v, u, spread, f, log_ratio, gamma, correction, rows[:, n - size :])
+        losses.append(last[:, size - rest :])
+    return torch.cat(losses, dim=1)
+
+
+def _group_loss(
+    v: Tensor,
+    u: Tensor,
+    spread: Tensor,
+    f: Tensor,
+    log_ratio: Callable[[Tensor, Tensor], Tensor],
+    gamma: float,
+    correction: LogProb,
+    rows: Tensor,
+) -> Tensor:
+    """Returns the loss of rows that are shown each other's parameters, ``(members, K + 1)``."""
+    size = rows.shape[1]
+    # Pairs (i, j): features of row i, parameters of row j.
+    own, other = spread[rows][:, :, None], spread[rows][:, None]
+    h = log_ratio(v[rows][:, None], u[rows][:, :, None] + other - own)
+    h = h + correction(v[rows], f[rows])
+    log_odds = math.log(gamma / (size - 1))
+    itself = torch.eye(size, dtype=torch.bool, device=rows.device)
+    # Of the others, the next one makes room for the row's own.
+    replaced = itself.roll(1, dims=1)
+    independent = h.masked_fill(itself, -torch.inf).logsumexp(-1)
+    joint = h.masked_fill(replaced, -torch.inf).logsumexp(-1)
+    right = h.diagonal(dim1=-2, dim2=-1)
+    softplus = torch.nn.functional.softplus
+    wrong = softplus(log_odds + independent)
+    return (wrong + gamma * (softplus(log_odds + joint) - log_odds - right)) / (1 + gamma)
