@@ -27,7 +27,6 @@ from pyro.infer import MCMC, NUTS
 from torch import Tensor
 
 import npdr_ppl as npdr
-from npdr_ppl.inference.registry import backend
 from npdr_ppl.metrics import c2st
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.randomness import seeded
@@ -123,7 +122,7 @@ def learn(inputs: npdr.Inputs, num_simulations: int, seed: int) -> npdr.Posterio
     return npdr.infer(
         rig,
         rollouts,
-        backend=backend("nle", members=2),
+        backend="nle",
         num_simulations=num_simulations,
         embedding="all",
         initial_state="recorded",
@@ -159,7 +158,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--fleets", type=int, default=1)
     parser.add_argument("--references", type=int, default=1, help="fleets compared with NUTS")
-    parser.add_argument("--simulations", type=int, default=80_000)
+    parser.add_argument("--simulations", type=int, default=60_000)
     parser.add_argument("--samples", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path)

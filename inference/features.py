@@ -20,6 +20,8 @@ from torch import Tensor
 __all__ = [
     "Preconditioner",
     "fit_preconditioner",
+    "normal_scores",
+    "quantile_knots",
     "refit_regression",
     "residual_factor",
     "ridge_regression",
@@ -72,13 +74,7 @@ class Preconditioner:
         """
         if not len(self.scores):
             return ((x - self.knots[0]) / self.knots[1]).clamp(-RAW_LIMIT, RAW_LIMIT)
-        columns = x.T.contiguous()
-        above = torch.searchsorted(self.knots, columns).clamp(1, len(self.scores) - 1)
-        low, high = self.knots.gather(1, above - 1), self.knots.gather(1, above)
-        weight = ((columns - low) / (high - low).clamp(min=torch.finfo(x.dtype).tiny)).clamp(0, 1)
-        scores = torch.lerp(self.scores[above - 1], self.scores[above], weight)
-        # A feature that never varied says nothing, whatever value it has in the observation.
-        return torch.where(self.varies[:, None], scores, 0.0).T.contiguous()
+        return normal_scores(x, self.knots, self.scores)
 
     def outside(self, x: Tensor) -> Tensor:
         """Returns which features of one observation :meth:`features` clips, shape of x."""
@@ -142,6 +138,26 @@ def fit_preconditioner(z: Tensor, x: Tensor, is_raw: bool = False) -> Preconditi
         return Preconditioner(
             knots, scores, z.new_zeros(z.shape[1], 0), z.mean(0), residual_factor(z - z.mean(0), z)
         )
+    knots, scores = quantile_knots(x)
+    marginal = Preconditioner(
+        knots,
+        scores,
+        z.new_zeros(z.shape[1], x.shape[1]),
+        z.mean(0),
+        torch.eye(z.shape[1], dtype=z.dtype, device=z.device),
+    )
+    gain, offset, residuals = ridge_regression(marginal.features(x), z)
+    return Preconditioner(
+        marginal.knots, marginal.scores, gain, offset, residual_factor(residuals, z)
+    )
+
+
+def quantile_knots(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns quantiles of every feature, ``(F, K)``, and their normal scores, ``(K,)``.
+
+    Args:
+        x: Features, ``(n, F)``.
+    """
     num_knots = min(MAX_KNOTS, max(5, len(x) // SIMULATIONS_PER_KNOT))
     edge = -torch.special.ndtri(torch.tensor(0.5 / len(x), dtype=torch.float64)).item()
     scores = torch.linspace(-edge, edge, num_knots, dtype=torch.float64, device=x.device)
@@ -151,17 +167,24 @@ def fit_preconditioner(z: Tensor, x: Tensor, is_raw: bool = False) -> Preconditi
     position = levels * (len(x) - 1)
     low = position.floor().long().clamp(max=len(x) - 2)
     knots = torch.lerp(ordered[low], ordered[low + 1], (position - low)[:, None]).T
-    marginal = Preconditioner(
-        knots.to(x.dtype).contiguous(),
-        scores.to(x.dtype),
-        z.new_zeros(z.shape[1], x.shape[1]),
-        z.mean(0),
-        torch.eye(z.shape[1], dtype=z.dtype, device=z.device),
-    )
-    gain, offset, residuals = ridge_regression(marginal.features(x), z)
-    return Preconditioner(
-        marginal.knots, marginal.scores, gain, offset, residual_factor(residuals, z)
-    )
+    return knots.to(x.dtype).contiguous(), scores.to(x.dtype)
+
+
+def normal_scores(x: Tensor, knots: Tensor, scores: Tensor) -> Tensor:
+    """Maps features through their quantiles to normal scores, both ``(n, F)``.
+
+    Args:
+        x: Features; those beyond the outer quantiles are clipped to them.
+        knots: Quantiles, ``(F, K)``.
+        scores: Their normal scores, ``(K,)``.
+    """
+    columns = x.T.contiguous()
+    above = torch.searchsorted(knots, columns).clamp(1, len(scores) - 1)
+    low, high = knots.gather(1, above - 1), knots.gather(1, above)
+    weight = ((columns - low) / (high - low).clamp(min=torch.finfo(x.dtype).tiny)).clamp(0, 1)
+    found = torch.lerp(scores[above - 1], scores[above], weight)
+    # A feature that never varied says nothing, whatever value it has in the observation.
+    return torch.where((knots[:, -1] > knots[:, 0])[:, None], found, 0.0).T.contiguous()
 
 
 def refit_regression(preconditioner: Preconditioner, z: Tensor, x: Tensor) -> Preconditioner:

@@ -2,9 +2,11 @@
 
 Parameters are noise-free, so that what x depends on smoothly can be regressed away,
 
-    u = L^-1 (V^T x - m(z)),        L L^T = Cov[V^T x - m(z)],
+    u = L^-1 (V^T s - m(z)),        L L^T = Cov[V^T s - m(z)],        s_j = Phi^-1(F_j(x_j)),
 
-with a polynomial m in the parameters, scaled to [-1, 1], and combinations V of the features.
+with a polynomial m in the parameters, scaled to [-1, 1], and combinations V of the features'
+normal scores s. The scores keep what a few parameters do - a light pendulum that spins - from
+deciding the regression; a density of s is one of x up to a function of x.
 """
 
 from dataclasses import dataclass
@@ -14,7 +16,13 @@ from math import comb
 import torch
 from torch import Tensor
 
-from npdr_ppl.inference.features import Preconditioner, residual_factor, ridge_regression
+from npdr_ppl.inference.features import (
+    Preconditioner,
+    normal_scores,
+    quantile_knots,
+    residual_factor,
+    ridge_regression,
+)
 
 __all__ = ["LikelihoodPreconditioner", "fit_likelihood_preconditioner"]
 
@@ -40,21 +48,22 @@ class LikelihoodPreconditioner(Preconditioner):
         degrees: Degrees of m's terms in each parameter, ``(M, d)``.
         edges: Least and greatest standardised value of each parameter, ``(2, d)``; beyond them
             the polynomial is constant.
-        directions: Combinations V of the features, ``(F, k)``; ``(F, 0)`` for all of them.
-        lowest: Least simulated value of each feature, ``(F,)``.
-        highest: Greatest one. Beyond this range a density extrapolates; features are clipped.
+        directions: Combinations V of the scores, ``(F, k)``; ``(F, 0)`` for all of them.
+        feature_knots: Quantiles of each feature, ``(F, K)``; beyond the outer ones, where a
+            density would extrapolate, features are clipped.
+        feature_scores: Normal scores of the quantiles, ``(K,)``.
     """
 
     degrees: Tensor
     edges: Tensor
     directions: Tensor
-    lowest: Tensor
-    highest: Tensor
+    feature_knots: Tensor
+    feature_scores: Tensor
 
     def statistics(self, x: Tensor) -> Tensor:
-        """Returns V^T x of features ``(n, F)``, ``(n, k)``."""
-        x = x.clamp(self.lowest, self.highest)
-        return x @ self.directions if self.directions.shape[1] else x
+        """Returns V^T s of features ``(n, F)``, ``(n, k)``."""
+        s = normal_scores(x, self.feature_knots, self.feature_scores)
+        return s @ self.directions if self.directions.shape[1] else s
 
     def shift(self, f: Tensor) -> Tensor:
         """Returns m, ``(n, k)``, at standardised parameters ``(n, d)``."""
@@ -81,10 +90,12 @@ def fit_likelihood_preconditioner(
         if comb(z.shape[1] + degree, degree) - 1 <= limit or degree == 1
     ]
     bases = [polynomials(f, edges, degrees) for degrees in candidates]
-    directions, seen = x.new_zeros(x.shape[1], 0), x
+    feature_knots, feature_scores = quantile_knots(x)
+    seen = normal_scores(x, feature_knots, feature_scores)
+    directions = x.new_zeros(x.shape[1], 0)
     if x.shape[1] > max_features:
-        directions = discriminants(x, bases[-1], max_features)
-        seen = x @ directions
+        directions = discriminants(seen, bases[-1], max_features)
+        seen = seen @ directions
     best: tuple[float, Tensor, Tensor, Tensor, Tensor] | None = None
     for degrees, basis in zip(candidates, bases, strict=True):
         gain, offset, residuals = ridge_regression(basis, seen)
@@ -102,8 +113,8 @@ def fit_likelihood_preconditioner(
         degrees=degrees,
         edges=edges,
         directions=directions,
-        lowest=x.amin(0),
-        highest=x.amax(0),
+        feature_knots=feature_knots,
+        feature_scores=feature_scores,
     )
 
 

@@ -5,15 +5,15 @@ https://arxiv.org/abs/1805.07226, Algorithm 1. A conditional flow learns the den
 features, max sum_n log q(x_n | z_n), over all rounds' simulations, whatever proposal they came
 from; each round proposes draws of the present posterior, proportional to p(z) q(x_o | z).
 
-The flow sees features as whitened residuals u = L^-1 (x - m(z)) of their regression on a
-polynomial m of the parameters, whose degree the leave-one-out error chooses. Where x is a smooth
-function of z with Gaussian noise, as readings of a deterministic simulator are, little is left to
-learn.
+The flow sees the features' normal scores s as whitened residuals u = L^-1 (s(x) - m(z)) of their
+regression on a polynomial m of the parameters, whose degree the leave-one-out error chooses. Where
+x is a smooth function of z with Gaussian noise, as readings of a deterministic simulator are,
+little is left to learn.
 
 Of many features, such as the readings of a trajectory, the flow sees the few combinations that
 vary most with the parameters, in units of their scatter at given parameters (Fisher's linear
-discriminants). With noise that is Gaussian and the same for all
-parameters, combinations that span E[x | z] are a sufficient statistic.
+discriminants). With noise that is Gaussian and the same for all parameters, combinations that span
+E[x | z] are a sufficient statistic.
 """
 
 from dataclasses import dataclass
@@ -105,7 +105,8 @@ class NLE(LikelihoodBackend):
     def _outside(self, problem: Problem, preconditioner: Preconditioner) -> Tensor:
         assert isinstance(preconditioner, LikelihoodPreconditioner)
         x = problem.observation.cpu()
-        return (x < preconditioner.lowest) | (x > preconditioner.highest)
+        knots = preconditioner.feature_knots
+        return (x < knots[:, 0]) | (x > knots[:, -1])
 
     def _networks(self, problem: Problem) -> list[FlowNetwork]:
         return build_networks(
