@@ -14,12 +14,13 @@ Papamakarios 2020).
 
 We depart from the paper in the form of the classifier,
 
-    h(z, x) = log N(z; A f + b, L L^T) / N(z; m, S) + a(z)^T b(f) + c(z).
+    h(z, x) = log N(z; A f + b, L L^T) / N(z; m, S) + a(z)^T b(f) + c(z) + w^T [r(z) + s(f)]_+.
 
-The first term is the ratio of a linear-Gaussian model, where training starts; the networks a and b
-enter by their inner product, which is the form that the likelihood of any exponential family has.
-With it all pairs of a mini-batch cost little more than the pairs that belong together, and every
-simulation is shown a hundred parameters instead of a few.
+The first term is the ratio of a linear-Gaussian model, where training starts. The networks a and b
+enter by their inner product, the form that the likelihood of any exponential family has; r and s
+by ridge functions of their sum, which is what a likelihood of x - g(z) needs. With these forms all
+pairs of a mini-batch cost little more than the pairs that belong together, and every simulation is
+shown a hundred parameters instead of a few.
 """
 
 import math
@@ -70,26 +71,35 @@ class RatioPreconditioner(Preconditioner):
 
 
 class RatioNetwork(nn.Module):
-    """The correction to the linear-Gaussian ratio, a(z)^T b(f) + c(z), which starts at zero.
+    """The correction to the linear-Gaussian ratio, which starts at zero.
 
     Args:
         num_parameters: Dimension d.
         num_features: Number of features F.
-        hidden: Widths of the hidden layers of a, with c, and of b.
+        hidden: Widths of the hidden layers of the two networks.
         rank: Length of a and b.
+        units: Length of r and s.
     """
 
     def __init__(
-        self, num_parameters: int, num_features: int, hidden: tuple[int, ...], rank: int
+        self,
+        num_parameters: int,
+        num_features: int,
+        hidden: tuple[int, ...],
+        rank: int,
+        units: int,
     ) -> None:
         super().__init__()
-        self.of_parameters = _perceptron(num_parameters, hidden, rank + 1)
-        self.of_features = _perceptron(num_features, hidden, rank)
+        self.rank = rank
+        self.of_parameters = _perceptron(num_parameters, hidden, rank + units + 1)
+        self.of_features = _perceptron(num_features, hidden, rank + units)
+        self.weights = nn.Parameter(torch.zeros(units))
         last = self.of_parameters[-1]
         assert isinstance(last, nn.Linear)
         with torch.no_grad():
-            last.weight.zero_()
-            last.bias.zero_()
+            for rows in (slice(rank), slice(-1, None)):
+                last.weight[rows].zero_()
+                last.bias[rows].zero_()
 
     def forward(self, v: Tensor, f: Tensor) -> Tensor:
         """Returns the correction of all pairs, ``(..., n, k)``.
@@ -98,8 +108,11 @@ class RatioNetwork(nn.Module):
             v: Standardised parameters, ``(..., k, d)``.
             f: Standardised features, ``(..., n, F)``.
         """
-        a, b = self.of_parameters(v), self.of_features(f)
-        return b @ a[..., :-1].transpose(-1, -2) + a[..., None, :, -1]
+        of_v, of_f = self.of_parameters(v), self.of_features(f)
+        a, r, c = of_v.split((self.rank, len(self.weights), 1), dim=-1)
+        b, s = of_f.split((self.rank, len(self.weights)), dim=-1)
+        product = b @ a.transpose(-1, -2) + c.transpose(-1, -2)
+        return product + (r[..., None, :, :] + s[..., :, None, :]).relu() @ self.weights
 
 
 def _perceptron(num_inputs: int, hidden: tuple[int, ...], num_outputs: int) -> nn.Sequential:
@@ -117,6 +130,7 @@ class NRE(LikelihoodBackend):
     Args:
         hidden: Widths of the hidden layers of both networks.
         rank: Length of their inner product.
+        units: Units that see the sum of their outputs.
         num_atoms: Parameters K that a simulation is shown.
         gamma: Odds of the right one being among them.
 
@@ -129,9 +143,11 @@ class NRE(LikelihoodBackend):
     preconditioner_type: ClassVar[type[Preconditioner]] = RatioPreconditioner
 
     members: int = 1
+    epochs: int = 20
     batch_size: int = 256
     hidden: tuple[int, ...] = (128, 128, 128)
-    rank: int = 64
+    rank: int = 16
+    units: int = 32
     num_atoms: int = 127
     gamma: float = 50.0
 
@@ -140,7 +156,10 @@ class NRE(LikelihoodBackend):
         super().__post_init__()
         self._check_widths("hidden")
         self._check_ranges(
-            rank=(1, float("inf")), num_atoms=(2, float("inf")), gamma=(1e-9, float("inf"))
+            rank=(1, float("inf")),
+            units=(1, float("inf")),
+            num_atoms=(2, float("inf")),
+            gamma=(1e-9, float("inf")),
         )
 
     def init(self, problem: Problem) -> NeuralState:
@@ -189,7 +208,7 @@ class NRE(LikelihoodBackend):
     def _networks(self, problem: Problem) -> list[RatioNetwork]:
         num_features = problem.observation.numel()
         return [
-            RatioNetwork(problem.num_parameters, num_features, self.hidden, self.rank)
+            RatioNetwork(problem.num_parameters, num_features, self.hidden, self.rank, self.units)
             for _ in range(self.members)
         ]
 
