@@ -50,8 +50,9 @@ def reading_distribution(
         columns = [torch.as_tensor(noise[name]).to(readings) for name in channel_names]
         scale = torch.stack(torch.broadcast_tensors(*columns), dim=-1)
         scale = scale.reshape(scale.shape[:-1] + (1,) * (event_dim - 1) + scale.shape[-1:])
-        return dist.Normal(readings, scale)
+        return dist.Normal(readings, scale, validate_args=False)  # NaN marks a failure
     if callable(noise):
         return noise(readings)
     scale = torch.as_tensor(noise).to(readings)
-    return dist.Normal(readings, scale.reshape(scale.shape + (1,) * event_dim))
+    scale = scale.reshape(scale.shape + (1,) * event_dim)
+    return dist.Normal(readings, scale, validate_args=False)

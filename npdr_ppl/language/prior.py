@@ -19,6 +19,7 @@ from pyro.poutine.indep_messenger import CondIndepStackFrame
 from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
 from torch import Tensor
+from torch.distributions import Distribution
 
 from npdr_ppl.errors import ModelError, NpdrError
 from npdr_ppl.language.handlers import SkipSimulation
@@ -367,9 +368,19 @@ class _CheckSupport(Messenger):
 
 @contextmanager
 def _alone() -> Iterator[None]:
-    """Keeps a run of the program to itself: outside handlers do not see it."""
-    with poutine.block():
-        yield
+    """Keeps a run of the program to itself: outside handlers do not see it.
+
+    Values are not validated: those off a support are asked about on purpose, and a simulation that
+    gave NaN costs only itself. Pyro's own switch would not do, because other libraries change
+    torch's default behind its back.
+    """
+    is_validating = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        with poutine.block():
+            yield
+    finally:
+        Distribution.set_default_validate_args(is_validating)
 
 
 def _trace(model: Callable[..., Any], args: tuple[Any, ...]) -> Any:

@@ -184,7 +184,16 @@ def test_a_sensor_that_sees_only_the_position(noisy_pendulum, recording, quick):
         npdr.infer(noisy_pendulum, positions, initial_state="recorded", progress=False)
 
 
-def test_failed_simulations_cost_only_themselves(quick):
+@pytest.fixture(params=[True, False])
+def is_validating(request):
+    """Torch's default, which libraries change when they are imported or have run."""
+    before = torch.distributions.Distribution._validate_args
+    torch.distributions.Distribution.set_default_validate_args(request.param)
+    yield request.param
+    torch.distributions.Distribution.set_default_validate_args(before)
+
+
+def test_failed_simulations_cost_only_themselves(quick, is_validating):
     def sometimes_nan(theta):
         return torch.where(theta < -0.8, torch.nan, theta)[:, None]
 
