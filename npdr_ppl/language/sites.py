@@ -340,8 +340,11 @@ class FunctionBlackBox(BlackBox):
         }
         probe = FunctionBlackBox(self.site, self.function, arguments, self.noise)
         probe._event_dims = self._event_dims
-        with torch.random.fork_rng(devices=[]), torch.enable_grad():
-            return bool(probe._run(self.batch_shape).requires_grad)
+        try:
+            with torch.random.fork_rng(devices=[]), torch.enable_grad():
+                return bool(probe._run(self.batch_shape).requires_grad)
+        except RuntimeError:  # what leaves torch, for NumPy say, refuses tensors with gradients
+            return False
 
     @property
     def _is_deterministic(self) -> bool:

@@ -184,6 +184,20 @@ def test_a_sensor_that_sees_only_the_position(noisy_pendulum, recording, quick):
         npdr.infer(noisy_pendulum, positions, initial_state="recorded", progress=False)
 
 
+def test_a_function_may_leave_torch(quick):
+    def in_numpy(theta):
+        return torch.from_numpy(theta.numpy() ** 3)[:, None]
+
+    def model():
+        theta = pyro.sample("theta", dist.Normal(0.0, 1.0))
+        npdr.simulate("x", in_numpy, {"theta": theta}, noise=0.1)
+
+    posterior = npdr.infer(
+        model, torch.tensor([0.5]), backend=quick, num_simulations=200, progress=False
+    )
+    assert posterior.problem.log_likelihood is None
+
+
 @pytest.fixture(params=[True, False])
 def is_validating(request):
     """Torch's default, which libraries change when they are imported or have run."""
