@@ -22,7 +22,6 @@ Distances are Euclidean in the normal scores of the features, see
 bounded.
 """
 
-import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -38,8 +37,6 @@ from npdr_ppl.inference.checks import check_problem, check_restored, finite_rows
 from npdr_ppl.inference.features import Preconditioner, fit_preconditioner
 
 __all__ = ["ABC", "ABCState", "KernelDensity"]
-
-logger = logging.getLogger(__name__)
 
 MIN_SIMULATIONS = 10
 """Simulations below which there is no covariance to estimate."""
@@ -136,8 +133,6 @@ class ABC(Backend):
         num_simulations = len(z)
         min_rows = MIN_SIMULATIONS if state.round == 0 else 1
         z, x, num_failed = finite_rows(problem, z.detach().cpu(), x.detach().cpu(), min_rows)
-        if num_failed:
-            logger.warning("%d of %d simulations failed.", num_failed, num_simulations)
         state = ABCState(state.round + 1, torch.cat((state.z, z)), torch.cat((state.x, x)))
         preconditioner = fit_preconditioner(state.z, state.x)
         rows, distance = self._nearest(problem, state, preconditioner)

@@ -1,5 +1,6 @@
 """What every backend checks of the simulations it is told."""
 
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +11,8 @@ from npdr_ppl.errors import BackendError, ShapeError
 from npdr_ppl.inference.base import Problem
 
 __all__ = ["check_problem", "check_restored", "finite_rows"]
+
+logger = logging.getLogger(__name__)
 
 
 def check_problem(problem: Problem) -> None:
@@ -37,7 +40,7 @@ def check_problem(problem: Problem) -> None:
 def finite_rows(
     problem: Problem, z: Tensor, x: Tensor, min_rows: int
 ) -> tuple[Tensor, Tensor, int]:
-    """Drops failed simulations.
+    """Drops failed simulations, with a warning.
 
     Args:
         problem: The problem simulated.
@@ -64,6 +67,8 @@ def finite_rows(
     x = x.to(torch.float32)  # before the test: what overflows float32 is of no use either
     finite = x.flatten(1).isfinite().all(1)
     num_failed = len(z) - int(finite.sum())
+    if num_failed:
+        logger.warning("%d of %d simulations failed.", num_failed, len(z))
     if len(z) - num_failed < min_rows:
         raise BackendError(
             f"{num_failed} of {len(z)} simulations failed (their features are not finite); at "

@@ -222,8 +222,6 @@ class NeuralBackend(Backend):
         num_simulations = len(z)
         min_rows = MIN_SIMULATIONS if state.round == 0 else 1
         z, x, num_failed = finite_rows(problem, z.detach().cpu(), x.detach().cpu(), min_rows)
-        if num_failed:
-            logger.warning("%d of %d simulations failed.", num_failed, num_simulations)
         simulations = state.simulations.followed_by(z, x, state.round)
         used = torch.ones(len(simulations), dtype=torch.bool)
         used[: len(state.simulations)] = self._training_rows(problem, state)

@@ -27,11 +27,9 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.arviz_export import effective_share
 from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data
 from npdr_ppl.workflows.evaluation import closest_fit, declares_noise, replay
+from npdr_ppl.workflows.infer import MAX_READINGS_PER_CHUNK
 
 __all__ = ["ErrorModel", "find_error_model", "segment_log_likelihood"]
-
-MAX_READINGS = 2_000_000
-"""Readings of a chunk of simulations, 16 MiB in float64."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +111,7 @@ def segment_log_likelihood(bound: BoundModel, z: Tensor, share: Mapping[str, flo
         IntractableError: The model declares no noise, so there is no density.
     """
     readings = sum(o.value.numel() for o in bound.observations.values())
-    chunk = max(1, MAX_READINGS // max(1, readings))
+    chunk = max(1, MAX_READINGS_PER_CHUNK // max(1, readings))
     parts = [
         torch.cat([_of_site(bound, name, part, share) for name in bound.observations], dim=1)
         for part in z.split(chunk)
