@@ -170,9 +170,9 @@ def test_initial_state_survives_writing(method):
     assert state.round == 1
 
 
-def test_amortised_states_hold_at_every_observation(method):
-    if not method.amortises:
-        pytest.skip(f"{method.name} learns the posterior of one observation")
+@pytest.mark.parametrize("name", [n for n in sorted(backends()) if backend_class(n).amortises])
+def test_amortised_states_hold_at_every_observation(name):
+    method = backend(name)
     problem = make_problem()
     state, _ = run_round(method, problem, method.init(problem), 0, n=300)
     observations = torch.stack((OBSERVATION, -OBSERVATION, torch.zeros(3)))
