@@ -4,14 +4,12 @@ Other packages add theirs by an entry point of group ``npdr_ppl.backends``: its 
 backend, its value is a subclass of :class:`~npdr_ppl.inference.base.Backend`.
 """
 
-import inspect
-from difflib import get_close_matches
-from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Backend
+from npdr_ppl.registry import Registry
 
 __all__ = ["backend", "backend_class", "backends"]
 
@@ -39,6 +37,9 @@ def _locations() -> dict[str, str]:
     return {entry.name: entry.value for entry in entry_points(group=GROUP)} | BUILT_IN
 
 
+_REGISTRY = Registry("backend", Backend, BackendError, _locations)
+
+
 def backend_class(name: str) -> type[Backend]:
     """Returns the class of a backend.
 
@@ -48,21 +49,7 @@ def backend_class(name: str) -> type[Backend]:
     Raises:
         BackendError: There is no such backend, or it cannot be loaded.
     """
-    locations = _locations()
-    if name not in locations:
-        close = get_close_matches(name.lower().replace("_", "-"), locations, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(locations)}."
-        raise BackendError(f"There is no backend {name!r}; {hint}")
-    module, _, attribute = locations[name].partition(":")
-    try:
-        loaded = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise BackendError(
-            f"Backend {name!r} cannot be loaded from {locations[name]}: {error}"
-        ) from error
-    if not (isinstance(loaded, type) and issubclass(loaded, Backend)):
-        raise BackendError(f"Backend {name!r}: {locations[name]} is not a subclass of Backend.")
-    return loaded
+    return _REGISTRY.find(name)
 
 
 def backend(name: str, **options: Any) -> Backend:
@@ -75,14 +62,7 @@ def backend(name: str, **options: Any) -> Backend:
     Raises:
         BackendError: There is no such backend, or it has no such option.
     """
-    cls = backend_class(name)
-    known = inspect.signature(cls).parameters
-    for option in options:
-        if option not in known:
-            close = get_close_matches(option, known, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}."
-            raise BackendError(f"Backend {name!r} has no option {option!r}; {hint}")
-    return cls(**options)
+    return _REGISTRY.make(name, options)
 
 
 def backends() -> dict[str, str]:

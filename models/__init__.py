@@ -1,4 +1,4 @@
-"""The model zoo: simulators, their Pyro models, and the catalogue of effects."""
+"""The model zoo: simulators, their Pyro models, target domains, and the catalogue of effects."""
 
 import importlib
 from collections.abc import Callable
@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from npdr_ppl.language.simulator import Simulator
+from npdr_ppl.targets.base import TargetDomain
 
-__all__ = ["ZooEntry", "zoo"]
+__all__ = ["TargetEntry", "ZooEntry", "targets", "zoo"]
 
 
 @dataclass(frozen=True)
@@ -87,3 +88,47 @@ def zoo() -> dict[str, ZooEntry]:
         ['cart_pole', 'emps', 'furuta', 'furuta_paper', 'pendulum']
     """
     return {entry.name: entry for entry in _ENTRIES}
+
+
+@dataclass(frozen=True)
+class TargetEntry:
+    """A target domain of the zoo; its module is imported when it is made.
+
+    Attributes:
+        name: Name on the command line.
+        summary: One line for tables.
+        module: Module that holds the constructor.
+        function_name: Name of the constructor in the module, a function of the name.
+    """
+
+    name: str
+    summary: str
+    module: str
+    function_name: str
+
+    def make(self) -> TargetDomain:
+        """Returns a new target domain."""
+        return getattr(importlib.import_module(self.module), self.function_name)(self.name)
+
+
+_TARGETS = tuple(
+    TargetEntry(name, summary, "npdr_ppl.models.furuta_targets", "furuta_target")
+    for name, summary in (
+        ("furuta-easy", "Furuta pendulum in MuJoCo, nominal but for its sensors and damping"),
+        ("furuta-medium", "Furuta pendulum in MuJoCo, up to 8 % off, with some dry friction"),
+        ("furuta-hard", "Furuta pendulum in MuJoCo, 10 to 20 % off, with dry friction"),
+        ("furuta-random-0", "Furuta pendulum in MuJoCo drawn at random; any number will do"),
+    )
+)
+
+
+def targets() -> dict[str, TargetEntry]:
+    """Returns the target domains of the zoo by name.
+
+    Of the random pendulums, one stands for all; ``furuta_target`` makes the others.
+
+    Example:
+        >>> sorted(targets())
+        ['furuta-easy', 'furuta-hard', 'furuta-medium', 'furuta-random-0']
+    """
+    return {entry.name: entry for entry in _TARGETS}

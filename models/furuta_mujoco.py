@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from npdr_ppl.errors import ModelError
+from npdr_ppl.errors import ModelError, ShapeError
 from npdr_ppl.models.furuta import Furuta
+from npdr_ppl.targets.base import TargetError
 
 __all__ = ["FurutaRecording", "FurutaRig"]
 
 Array = NDArray[np.float64]
 
-Controller = Callable[[Array, float], float]
+VoltageController = Callable[[Array, float], float | Array]
 """Maps the four readings and the time in seconds to a voltage, before any limit."""
 
 _XML = Path(__file__).with_name("furuta.xml")
@@ -106,7 +107,7 @@ class FurutaRig:
 
     def run(
         self,
-        controller: Controller,
+        controller: VoltageController,
         num_steps: int,
         *,
         initial_state: Array | None = None,
@@ -115,7 +116,7 @@ class FurutaRig:
         """Runs one episode; it ends early where a state leaves its bounds.
 
         Args:
-            controller: What commands the voltage, from readings and time.
+            controller: What commands the voltage, a number or an array ``(1,)``.
             num_steps: Greatest number of steps K.
             initial_state: Arm angle, pole angle and rates, ``(4,)``; ``None`` for hanging.
             time_step: Seconds between commands, a multiple of the physics' half millisecond.
@@ -125,37 +126,46 @@ class FurutaRig:
         data = mujoco.MjData(model)
         start = np.zeros(4) if initial_state is None else np.asarray(initial_state, float)
         data.qpos[:], data.qvel[:] = start[:2], start[2:]
+        position, velocity = data.qpos, data.qvel  # views, for the whole episode
         physics_step = float(model.opt.timestep)
         num_substeps = round(time_step / physics_step)
-        delay = round(self.input_delay / physics_step)
-        pending = [0.0] * delay
+        # A voltage arrives some whole steps and some substeps after it was commanded.
+        whole, late = divmod(round(self.input_delay / physics_step), num_substeps)
+        voltages = [0.0] * (whole + 1)
         limit = Furuta.actions[0].upper
-        bounds = np.array([state.upper for state in Furuta.states])
-        true = [start]
-        encoder = self._encode(start[:2])
-        rates = start[2:]
-        readings = [np.concatenate((encoder, rates))]
-        commands: list[float] = []
+        bounds = [state.upper for state in Furuta.states]
+        count = 2.0 * math.pi / self.encoder_counts if self.encoder_counts else 0.0
         decay = 0.0
         if self.velocity_time_constant > 0.0:
             decay = math.exp(-time_step / self.velocity_time_constant)
+        state = start.tolist()
+        true = [state]
+        angles, rates = _encoded(state[:2], count), state[2:]
+        readings = [angles + rates]
+        commands: list[float] = []
+        # Four numbers at a time are quicker as floats than as arrays.
         for step in range(num_steps):
-            command = float(controller(readings[-1], step * time_step))
+            command = _voltage(controller(np.array(readings[-1]), step * time_step))
             commands.append(command)
-            for _ in range(num_substeps):
-                pending.append(min(max(command, -limit), limit))
-                data.ctrl[0] = pending.pop(0)
-                mujoco.mj_step(model, data)
-            state = np.concatenate((data.qpos, data.qvel))
+            voltages.append(min(max(command, -limit), limit))
+            if late:
+                data.ctrl[0] = voltages[step]
+                mujoco.mj_step(model, data, nstep=late)
+            data.ctrl[0] = voltages[step + 1]
+            mujoco.mj_step(model, data, nstep=num_substeps - late)
+            state = position.tolist() + velocity.tolist()
             true.append(state)
-            previous, encoder = encoder, self._encode(state[:2])
+            previous, angles = angles, _encoded(state[:2], count)
             if self.velocity_time_constant > 0.0:
-                difference = (encoder - previous) / time_step
-                rates = difference + decay * (rates - difference)
+                slopes = [
+                    (new - old) / time_step for new, old in zip(angles, previous, strict=True)
+                ]
+                rates = [s + decay * (r - s) for s, r in zip(slopes, rates, strict=True)]
             else:
                 rates = state[2:]
-            readings.append(np.concatenate((encoder, rates)))
-            if np.any(np.abs(state) > bounds):
+            readings.append(angles + rates)
+            # Written so that a NaN counts as outside.
+            if not all(abs(x) <= bound for x, bound in zip(state, bounds, strict=True)):
                 break
         issued = np.array(commands)
         return FurutaRecording(
@@ -166,15 +176,29 @@ class FurutaRig:
             true_states=np.array(true),
         )
 
-    def _encode(self, angles: Array) -> Array:
-        """Returns the angles to the nearest encoder count."""
-        if self.encoder_counts == 0:
-            return angles.copy()
-        count = 2.0 * math.pi / self.encoder_counts
-        return np.round(angles / count) * count
-
     def _gravity(self, magnitude: float) -> list[float]:
         """Returns gravity turned by roll about x, then by pitch about y."""
         roll, pitch = self.tilt
         y, z = math.sin(roll) * magnitude, -math.cos(roll) * magnitude
         return [math.sin(pitch) * z, y, math.cos(pitch) * z]
+
+
+def _encoded(angles: list[float], count: float) -> list[float]:
+    """Returns angles to the nearest encoder count of this size in rad; 0 keeps them."""
+    return [round(angle / count) * count for angle in angles] if count else angles
+
+
+def _voltage(command: float | Array) -> float:
+    """Returns a controller's command as a number.
+
+    Raises:
+        ShapeError: It is not one number.
+        TargetError: It is not finite.
+    """
+    values = np.asarray(command, dtype=np.float64)
+    if values.size != 1:
+        raise ShapeError(f"The rig takes one voltage, but the controller gave {values.shape=}.")
+    voltage = values.item()
+    if not math.isfinite(voltage):
+        raise TargetError(f"The controller commanded {voltage} V.")
+    return voltage

@@ -46,7 +46,8 @@ class Policy(ABC):
     Attributes:
         observations: Names of the sensor channels that the policy reads.
         actions: Names of the action channels that it commands.
-        parameter_info: Names, defaults and bounds of its parameters.
+        parameter_info: Names, defaults and bounds of its parameters; set before this constructor
+            runs where their number depends on the instance.
         parameters: The values.
     """
 
@@ -98,7 +99,7 @@ class Policy(ABC):
 
     def controller(
         self, domain: Mapping[str, Tensor]
-    ) -> Callable[[NDArray[np.float64], float], float]:
+    ) -> Callable[[NDArray[np.float64], float], NDArray[np.float64]]:
         """Returns one policy as a function of readings and time, for devices and other engines.
 
         The function carries the policy's memory, so it serves one episode.
@@ -108,18 +109,18 @@ class Policy(ABC):
 
         Returns:
             Function of the observed readings, ``(observations,)``, and of the time in seconds; it
-            returns the command, of policies with one action.
+            returns the commands in the order of ``actions``, ``(actions,)``, before any limit.
         """
         constants = self.constants(domain)
         memory: list[Any] = []
 
-        def command(readings: NDArray[np.float64], time: float) -> float:
+        def command(readings: NDArray[np.float64], time: float) -> NDArray[np.float64]:
             observation = torch.as_tensor(readings, dtype=self.parameters.dtype).unbind()
             if not memory:
                 memory.append(self.initial_memory(observation))
             with torch.no_grad():
-                (chosen,), memory[0] = self.act(observation, time, memory[0], constants)
-            return float(chosen)
+                chosen, memory[0] = self.act(observation, time, memory[0], constants)
+            return np.asarray([float(value) for value in chosen])
 
         return command
 

@@ -27,6 +27,7 @@ __all__ = [
     "available",
     "candidates",
     "folder_name",
+    "name_and_options",
     "split_candidates",
 ]
 
@@ -116,7 +117,7 @@ def _candidate(value: str | Backend | Candidate) -> tuple[str, Candidate]:
     if isinstance(value, Backend):
         return value.name, Candidate(value)
     label, _, rest = value.rpartition("=") if "(" not in value else _label(value)
-    name, options = _options(rest)
+    name, options = name_and_options(rest)
     embedding = options.pop("embedding", None)
     if embedding is not None:
         embedding_by_name(embedding)  # says so now if there is none of this name
@@ -136,8 +137,12 @@ def _label(text: str) -> tuple[str, str, str]:
     return label, separator, name + bracket + tail
 
 
-def _options(text: str) -> tuple[str, dict[str, Any]]:
-    """Splits ``name(option=value, ...)`` into the name and its options."""
+def name_and_options(text: str) -> tuple[str, dict[str, Any]]:
+    """Splits ``name(option=value, ...)`` into the name and its options.
+
+    Raises:
+        BackendError: Parentheses do not match, or something is not an option with a value.
+    """
     name, bracket, inside = text.strip().partition("(")
     if not bracket:
         return name, {}

@@ -95,7 +95,11 @@ class Diagnosis:
 
 
 def diagnose(
-    data: "Data", thresholds: Thresholds | None = None, *, rounds_left: int = 0
+    data: "Data",
+    thresholds: Thresholds | None = None,
+    *,
+    rounds_left: int = 0,
+    rollouts_left: int = 1,
 ) -> Diagnosis:
     """Diagnoses a posterior and decides what to do next.
 
@@ -103,6 +107,7 @@ def diagnose(
         data: An ArviZ object as :meth:`npdr_ppl.Posterior.to_arviz` makes it.
         thresholds: Limits behind the decisions.
         rounds_left: Rounds of inference that could still be spent.
+        rollouts_left: Rollouts that could still be recorded.
 
     Raises:
         DataError: A needed group is missing.
@@ -121,7 +126,14 @@ def diagnose(
     coverage, pit_deviation, p_value = _predictive_checks(groups)
     elpd, k = _loo(data)
     decision, reason = _decide(
-        limits, rounds_left, r_hat, contraction, edge_mass, coverage, p_value
+        limits,
+        rounds_left,
+        rollouts_left,
+        r_hat,
+        contraction,
+        edge_mass,
+        coverage,
+        p_value,
     )
     return Diagnosis(
         decision,
@@ -141,6 +153,7 @@ def diagnose(
 def _decide(
     limits: Thresholds,
     rounds_left: int,
+    rollouts_left: int,
     r_hat: float,
     contraction: Mapping[str, float],
     edge_mass: Mapping[str, float],
@@ -169,16 +182,18 @@ def _decide(
             f"No parameters explain the recording ({shown}): an effect is missing in the model.",
         )
     if contraction and max(contraction.values()) < limits.contraction:
-        return (
-            Decision.NEW_ROLLOUT,
-            f"The data contract no parameter by more than {max(contraction.values()):.0%}: "
-            "record a rollout that excites the system more.",
-        )
+        learnt = f"The data contract no parameter by more than {max(contraction.values()):.0%}"
+        if rollouts_left > 0:
+            return (
+                Decision.NEW_ROLLOUT,
+                f"{learnt}: record a rollout that excites the system more.",
+            )
+        return Decision.STOP, f"{learnt}, and no more can be recorded."
     if r_hat > limits.r_hat:
         return (
-            Decision.STOP,
+            Decision.WIDEN,
             f"The ensemble members still disagree (r-hat {r_hat:.2f} > {limits.r_hat}) and no "
-            "rounds are left.",
+            "rounds are left: mix the posterior with the prior.",
         )
     return (
         Decision.ACCEPT,

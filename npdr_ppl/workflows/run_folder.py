@@ -32,7 +32,16 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.atomic import replacing
 from npdr_ppl.workflows.binding import BoundModel
 
-__all__ = ["RunFolder", "read_json", "source_text", "versions", "write_json"]
+__all__ = [
+    "RunFolder",
+    "load_tensors",
+    "plain",
+    "read_json",
+    "save_tensors",
+    "source_text",
+    "versions",
+    "write_json",
+]
 
 FORMAT = 1
 _PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
@@ -79,7 +88,7 @@ class RunFolder:
         file = self.path / "run.json"
         if file.exists():
             present = read_json(file)
-            differing = [k for k, v in _plain(description).items() if present.get(k) != v]
+            differing = [k for k, v in plain(description).items() if present.get(k) != v]
             if differing:
                 raise BackendError(
                     f"{self.path} holds a run that differs in {', '.join(differing)}; choose "
@@ -91,7 +100,7 @@ class RunFolder:
                 data.to_netcdf(self.path / f"data_{name}.nc")
             else:
                 file_name = f"data_{name}.safetensors"
-                _save_tensors(self.path / file_name, {"value": torch.as_tensor(data)})
+                save_tensors(self.path / file_name, {"value": torch.as_tensor(data)})
         write_json(
             file,
             description
@@ -111,7 +120,7 @@ class RunFolder:
         stem = self.path / f"round_{index}"
         record = read_json(stem.with_suffix(".json"))
         infos = [RoundInfo(**info) for info in record["infos"]]
-        tensors = _load_tensors(stem.with_suffix(".safetensors"))
+        tensors = load_tensors(stem.with_suffix(".safetensors"))
         return SavedRound(tensors, record["values"], infos, record["seconds"])
 
     def save_round(
@@ -123,7 +132,7 @@ class RunFolder:
         seconds: Mapping[str, float],
     ) -> None:
         """Saves the state after a round; the JSON goes last and makes the round count."""
-        _save_tensors(self.path / f"round_{index}.safetensors", tensors)
+        save_tensors(self.path / f"round_{index}.safetensors", tensors)
         write_json(
             self.path / f"round_{index}.json",
             {
@@ -135,14 +144,14 @@ class RunFolder:
 
     def save_simulations(self, index: int, z: Tensor, x: Tensor) -> None:
         """Saves a round's simulations before anything is learnt from them."""
-        _save_tensors(self._simulations(index), {"z": z, "x": x})
+        save_tensors(self._simulations(index), {"z": z, "x": x})
 
     def simulations(self, index: int, z: Tensor) -> Tensor | None:
         """Returns the features of a round simulated before the run was interrupted."""
         file = self._simulations(index)
         if not file.exists():
             return None
-        saved = _load_tensors(file)
+        saved = load_tensors(file)
         return saved["x"] if torch.equal(saved["z"], z.cpu()) else None
 
     def description(self) -> dict[str, Any]:
@@ -164,7 +173,7 @@ class RunFolder:
             if file.suffix == ".nc":
                 result[name] = Rollouts.from_netcdf(file)
             else:
-                result[name] = _load_tensors(file)["value"]
+                result[name] = load_tensors(file)["value"]
         return result
 
     def _simulations(self, index: int) -> Path:
@@ -174,7 +183,7 @@ class RunFolder:
 def write_json(path: Path, value: Any) -> None:
     """Writes JSON in one step."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+        temporary.write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -226,25 +235,31 @@ def _fingerprint(tensor: Tensor) -> str:
     return hashlib.sha256(values.tobytes()).hexdigest()
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Turns tensors, tuples and mappings into what JSON has; NaN and infinity become null."""
     if isinstance(value, Tensor):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if hasattr(value, "item") and not isinstance(value, str):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Writes tensors in one step."""
     with replacing(path) as temporary:
         save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary)
 
 
-def _load_tensors(path: Path) -> dict[str, Tensor]:
+def load_tensors(path: Path) -> dict[str, Tensor]:
+    """Reads tensors.
+
+    Raises:
+        DataError: The file is not safetensors.
+    """
     try:
         return load_file(path)
     except (OSError, SafetensorError) as error:

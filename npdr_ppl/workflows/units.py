@@ -2,21 +2,27 @@
 
 from typing import TYPE_CHECKING
 
+from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
 
 if TYPE_CHECKING:
     from npdr_ppl.workflows.posterior import PosteriorBase
 
-__all__ = ["parameter_units"]
+__all__ = ["parameter_units", "prior_units"]
 
 
 def parameter_units(posterior: "PosteriorBase") -> dict[str, str]:
     """Returns the units of the latent sites that carry a parameter's name."""
+    return prior_units(posterior.prior)
+
+
+def prior_units(prior: Prior) -> dict[str, str]:
+    """Returns the units of the latent sites that carry a parameter's name."""
     known: dict[str, str] = {}
-    for box in posterior.prior.black_boxes.values():
+    for box in prior.black_boxes.values():
         if isinstance(box, SimulatorBlackBox):
             known |= {p.name: p.unit for p in box.simulator.parameters}
             for effect in box.simulator.effects:
                 units = effect.units(box.simulator.port(effect.port))
                 known |= {f"{effect.name}.{name}": unit for name, unit in units.items()}
-    return {site.name: known[site.name] for site in posterior.prior.sites if site.name in known}
+    return {site.name: known[site.name] for site in prior.sites if site.name in known}

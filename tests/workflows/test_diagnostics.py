@@ -47,12 +47,14 @@ def test_a_good_posterior_is_accepted():
     assert abs(found.coverage_90 - 0.9) < 0.1
 
 
-def test_members_that_disagree_want_more_rounds_and_stop_when_there_are_none():
+def test_members_that_disagree_want_more_rounds_and_the_prior_when_there_are_none():
     data = exported(sd=0.02, members_differ=0.1)
     found = npdr.diagnose(data, rounds_left=2)
     assert found.decision is Decision.MORE_ROUNDS
     assert "r-hat" in found.reason
-    assert npdr.diagnose(data).decision in (Decision.STOP, Decision.REVISE_MODEL)
+    found = npdr.diagnose(data)
+    assert found.decision is Decision.WIDEN
+    assert "no rounds are left" in found.reason
 
 
 def test_a_posterior_at_the_edge_that_misses_the_data_is_widened():
@@ -72,6 +74,9 @@ def test_data_that_say_nothing_call_for_another_rollout():
     assert found.contraction["level"] < 0.3
     strict = npdr.diagnose(exported(sd=0.6), Thresholds(contraction=0.5))
     assert strict.decision is Decision.NEW_ROLLOUT
+    last = npdr.diagnose(exported(sd=0.6), Thresholds(contraction=0.5), rollouts_left=0)
+    assert last.decision is Decision.STOP
+    assert "no more can be recorded" in last.reason
 
 
 def test_figures_are_json():

@@ -1,0 +1,17 @@
+"""Target domains: the devices, other engines and recordings that policies are run on."""
+
+from npdr_ppl.targets.base import Controller, TargetDomain, TargetError, partial_rollout
+from npdr_ppl.targets.gymnasium import GymnasiumTarget
+from npdr_ppl.targets.hardware import HardwareReport, HardwareTarget
+from npdr_ppl.targets.recorded import RecordedTarget
+
+__all__ = [
+    "Controller",
+    "GymnasiumTarget",
+    "HardwareReport",
+    "HardwareTarget",
+    "RecordedTarget",
+    "TargetDomain",
+    "TargetError",
+    "partial_rollout",
+]

@@ -1,0 +1,171 @@
+"""Any Gymnasium environment with a box of actions as a target domain."""
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from npdr_ppl.errors import DependencyError, ModelError
+from npdr_ppl.language.channels import Channel
+from npdr_ppl.randomness import derived_seed
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.targets.base import Array, Controller, TargetDomain
+
+__all__ = ["GymnasiumTarget"]
+
+
+class GymnasiumTarget(TargetDomain):
+    """Runs controllers in a Gymnasium environment and records its observations and rewards.
+
+    An episode ends where the environment terminates or truncates it; mind the step limits that
+    ``gymnasium.make`` brings along.
+
+    Args:
+        environment: An environment, or the id of a registered one, e.g. ``"Pendulum-v1"``.
+        sensors: Names, units and bounds of the readings; ``None`` names the observation's
+            entries ``observation_0`` and so on, with the bounds of its box.
+        actions: Names and units of the commands; ``None`` names them ``action_0`` and so on.
+            Limits are those of the environment's box in either case.
+        read: Maps an observation to the readings ``(sensors,)``, e.g. a cosine and a sine to an
+            angle; needs ``sensors``. ``None`` takes the observation as it is.
+        time_step: Seconds per step; ``None`` takes the environment's attribute ``dt``.
+        name: Name in tables and files; ``None`` takes the environment's id.
+
+    Raises:
+        DependencyError: Gymnasium is not installed.
+        ModelError: The environment does not exist, or its spaces or time step do not do.
+
+    Example:
+        >>> pendulum = GymnasiumTarget(
+        ...     "Pendulum-v1",
+        ...     sensors=(Channel("angle", "rad"), Channel("velocity", "rad/s")),
+        ...     actions=(Channel("torque", "N m"),),
+        ...     read=lambda o: np.array([np.arctan2(o[1], o[0]), o[2]]),
+        ... )
+        >>> pendulum
+        Pendulum-v1: angle [rad], velocity [rad/s]; torque [N m]; every 0.05 s
+    """
+
+    def __init__(
+        self,
+        environment: Any,
+        *,
+        sensors: Sequence[Channel] | None = None,
+        actions: Sequence[Channel] | None = None,
+        read: Callable[[Any], Array] | None = None,
+        time_step: float | None = None,
+        name: str | None = None,
+    ) -> None:
+        gymnasium = _gymnasium()
+        if isinstance(environment, str):
+            environment = _made(gymnasium, environment)
+        self._environment = environment
+        self._read = read or _flat
+        spec = environment.spec
+        self.name = name or (spec.id if spec else type(environment.unwrapped).__name__)
+        is_box = isinstance(environment.observation_space, gymnasium.spaces.Box)
+        if sensors is None and read is not None:
+            raise ModelError(f"{self.name} needs sensors, because it has a function to read them.")
+        if read is None and not is_box:
+            raise ModelError(
+                f"{self.name} needs sensors and a function to read them, because its observations "
+                f"are {environment.observation_space}, no Box."
+            )
+        if not isinstance(environment.action_space, gymnasium.spaces.Box):
+            raise ModelError(
+                f"{self.name} takes actions from {environment.action_space}, but controllers "
+                "command real numbers, of a Box."
+            )
+        self.sensors = (
+            _channels(environment.observation_space, "observation")
+            if sensors is None
+            else tuple(sensors)
+        )
+        self.actions = _limited(environment.action_space, actions, self.name)
+        if time_step is None:
+            time_step = getattr(environment.unwrapped, "dt", None)
+        if time_step is None:
+            raise ModelError(f"{self.name} does not say how long a step is: give time_step.")
+        self.time_step = float(time_step)
+
+    def run(
+        self, controller: Controller, num_steps: int, *, episode: int = 0, seed: int
+    ) -> Rollouts:
+        """Runs one episode from the environment's own initial state; see :class:`TargetDomain`.
+
+        The rollout's rewards are the environment's.
+        """
+        environment, space = self._environment, self._environment.action_space
+        # Environments outside Python know 32-bit seeds only.
+        observation, _ = environment.reset(seed=derived_seed(seed, "environment") % 2**31)
+        readings = [self._reading(observation)]
+        actions: list[Array] = []
+        rewards: list[float] = []
+        for step in range(num_steps):
+            commands = self.limit(controller(readings[-1].copy(), step * self.time_step))
+            applied = commands.astype(space.dtype).reshape(space.shape)
+            observation, reward, is_terminated, is_truncated, _ = environment.step(applied)
+            readings.append(self._reading(observation))
+            actions.append(_flat(applied))
+            rewards.append(float(reward))
+            if is_terminated or is_truncated:
+                break
+        return self.rollout(readings, actions, rewards)
+
+    def close(self) -> None:
+        """Closes the environment."""
+        self._environment.close()
+
+    def _reading(self, observation: Any) -> Array:
+        """Returns the readings of an observation, as a copy: environments may reuse theirs."""
+        reading = np.array(self._read(observation), dtype=np.float64)
+        if reading.shape != (len(self.sensors),):
+            raise ModelError(
+                f"{self.name} has {len(self.sensors)} sensors, but an observation gave "
+                f"{reading.shape=}."
+            )
+        return reading
+
+
+def _gymnasium() -> Any:
+    try:
+        return importlib.import_module("gymnasium")
+    except ImportError as error:
+        raise DependencyError(
+            "Targets made of environments need Gymnasium: pip install npdr-ppl[gymnasium]."
+        ) from error
+
+
+def _made(gymnasium: Any, name: str) -> Any:
+    """Returns a new environment."""
+    try:
+        return gymnasium.make(name)
+    except gymnasium.error.Error as error:
+        raise ModelError(f"Gymnasium cannot make {name!r}: {error}") from error
+
+
+def _flat(values: Any) -> Array:
+    return np.array(values, dtype=np.float64).reshape(-1)
+
+
+def _channels(space: Any, prefix: str) -> tuple[Channel, ...]:
+    """Returns a channel without a unit for each entry of a box."""
+    bounds = zip(_flat(space.low), _flat(space.high), strict=True)
+    return tuple(
+        Channel(f"{prefix}_{index}", "", float(lower), float(upper))
+        for index, (lower, upper) in enumerate(bounds)
+    )
+
+
+def _limited(space: Any, actions: Sequence[Channel] | None, name: str) -> tuple[Channel, ...]:
+    """Returns action channels with the limits of the environment's box."""
+    own = _channels(space, "action")
+    if actions is None:
+        return own
+    if len(actions) != len(own):
+        raise ModelError(f"{name} has {len(own)} actions, but {len(actions)} were named.")
+    return tuple(
+        Channel(named.name, named.unit, limit.lower, limit.upper, named.rate_of)
+        for named, limit in zip(actions, own, strict=True)
+    )

@@ -1,0 +1,62 @@
+"""Recorded data as a target domain, for devices that are not at hand."""
+
+from dataclasses import replace
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.channels import Channel
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.targets.base import Controller, TargetDomain
+
+__all__ = ["RecordedTarget"]
+
+
+class RecordedTarget(TargetDomain):
+    """Hands out recorded rollouts, whatever the controller would have done.
+
+    Args:
+        rollouts: The recordings, one per episode.
+        name: Name in tables and files.
+    """
+
+    is_recorded = True
+
+    def __init__(self, rollouts: Rollouts, *, name: str = "recorded") -> None:
+        self.name = name
+        self.sensors = _channels(rollouts.channel_names, rollouts.channel_units)
+        self.actions = _channels(rollouts.action_names, rollouts.action_units)
+        self.time_step = rollouts.time_step
+        self.num_episodes = len(rollouts)
+        self._rollouts = rollouts
+
+    def run(
+        self, controller: Controller, num_steps: int, *, episode: int = 0, seed: int
+    ) -> Rollouts:
+        """Returns the rollout of an episode, cut after ``num_steps`` steps.
+
+        Args:
+            controller: Ignored.
+            num_steps: Greatest number of steps.
+            episode: Position of the recording.
+            seed: Ignored.
+
+        Raises:
+            DataError: There are not so many recordings.
+        """
+        if not 0 <= episode < len(self._rollouts):
+            raise DataError(
+                f"There are {len(self._rollouts)} recorded rollouts and no episode {episode}; "
+                "record more, or ask for fewer iterations."
+            )
+        chosen = self._rollouts[episode]
+        rewards = chosen.rewards
+        return replace(
+            chosen,
+            readings=tuple(values[: num_steps + 1] for values in chosen.readings),
+            actions=tuple(values[:num_steps] for values in chosen.actions),
+            time=tuple(values[: num_steps + 1] for values in chosen.time),
+            rewards=rewards and tuple(values[:num_steps] for values in rewards),
+        )
+
+
+def _channels(names: tuple[str, ...], units: tuple[str, ...]) -> tuple[Channel, ...]:
+    return tuple(Channel(name, unit) for name, unit in zip(names, units, strict=True))

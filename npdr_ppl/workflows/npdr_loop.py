@@ -1,0 +1,501 @@
+"""The NPDR loop, Algorithm 1 of Muratore et al. (2021), driven by diagnostics.
+
+An iteration runs the policy on the target domain, infers the domain parameters from what was
+recorded, lets the diagnosis of that posterior decide what to do about it, and trains the policy in
+domains drawn from it::
+
+    policy ← POLOPT(prior)
+    repeat
+        rollouts ← run the policy on the target, its internal model being the most likely sample
+        posterior ← INFER(model, rollouts), in rounds
+        decision ← diagnose(posterior): accept, more rounds, another rollout, revise the model,
+                   widen, stop
+        policy ← POLOPT(posterior)
+
+With a folder, every rollout, round and policy is on disk before the next step, and a run that was
+killed continues to the same result; see :mod:`npdr_ppl.workflows.loop_folder`.
+"""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from enum import StrEnum
+from os import PathLike
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import torch
+
+from npdr_ppl.errors import DataError, ModelError
+from npdr_ppl.inference.base import Backend
+from npdr_ppl.inference.registry import backend as backend_by_name
+from npdr_ppl.language.handlers import with_noise
+from npdr_ppl.policies.base import Policy
+from npdr_ppl.policies.search import PolicySearch
+from npdr_ppl.policies.search_registry import policy_search
+from npdr_ppl.randomness import derived_seed, seeded
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.targets.base import TargetDomain
+from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.control_task import ControlTask
+from npdr_ppl.workflows.diagnostics import Decision, Thresholds, diagnose
+from npdr_ppl.workflows.domains import (
+    Domains,
+    domains_at,
+    most_likely_domain,
+    prior_of,
+    simulator_of,
+)
+from npdr_ppl.workflows.evaluation import declares_noise, residual_noise
+from npdr_ppl.workflows.infer import infer
+from npdr_ppl.workflows.loop_folder import LoopFolder
+from npdr_ppl.workflows.policy_optimisation import optimise_policy
+from npdr_ppl.workflows.posterior import Posterior
+from npdr_ppl.workflows.progress import Reporter, reporter
+from npdr_ppl.workflows.real_rollouts import RealRollouts
+from npdr_ppl.workflows.run_folder import plain
+
+__all__ = ["LoopOptions", "Revise", "Training", "train"]
+
+Model = Callable[..., Any]
+
+Revise = Callable[[Model, Rollouts, Path | None], Model | None]
+"""Looks for what a model lacks: takes the model, all real rollouts and a folder of its own, and
+returns the revised model, or ``None`` if it found nothing. Called again with the same folder, as
+when a run is resumed, it must return the same."""
+
+PREDICTIVE_DRAWS = 500
+"""Draws per ensemble member that a diagnosis reads."""
+
+
+class Action(StrEnum):
+    """What the loop did about a decision."""
+
+    TRAINED = "trained the policy on the posterior"
+    MIXED = "trained the policy on the posterior mixed with the prior"
+    SPREAD = "trained the policy on the posterior, spread wider"
+    MORE_ROUNDS = "added a round"
+    ANOTHER_ROLLOUT = "ran another rollout"
+    REVISED = "revised the model"
+    NOTHING_FOUND = "looked for a missing effect and found none"
+    KEPT = "kept the policy"
+    LOGGED = "none, decisions are only logged"
+
+
+_GO_ON = (Action.MORE_ROUNDS, Action.ANOTHER_ROLLOUT, Action.REVISED, Action.NOTHING_FOUND)
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """Options of Algorithm 1.
+
+    Attributes:
+        iterations: Iterations of the loop.
+        rollouts: Real rollouts H of each iteration.
+        extra_rollouts: Real rollouts that diagnoses may ask for in the whole run.
+        rollouts_used: Whether inference sees all rollouts so far or the latest iteration's.
+        backend: The inference backend; one with options of its own if it is no name.
+        rounds: Rounds R of inference in each iteration; one for backends that are not sequential.
+        extra_rounds: Rounds that a diagnosis may ask for in each iteration.
+        num_simulations: Simulations of each round.
+        binding: How rollouts are prepared for inference.
+        noise: ``"auto"`` gives a model without noise that of the closest fit's residuals;
+            ``"model"`` takes it as it is.
+        search: The policy search; one with options of its own if it is no name.
+        search_iterations: Iterations of the policy search, each time.
+        num_domains: Domains that the policy is trained in.
+        num_initial_states: Initial states in each.
+        is_warm_start: Whether the search goes on from the last policy or begins anew.
+        starts_from_prior: Whether the first policy is trained on the prior or taken as it comes.
+        spread: Parameters of the domains are multiplied by numbers uniform in 1 ± ``spread``.
+        prior_share: Share of the domains drawn from the prior where the posterior is widened.
+        internal_model: Parameters of the policy's own model on the target: the most likely
+            sample's, or nominal.
+        follows_decisions: Whether diagnoses change what the loop does, or are logged only.
+        stop_return: Mean real return of an iteration at which an accepted posterior ends the
+            loop; ``None`` to use all iterations.
+        thresholds: Limits behind the decisions.
+    """
+
+    iterations: int = 5
+    rollouts: int = 1
+    extra_rollouts: int = 0
+    rollouts_used: Literal["all", "latest"] = "all"
+    backend: str | Backend = "snpe-c"
+    rounds: int = 3
+    extra_rounds: int = 2
+    num_simulations: int = 5_000
+    binding: BindingOptions = field(
+        default_factory=lambda: BindingOptions("all/50", 200, "estimated", "float32")
+    )
+    noise: Literal["auto", "model"] = "auto"
+    search: str | PolicySearch[Any] = "power"
+    search_iterations: int = 5
+    num_domains: int = 50
+    num_initial_states: int = 4
+    is_warm_start: bool = True
+    starts_from_prior: bool = True
+    spread: float = 0.1
+    prior_share: float = 0.2
+    internal_model: Literal["most likely", "nominal"] = "most likely"
+    follows_decisions: bool = True
+    stop_return: float | None = None
+    thresholds: Thresholds = field(default_factory=Thresholds)
+
+    def __post_init__(self) -> None:
+        """Checks the options.
+
+        Raises:
+            ModelError: One is out of range.
+        """
+        least = {
+            "iterations": 1, "rollouts": 1, "rounds": 1, "num_simulations": 10,
+            "search_iterations": 1, "num_domains": 1, "num_initial_states": 1,
+            "extra_rollouts": 0, "extra_rounds": 0, "spread": 0, "prior_share": 0,
+        }  # fmt: skip
+        for name, low in least.items():
+            if not getattr(self, name) >= low:
+                raise ModelError(f"{name} must be at least {low}; got {getattr(self, name)}.")
+        for name in ("spread", "prior_share"):
+            if getattr(self, name) > 1:
+                raise ModelError(f"{name} must be at most 1; got {getattr(self, name)}.")
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a training run came to.
+
+    Attributes:
+        policy: The last policy.
+        domain: Parameters of its internal model.
+        iterations: The records of the iterations, as in ``train.json``.
+        rollouts: All real rollouts.
+        posterior: The last posterior; ``None`` if no iteration was computed in this process.
+        model: The model, with what was added to it.
+    """
+
+    policy: Policy
+    domain: dict[str, float]
+    iterations: list[dict[str, Any]]
+    rollouts: Rollouts
+    posterior: Posterior | None
+    model: Model
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the content of ``train.json``."""
+        values = self.policy.parameters.tolist()
+        return {
+            "iterations": self.iterations,
+            "policy": dict(zip(self.policy.names, values, strict=True)),
+            "internal_model": self.domain,
+        }
+
+
+def train(
+    model: Model,
+    target: TargetDomain,
+    task: ControlTask,
+    options: LoopOptions | None = None,
+    *,
+    out: str | PathLike[str] | None = None,
+    revise: Revise | None = None,
+    seed: int = 0,
+    progress: bool | Reporter | None = None,
+) -> Training:
+    """Trains a policy for a target domain that differs from its simulator.
+
+    Args:
+        model: A Pyro model of the target with one black-box site.
+        target: The target domain; its parameters stay unknown.
+        task: What the policy is to do.
+        options: Options of the loop.
+        out: Folder for the run, ``train.json`` included; a run killed there continues.
+        revise: What looks for a missing effect where a diagnosis asks for it.
+        seed: Seed of everything random.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
+
+    Raises:
+        DataError: The target's channels do not fit, or the folder holds another run.
+        ModelError: The model cannot be trained on; see
+            :func:`npdr_ppl.workflows.domains.simulator_of`.
+    """
+    options = options or LoopOptions()
+    with reporter(progress) as report, ExitStack() as stack:
+        path = out or stack.enter_context(TemporaryDirectory(prefix="npdr-"))
+        folder = LoopFolder(Path(path))
+        folder.begin(model, target, task, options, seed=seed)
+        return _Loop(model, target, task, options, folder, revise, seed, report).run()
+
+
+class _Loop:
+    """The state of one run."""
+
+    def __init__(
+        self,
+        model: Model,
+        target: TargetDomain,
+        task: ControlTask,
+        options: LoopOptions,
+        folder: LoopFolder,
+        revise: Revise | None,
+        seed: int,
+        report: Reporter,
+    ) -> None:
+        self.model = model
+        self.target = target
+        self.task = task
+        self.options = options
+        self.folder = folder
+        self.revise = revise
+        self.seed = seed
+        self.report = report
+        search, backend = options.search, options.backend
+        self.search = policy_search(search) if isinstance(search, str) else search
+        self.backend = backend_by_name(backend) if isinstance(backend, str) else backend
+        self.prior = prior_of(model, target.sensors, target.actions, target.time_step)
+        simulator = simulator_of(self.prior)
+        self.domain = {name: float(value) for name, value in simulator.nominal().items()}
+        self.real = RealRollouts(target, task, simulator, folder.rollouts)
+        self.rollouts: list[Rollouts] = []
+        self.policy = task.policy
+        self.posterior: Posterior | None = None
+        self.records: list[dict[str, Any]] = []
+
+    def run(self) -> Training:
+        """Runs all iterations, or those that are left."""
+        if self.options.starts_from_prior:
+            self._optimise(0, self._prior_domains(self.options.num_domains), self.report)
+        for index in range(self.options.iterations):
+            report = self.report.under(f"iteration {index + 1}/{self.options.iterations}")
+            if not self._can_collect(self.options.rollouts):
+                break
+            self.records.append(self._iterate(index, report))
+            self.folder.write_result(self._result().to_dict())
+            if _is_final(self.records[-1]):
+                break
+        return self._result()
+
+    def _result(self) -> Training:
+        return Training(
+            self.policy,
+            self.domain,
+            list(self.records),
+            _joined(self.rollouts),
+            self.posterior,
+            self.model,
+        )
+
+    def _can_collect(self, number: int) -> bool:
+        """Returns whether the target has so many episodes left."""
+        limit = self.target.num_episodes
+        return limit is None or len(self.rollouts) + number <= limit
+
+    def _collect(self, policy: Policy) -> Rollouts:
+        """Runs the next episode on the target."""
+        episode = len(self.rollouts)
+        seed = derived_seed(self.seed, "episode", episode)
+        self.rollouts.append(self.real.collect(episode, policy, self.domain, seed=seed))
+        return self.rollouts[-1]
+
+    def _iterate(self, index: int, report: Reporter) -> dict[str, Any]:
+        """Runs one iteration, or takes over what an earlier process made of it."""
+        new = [self._collect(self.policy) for _ in range(self.options.rollouts)]
+        returns = [float(rollout.rewards[0].sum()) for rollout in new if rollout.rewards]
+        saved = self.folder.iteration(index)
+        if saved is not None:
+            self._take_over(index, saved, report)
+            return saved
+        settled = self._infer_and_decide(index, sum(returns) / len(returns), report)
+        self.posterior = settled.posterior
+        last = settled.decisions[-1]
+        is_last = _is_final({"decisions": settled.decisions})
+        if self.options.internal_model == "most likely" and not is_last:
+            self.domain = most_likely_domain(settled.posterior, seed=self.seed)
+        record: dict[str, Any] = {
+            "decision": last["decision"],
+            "reason": last["reason"],
+            "real_return": sum(returns) / len(returns),
+            "real_returns": returns,
+            "num_rollouts": len(self.rollouts),
+            "decisions": settled.decisions,
+            "internal_model": self.domain,
+        }
+        if not is_last:
+            domains = self._posterior_domains(index, settled)
+            record |= self._optimise(index + 1, domains, report)
+        record = plain(record)
+        self.folder.save_iteration(index, record)
+        return record
+
+    def _take_over(self, index: int, saved: dict[str, Any], report: Reporter) -> None:
+        """Repeats the steps of a finished iteration that change more than its record."""
+        for decision in saved["decisions"]:
+            if decision["action"] == Action.ANOTHER_ROLLOUT:
+                self._collect(self.task.excitation or self.policy)
+            if decision["action"] == Action.REVISED:
+                self._revised(index)
+        self.domain = saved["internal_model"]
+        if not _is_final(saved):
+            self._optimise(index + 1, None, report)
+
+    def _infer_and_decide(self, index: int, real_return: float, report: Reporter) -> "_Settled":
+        """Infers the posterior and does what its diagnosis asks for until that settles it."""
+        options = self.options
+        decisions: list[dict[str, Any]] = []
+        rounds = options.rounds if self.backend.is_sequential else 1
+        extra_rounds = options.extra_rounds if self.backend.is_sequential else 0
+        has_revised = self.revise is None
+        attempt = 0
+        while True:
+            posterior = self._infer(index, attempt, rounds, report)
+            diagnosis = diagnose(
+                posterior.to_arviz(PREDICTIVE_DRAWS, seed=self.seed),
+                options.thresholds,
+                rounds_left=extra_rounds,
+                rollouts_left=self._extra_rollouts_left(index),
+            )
+            decision, reason = diagnosis.decision, diagnosis.reason
+            if not options.follows_decisions:
+                action = Action.LOGGED
+            elif decision is Decision.MORE_ROUNDS:
+                action, rounds, extra_rounds = Action.MORE_ROUNDS, rounds + 1, extra_rounds - 1
+            elif decision is Decision.NEW_ROLLOUT:
+                action, attempt = Action.ANOTHER_ROLLOUT, attempt + 1
+                self._collect(self.task.excitation or self.policy)
+            elif decision is Decision.REVISE_MODEL and not has_revised:
+                has_revised = True
+                is_found = self._revised(index)
+                action = Action.REVISED if is_found else Action.NOTHING_FOUND
+                attempt += 1
+            elif decision is Decision.REVISE_MODEL:
+                action = Action.SPREAD
+            elif decision is Decision.WIDEN:
+                action = Action.MIXED
+            elif decision is Decision.ACCEPT and _reaches(real_return, options.stop_return):
+                action, decision = Action.KEPT, Decision.STOP
+                reason = f"The return on the target, {real_return:.0f}, is what was asked for."
+            else:
+                action = Action.KEPT if decision is Decision.STOP else Action.TRAINED
+            decisions.append(
+                {
+                    "decision": decision.value,
+                    "reason": reason,
+                    "action": action.value,
+                    "diagnosis": diagnosis.to_dict(),
+                }
+            )
+            if action not in _GO_ON:
+                return _Settled(posterior, decisions, action)
+
+    def _extra_rollouts_left(self, index: int) -> int:
+        """Returns how many more episodes a diagnosis may ask for."""
+        used = len(self.rollouts) - self.options.rollouts * (index + 1)
+        left = self.options.extra_rollouts - used
+        return left if self._can_collect(1) else 0
+
+    def _revised(self, index: int) -> bool:
+        """Returns whether an effect was found that the model lacked; the model then has it."""
+        assert self.revise is not None
+        found = self.revise(self.model, _joined(self.rollouts), self.folder.revision(index))
+        if found is None:
+            return False
+        target = self.target
+        self.model = found
+        self.prior = prior_of(found, target.sensors, target.actions, target.time_step)
+        return True
+
+    def _infer(self, index: int, attempt: int, rounds: int, report: Reporter) -> Posterior:
+        """Infers the posterior; rounds that are on disk are not repeated."""
+        options = self.options
+        binding = options.binding
+        number = len(self.rollouts) if options.rollouts_used == "all" else options.rollouts
+        data = _joined(self.rollouts[-number:])
+        seed = derived_seed(self.seed, "inference", index, attempt)
+        model = self.model
+        if options.noise == "auto" and not declares_noise(model, data, binding):
+            model = with_noise(model, residual_noise(model, data, binding, seed=seed))
+        return infer(
+            model,
+            data,
+            backend=self.backend,
+            rounds=rounds,
+            num_simulations=options.num_simulations,
+            seed=seed,
+            embedding=binding.embedding,
+            segment_length=binding.segment_length,
+            initial_state=binding.initial_state,
+            precision=binding.precision,
+            checkpoint=self.folder.inference(index, attempt),
+            progress=report,
+        )
+
+    def _prior_domains(self, number: int) -> Domains:
+        with seeded(self.seed, "prior domains"):
+            return domains_at(self.prior, self.prior.sample(number))
+
+    def _posterior_domains(self, index: int, settled: "_Settled") -> Domains:
+        """Returns what the policy is trained in next."""
+        options = self.options
+        number = options.num_domains
+        from_prior = 0
+        if settled.action is Action.MIXED:
+            from_prior = round(options.prior_share * number)
+        seed = derived_seed(self.seed, "posterior domains", index)
+        z = settled.posterior.sample_mixture(number - from_prior, seed=seed)
+        generator = torch.Generator().manual_seed(seed)
+        # Where the model is wrong its posterior is too narrow, by how much nobody knows.
+        spread = options.spread * (2.0 if settled.action is Action.SPREAD else 1.0)
+        domains = domains_at(settled.posterior.prior, z).spread(spread, generator)
+        if from_prior:
+            domains = domains.followed_by(self._prior_domains(from_prior))
+        return domains
+
+    def _optimise(self, number: int, domains: Domains | None, report: Reporter) -> dict[str, Any]:
+        """Trains policy ``number``, unless it is on disk, and returns the figures."""
+        saved = self.folder.policy(number)
+        if saved is not None:
+            parameters, figures = saved
+        elif domains is None:
+            raise DataError(f"{self.folder.path} lacks policy {number}.")
+        else:
+            options = self.options
+            found = optimise_policy(
+                self.task,
+                domains,
+                self.search,
+                (self.policy if options.is_warm_start else self.task.policy).parameters,
+                iterations=options.search_iterations,
+                num_initial_states=options.num_initial_states,
+                seed=derived_seed(self.seed, "policy", number),
+                expected_calls=options.search_iterations * (options.iterations + 1),
+                progress=report.stage("train the policy"),
+            )
+            parameters, figures = found.parameters, found.figures()
+            self.folder.save_policy(number, parameters, figures)
+        self.policy = self.task.policy.with_parameters(parameters.to(self.task.policy.parameters))
+        return figures
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """A posterior, and what was decided about it."""
+
+    posterior: Posterior
+    decisions: list[dict[str, Any]]
+    action: "Action"
+
+
+def _is_final(record: dict[str, Any]) -> bool:
+    """Returns whether the loop ends with an iteration."""
+    return record["decisions"][-1]["action"] == Action.KEPT
+
+
+def _reaches(real_return: float, wanted: float | None) -> bool:
+    return wanted is not None and real_return >= wanted
+
+
+def _joined(rollouts: list[Rollouts]) -> Rollouts:
+    """Returns several rollouts as one set."""
+    first, *others = rollouts
+    return first.concatenate(*others) if others else first

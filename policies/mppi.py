@@ -1,0 +1,253 @@
+"""Model-predictive path integral control: replanning by weighted random roll-outs of a model."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.closed_loop import Reward
+from npdr_ppl.engines.ode import ODESimulator
+from npdr_ppl.errors import ModelError, ShapeError
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.policies.base import Policy
+from npdr_ppl.randomness import derived_seed
+
+__all__ = ["MPPI", "Plan"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Memory of :class:`MPPI` for N episodes, H steps of the plan and A actions.
+
+    Attributes:
+        commands: Planned commands, ``(N, H, A)``.
+        time: Seconds at which the first of them is due.
+        past: Commands of the H steps before, oldest first, zero before the start, ``(N, H, A)``.
+        num_replans: How often it was planned anew; numbers the random stream.
+    """
+
+    commands: Tensor
+    time: float
+    past: Tensor
+    num_replans: int
+
+
+class MPPI(Policy):
+    """Replans a sequence of commands every few steps and executes its beginning.
+
+    From the present readings, K candidate sequences V_k = clip(U + ε_k) around the former plan U
+    are simulated under M domains ξ_m at once; the next plan is their mean with weights
+
+        w_k ∝ exp(R̄_k / λ),   R̄_k = (1/M) Σ_m Σ_h r(x_{m,k,h+1}, V_{k,h}).
+
+    ε are Gaussian knots spread evenly over the horizon and joined linearly, scaled to the same
+    standard deviation everywhere; white noise shakes a device instead of moving it. ε_0 is zero,
+    so that the former plan always competes. As in the paper with base distribution U (α = 1),
+    commands cost only what the reward makes of them. A candidate that leaves the states' bounds
+    earns from then on the least reward of any step, whatever the reward's sign.
+
+    Averaging returns over posterior draws (M > 1) makes the plan robust to what the posterior
+    leaves open; M = 1 with the most likely sample is the usual controller.
+
+    It is for devices and for batches of a few episodes: loops cannot compile it, because its
+    memory is a plan and not a number per simulation. For speed give it a simulator made with
+    ``compile="always"`` instead. Episodes of a batch share the random numbers, so that each is
+    planned as if alone. It has no parameters to search over; their floating type is that of the
+    plan on devices.
+
+    Args:
+        simulator: The internal model; its effects act, with the past commands known.
+        reward: Reward of a step, from the readings at its end and the limited command.
+        horizon: Steps of the plan H.
+        num_samples: Candidate sequences K.
+        temperature: λ, in units of the return over the horizon.
+        noise: Standard deviation of ε per action in its unit, A numbers.
+        domains: Parameters of the internal model, scalars or M draws ``(M,)``; missing ones are
+            the episode's own, as in :class:`~npdr_ppl.policies.furuta_swing_up.FurutaSwingUp`.
+        num_knots: Knots of the noise over the horizon, 2 … H; ``None`` for white noise.
+        replan_every: Steps of the plan that are executed before the next is made.
+        time_step: Seconds per step of the plan, a multiple of the loop's step; ``None`` for the
+            simulator's. Commands are held within a step.
+        seed: Seed of ε.
+
+    References: Williams et al., Information Theoretic MPC for Model-Based Reinforcement Learning,
+    ICRA 2017, algorithm 2; Barcelos et al., DISCO: Double Likelihood-free Inference Stochastic
+    Control, ICRA 2020 (averages over posterior draws).
+    """
+
+    def __init__(
+        self,
+        simulator: ODESimulator,
+        reward: Reward,
+        *,
+        horizon: int,
+        num_samples: int,
+        temperature: float,
+        noise: Sequence[float],
+        domains: Mapping[str, Tensor] | None = None,
+        num_knots: int | None = None,
+        replan_every: int = 1,
+        time_step: float | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.simulator = simulator
+        self.reward = reward
+        self.domains = {name: torch.as_tensor(x) for name, x in (domains or {}).items()}
+        simulator.check_parameters(self.domains)
+        self.observations = tuple(state.name for state in simulator.states)
+        self.actions = tuple(action.name for action in simulator.actions)
+        sensors = [sensor.name for sensor in simulator.sensors]
+        if missing := [name for name in self.observations if name not in sensors]:
+            raise ModelError(
+                f"MPPI needs the full state, but {simulator.name} has no sensor of "
+                f"{', '.join(missing)}."
+            )
+        if not 1 <= replan_every <= horizon or num_samples < 1 or temperature <= 0.0:
+            raise ModelError(
+                "MPPI needs 1 <= replan_every <= horizon, a sample and a positive temperature, "
+                f"got {replan_every=}, {horizon=}, {num_samples=}, {temperature=}."
+            )
+        if len(noise) != len(self.actions):
+            raise ShapeError(
+                f"Each of {', '.join(self.actions)} has its noise, but got {len(noise)} numbers."
+            )
+        if any(value.ndim > 1 for value in self.domains.values()):
+            raise ShapeError("Domains of MPPI are scalars or draws (M,), not further batches.")
+        self.horizon = horizon
+        self.num_samples = num_samples
+        self.temperature = temperature
+        self.noise = torch.tensor(noise, dtype=torch.float64)
+        self.blend = _blend(horizon, num_knots or horizon)
+        self.replan_every = replan_every
+        self.time_step = time_step or simulator.time_step
+        self.seed = seed
+        self._columns = [sensors.index(name) for name in self.observations]
+
+    def constants(self, domain: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Returns the episode's own parameters where the internal model has no others."""
+        known = {parameter.name for parameter in self.simulator.parameters}
+        known |= {name for effect in self.simulator.effects for name in effect.parameter_names}
+        known -= set(self.domains)
+        return {name: value for name, value in domain.items() if name in known}
+
+    def initial_memory(self, observation: tuple[Tensor, ...]) -> Plan:
+        """Returns a plan of no commands that is due to be replaced."""
+        nothing = observation[0].new_zeros(observation[0].numel(), self.horizon, len(self.actions))
+        return Plan(nothing, 0.0, nothing, 0)
+
+    def act(
+        self,
+        observation: tuple[Tensor, ...],
+        time: Tensor | float,
+        memory: Plan,
+        constants: dict[str, Tensor],
+    ) -> tuple[tuple[Tensor, ...], Plan]:
+        """Returns the planned commands of the present time, replanned where that is due.
+
+        Raises:
+            ModelError: The loop is being compiled; torch's own error quotes it.
+        """
+        if torch.compiler.is_compiling():
+            raise ModelError("MPPI cannot be compiled into a loop; use compile='never'.")
+        step = self._step(memory, float(time))
+        if memory.num_replans == 0 or step >= self.replan_every:
+            states = torch.stack(observation, dim=-1).reshape(-1, len(observation))
+            with torch.no_grad():
+                memory = self._replan(memory, states, step, constants)
+            step = 0
+        present = memory.commands[:, step].reshape(*observation[0].shape, len(self.actions))
+        return present.unbind(-1), memory
+
+    def _step(self, plan: Plan, time: float) -> int:
+        """Returns the step of the plan that is being executed."""
+        # Times are products of steps and rounded, so that a step may begin a little early.
+        return math.floor((time - plan.time) / self.time_step + 1e-3)
+
+    def _replan(self, plan: Plan, states: Tensor, step: int, constants: dict[str, Tensor]) -> Plan:
+        """Returns the next plan, which begins at a step of the former.
+
+        Args:
+            plan: The former plan.
+            states: Present readings of the state, ``(N, states)``.
+            step: Steps since the former plan began.
+            constants: What :meth:`constants` returned.
+        """
+        held = plan.commands[:, -1:].expand(-1, step, -1)
+        whole = torch.cat((plan.past, plan.commands, held), dim=1)
+        first = self.horizon + step
+        past, former = whole[:, step:first], whole[:, first:]
+        candidates = self._candidates(former, plan.num_replans)
+        returns = self._returns(candidates, past, states, constants)
+        weights = torch.softmax(returns / self.temperature, dim=-1)
+        commands = torch.einsum("nk,nkha->nha", weights, candidates)
+        time = plan.time + step * self.time_step
+        return Plan(commands, time, past, plan.num_replans + 1)
+
+    def _candidates(self, former: Tensor, number: int) -> Tensor:
+        """Returns sequences around the former plan, ``(N, K, H, A)``, within the limits."""
+        generator = torch.Generator().manual_seed(derived_seed(self.seed, "mppi", number))
+        # Drawn alike for all floating types and devices.
+        shape = self.num_samples, self.blend.shape[-1], len(self.actions)
+        knots = torch.randn(*shape, generator=generator, dtype=torch.float64)
+        noise = self.noise * torch.einsum("hj,kja->kha", self.blend, knots)
+        noise[0] = 0.0
+        candidates = former[:, None] + noise.to(former)
+        lower = candidates.new_tensor([action.lower for action in self.simulator.actions])
+        upper = candidates.new_tensor([action.upper for action in self.simulator.actions])
+        return candidates.clamp(lower, upper)
+
+    def _returns(
+        self, candidates: Tensor, past: Tensor, states: Tensor, constants: dict[str, Tensor]
+    ) -> Tensor:
+        """Returns the candidates' returns, averaged over domains, ``(N, K)``."""
+        count = self.num_samples
+        readings = states[:, None].expand(-1, count, -1)
+        like = {"dtype": states.dtype, "device": states.device}
+        inputs = Inputs(
+            actions=candidates,
+            action_names=self.actions,
+            initial_readings=readings,
+            initial_values=readings,
+            initial_rates=None,
+            channel_names=self.observations,
+            past_actions=past[:, None].expand(-1, count, -1, -1),
+            time_step=self.time_step,
+            mask=torch.ones(count, self.horizon, dtype=torch.bool, device=states.device),
+            rollout=torch.zeros(count, dtype=torch.long, device=states.device),
+            start=torch.zeros(count, dtype=torch.long, device=states.device),
+        )
+        # Draws are on an axis in front of the episodes'.
+        domains = {name: x.to(**like)[..., None] for name, x in self.domains.items()}
+        domains |= {name: x.to(**like) for name, x in constants.items()}
+        trajectories = self.simulator.simulate(domains, inputs)
+        values = trajectories[..., self._columns].unbind(-1)
+        num_joints = len(self.simulator.joints)
+        rewards = self.reward(values[:num_joints], values[num_joints:], candidates.unbind(-1))
+        outside = torch.zeros_like(rewards, dtype=torch.bool)
+        for value, state in zip(values, self.simulator.states, strict=True):
+            # Written so that a NaN counts as outside.
+            outside |= ~((value >= state.lower) & (value <= state.upper))
+        shape = -1, *candidates.shape[:3]  # domains, episodes, candidates, steps
+        rewards, outside = rewards.reshape(shape), outside.cummax(dim=-1).values.reshape(shape)
+        least = torch.where(outside, math.inf, rewards).amin(dim=(0, 2, 3), keepdim=True)
+        # Where all is outside, all is equal.
+        least = torch.where(least.isinf(), 0.0, least)
+        return torch.where(outside, least, rewards).sum(dim=-1).mean(dim=0)
+
+
+def _blend(horizon: int, num_knots: int) -> Tensor:
+    """Returns what each step of the horizon takes from each knot, ``(horizon, num_knots)``.
+
+    Rows have unit norm, so that independent knots of unit variance make steps of unit variance.
+    """
+    if num_knots == horizon:
+        return torch.eye(horizon, dtype=torch.float64)
+    if not 2 <= num_knots < horizon:
+        raise ModelError(f"MPPI needs 2 … {horizon} knots, got {num_knots=}.")
+    place = torch.linspace(0.0, num_knots - 1.0, horizon, dtype=torch.float64)
+    distance = (place[:, None] - torch.arange(num_knots, dtype=torch.float64)).abs()
+    share = (1.0 - distance).clamp_min(0.0)
+    return share / share.norm(dim=-1, keepdim=True)

@@ -1,0 +1,161 @@
+"""PoWER: policy search by exploration that is weighted with the returns.
+
+Perturb the mean θ of the parameters, and move it to where the returns were good (Kober & Peters
+2011, *Policy search for motor primitives in robotics*, Machine Learning 84; exploration is
+constant during an episode, and covariance matters between parameters). With the candidates θᵢ of
+this iteration and of the memory, their returns Rᵢ and the elite E, the best of them,
+
+    wᵢ = Rᵢ − min_j R_j,
+    θ ← θ + Σ_{i∈E} wᵢ (θᵢ − θ) / Σ_{i∈E} wᵢ,
+    Σ ← Σ_i wᵢ (θᵢ − θ)(θᵢ − θ)ᵀ / Σ_i wᵢ,        Σ ≽ diag(σ_min²),
+
+both with the θ before. Taking the elite instead of all candidates is the paper's importance
+sampling. Where the paper uses the returns themselves, the worst is subtracted here: returns may
+be negative, and a constant added to all of them, or another unit, makes no difference. Higher
+baselines (their median, say) shrink Σ faster and stop farther from the optimum of noisy returns.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.errors import ModelError
+from npdr_ppl.policies.search import (
+    PolicySearch,
+    SearchSpace,
+    SearchState,
+    checked,
+    counted,
+    per_parameter,
+)
+
+__all__ = ["PoWER", "PoWERState"]
+
+
+@dataclass(frozen=True)
+class PoWERState(SearchState):
+    """What the next iteration needs.
+
+    Attributes:
+        mean: Present parameters θ, ``(P,)``.
+        covariance: Exploration Σ, ``(P, P)``.
+        floor: Least standard deviations σ_min, ``(P,)``.
+        memory: Best candidates so far, ``(m, P)``, the best first.
+        memory_returns: Their returns, ``(m,)``, as they were told then.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    floor: Tensor
+    memory: Tensor
+    memory_returns: Tensor
+
+
+@dataclass(frozen=True)
+class PoWER(PolicySearch[PoWERState]):
+    """PoWER; see the module's text for the method. It deploys the mean.
+
+    Candidates in the memory keep the returns that they were told with. If domains change, call
+    :meth:`forget`, or candidates that were lucky with the domains before hold the search back.
+
+    Args:
+        population: Perturbed candidates per iteration; the mean comes first, on top of them.
+        memory: Best candidates that are remembered, the elite.
+        exploration: Standard deviations at first, one number or one per parameter.
+        floor: Least standard deviations, one number or one per parameter.
+    """
+
+    name: ClassVar[str] = "power"
+    summary: ClassVar[str] = "PoWER: exploration weighted with the returns, with a memory"
+    state_class = PoWERState
+
+    population: int = 50
+    memory: int = 10
+    exploration: float | Sequence[float] = 2.0
+    floor: float | Sequence[float] = 0.02
+
+    def __post_init__(self) -> None:
+        """Validates the options.
+
+        Raises:
+            ModelError: One is out of range.
+        """
+        if self.population < 1 or self.memory < 1:
+            raise ModelError(
+                f"{self.name}: population and memory must be at least 1; got {self.population} "
+                f"and {self.memory}."
+            )
+
+    def begin(self, space: SearchSpace, start: Tensor) -> PoWERState:
+        """Returns the state before any return is told; see :meth:`PolicySearch.begin`."""
+        exploration = per_parameter("exploration", self.exploration, space)
+        return PoWERState(
+            space=space,
+            iteration=0,
+            best=start,
+            best_return=start.new_tensor(-torch.inf),
+            mean=start,
+            covariance=exploration.square().diag(),
+            floor=per_parameter("floor", self.floor, space),
+            memory=start.new_empty(0, len(start)),
+            memory_returns=start.new_empty(0),
+        )
+
+    def ask(self, state: PoWERState, generator: torch.Generator) -> Tensor:
+        """Perturbs the mean, which is the first row; see :meth:`PolicySearch.ask`."""
+        noise = torch.randn(
+            self.population, len(state.mean), generator=generator, dtype=torch.float64
+        )
+        factor = torch.linalg.cholesky(state.covariance)
+        candidates = torch.cat((state.mean[None], state.mean + noise @ factor.T))
+        return state.space.clamp(candidates)
+
+    def tell(self, state: PoWERState, candidates: Tensor, returns: Tensor) -> PoWERState:
+        """Moves mean and covariance; see :meth:`PolicySearch.tell`.
+
+        Any number of candidates will do, also such as were not asked for. Failed ones are left
+        out, and if no return differs from another, nothing is learnt but what to remember.
+        """
+        candidates, returns = checked(state, candidates, returns)
+        state = counted(state, candidates, returns)
+        succeeded = returns > -torch.inf
+        if not succeeded.any():
+            return state
+        pool = torch.cat((state.memory, candidates[succeeded]))
+        pool_returns = torch.cat((state.memory_returns, returns[succeeded]))
+        elite = pool_returns.argsort(descending=True, stable=True)[: self.memory]
+        mean, covariance = state.mean, state.covariance
+        weight = pool_returns - pool_returns.min()
+        if weight.max() > 0:
+            weight = weight / weight.max()
+            offset = pool - mean
+            covariance = offset.T @ (weight[:, None] * offset) / weight.sum()
+            covariance = _raised(covariance, state.floor)
+            step = weight[elite] @ offset[elite] / weight[elite].sum()
+            mean = state.space.clamp(mean + step)  # against rounding: bounds are convex
+        return replace(
+            state,
+            mean=mean,
+            covariance=covariance,
+            memory=pool[elite],
+            memory_returns=pool_returns[elite],
+        )
+
+    def parameters(self, state: PoWERState) -> Tensor:
+        """Returns the mean."""
+        return state.mean
+
+
+def _raised(covariance: Tensor, floor: Tensor) -> Tensor:
+    """Returns a covariance C with C ≽ diag(floor²): no direction is explored less than that.
+
+    Args:
+        covariance: Positive semidefinite, ``(P, P)``.
+        floor: Standard deviations, ``(P,)``.
+    """
+    eigenvalues, vectors = torch.linalg.eigh(covariance / floor / floor[:, None])
+    raised = vectors @ (eigenvalues.clamp(min=1.0)[:, None] * vectors.T)
+    return raised * floor * floor[:, None]

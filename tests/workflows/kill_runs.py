@@ -1,0 +1,91 @@
+"""Kills a run of the NPDR loop at random moments, resumes it, and compares what comes out.
+
+    python kill_runs.py FOLDER NUM_KILLS SEED
+
+One process imports everything and forks a child for every attempt, so that a hundred take minutes.
+It exits with an error if a resumed run differs from the undisturbed one, or if the target ran an
+episode that was not used.
+"""
+
+import json
+import os
+import random
+import signal
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import torch
+from small_loop import HandmadePendulum, small_options, small_task
+
+from npdr_ppl.models.pendulum import pendulum
+from npdr_ppl.workflows.npdr_loop import train
+
+
+def fork(folder, seed):
+    """Starts the run, or goes on with it, in a process of its own."""
+    child = os.fork()
+    if child:
+        return child
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        target = HandmadePendulum(folder / "episodes.log")
+        train(pendulum, target, small_task(), small_options(), out=folder / "run", seed=seed,
+              progress=False)  # fmt: skip
+        os._exit(0)
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
+
+
+def finish(child):
+    _, status = os.waitpid(child, 0)
+    if status:
+        raise SystemExit(f"a run failed with status {status}")
+
+
+def outcome(folder):
+    return {
+        "train": json.loads((folder / "run/train.json").read_text()),
+        "rollouts": [
+            file.read_text() for file in sorted((folder / "run/rollouts").glob("*_[0-9]*.jsonl"))
+        ],
+        "episodes": (folder / "episodes.log").read_text().split(),
+    }
+
+
+def main():
+    root, num_kills, seed = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    torch.set_num_threads(1)
+    moments = random.Random(seed)
+    started = time.monotonic()
+    finish(fork(root / "undisturbed", seed))
+    seconds = time.monotonic() - started
+    expected = outcome(root / "undisturbed")
+    kills = runs = 0
+    while kills < num_kills:
+        folder = root / f"run_{runs}"
+        runs += 1
+        is_done = False
+        while not is_done:
+            child = fork(folder, seed)
+            # Short lives, so that a run is killed several times on its way.
+            time.sleep(moments.uniform(0.0, 0.5 * seconds))
+            if kills < num_kills:
+                os.kill(child, signal.SIGKILL)
+            _, status = os.waitpid(child, 0)
+            is_done = status == 0
+            if os.WIFSIGNALED(status):
+                kills += 1
+            elif status:
+                raise SystemExit(f"{folder}: a resumed run failed with status {status}")
+        found = outcome(folder)
+        for name, value in expected.items():
+            if found[name] != value:
+                raise SystemExit(f"{folder}: {name} differ from those of the undisturbed run")
+    print(json.dumps({"kills": kills, "runs": runs, "seconds": seconds}))
+
+
+if __name__ == "__main__":
+    main()
