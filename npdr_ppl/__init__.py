@@ -16,19 +16,22 @@ __all__ = [
     "Channel",
     "Effect",
     "Inputs",
+    "LoopOptions",
     "NpdrError",
     "Parameter",
     "Port",
     "Posterior",
     "Rollouts",
     "Simulator",
+    "Training",
     "add_effect",
-    "compare",
     "calibrate",
+    "compare",
     "diagnose",
     "infer",
     "remove_effect",
     "simulate",
+    "train",
     "with_likelihood",
     "with_noise",
 ]
@@ -48,6 +51,7 @@ if TYPE_CHECKING:
     from npdr_ppl.workflows.diagnostics import diagnose
     from npdr_ppl.workflows.infer import infer
     from npdr_ppl.workflows.learned_likelihood import with_likelihood
+    from npdr_ppl.workflows.npdr_loop import LoopOptions, Training, train
     from npdr_ppl.workflows.posterior import Posterior
 
 # Loaded when first used, so that importing the package stays quick.
@@ -56,19 +60,22 @@ _HOMES = {
     "Channel": "language.channels",
     "Effect": "language.effects",
     "Inputs": "language.inputs",
+    "LoopOptions": "workflows.npdr_loop",
     "NpdrError": "errors",
     "Parameter": "language.channels",
     "Port": "language.channels",
     "Posterior": "workflows.posterior",
     "Rollouts": "rollouts",
     "Simulator": "language.simulator",
+    "Training": "workflows.npdr_loop",
     "add_effect": "language.handlers",
-    "compare": "workflows.compare",
     "calibrate": "workflows.calibration",
+    "compare": "workflows.compare",
     "diagnose": "workflows.diagnostics",
     "infer": "workflows.infer",
     "remove_effect": "language.handlers",
     "simulate": "language.sites",
+    "train": "workflows.npdr_loop",
     "with_likelihood": "workflows.learned_likelihood",
     "with_noise": "language.handlers",
 }

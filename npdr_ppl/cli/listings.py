@@ -1,4 +1,4 @@
-"""`npdr models`, `npdr backends`, `npdr effects`: what there is to choose from."""
+"""`npdr models`, `npdr backends`, `npdr targets` and so on: what there is to choose from."""
 
 import json
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["backends", "effects", "models"]
+__all__ = ["backends", "effects", "models", "searches", "targets", "tasks"]
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 
@@ -54,13 +54,72 @@ def effects(as_json: Json = False) -> None:
     rows = [
         {
             "name": name,
-            "summary": (effect.__doc__ or "").strip().splitlines()[0],
+            "summary": _first_line(effect),
             "attaches to": list(effect.port_kinds),
             "parameters": [f"{p.name} [{p.unit}]" for p in effect.parameters],
         }
         for name, effect in catalogue().items()
     ]
     _show(rows, as_json)
+
+
+def targets(as_json: Json = False) -> None:
+    """List the target domains of the zoo.
+
+    Example: npdr targets
+    """
+    from npdr_ppl.models import targets as registered
+
+    rows = []
+    for name, entry in registered().items():
+        target = entry.make()
+        rows.append(
+            {
+                "name": name,
+                "summary": entry.summary,
+                "channels": [f"{c.name} [{c.unit}]" for c in target.sensors],
+                "actions": [f"{c.name} [{c.unit}]" for c in target.actions],
+                "time step": f"{target.time_step:g} s",
+            }
+        )
+    _show(rows, as_json)
+
+
+def tasks(as_json: Json = False) -> None:
+    """List what policies can be trained to do.
+
+    Example: npdr tasks
+    """
+    from npdr_ppl.workflows.control_task import control_task, control_tasks
+
+    rows = []
+    for name in control_tasks():
+        task = control_task(name)
+        rows.append(
+            {
+                "name": name,
+                "summary": _first_line(task.policy),
+                "reads": list(task.policy.observations),
+                "commands": list(task.policy.actions),
+                "steps": task.num_steps,
+                "success": "–" if task.success is None else f"return above {task.success:g}",
+            }
+        )
+    _show(rows, as_json)
+
+
+def searches(as_json: Json = False) -> None:
+    """List the policy searches.
+
+    Example: npdr searches
+    """
+    from npdr_ppl.policies.search_registry import policy_searches
+
+    _show([{"name": n, "summary": s} for n, s in policy_searches().items()], as_json)
+
+
+def _first_line(documented: object) -> str:
+    return (documented.__doc__ or "").strip().partition("\n")[0]
 
 
 def _show(rows: Sequence[dict[str, object]], as_json: bool) -> None:

@@ -1,15 +1,37 @@
-"""Turns words on the command line into models, effects and data."""
+"""Turns words on the command line into models, effects, data, targets, tasks and methods."""
 
 import importlib.util
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from npdr_ppl.errors import DataError, ModelError
+from npdr_ppl.errors import DataError, ModelError, NpdrError
 
-__all__ = ["resolve_effects", "resolve_model", "resolve_rollouts"]
+if TYPE_CHECKING:
+    from npdr_ppl.inference.base import Backend
+    from npdr_ppl.policies.search import PolicySearch
+    from npdr_ppl.targets.base import TargetDomain
+    from npdr_ppl.workflows.control_task import ControlTask
+
+__all__ = [
+    "resolve_backend",
+    "resolve_effects",
+    "resolve_model",
+    "resolve_rollouts",
+    "resolve_search",
+    "resolve_target",
+    "resolve_task",
+]
+
+T = TypeVar("T")
+
+DATA_FILES = (".csv", ".parquet", ".npz", ".nc")
+"""Endings of files with rollouts."""
+
+DEFAULT_TASKS = {"furuta": "furuta-swing-up", "furuta_paper": "furuta-swing-up"}
+"""What a policy is to do, by model of the zoo."""
 
 
 def resolve_model(word: str) -> Callable[..., Any]:
@@ -23,13 +45,13 @@ def resolve_model(word: str) -> Callable[..., Any]:
     entries = zoo()
     if word in entries:
         return entries[word].model
-    path, separator, function = word.rpartition(":")
-    if not separator or not path.endswith(".py"):
+    if not _is_function(word):
         close = get_close_matches(word, entries, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"the zoo has {', '.join(entries)}."
         raise ModelError(
             f"{word!r} is neither a model of the zoo nor path/to/file.py:function; {hint}"
         )
+    path, _, function = word.rpartition(":")
     return _load_function(Path(path), function)
 
 
@@ -56,6 +78,8 @@ def _load_function(path: Path, function: str) -> Callable[..., Any]:
 def resolve_effects(model: Callable[..., Any], words: Sequence[str]) -> Callable[..., Any]:
     """Attaches effects given as ``port.effect``, e.g. ``pole.coulomb_friction``.
 
+    A word may hold several of them, with commas in between.
+
     Raises:
         ModelError: There is no such effect.
     """
@@ -63,7 +87,7 @@ def resolve_effects(model: Callable[..., Any], words: Sequence[str]) -> Callable
     from npdr_ppl.models.effects import effects
 
     catalogue = effects()
-    for word in words:
+    for word in (part for text in words for part in _split_effects(text, catalogue)):
         port, separator, name = word.rpartition(".")
         if not separator or name not in catalogue:
             close = get_close_matches(name, catalogue, n=1)
@@ -73,6 +97,17 @@ def resolve_effects(model: Callable[..., Any], words: Sequence[str]) -> Callable
             )
         model = add_effect(model, catalogue[name](port))
     return model
+
+
+def _split_effects(text: str, known: Collection[str]) -> list[str]:
+    """Splits at commas that follow an effect; the name of a port may have commas of its own."""
+    parts = [""]
+    for piece in text.split(","):
+        if parts[-1].rpartition(".")[2] in known:
+            parts.append(piece.strip())
+        else:
+            parts[-1] = f"{parts[-1]},{piece.strip()}".lstrip(",")
+    return parts
 
 
 def resolve_rollouts(path: Path, holdout: str = "") -> tuple[Any, Any]:
@@ -104,3 +139,121 @@ def resolve_rollouts(path: Path, holdout: str = "") -> tuple[Any, Any]:
         )
     train = [i for i in range(len(rollouts)) if i not in test]
     return rollouts[train], rollouts[test]
+
+
+def resolve_target(word: str) -> "TargetDomain":
+    """Returns the target domain that ``TARGET`` names.
+
+    It is a target of the zoo, a file of recordings, ``gym:`` with the id of a Gymnasium
+    environment, or ``path/to/file.py:function`` with a function that returns a target.
+
+    Raises:
+        DataError: The file is bad.
+        ModelError: There is no such target.
+    """
+    from npdr_ppl.models import targets
+    from npdr_ppl.models.furuta_targets import furuta_target
+    from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.targets import GymnasiumTarget, RecordedTarget, TargetDomain
+
+    entries = targets()
+    path = Path(word)
+    if word in entries:
+        return entries[word].make()
+    if word.startswith("gym:"):
+        return GymnasiumTarget(word.removeprefix("gym:"))
+    if _is_function(word):
+        return _returned_by(word, TargetDomain)
+    if path.suffix.lower() in DATA_FILES:
+        return RecordedTarget(Rollouts.load(path), name=path.stem)
+    if word.startswith("furuta-"):
+        return furuta_target(word)
+    close = get_close_matches(word, entries, n=1)
+    hint = f"did you mean {close[0]!r}?" if close else f"the zoo has {', '.join(entries)}."
+    raise ModelError(
+        f"{word!r} is neither a target of the zoo nor a data file, gym:ENVIRONMENT or "
+        f"path/to/file.py:function; {hint}"
+    )
+
+
+def resolve_task(word: str, model: str) -> "ControlTask":
+    """Returns the task that ``--task`` names: one of the zoo, or ``path/to/file.py:function``.
+
+    Args:
+        word: The task; the model's own if empty.
+        model: The word that named the model.
+
+    Raises:
+        ModelError: There is no such task, or the model has none of its own.
+    """
+    from npdr_ppl.workflows.control_task import ControlTask, control_task, control_tasks
+
+    if _is_function(word):
+        return _returned_by(word, ControlTask)
+    word = word or DEFAULT_TASKS.get(model, "")
+    if not word:
+        raise ModelError(
+            f"There is no task that goes with {model}: pass --task with path/to/file.py:function "
+            f"or one of {', '.join(control_tasks())}."
+        )
+    return control_task(word)
+
+
+def resolve_backend(word: str) -> "str | Backend":
+    """Returns the backend that e.g. ``snpe-c`` or ``snpe-c(flow=maf)`` names.
+
+    One without options stays a word, as which it is recorded with a run.
+
+    Raises:
+        BackendError: There is no such backend or option.
+    """
+    from npdr_ppl.inference.registry import backend
+
+    return _method(word, backend)
+
+
+def resolve_search(word: str) -> "str | PolicySearch[Any]":
+    """Returns the policy search that e.g. ``power`` or ``power(population=100)`` names.
+
+    One without options stays a word, as which it is recorded with a run.
+
+    Raises:
+        ModelError: There is no such search or option.
+    """
+    from npdr_ppl.policies.search_registry import policy_search
+
+    return _method(word, policy_search)
+
+
+def _method(word: str, make: Callable[..., T]) -> str | T:
+    """Makes what a word with options in parentheses names; without options, only checks it."""
+    from npdr_ppl.workflows.candidates import name_and_options
+
+    name, options = name_and_options(word)
+    try:
+        method = make(name, **options)
+    except TypeError as error:
+        raise ModelError(f"{word!r} has an option of the wrong type: {error}.") from error
+    return method if options else name
+
+
+def _is_function(word: str) -> bool:
+    """Returns whether a word has the form ``path/to/file.py:function``."""
+    path, separator, _ = word.rpartition(":")
+    return bool(separator) and path.endswith(".py")
+
+
+def _returned_by(word: str, kind: type[T]) -> T:
+    """Calls the function that ``path/to/file.py:function`` names, and checks what it returns."""
+    path, _, function = word.rpartition(":")
+    try:
+        found = _load_function(Path(path), function)()
+    except NpdrError:
+        raise
+    except Exception as error:
+        raise ModelError(f"{word} failed: {type(error).__name__}: {error}.") from error
+    if not isinstance(found, kind):
+        raise ModelError(
+            f"{word} should return a {kind.__name__}; it returned a {type(found).__name__}."
+        )
+    return found

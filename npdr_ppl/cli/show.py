@@ -1,8 +1,9 @@
 """Result tables on the terminal."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import mean, stdev
 from typing import Any
 
 from rich.box import SIMPLE
@@ -10,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["show_comparison", "show_fit", "show_rows"]
+__all__ = ["show_comparison", "show_fit", "show_rows", "show_training"]
 
 FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
 """Columns of figures with the width they need."""
@@ -89,6 +90,30 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
     console.print(f"Results and figures are in {out}/")
 
 
+def show_training(result: Mapping[str, Any], out: Path) -> None:
+    """Prints the content of ``train.json``, a row for each iteration."""
+    console = _console()
+    table = Table(title="Returns on the target and in simulation", box=SIMPLE)
+    table.add_column("iteration", justify="right", no_wrap=True)
+    table.add_column("real return", justify="right", no_wrap=True)
+    table.add_column("decision", no_wrap=True)
+    table.add_column("what the loop did", no_wrap=True)
+    # Of the policy that the iteration trained, which the next one runs.
+    table.add_column("simulated return", justify="right", no_wrap=True)
+    for number, row in enumerate(result["iterations"], start=1):
+        table.add_row(
+            str(number),
+            _spread(row["real_returns"]),
+            "\n".join(decision["decision"] for decision in row["decisions"]),
+            "\n".join(decision["action"] for decision in row["decisions"]),
+            _number(row.get("sim_return"), ".0f"),
+        )
+    console.print(table)
+    last = result["iterations"][-1]
+    _print_reason(console, last["decision"], last["reason"])
+    console.print(f"Results and figures are in {out}/")
+
+
 def show_rows(title: str, result: Mapping[str, Any]) -> None:
     """Prints the content of a reproduction's JSON: ours beside the paper's."""
     table = Table(title=title, box=SIMPLE)
@@ -125,6 +150,12 @@ def _print_reason(console: Console, what: str, reason: str) -> None:
 
 def _number(value: float | None, format_spec: str) -> str:
     return "–" if value is None or not math.isfinite(value) else format(value, format_spec)
+
+
+def _spread(values: Sequence[float]) -> str:
+    """Returns the mean of some values, and their standard deviation if they are several."""
+    middle = f"{mean(values):.0f}"
+    return f"{middle} ± {stdev(values):.0f}" if len(values) > 1 else middle
 
 
 def _figure(value: Mapping[str, float] | None) -> str:

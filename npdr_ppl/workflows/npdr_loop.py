@@ -16,6 +16,7 @@ With a folder, every rollout, round and policy is on disk before the next step, 
 killed continues to the same result; see :mod:`npdr_ppl.workflows.loop_folder`.
 """
 
+import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from enum import StrEnum
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
@@ -48,6 +49,7 @@ from npdr_ppl.workflows.domains import (
     simulator_of,
 )
 from npdr_ppl.workflows.evaluation import declares_noise, residual_noise
+from npdr_ppl.workflows.fit import describe
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.loop_folder import LoopFolder
 from npdr_ppl.workflows.policy_optimisation import optimise_policy
@@ -56,7 +58,12 @@ from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.real_rollouts import RealRollouts
 from npdr_ppl.workflows.run_folder import plain
 
+if TYPE_CHECKING:
+    from npdr_ppl.workflows.arviz_module import Data
+
 __all__ = ["LoopOptions", "Revise", "Training", "train"]
+
+_LOGGER = logging.getLogger(__name__)
 
 Model = Callable[..., Any]
 
@@ -224,8 +231,10 @@ def train(
     with reporter(progress) as report, ExitStack() as stack:
         path = out or stack.enter_context(TemporaryDirectory(prefix="npdr-"))
         folder = LoopFolder(Path(path))
+        loop = _Loop(model, target, task, options, folder, revise, seed, report)
+        # Only now: a model or target that does not fit leaves no folder of a run.
         folder.begin(model, target, task, options, seed=seed)
-        return _Loop(model, target, task, options, folder, revise, seed, report).run()
+        return loop.run()
 
 
 class _Loop:
@@ -264,11 +273,20 @@ class _Loop:
 
     def run(self) -> Training:
         """Runs all iterations, or those that are left."""
+        if not self._can_collect(self.options.rollouts):
+            raise DataError(
+                f"{self.target.name} has {self.target.num_episodes} episodes; an iteration takes "
+                f"{self.options.rollouts}."
+            )
         if self.options.starts_from_prior:
             self._optimise(0, self._prior_domains(self.options.num_domains), self.report)
         for index in range(self.options.iterations):
             report = self.report.under(f"iteration {index + 1}/{self.options.iterations}")
             if not self._can_collect(self.options.rollouts):
+                _LOGGER.warning(
+                    "All %d episodes of %s have been used, after %d of %d iterations.",
+                    self.target.num_episodes, self.target.name, index, self.options.iterations,
+                )  # fmt: skip
                 break
             self.records.append(self._iterate(index, report))
             self.folder.write_result(self._result().to_dict())
@@ -320,6 +338,7 @@ class _Loop:
             "num_rollouts": len(self.rollouts),
             "decisions": settled.decisions,
             "internal_model": self.domain,
+            "parameters": describe(settled.data)["parameters"],
         }
         if not is_last:
             domains = self._posterior_domains(index, settled)
@@ -349,8 +368,9 @@ class _Loop:
         attempt = 0
         while True:
             posterior = self._infer(index, attempt, rounds, report)
+            data = posterior.to_arviz(PREDICTIVE_DRAWS, seed=self.seed)
             diagnosis = diagnose(
-                posterior.to_arviz(PREDICTIVE_DRAWS, seed=self.seed),
+                data,
                 options.thresholds,
                 rounds_left=extra_rounds,
                 rollouts_left=self._extra_rollouts_left(index),
@@ -386,7 +406,7 @@ class _Loop:
                 }
             )
             if action not in _GO_ON:
-                return _Settled(posterior, decisions, action)
+                return _Settled(posterior, data, decisions, action)
 
     def _extra_rollouts_left(self, index: int) -> int:
         """Returns how many more episodes a diagnosis may ask for."""
@@ -482,6 +502,7 @@ class _Settled:
     """A posterior, and what was decided about it."""
 
     posterior: Posterior
+    data: "Data"
     decisions: list[dict[str, Any]]
     action: "Action"
 

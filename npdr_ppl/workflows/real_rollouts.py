@@ -46,12 +46,13 @@ class RealRollouts:
         sensors = [sensor.name for sensor in target.sensors]
         actions = [action.name for action in target.actions]
         policy = task.policy
-        missing = [name for name in policy.observations if name not in sensors]
-        missing += [name for name in policy.actions if name not in actions]
-        if missing and not target.is_recorded:
+        needed = [*policy.observations, *policy.actions]
+        if target.is_recorded:  # no policy is run, but rewards are computed
+            needed = [state.name for state in simulator.states]
+            needed += [action.name for action in simulator.actions]
+        missing = [name for name in needed if name not in sensors + actions]
+        if missing:
             raise DataError(f"{target.name} has no channel {', '.join(missing)}.")
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
 
     def collect(
         self, episode: int, policy: Policy, domain: Mapping[str, float], *, seed: int
@@ -67,6 +68,8 @@ class RealRollouts:
         Raises:
             DataError: The rollout has no whole step.
         """
+        if self.folder is not None:
+            self.folder.mkdir(parents=True, exist_ok=True)
         file = None if self.folder is None else self.folder / f"rollout_{episode:03d}.nc"
         if file is not None and file.exists():
             return Rollouts.from_netcdf(file)

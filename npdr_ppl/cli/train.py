@@ -1,0 +1,185 @@
+"""`npdr train`: a policy for a device that differs from its simulator."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["train"]
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
+class InternalModel(StrEnum):
+    """Parameters of the policy's own model on the target."""
+
+    MOST_LIKELY = "most-likely"
+    NOMINAL = "nominal"
+
+
+def train(
+    model: Annotated[str, typer.Argument(help="Zoo name, or path/to/file.py:function.")],
+    target: Annotated[
+        str,
+        typer.Option(
+            help="What the policy is for: a target of the zoo (see npdr targets), a file of "
+            "rollouts, gym:ENVIRONMENT, or path/to/file.py:function."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the run and its results.")],
+    task: Annotated[
+        str,
+        typer.Option(
+            help="What the policy is to do: see npdr tasks, or path/to/file.py:function; the "
+            "model's own if not given."
+        ),
+    ] = "",
+    backend: Annotated[
+        str, typer.Option(help="Inference backend, e.g. snpe-c(flow=maf); see npdr backends.")
+    ] = "snpe-c",
+    search: Annotated[
+        str, typer.Option(help="Policy search, e.g. power(population=100); see npdr searches.")
+    ] = "power",
+    iterations: Annotated[int, typer.Option(min=1, help="Iterations of the loop.")] = 5,
+    rollouts: Annotated[int, typer.Option(min=1, help="Real rollouts per iteration.")] = 1,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of simulating and training.")] = 3,
+    simulations: Annotated[int, typer.Option(min=10, help="Simulations per round.")] = 5_000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--effect",
+            "--effects",
+            help="Effect to attach, port.effect; may be repeated, or several with commas.",
+        ),
+    ] = None,
+    embedding: Annotated[
+        str, typer.Option(help="Trajectory features: bayessim, all/50, gru/10, ...")
+    ] = "all/50",
+    segment_length: Annotated[
+        int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")
+    ] = 200,
+    search_iterations: Annotated[
+        int, typer.Option(min=1, help="Iterations of the policy search, each time.")
+    ] = 5,
+    domains: Annotated[
+        int, typer.Option(min=1, help="Domains that the policy is trained in.")
+    ] = 50,
+    spread: Annotated[
+        float, typer.Option(min=0, max=1, help="Spread of the domains around the posterior.")
+    ] = 0.1,
+    internal_model: Annotated[
+        InternalModel, typer.Option(help="Parameters of the policy's own model.")
+    ] = InternalModel.MOST_LIKELY,
+    decisions: Annotated[
+        bool,
+        typer.Option("--decisions/--no-decisions", help="Follow diagnoses, or only log them."),
+    ] = True,
+    extra_rollouts: Annotated[
+        int, typer.Option(min=0, help="Real rollouts that diagnoses may ask for in all.")
+    ] = 0,
+    stop_return: Annotated[
+        float | None, typer.Option(help="Real return at which an accepted posterior is the end.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the run that the folder holds.")
+    ] = False,
+    animate: Annotated[
+        bool, typer.Option("--animate", help="Draw the last rollout as rollout.gif (Furuta only).")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON instead of a table.")
+    ] = False,
+) -> None:
+    """Train a policy for a target domain: run it, infer the parameters, train, and again.
+
+    The simulator is fitted to what the policy does on the target, and the policy is trained in
+    simulators drawn from the posterior. An interrupted run continues with --resume.
+
+    Example: npdr train furuta --target furuta-hard --effects
+    arm.coulomb_friction,pole.coulomb_friction --iterations 3 --out run
+    """
+    from npdr_ppl.cli.resolve import (
+        resolve_backend,
+        resolve_effects,
+        resolve_model,
+        resolve_search,
+        resolve_target,
+        resolve_task,
+    )
+    from npdr_ppl.cli.show import show_training
+    from npdr_ppl.errors import DataError
+    from npdr_ppl.plots.furuta_animation import check_animated, write_furuta_animation
+    from npdr_ppl.plots.training_figures import last_rollout, write_training_figures
+    from npdr_ppl.workflows.binding import BindingOptions
+    from npdr_ppl.workflows.npdr_loop import LoopOptions
+    from npdr_ppl.workflows.npdr_loop import train as run_train
+
+    _check_folder(out, resume)
+    chosen = resolve_effects(resolve_model(model), effect or [])
+    chosen_task = resolve_task(task, model)
+    device = resolve_target(target)
+    if device.num_episodes is not None and rollouts > device.num_episodes:
+        raise DataError(
+            f"{target} has {device.num_episodes} rollouts, too few for --rollouts {rollouts}."
+        )
+    if animate:
+        check_animated([sensor.name for sensor in device.sensors])
+    options = LoopOptions(
+        iterations=iterations,
+        rollouts=rollouts,
+        extra_rollouts=extra_rollouts,
+        backend=resolve_backend(backend),
+        rounds=rounds,
+        num_simulations=simulations,
+        binding=BindingOptions(embedding, segment_length or None, "estimated", "float32"),
+        search=resolve_search(search),
+        search_iterations=search_iterations,
+        num_domains=domains,
+        spread=spread,
+        internal_model=(
+            "most likely" if internal_model is InternalModel.MOST_LIKELY else "nominal"
+        ),
+        follows_decisions=decisions,
+        stop_return=stop_return,
+    )
+    try:
+        training = run_train(
+            chosen,
+            device,
+            chosen_task,
+            options,
+            out=out,
+            seed=seed,
+            progress=False if quiet else None,
+        )
+    except KeyboardInterrupt:
+        typer.echo(
+            f"npdr: interrupted; the same command with --resume continues the run in {out}.",
+            err=True,
+        )
+        raise typer.Exit(INTERRUPTED) from None
+    write_training_figures(training, device, chosen_task, options, out)
+    if animate:
+        rollout = training.rollouts[[last_rollout(training.iterations)]]
+        write_furuta_animation(rollout, out / "rollout.gif", domain=training.domain)
+    if as_json:
+        typer.echo((out / "train.json").read_text(), nl=False)
+    elif not quiet:
+        show_training(training.to_dict(), out)
+
+
+def _check_folder(out: Path, is_resumed: bool) -> None:
+    """Raises an error if a run would be continued by accident, or begun by accident."""
+    from npdr_ppl.errors import DataError
+
+    holds_run = (out / "loop.json").exists()
+    if holds_run and not is_resumed:
+        raise DataError(
+            f"{out} holds a run already: pass --resume to continue it, or choose another folder."
+        )
+    if is_resumed and not holds_run:
+        raise DataError(f"{out} holds no run to continue: leave --resume away to begin one.")

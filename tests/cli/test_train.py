@@ -1,0 +1,205 @@
+"""`npdr train`: what it writes, how it continues, and one sentence for bad input."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from npdr_ppl.cli import main as cli
+from npdr_ppl.cli.resolve import (
+    resolve_backend,
+    resolve_effects,
+    resolve_search,
+    resolve_target,
+    resolve_task,
+)
+from npdr_ppl.errors import ModelError, NpdrError
+from npdr_ppl.models.furuta import furuta
+from npdr_ppl.rollouts import Rollouts
+
+RIG = """
+import dataclasses
+from npdr_ppl.models.furuta_targets import furuta_target
+from npdr_ppl.workflows.control_task import control_task
+
+class Stuck:
+    pass
+
+def short():
+    return dataclasses.replace(control_task("furuta-swing-up"), num_steps=60)
+
+def interrupted():
+    target = furuta_target("furuta-easy")
+    def run(*args, **kwargs):
+        raise KeyboardInterrupt
+    target.run = run
+    return target
+
+def wrong():
+    return Stuck()
+
+def broken():
+    raise ValueError("no rig at port 7")
+"""
+
+QUICK = [
+    "--rounds", 1, "--simulations", 20, "--segment-length", 20, "--embedding", "all/10",
+    "--backend", "snpe-c(transforms=1, hidden=(8,), epochs=2, members=2)",
+    "--search", "power(population=3)", "--search-iterations", 1, "--domains", 3,
+]  # fmt: skip
+
+
+def run(monkeypatch, capsys, *words):
+    """Runs the command line in this process; returns exit code, output and error text."""
+    monkeypatch.setattr(sys, "argv", ["npdr", *map(str, words)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    out, err = capsys.readouterr()
+    return stop.value.code or 0, out, err
+
+
+@pytest.fixture
+def rig(tmp_path):
+    path = tmp_path / "rig.py"
+    path.write_text(RIG)
+    return path
+
+
+@pytest.fixture
+def recording(tmp_path):
+    path = tmp_path / "recorded.csv"
+    Rollouts.from_arrays(
+        readings=np.zeros((2, 5, 2)), actions=np.zeros((2, 4, 1)),
+        channel_names=("angle", "velocity"), action_names=("torque",), time_step=0.02,
+    ).to_csv(path)  # fmt: skip
+    return path
+
+
+def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
+    out = tmp_path / "run"
+    words = [
+        "train", "furuta", "--target", "furuta-random-7", "--task", f"{rig}:short", "--out", out,
+        "--rollouts", 2, "--no-decisions", *QUICK,
+    ]  # fmt: skip
+    code, text, err = run(monkeypatch, capsys, *words, "--iterations", 1, "--animate")
+    assert code == 0, err
+    assert "simulated return" in text and "decisions are only logged" in text
+    assert max(map(len, text.splitlines())) <= 100
+    first = json.loads((out / "train.json").read_text())
+    assert {"decision", "reason", "real_return", "sim_return"} <= set(first["iterations"][0])
+    assert len(first["iterations"][0]["real_returns"]) == 2
+    for name in ("learning_curve.png", "rollouts.png", "parameters.png", "rollout.gif"):
+        assert (out / name).stat().st_size > 1_000
+    # A run is not continued by accident.
+    code, _, err = run(monkeypatch, capsys, *words)
+    assert code == 2 and "--resume" in err and len(err.strip().splitlines()) == 1
+    code, _, err = run(monkeypatch, capsys, *words, "--resume", "--seed", 1)
+    assert code == 2 and "differs in seed" in err
+    # More iterations continue it; figures are made anew.
+    (out / "learning_curve.png").unlink()
+    code, text, _ = run(
+        monkeypatch, capsys, *words, "--resume", "--iterations", 2, "--json", "--quiet"
+    )
+    assert code == 0
+    second = json.loads(text)
+    assert second == json.loads((out / "train.json").read_text())
+    assert second["iterations"][0] == first["iterations"][0]
+    assert len(second["iterations"]) == 2
+    assert (out / "learning_curve.png").exists()
+
+
+def test_ctrl_c_says_how_to_go_on(monkeypatch, capsys, tmp_path, rig):
+    out = tmp_path / "run"
+    code, _, err = run(
+        monkeypatch, capsys, "train", "furuta", "--target", f"{rig}:interrupted", "--task",
+        f"{rig}:short", "--out", out, *QUICK,
+    )  # fmt: skip
+    assert code not in (0, 2)
+    assert "--resume" in err and str(out) in err and "Traceback" not in err
+    assert (out / "loop.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--target", "furta-hard"], "did you mean 'furuta-hard'"),
+        (["--target", "furuta-hrad"], "did you mean 'furuta-hard'"),
+        (["--target", "missing.csv"], "missing.csv"),
+        (["--target", "missing.py:rig"], "missing.py does not exist"),
+        (["--target", "RIG:nothing"], "no function 'nothing'"),
+        (["--target", "RIG:wrong"], "should return a TargetDomain; it returned a Stuck"),
+        (["--target", "RIG:broken"], "no rig at port 7"),
+        (["--target", "furuta-easy", "--task", "furuta-swing-down"], "furuta-swing-up"),
+        (["--target", "furuta-easy", "--task", "RIG:wrong"], "should return a ControlTask"),
+        (["--target", "furuta-easy", "--backend", "mcmc"], "mcmc"),
+        (["--target", "furuta-easy", "--backend", "snpe-c(flw=maf)"], "did you mean 'flow'"),
+        (["--target", "furuta-easy", "--search", "powre"], "did you mean 'power'"),
+        (["--target", "furuta-easy", "--search", "power(population=many)"], "wrong type"),
+        (["--target", "furuta-easy", "--effects", "arm.coulomb"], "'coulomb_friction'"),
+        (["--target", "furuta-easy", "--resume"], "no run to continue"),
+        (["--target", "DATA", "--rollouts", "3"], "has 2 rollouts, too few"),
+        (["--target", "DATA", "--animate"], "no channel arm_angle, pole_angle"),
+    ],
+)
+def test_bad_input_gets_one_sentence(
+    monkeypatch, capsys, tmp_path, rig, recording, words, sentence
+):
+    words = [word.replace("RIG", str(rig)).replace("DATA", str(recording)) for word in words]
+    out = tmp_path / "run"
+    code, _, err = run(monkeypatch, capsys, "train", "furuta", "--out", out, *words)
+    assert code == 2
+    assert sentence in err
+    assert "Traceback" not in err
+    assert len(err.strip().splitlines()) == 1
+    assert not out.exists(), "what never began leaves nothing to continue"
+
+
+def test_targets_come_from_everywhere(monkeypatch, recording):
+    assert resolve_target("furuta-random-7").name == "furuta-random-7"
+    recorded = resolve_target(str(recording))
+    assert recorded.is_recorded and recorded.num_episodes == 2
+    assert recorded.name == "recorded"
+    # A file may well be called like a target.
+    named = recording.rename(recording.with_name("furuta-easy.csv"))
+    assert resolve_target(str(named)).is_recorded
+    with pytest.raises(NpdrError, match="NoSuchRobot"):
+        resolve_target("gym:NoSuchRobot-v1")
+
+
+def test_gymnasium_targets():
+    pytest.importorskip("gymnasium")
+    assert resolve_target("gym:Pendulum-v1").name == "Pendulum-v1"
+
+
+def test_tasks_go_with_models_of_the_zoo(rig):
+    assert resolve_task("", "furuta").name == "furuta-swing-up"
+    assert resolve_task(f"{rig}:short", "pendulum").num_steps == 60
+    with pytest.raises(ModelError, match="no task that goes with pendulum.*--task"):
+        resolve_task("", "pendulum")
+
+
+def test_methods_without_options_stay_words():
+    assert resolve_search("power") == "power"
+    assert resolve_search("power(population=7)").population == 7
+    assert resolve_backend("snpe-a") == "snpe-a"
+    assert resolve_backend("snpe-c(members=2)").members == 2
+
+
+def test_effects_are_split_at_the_commas_between_them():
+    several = "arm.coulomb_friction, arm_velocity,pole_velocity.sensor_low_pass"
+    attached = resolve_effects(furuta, [several, "pole.coulomb_friction"]).effects
+    assert [effect.name for effect, _ in attached] == [
+        "arm.coulomb_friction",
+        "arm_velocity,pole_velocity.sensor_low_pass",
+        "pole.coulomb_friction",
+    ]
+
+
+@pytest.mark.parametrize("command", ["targets", "tasks", "searches"])
+def test_listings(monkeypatch, capsys, command):
+    code, text, _ = run(monkeypatch, capsys, command, "--json")
+    rows = json.loads(text)
+    assert code == 0
+    assert all(row["summary"] for row in rows)
+    assert run(monkeypatch, capsys, command)[0] == 0
