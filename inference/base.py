@@ -119,6 +119,15 @@ class Backend(ABC):
     def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
         """Proposes parameters to simulate, ``(num_simulations, d)``."""
 
+    def ask_near(
+        self, problem: Problem, posterior: Density, num_simulations: int
+    ) -> Tensor | None:
+        """Proposes a first round near the posterior of an earlier inference of the same model.
+
+        ``None`` if the method cannot correct for such a proposal and has to start from the prior.
+        """
+        return None
+
     @abstractmethod
     def tell(
         self,

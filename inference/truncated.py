@@ -16,12 +16,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npdr_ppl.inference.base import Problem, State
+from npdr_ppl.inference.base import Density, Problem, State
 from npdr_ppl.inference.mixture import Mixture
 from npdr_ppl.inference.neural import NeuralBackend, NeuralState
 from npdr_ppl.inference.proposals import log_density_bound, sample_truncated_prior
 
 __all__ = ["TruncatedBackend"]
+
+OUTSIDE_EARLIER = 1e-3
+"""Mass of an earlier posterior outside the region it is a proposal for: less than within one
+inference, because other data may move the posterior."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,13 @@ class TruncatedBackend(NeuralBackend):
         posterior = Mixture(self.densities(problem, state))
         with torch.no_grad():
             return sample_truncated_prior(problem, num_simulations, posterior, self.outside)
+
+    def ask_near(
+        self, problem: Problem, posterior: Density, num_simulations: int
+    ) -> Tensor | None:
+        """Proposes the prior restricted to the region of an earlier posterior."""
+        with torch.no_grad():
+            return sample_truncated_prior(problem, num_simulations, posterior, OUTSIDE_EARLIER)
 
     def _training_rows(self, problem: Problem, state: NeuralState) -> Tensor:
         """Returns which simulations lie in the neighbourhood to train on, ``(n,)``."""

@@ -12,10 +12,11 @@ from torch import Tensor
 from npdr_ppl.embeddings import Embedding
 from npdr_ppl.errors import BackendError, NpdrError
 from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
+from npdr_ppl.inference.mixture import Mixture
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.randomness import seeded
 from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data, bind, problem_of
-from npdr_ppl.workflows.posterior import Posterior, Provenance
+from npdr_ppl.workflows.posterior import Posterior, PosteriorBase, Provenance
 from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.run_folder import RunFolder
 
@@ -39,6 +40,7 @@ def infer(
     initial_state: Literal["estimated", "recorded"] = "estimated",
     precision: Literal["float64", "float32"] = "float64",
     device: str | torch.device = "cpu",
+    start: PosteriorBase | None = None,
     checkpoint: str | PathLike[str] | None = None,
     progress: bool | Reporter | None = None,
 ) -> Posterior:
@@ -58,6 +60,9 @@ def infer(
         initial_state: State at a segment's start: ``"estimated"`` or ``"recorded"``.
         precision: Floating-point type of the simulation.
         device: Where trajectories are simulated and the backend trains.
+        start: Posterior of the same model given other data. A backend that can correct for it
+            simulates the prior in that region only; if the new posterior lies elsewhere it is not
+            found.
         checkpoint: Folder to save every round in; an interrupted run continues from there.
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
@@ -106,7 +111,7 @@ def infer(
             state, info, spent = run_round(
                 bound, method, problem, states[-1], index,
                 num_simulations=num_simulations, seed=seed, report=report, label=label,
-                store=store,
+                start=start if index == 0 else None, store=store,
             )  # fmt: skip
             states.append(state)
             seconds = {stage: seconds[stage] + spent[stage] for stage in seconds}
@@ -128,6 +133,7 @@ def run_round(
     seed: int,
     report: Reporter,
     label: str = "",
+    start: PosteriorBase | None = None,
     store: RunFolder | None = None,
 ) -> tuple[State, RoundInfo, dict[str, float]]:
     """Proposes, simulates and trains once.
@@ -142,6 +148,7 @@ def run_round(
         seed: Seed of the run.
         report: Where to report progress.
         label: Words for the progress bar.
+        start: An earlier posterior to propose from, if the backend can.
         store: Where the round's simulations are kept, if anywhere.
 
     Returns:
@@ -150,7 +157,10 @@ def run_round(
     """
     started = time.perf_counter()
     with seeded(seed, "propose", index):
-        z = method.ask(problem, state, num_simulations).cpu()
+        z = None
+        if start is not None:
+            z = method.ask_near(problem, Mixture(start.densities), num_simulations)
+        z = (method.ask(problem, state, num_simulations) if z is None else z).cpu()
     x = None if store is None else store.simulations(index, z)
     if x is None:
         x = simulate_features(bound, z, seed, f"round {index}", report, label)

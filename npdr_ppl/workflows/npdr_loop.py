@@ -90,7 +90,8 @@ class Action(StrEnum):
     LOGGED = "none, decisions are only logged"
 
 
-_GO_ON = (Action.MORE_ROUNDS, Action.ANOTHER_ROLLOUT, Action.REVISED, Action.NOTHING_FOUND)
+# After these the posterior is inferred anew, in a folder of its own.
+_NEW_ATTEMPTS = (Action.ANOTHER_ROLLOUT, Action.REVISED, Action.NOTHING_FOUND)
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,8 @@ class LoopOptions:
         binding: How rollouts are prepared for inference.
         noise: ``"auto"`` gives a model without noise that of the closest fit's residuals;
             ``"model"`` takes it as it is.
+        start: Where inference starts in later iterations: from the prior, or, as in the paper,
+            from the last posterior where the backend can and does.
         search: The policy search; one with options of its own if it is no name.
         search_iterations: Iterations of the policy search, each time.
         num_domains: Domains that the policy is trained in.
@@ -137,6 +140,7 @@ class LoopOptions:
         default_factory=lambda: BindingOptions("all/50", 200, "estimated", "float32")
     )
     noise: Literal["auto", "model"] = "auto"
+    start: Literal["prior", "posterior"] = "prior"
     search: str | PolicySearch[Any] = "power"
     search_iterations: int = 5
     num_domains: int = 50
@@ -349,20 +353,31 @@ class _Loop:
 
     def _take_over(self, index: int, saved: dict[str, Any], report: Reporter) -> None:
         """Repeats the steps of a finished iteration that change more than its record."""
+        rounds, attempt = self._rounds(), 0
         for decision in saved["decisions"]:
-            if decision["action"] == Action.ANOTHER_ROLLOUT:
+            action = decision["action"]
+            if action == Action.ANOTHER_ROLLOUT:
                 self._collect(self.task.excitation or self.policy)
-            if decision["action"] == Action.REVISED:
+            if action == Action.REVISED:
                 self._revised(index)
+            rounds += action == Action.MORE_ROUNDS
+            attempt += action in _NEW_ATTEMPTS
+        if self.folder.iteration(index + 1) is None:
+            # The last one finished: its posterior is read from disk.
+            self.posterior = self._infer(index, attempt, rounds, report)
         self.domain = saved["internal_model"]
         if not _is_final(saved):
             self._optimise(index + 1, None, report)
+
+    def _rounds(self) -> int:
+        """Returns how many rounds inference has before any is added."""
+        return self.options.rounds if self.backend.is_sequential else 1
 
     def _infer_and_decide(self, index: int, real_return: float, report: Reporter) -> "_Settled":
         """Infers the posterior and does what its diagnosis asks for until that settles it."""
         options = self.options
         decisions: list[dict[str, Any]] = []
-        rounds = options.rounds if self.backend.is_sequential else 1
+        rounds = self._rounds()
         extra_rounds = options.extra_rounds if self.backend.is_sequential else 0
         has_revised = self.revise is None
         attempt = 0
@@ -381,13 +396,12 @@ class _Loop:
             elif decision is Decision.MORE_ROUNDS:
                 action, rounds, extra_rounds = Action.MORE_ROUNDS, rounds + 1, extra_rounds - 1
             elif decision is Decision.NEW_ROLLOUT:
-                action, attempt = Action.ANOTHER_ROLLOUT, attempt + 1
+                action = Action.ANOTHER_ROLLOUT
                 self._collect(self.task.excitation or self.policy)
             elif decision is Decision.REVISE_MODEL and not has_revised:
                 has_revised = True
                 is_found = self._revised(index)
                 action = Action.REVISED if is_found else Action.NOTHING_FOUND
-                attempt += 1
             elif decision is Decision.REVISE_MODEL:
                 action = Action.SPREAD
             elif decision is Decision.WIDEN:
@@ -405,7 +419,8 @@ class _Loop:
                     "diagnosis": diagnosis.to_dict(),
                 }
             )
-            if action not in _GO_ON:
+            attempt += action in _NEW_ATTEMPTS
+            if action not in (Action.MORE_ROUNDS, *_NEW_ATTEMPTS):
                 return _Settled(posterior, data, decisions, action)
 
     def _extra_rollouts_left(self, index: int) -> int:
@@ -446,9 +461,19 @@ class _Loop:
             segment_length=binding.segment_length,
             initial_state=binding.initial_state,
             precision=binding.precision,
+            start=self._start(index),
             checkpoint=self.folder.inference(index, attempt),
             progress=report,
         )
+
+    def _start(self, index: int) -> Posterior | None:
+        """Returns the last iteration's posterior if inference is to start from it."""
+        if self.options.start == "prior" or not self.backend.continues or index == 0:
+            return None
+        last = self.posterior
+        if last is None or last.prior.num_parameters != self.prior.num_parameters:
+            return None  # the model was revised
+        return last
 
     def _prior_domains(self, number: int) -> Domains:
         with seeded(self.seed, "prior domains"):

@@ -21,6 +21,7 @@ from npdr_ppl.targets import RecordedTarget
 from npdr_ppl.workflows import npdr_loop
 from npdr_ppl.workflows.diagnostics import Decision, Diagnosis
 from npdr_ppl.workflows.npdr_loop import Action, LoopOptions, train
+from npdr_ppl.workflows.run_folder import load_tensors
 
 sys.path.insert(0, str(Path(__file__).parent))
 from small_loop import HandmadePendulum, small_options, small_task  # noqa: E402
@@ -217,6 +218,26 @@ def test_more_iterations_continue_a_finished_run(tmp_path):
     longer = run(tmp_path, small_options(iterations=2))
     at_once = run(tmp_path / "other", small_options(iterations=2))
     assert longer.to_dict() == at_once.to_dict()
+
+
+def test_inference_may_start_from_the_last_posterior(tmp_path):
+    options = small_options(iterations=2, num_simulations=200)
+    anew = run(tmp_path / "anew", options)
+    options = dataclasses.replace(options, start="posterior")
+    onward = run(tmp_path / "onward", options)
+    spreads = [
+        load_tensors(tmp_path / name / "run/inference_1_0/round_0_simulations.safetensors")["z"]
+        .std(0)
+        .mean()
+        for name in ("anew", "onward")
+    ]
+    assert spreads[0] == pytest.approx(1.0, abs=0.15)  # the prior is N(0, I)
+    assert spreads[1] < 0.8 * spreads[0]
+    assert anew.iterations[0] == onward.iterations[0]
+    # Nothing was simulated again, and the posterior is there, where a finished run is resumed.
+    again = run(tmp_path / "onward", options)
+    assert again.to_dict() == onward.to_dict()
+    assert again.posterior is not None
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
