@@ -35,6 +35,14 @@ def reproduce(
     initial_state: Annotated[
         InitialState, typer.Option(help="State at a segment's start; the paper took recorded.")
     ] = InitialState.RECORDED,
+    returns: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="table2: training runs per method for the rows of returns, on a hidden rig in "
+            "MuJoCo; minutes each. 0 leaves these rows out.",
+        ),
+    ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
 ) -> None:
@@ -59,7 +67,7 @@ def reproduce(
         from npdr_ppl.models.furuta import furuta
         from npdr_ppl.plots.comparison_figures import write_comparison_figures
         from npdr_ppl.rollouts import Rollouts
-        from npdr_ppl.workflows.table2 import reproduce_table2
+        from npdr_ppl.workflows.table2 import add_returns, reproduce_table2
 
         if data is None:
             raise DataError("table2 needs the paper's recordings: pass --data FILE.")
@@ -74,5 +82,7 @@ def reproduce(
         )
         held_out = rollouts[result["held_out"]]
         write_comparison_figures(comparison, furuta, held_out, out, seed=seed)
+        if returns:
+            result = add_returns(result, out, num_seeds=returns, progress=progress)
     if not quiet:
         show_rows(experiment.value, result)

@@ -1,0 +1,109 @@
+"""Returns of trained policies on hidden rigs in MuJoCo, and what each part of the loop is worth.
+
+    python benchmarks/policy_loop.py --out study                     # the table
+    python benchmarks/policy_loop.py --out study --ablation          # the ablation
+    python benchmarks/policy_loop.py --out study --rigs furuta-random-100 --seeds 2
+
+Rigs hide their parameters and effects. Each method gets at most five real rollouts; a run is
+judged by fresh episodes of its last policy. Rollouts of one policy are nearly identical, so runs
+(rig and seed) are counted. What the folder holds is not run again, so a killed study continues.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from npdr_ppl.workflows.npdr_loop import LoopOptions
+from npdr_ppl.workflows.rig_study import METHODS, study, summarise
+
+SUCCESS = 1_400.0
+
+HARD = ("furuta-hard",)
+RANDOM = tuple(f"furuta-random-{seed}" for seed in range(10))
+
+ABLATION = {
+    "as it is": {},
+    "recorded initial states": {"binding.initial_state": "recorded"},
+    "decisions logged only": {"follows_decisions": False},
+    "point estimate": {"spread": 0.0, "num_domains": 1},
+    "posterior": {"spread": 0.0},
+    "posterior ± 20 %": {"spread": 0.2},
+    "nominal controller": {"internal_model": "nominal"},
+    "latest rollout only": {"rollouts_used": "latest"},
+    "started from the last posterior": {"start": "posterior"},
+}
+"""Changes of the loop's options; a dot goes into the binding's."""
+
+
+def changed(options: LoopOptions, changes: dict) -> LoopOptions:
+    """Returns the options with some changed."""
+    for name, value in changes.items():
+        group, _, option = name.rpartition(".")
+        if group:
+            value = replace(getattr(options, group), **{option: value})
+            name = group
+        options = replace(options, **{name: value})
+    return options
+
+
+def main() -> None:
+    """Runs the study that the arguments choose."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--methods", default=",".join(METHODS))
+    parser.add_argument("--rigs", default="", help="names; both sets of the table if not given")
+    parser.add_argument("--seeds", type=int, default=5, help="how many, from 0")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--simulations", type=int, default=5_000, help="of each round")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--iterations", type=int, default=5)
+    parser.add_argument("--ablation", action="store_true")
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    options = LoopOptions(
+        iterations=arguments.iterations,
+        rounds=arguments.rounds,
+        num_simulations=arguments.simulations,
+    )
+    sets = {"hard": HARD, "random": RANDOM}
+    if arguments.rigs:
+        sets = {"chosen": tuple(arguments.rigs.split(","))}
+    variants = ABLATION if arguments.ablation else {"": {}}
+    methods = ["npdr with effects"] if arguments.ablation else arguments.methods.split(",")
+    result = {}
+    started = time.perf_counter()
+
+    def note(label: str, rig: str, seed: int, outcome) -> None:
+        own = sum(outcome.returns) / len(outcome.returns)
+        real = " ".join(f"{record['real_return']:.0f}" for record in outcome.iterations)
+        seconds = time.perf_counter() - started
+        print(f"{seconds:6.0f} s  {label:27} {rig:18} {seed:3}  {own:6.0f}  ({real})", flush=True)
+
+    for variant, changes in variants.items():
+        folder = arguments.out / variant.replace(" ", "_").replace("%", "percent")
+        for name, rigs in sets.items():
+            found = study(
+                methods, rigs, seeds, changed(options, changes), folder, progress=False, note=note
+            )
+            for label, outcomes in found.items():
+                row = summarise(outcomes, SUCCESS)
+                result.setdefault(variant or label, {})[name] = row
+                rig = row["return_rig"]
+                print(
+                    f"{variant or label:32} {name:7} {rig['mean']:6.0f} ± {rig['std']:4.0f}  "
+                    f"success {row['success']:4.0%} of {row['runs']}  "
+                    f"nominal simulator {row['return_sim']['mean']:6.0f}",
+                    flush=True,
+                )
+    (arguments.out / "study.json").write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
