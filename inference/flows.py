@@ -18,6 +18,7 @@ from zuko.transforms import MonotonicAffineTransform, MonotonicRQSTransform
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density
+from npdr_ppl.inference.conditioned_flow import conditioned
 from npdr_ppl.inference.embedding_network import build_embedding
 from npdr_ppl.inference.features import Preconditioner
 from npdr_ppl.randomness import seeded
@@ -153,12 +154,13 @@ class FlowNetwork(nn.Module):
 
     def log_prob(self, u: Tensor, context: Tensor) -> Tensor:
         """Returns log q(u | f), ``(n,)``, given h(f), ``(n, num_features)``."""
-        base, log_det = self.transform(context).call_and_ladj(u)
-        return log_det - 0.5 * (base**2 + math.log(2 * math.pi)).sum(-1)
+        return _log_prob(self.transform(context), u)
 
-    def inverse(self, base: Tensor, context: Tensor) -> Tensor:
-        """Returns T^-1(base; h(f)), ``(n, d)``."""
-        return self.transform(context).inv(base)
+
+def _log_prob(transform: Any, u: Tensor) -> Tensor:
+    """Returns log N(T(u); 0, I) + log |det dT/du|."""
+    base, log_det = transform.call_and_ladj(u)
+    return log_det - 0.5 * (base**2 + math.log(2 * math.pi)).sum(-1)
 
 
 def _univariate(flow: str, transforms: int, bins: int) -> Sequence[Any]:
@@ -244,21 +246,20 @@ class FlowDensity(Density):
     def __init__(
         self, network: FlowNetwork, preconditioner: Preconditioner, observation: Tensor
     ) -> None:
-        self._network = network
         self._preconditioner = preconditioner
         self._features = preconditioner.features(observation[None])
         with torch.no_grad():
-            self._context = network.context(self._features)
+            self._transform: Any = conditioned(network.transform, network.context(self._features))
 
     def sample(self, num_samples: int) -> Tensor:
         """Draws ``(num_samples, d)`` from torch's global stream."""
-        device, d = self._context.device, len(self._preconditioner.offset)
+        device, d = self._features.device, len(self._preconditioner.offset)
         chunks: list[Tensor] = []
         drawn, redraws = 0, 0
         while drawn < num_samples:
             base = torch.randn(min(SAMPLE_CHUNK, num_samples - drawn), d).to(device)
             with torch.no_grad():
-                u = self._network.inverse(base, self._context.expand(len(base), -1))
+                u = self._transform.inv(base)
                 z = self._preconditioner.unwhiten(u, self._features)
             # Rounding can make the quadratic that inverts a spline unsolvable at a knot.
             z = z[z.isfinite().all(-1)]
@@ -271,6 +272,6 @@ class FlowDensity(Density):
 
     def log_prob(self, z: Tensor) -> Tensor:
         """Returns the log density at ``(n, d)``, shape ``(n,)``; differentiable in z."""
-        u = self._preconditioner.whiten(z.to(self._context.device), self._features)
-        log_q = self._network.log_prob(u, self._context.expand(len(z), -1))
+        u = self._preconditioner.whiten(z.to(self._features.device), self._features)
+        log_q = _log_prob(self._transform, u)
         return (log_q + self._preconditioner.log_det).to(z.device)
