@@ -23,7 +23,7 @@ bounded.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, ClassVar
@@ -46,6 +46,12 @@ RIDGE = 1e-3
 
 JITTER = 1e-6
 """Added to the correlation of the adjusted parameters: they may coincide."""
+
+FRACTIONS = (0.05, 0.1, 0.2, 0.35, 0.6, 1.0)
+"""Bandwidths to choose from, as fractions of Silverman's."""
+
+MAX_LEFT_OUT = 500
+"""Points left out, one at a time, to choose the bandwidth."""
 
 CHUNK = 1024
 """Points whose density is evaluated at once: each has a term for every accepted simulation."""
@@ -213,10 +219,32 @@ def _adjust(z: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
     return z - offset / scale @ gain
 
 
+def _likeliest_width(points: Tensor, share: Tensor, widths: Sequence[float]) -> float:
+    """Returns the bandwidth with the greatest leave-one-out log likelihood.
+
+    Args:
+        points: Points with mean zero and unit covariance, ``(k, d)``.
+        share: Their weights, ``(k,)``, with sum 1.
+        widths: Bandwidths to choose from.
+    """
+    some = torch.arange(0, len(points), max(1, len(points) // MAX_LEFT_OUT))
+    log_share = share.log().expand(len(some), -1).clone()
+    log_share[torch.arange(len(some)), some] = -torch.inf
+    scores = []
+    for width in widths:
+        shrunk = math.sqrt(1 - width**2) * points
+        square = (points[some, None] - shrunk).square().sum(-1) / width**2
+        log_density = (log_share - 0.5 * square).logsumexp(-1) - points.shape[1] * math.log(width)
+        scores.append(float((share[some] * log_density).sum()))
+    return widths[max(range(len(widths)), key=scores.__getitem__)]
+
+
 class KernelDensity(Density):
     """A mixture of Gaussian kernels with the mean and covariance of the points it is made of.
 
-    The bandwidth h is Silverman's (1986, Eq. 4.14) for the effective number of points.
+    The bandwidth h is a fraction of Silverman's (1986, Eq. 4.14) for the effective number of
+    points: the one under which each point is most likely given the others, because Silverman's is
+    meant for a single Gaussian and blurs modes and ridges.
 
     Args:
         points: Points z*, ``(k, d)``, in float64.
@@ -235,8 +263,13 @@ class KernelDensity(Density):
         correlation = correlation + JITTER * torch.eye(d, dtype=points.dtype)
         self._factor = scale[:, None] * torch.linalg.cholesky(correlation)
         effective = float(1 / (share**2).sum())
-        self._width = min(1.0, (4 / ((d + 2) * effective)) ** (1 / (d + 4)))
+        silverman = min(1.0, (4 / ((d + 2) * effective)) ** (1 / (d + 4)))
         self._share = share
+        self._width = _likeliest_width(
+            torch.linalg.solve_triangular(self._factor, centred.T, upper=False).T,
+            share,
+            [fraction * silverman for fraction in FRACTIONS],
+        )
         self._centres = mean + math.sqrt(1 - self._width**2) * centred
 
     def sample(self, num_samples: int) -> Tensor:
