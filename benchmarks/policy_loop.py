@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 
-from npdr_ppl.workflows.npdr_loop import LoopOptions
+from npdr_ppl.workflows.loop_options import LoopOptions
 from npdr_ppl.workflows.rig_study import METHODS, study, summarise
 
 SUCCESS = 1_400.0

@@ -51,7 +51,8 @@ if TYPE_CHECKING:
     from npdr_ppl.workflows.diagnostics import diagnose
     from npdr_ppl.workflows.infer import infer
     from npdr_ppl.workflows.learned_likelihood import with_likelihood
-    from npdr_ppl.workflows.npdr_loop import LoopOptions, Training, train
+    from npdr_ppl.workflows.loop_options import LoopOptions
+    from npdr_ppl.workflows.npdr_loop import Training, train
     from npdr_ppl.workflows.posterior import Posterior
 
 # Loaded when first used, so that importing the package stays quick.
@@ -60,7 +61,7 @@ _HOMES = {
     "Channel": "language.channels",
     "Effect": "language.effects",
     "Inputs": "language.inputs",
-    "LoopOptions": "workflows.npdr_loop",
+    "LoopOptions": "workflows.loop_options",
     "NpdrError": "errors",
     "Parameter": "language.channels",
     "Port": "language.channels",

@@ -115,7 +115,7 @@ def train(
     from npdr_ppl.plots.furuta_animation import check_animated, write_furuta_animation
     from npdr_ppl.plots.training_figures import last_rollout, write_training_figures
     from npdr_ppl.workflows.binding import BindingOptions
-    from npdr_ppl.workflows.npdr_loop import LoopOptions
+    from npdr_ppl.workflows.loop_options import LoopOptions
     from npdr_ppl.workflows.npdr_loop import train as run_train
 
     _check_folder(out, resume)

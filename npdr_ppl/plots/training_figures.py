@@ -18,7 +18,8 @@ from npdr_ppl.targets.base import TargetDomain
 from npdr_ppl.workflows.control_task import ControlTask
 from npdr_ppl.workflows.domains import domains_at, prior_of, simulator_of
 from npdr_ppl.workflows.loop_folder import LoopFolder
-from npdr_ppl.workflows.npdr_loop import LoopOptions, Training
+from npdr_ppl.workflows.loop_options import LoopOptions
+from npdr_ppl.workflows.npdr_loop import Training
 from npdr_ppl.workflows.units import prior_units
 
 __all__ = [

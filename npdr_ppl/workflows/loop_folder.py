@@ -33,7 +33,7 @@ from npdr_ppl.workflows.run_folder import (
 )
 
 if TYPE_CHECKING:
-    from npdr_ppl.workflows.npdr_loop import LoopOptions
+    from npdr_ppl.workflows.loop_options import LoopOptions
 
 __all__ = ["LoopFolder"]
 

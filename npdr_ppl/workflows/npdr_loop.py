@@ -17,30 +17,25 @@ killed continues to the same result; see :mod:`npdr_ppl.workflows.loop_folder`.
 """
 
 import logging
-from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
-from enum import StrEnum
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from npdr_ppl.errors import DataError, ModelError
-from npdr_ppl.inference.base import Backend
+from npdr_ppl.errors import DataError
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.policies.base import Policy
-from npdr_ppl.policies.search import PolicySearch
 from npdr_ppl.policies.search_registry import policy_search
 from npdr_ppl.randomness import derived_seed, seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.targets.base import TargetDomain
-from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.control_task import ControlTask
-from npdr_ppl.workflows.diagnostics import Decision, Thresholds, diagnose
+from npdr_ppl.workflows.diagnostics import Decision, diagnose
 from npdr_ppl.workflows.domains import (
     Domains,
     domains_at,
@@ -52,6 +47,14 @@ from npdr_ppl.workflows.evaluation import declares_noise, residual_noise
 from npdr_ppl.workflows.fit import describe
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.loop_folder import LoopFolder
+from npdr_ppl.workflows.loop_options import (
+    NEW_ATTEMPTS,
+    SPREAD_WIDER,
+    Action,
+    LoopOptions,
+    Model,
+    Revise,
+)
 from npdr_ppl.workflows.policy_optimisation import optimise_policy
 from npdr_ppl.workflows.posterior import Posterior
 from npdr_ppl.workflows.progress import Reporter, reporter
@@ -61,116 +64,12 @@ from npdr_ppl.workflows.run_folder import plain
 if TYPE_CHECKING:
     from npdr_ppl.workflows.arviz_module import Data
 
-__all__ = ["LoopOptions", "Revise", "Training", "train"]
+__all__ = ["Training", "train"]
 
 _LOGGER = logging.getLogger(__name__)
 
-Model = Callable[..., Any]
-
-Revise = Callable[[Model, Rollouts, Path | None], Model | None]
-"""Looks for what a model lacks: takes the model, all real rollouts and a folder of its own, and
-returns the revised model, or ``None`` if it found nothing. Called again with the same folder, as
-when a run is resumed, it must return the same."""
-
 PREDICTIVE_DRAWS = 500
 """Draws per ensemble member that a diagnosis reads."""
-
-
-class Action(StrEnum):
-    """What the loop did about a decision."""
-
-    TRAINED = "trained the policy on the posterior"
-    MIXED = "trained the policy on the posterior mixed with the prior"
-    SPREAD = "trained the policy on the posterior, spread wider"
-    MORE_ROUNDS = "added a round"
-    ANOTHER_ROLLOUT = "ran another rollout"
-    REVISED = "revised the model"
-    NOTHING_FOUND = "looked for a missing effect and found none"
-    KEPT = "kept the policy"
-    LOGGED = "none, decisions are only logged"
-
-
-# After these the posterior is inferred anew, in a folder of its own.
-_NEW_ATTEMPTS = (Action.ANOTHER_ROLLOUT, Action.REVISED, Action.NOTHING_FOUND)
-
-
-@dataclass(frozen=True)
-class LoopOptions:
-    """Options of Algorithm 1.
-
-    Attributes:
-        iterations: Iterations of the loop.
-        rollouts: Real rollouts H of each iteration.
-        extra_rollouts: Real rollouts that diagnoses may ask for in the whole run.
-        rollouts_used: Whether inference sees all rollouts so far or the latest iteration's.
-        backend: The inference backend; one with options of its own if it is no name.
-        rounds: Rounds R of inference in each iteration; one for backends that are not sequential.
-        extra_rounds: Rounds that a diagnosis may ask for in each iteration.
-        num_simulations: Simulations of each round.
-        binding: How rollouts are prepared for inference.
-        noise: ``"auto"`` gives a model without noise that of the closest fit's residuals;
-            ``"model"`` takes it as it is.
-        start: Where inference starts in later iterations: from the prior, or, as in the paper,
-            from the last posterior where the backend can and does.
-        search: The policy search; one with options of its own if it is no name.
-        search_iterations: Iterations of the policy search, each time.
-        num_domains: Domains that the policy is trained in.
-        num_initial_states: Initial states in each.
-        is_warm_start: Whether the search goes on from the last policy or begins anew.
-        starts_from_prior: Whether the first policy is trained on the prior or taken as it comes.
-        spread: Parameters of the domains are multiplied by numbers uniform in 1 ± ``spread``.
-        prior_share: Share of the domains drawn from the prior where the posterior is widened.
-        internal_model: Parameters of the policy's own model on the target: the most likely
-            sample's, or nominal.
-        follows_decisions: Whether diagnoses change what the loop does, or are logged only.
-        stop_return: Mean real return of an iteration at which an accepted posterior ends the
-            loop; ``None`` to use all iterations.
-        thresholds: Limits behind the decisions.
-    """
-
-    iterations: int = 5
-    rollouts: int = 1
-    extra_rollouts: int = 0
-    rollouts_used: Literal["all", "latest"] = "all"
-    backend: str | Backend = "snpe-c"
-    rounds: int = 3
-    extra_rounds: int = 2
-    num_simulations: int = 5_000
-    binding: BindingOptions = field(
-        default_factory=lambda: BindingOptions("all/50", 200, "estimated", "float32")
-    )
-    noise: Literal["auto", "model"] = "auto"
-    start: Literal["prior", "posterior"] = "prior"
-    search: str | PolicySearch[Any] = "power"
-    search_iterations: int = 5
-    num_domains: int = 50
-    num_initial_states: int = 4
-    is_warm_start: bool = True
-    starts_from_prior: bool = True
-    spread: float = 0.1
-    prior_share: float = 0.2
-    internal_model: Literal["most likely", "nominal"] = "most likely"
-    follows_decisions: bool = True
-    stop_return: float | None = None
-    thresholds: Thresholds = field(default_factory=Thresholds)
-
-    def __post_init__(self) -> None:
-        """Checks the options.
-
-        Raises:
-            ModelError: One is out of range.
-        """
-        least = {
-            "iterations": 1, "rollouts": 1, "rounds": 1, "num_simulations": 10,
-            "search_iterations": 1, "num_domains": 1, "num_initial_states": 1,
-            "extra_rollouts": 0, "extra_rounds": 0, "spread": 0, "prior_share": 0,
-        }  # fmt: skip
-        for name, low in least.items():
-            if not getattr(self, name) >= low:
-                raise ModelError(f"{name} must be at least {low}; got {getattr(self, name)}.")
-        for name in ("spread", "prior_share"):
-            if getattr(self, name) > 1:
-                raise ModelError(f"{name} must be at most 1; got {getattr(self, name)}.")
 
 
 @dataclass(frozen=True)
@@ -361,7 +260,7 @@ class _Loop:
             if action == Action.REVISED:
                 self._revised(index)
             rounds += action == Action.MORE_ROUNDS
-            attempt += action in _NEW_ATTEMPTS
+            attempt += action in NEW_ATTEMPTS
         if self.folder.iteration(index + 1) is None:
             # The last one finished: its posterior is read from disk.
             self.posterior = self._infer(index, attempt, rounds, report)
@@ -419,8 +318,8 @@ class _Loop:
                     "diagnosis": diagnosis.to_dict(),
                 }
             )
-            attempt += action in _NEW_ATTEMPTS
-            if action not in (Action.MORE_ROUNDS, *_NEW_ATTEMPTS):
+            attempt += action in NEW_ATTEMPTS
+            if action not in (Action.MORE_ROUNDS, *NEW_ATTEMPTS):
                 return _Settled(posterior, data, decisions, action)
 
     def _extra_rollouts_left(self, index: int) -> int:
@@ -490,7 +389,7 @@ class _Loop:
         z = settled.posterior.sample_mixture(number - from_prior, seed=seed)
         generator = torch.Generator().manual_seed(seed)
         # Where the model is wrong its posterior is too narrow, by how much nobody knows.
-        spread = options.spread * (2.0 if settled.action is Action.SPREAD else 1.0)
+        spread = options.spread * (2.0 if settled.action in SPREAD_WIDER else 1.0)
         domains = domains_at(settled.posterior.prior, z).spread(spread, generator)
         if from_prior:
             domains = domains.followed_by(self._prior_domains(from_prior))

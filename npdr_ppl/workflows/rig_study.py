@@ -24,7 +24,8 @@ from npdr_ppl.randomness import derived_seed, seeded
 from npdr_ppl.targets.base import TargetDomain
 from npdr_ppl.workflows.control_task import ControlTask, control_task
 from npdr_ppl.workflows.domains import Domains, domains_at, prior_of
-from npdr_ppl.workflows.npdr_loop import LoopOptions, train
+from npdr_ppl.workflows.loop_options import LoopOptions
+from npdr_ppl.workflows.npdr_loop import train
 from npdr_ppl.workflows.policy_optimisation import optimise_policy, returns_of
 from npdr_ppl.workflows.progress import Reporter
 from npdr_ppl.workflows.real_rollouts import RealRollouts

@@ -20,7 +20,7 @@ from npdr_ppl.workflows.compare import compare
 from npdr_ppl.workflows.comparison import Comparison
 from npdr_ppl.workflows.control_task import control_task
 from npdr_ppl.workflows.evaluation import nominal_parameters, score
-from npdr_ppl.workflows.npdr_loop import LoopOptions
+from npdr_ppl.workflows.loop_options import LoopOptions
 from npdr_ppl.workflows.rig_study import study, summarise
 from npdr_ppl.workflows.run_folder import write_json
 

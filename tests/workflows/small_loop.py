@@ -17,7 +17,7 @@ from npdr_ppl.policies.search_registry import policy_search
 from npdr_ppl.targets.base import TargetDomain
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.control_task import ControlTask
-from npdr_ppl.workflows.npdr_loop import LoopOptions
+from npdr_ppl.workflows.loop_options import LoopOptions
 
 NUM_STEPS = 40
 

@@ -1,0 +1,122 @@
+"""Options of the NPDR loop, and what it can do about a decision."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Literal
+
+from npdr_ppl.errors import ModelError
+from npdr_ppl.inference.base import Backend
+from npdr_ppl.policies.search import PolicySearch
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.diagnostics import Thresholds
+
+__all__ = ["NEW_ATTEMPTS", "SPREAD_WIDER", "Action", "LoopOptions", "Model", "Revise"]
+
+Model = Callable[..., Any]
+
+Revise = Callable[[Model, Rollouts, Path | None], Model | None]
+"""Looks for what a model lacks: takes the model, all real rollouts and a folder of its own, and
+returns the revised model, or ``None`` if it found nothing. Called again with the same folder, as
+when a run is resumed, it must return the same."""
+
+
+class Action(StrEnum):
+    """What the loop did about a decision."""
+
+    TRAINED = "trained the policy on the posterior"
+    MIXED = "trained the policy on the posterior mixed with the prior"
+    SPREAD = "trained the policy on the posterior, spread wider"
+    MORE_ROUNDS = "added a round"
+    ANOTHER_ROLLOUT = "ran another rollout"
+    REVISED = "revised the model"
+    NOTHING_FOUND = "looked for a missing effect, found none, and spread the domains wider"
+    KEPT = "kept the policy"
+    LOGGED = "none, decisions are only logged"
+
+
+# After these the posterior is inferred anew, in a folder of its own.
+NEW_ATTEMPTS = (Action.ANOTHER_ROLLOUT, Action.REVISED)
+# After these the policy is trained in domains spread wider: the model is wrong.
+SPREAD_WIDER = (Action.SPREAD, Action.NOTHING_FOUND)
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """Options of Algorithm 1.
+
+    Attributes:
+        iterations: Iterations of the loop.
+        rollouts: Real rollouts H of each iteration.
+        extra_rollouts: Real rollouts that diagnoses may ask for in the whole run.
+        rollouts_used: Whether inference sees all rollouts so far or the latest iteration's.
+        backend: The inference backend; one with options of its own if it is no name.
+        rounds: Rounds R of inference in each iteration; one for backends that are not sequential.
+        extra_rounds: Rounds that a diagnosis may ask for in each iteration.
+        num_simulations: Simulations of each round.
+        binding: How rollouts are prepared for inference.
+        noise: ``"auto"`` gives a model without noise that of the closest fit's residuals;
+            ``"model"`` takes it as it is.
+        start: Where inference starts in later iterations: from the prior, or, as in the paper,
+            from the last posterior where the backend can and does.
+        search: The policy search; one with options of its own if it is no name.
+        search_iterations: Iterations of the policy search, each time.
+        num_domains: Domains that the policy is trained in.
+        num_initial_states: Initial states in each.
+        is_warm_start: Whether the search goes on from the last policy or begins anew.
+        starts_from_prior: Whether the first policy is trained on the prior or taken as it comes.
+        spread: Parameters of the domains are multiplied by numbers uniform in 1 ± ``spread``.
+        prior_share: Share of the domains drawn from the prior where the posterior is widened.
+        internal_model: Parameters of the policy's own model on the target: the most likely
+            sample's, or nominal.
+        follows_decisions: Whether diagnoses change what the loop does, or are logged only.
+        stop_return: Mean real return of an iteration at which an accepted posterior ends the
+            loop; ``None`` to use all iterations.
+        thresholds: Limits behind the decisions.
+    """
+
+    iterations: int = 5
+    rollouts: int = 1
+    extra_rollouts: int = 0
+    rollouts_used: Literal["all", "latest"] = "all"
+    backend: str | Backend = "snpe-c"
+    rounds: int = 3
+    extra_rounds: int = 2
+    num_simulations: int = 5_000
+    binding: BindingOptions = field(
+        default_factory=lambda: BindingOptions("all/50", 200, "estimated", "float32")
+    )
+    noise: Literal["auto", "model"] = "auto"
+    start: Literal["prior", "posterior"] = "prior"
+    search: str | PolicySearch[Any] = "power"
+    search_iterations: int = 5
+    num_domains: int = 50
+    num_initial_states: int = 4
+    is_warm_start: bool = True
+    starts_from_prior: bool = True
+    spread: float = 0.1
+    prior_share: float = 0.2
+    internal_model: Literal["most likely", "nominal"] = "most likely"
+    follows_decisions: bool = True
+    stop_return: float | None = None
+    thresholds: Thresholds = field(default_factory=Thresholds)
+
+    def __post_init__(self) -> None:
+        """Checks the options.
+
+        Raises:
+            ModelError: One is out of range.
+        """
+        least = {
+            "iterations": 1, "rollouts": 1, "rounds": 1, "num_simulations": 10,
+            "search_iterations": 1, "num_domains": 1, "num_initial_states": 1,
+            "extra_rollouts": 0, "extra_rounds": 0, "spread": 0, "prior_share": 0,
+        }  # fmt: skip
+        for name, low in least.items():
+            if not getattr(self, name) >= low:
+                raise ModelError(f"{name} must be at least {low}; got {getattr(self, name)}.")
+        for name in ("spread", "prior_share"):
+            if getattr(self, name) > 1:
+                raise ModelError(f"{name} must be at most 1; got {getattr(self, name)}.")
