@@ -162,7 +162,7 @@ def train(
             err=True,
         )
         raise typer.Exit(INTERRUPTED) from None
-    write_training_figures(training, device, chosen_task, options, out)
+    write_training_figures(training, device, chosen_task, out)
     if animate:
         rollout = training.rollouts[[last_rollout(training.iterations)]]
         write_furuta_animation(rollout, out / "rollout.gif", domain=training.domain)

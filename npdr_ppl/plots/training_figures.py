@@ -16,9 +16,8 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.targets.base import TargetDomain
 from npdr_ppl.workflows.control_task import ControlTask
-from npdr_ppl.workflows.domains import domains_at, prior_of, simulator_of
+from npdr_ppl.workflows.domains import prior_of, simulator_of
 from npdr_ppl.workflows.loop_folder import LoopFolder
-from npdr_ppl.workflows.loop_options import LoopOptions
 from npdr_ppl.workflows.npdr_loop import Training
 from npdr_ppl.workflows.units import prior_units
 
@@ -41,7 +40,7 @@ RANGE = (0.005, 0.995)
 
 
 def write_training_figures(
-    training: Training, target: TargetDomain, task: ControlTask, options: LoopOptions, out: Path
+    training: Training, target: TargetDomain, task: ControlTask, out: Path
 ) -> list[Path]:
     """Draws what became of a run of the loop.
 
@@ -49,9 +48,7 @@ def write_training_figures(
         training: The run's result.
         target: Its target domain.
         task: Its task.
-        options: Its options.
-        out: Its folder; gets ``learning_curve.png``, ``rollouts.png`` and, where the internal
-            model is the most likely one, ``parameters.png``.
+        out: Its folder; gets ``learning_curve.png``, ``rollouts.png`` and ``parameters.png``.
     """
     records = training.iterations
     first = LoopFolder(out).policy(0)
@@ -71,9 +68,8 @@ def write_training_figures(
         }
     )
     paths.append(save_figure(figure, out / "rollouts.png"))
-    if options.internal_model == "most likely":
-        figure = _parameters_figure(training, target, seed=0)
-        paths += [] if figure is None else [save_figure(figure, out / "parameters.png")]
+    figure = _parameters_figure(training, target, seed=0)
+    paths.append(save_figure(figure, out / "parameters.png"))
     return paths
 
 
@@ -172,7 +168,7 @@ def plot_rollouts(rollouts: Mapping[str, Rollouts]) -> Figure:
 
 
 def plot_parameters_by_iteration(
-    most_likely: Samples,
+    mean: Samples,
     sd: Samples,
     prior: Samples,
     *,
@@ -182,34 +178,34 @@ def plot_parameters_by_iteration(
     """Draws how domain parameters change from iteration to iteration, against their prior.
 
     Args:
-        most_likely: Most likely values by parameter, one per iteration, ``(I,)``; NaN where an
-            iteration has none.
-        sd: The posterior's standard deviations, alike.
+        mean: Posterior means by parameter, one per iteration, ``(I,)``; NaN where an iteration has
+            none.
+        sd: Posterior standard deviations, alike.
         prior: Draws ``(m,)`` by parameter; their range is shaded.
         nominal: Values to mark.
         units: Units by parameter.
     """
-    names = list(most_likely)
+    names = list(mean)
     columns = min(MAX_COLUMNS, len(names))
     rows = -(-len(names) // columns)
     with theme():
         figure = Figure(figsize=(2.6 * columns, 1.9 * rows + 0.4), layout="constrained")
         axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
         for axis, name in zip(axes, names, strict=False):
-            numbers = np.arange(1, len(most_likely[name]) + 1)
+            numbers = np.arange(1, len(mean[name]) + 1)
             low, high = np.quantile(prior[name], RANGE)
             axis.axhspan(low, high, color=COLORS["prior"], alpha=0.25, lw=0, label="prior, 99 %")
             if nominal and name in nominal:
                 axis.axhline(nominal[name], color=COLORS["nominal"], lw=1, ls=":", label="nominal")
             axis.errorbar(
-                numbers, most_likely[name], sd[name], color=COLORS["most likely"], fmt="o-", ms=4,
-                lw=1, capsize=3, label="most likely ± posterior sd",
+                numbers, mean[name], sd[name], color=COLORS["posterior"], fmt="o-", ms=4,
+                lw=1, capsize=3, label="posterior mean ± sd",
             )  # fmt: skip
             # Error bars know no edges; the prior does.
             margin = 0.04 * (high - low)
             bottom, top = (
-                np.nanmin([low, *most_likely[name]]),
-                np.nanmax([high, *most_likely[name]]),
+                np.nanmin([low, *mean[name]]),
+                np.nanmax([high, *mean[name]]),
             )
             axis.set_ylim(bottom - margin, top + margin)
             _name_parameter(axis, name, (units or {}).get(name, ""))
@@ -224,36 +220,26 @@ def plot_parameters_by_iteration(
     return figure
 
 
-def _parameters_figure(training: Training, target: TargetDomain, *, seed: int) -> Figure | None:
-    """Returns the figure of the parameters, ``None`` where no iteration has any.
-
-    A record has no standard deviations; they follow from the contraction 1 − sd/sd_prior.
-    """
-    # An iteration that keeps the policy keeps its internal model as well.
-    records = [record for record in training.iterations if "sim_return" in record]
+def _parameters_figure(training: Training, target: TargetDomain, *, seed: int) -> Figure:
     prior = prior_of(training.model, target.sensors, target.actions, target.time_step)
     with seeded(seed, "figures"):
-        drawn = domains_at(prior, prior.sample(NUM_PRIOR_DRAWS)).parameters
-    draws = {name: value.double().numpy() for name, value in drawn.items()}
-    contractions = [r["decisions"][-1]["diagnosis"]["contraction"] for r in records]
-    names = [name for name in draws if any(name in found for found in contractions)]
-    if not names:
-        return None
-    spreads = {
-        name: draws[name].std() * (1.0 - _by_iteration(contractions, name)) for name in names
-    }
+        draws = prior.to_parameters(prior.sample(NUM_PRIOR_DRAWS))
+    moments = [record["parameters"] for record in training.iterations]
     return plot_parameters_by_iteration(
-        {name: _by_iteration([r["internal_model"] for r in records], name) for name in names},
-        spreads,
-        draws,
+        {name: _by_iteration(moments, name, "mean") for name in draws},
+        {name: _by_iteration(moments, name, "sd") for name in draws},
+        {name: values.double().numpy() for name, values in draws.items()},
         nominal={n: float(v) for n, v in simulator_of(prior).nominal().items()},
         units=prior_units(prior),
     )
 
 
-def _by_iteration(values: Sequence[Mapping[str, float]], name: str) -> NDArray[np.float64]:
-    """Returns a value of every iteration, NaN for those before an effect was added."""
-    return np.array([found.get(name, np.nan) for found in values], dtype=np.float64)
+def _by_iteration(
+    moments: Sequence[Mapping[str, Mapping[str, float]]], name: str, moment: str
+) -> NDArray[np.float64]:
+    """Returns a parameter's moment in every iteration, NaN before its effect was added."""
+    none = {moment: np.nan}
+    return np.array([found.get(name, none)[moment] for found in moments], dtype=np.float64)
 
 
 def _decisions(record: Mapping[str, Any]) -> str:

@@ -7,13 +7,17 @@ import torch
 
 from npdr_ppl.engines import compilation
 from npdr_ppl.engines.compilation import has_compiler, is_worthwhile, signature
-from npdr_ppl.errors import DependencyError
+from npdr_ppl.errors import CompilationError, DependencyError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import ActuatorLag, CoulombFriction, InputDelay, SensorLowPass
 from npdr_ppl.models.furuta import Furuta, SwingUpReward
 from npdr_ppl.models.pendulum import Pendulum
+from npdr_ppl.policies.linear import Linear
+from npdr_ppl.policies.neural import Neural
 
 CPU = torch.device("cpu")
+
+needs_compiler = pytest.mark.skipif(not has_compiler("cpu"), reason="there is no C++ compiler")
 
 
 def test_equal_simulators_share_a_kernel():
@@ -43,9 +47,25 @@ def test_tensors_and_functions_count_by_identity():
     assert signature(len) != signature(max)
 
 
+def test_policies_that_differ_in_their_default_weights_share_a_kernel():
+    def neural(**options):
+        return Neural(("angle", "velocity"), ("torque",), [(-1.0, 1.0)], **options)
+
+    assert signature(neural(seed=0)) == signature(neural(seed=1))
+    assert signature(neural(hidden=(8,))) != signature(neural(hidden=(4,)))
+
+
 def test_small_computations_are_not_compiled():
-    assert not is_worthwhile("auto", 1_000_000, CPU)
-    assert not is_worthwhile("never", 10**12, CPU)
+    assert not is_worthwhile("auto", CPU, num_steps=1_000, batch_size=1_000)
+    assert not is_worthwhile("never", CPU, num_steps=10**6, batch_size=10**6)
+
+
+@needs_compiler
+def test_many_time_steps_many_simulations_and_many_calls_each_make_a_computation_large():
+    assert is_worthwhile("auto", CPU, num_steps=10**6, batch_size=1)
+    assert is_worthwhile("auto", CPU, num_steps=100, batch_size=10**8)
+    assert is_worthwhile("auto", CPU, num_steps=1_000, batch_size=1_000, expected_calls=10**3)
+    assert is_worthwhile("always", CPU, num_steps=1, batch_size=1)
 
 
 @pytest.fixture
@@ -59,20 +79,111 @@ def no_compiler(monkeypatch):
 
 def test_without_a_compiler_large_computations_run_eagerly_and_say_so_once(no_compiler, caplog):
     with caplog.at_level(logging.WARNING):
-        assert not is_worthwhile("auto", 10**12, CPU)
-        assert not is_worthwhile("auto", 10**12, CPU)
+        for _ in range(2):
+            assert not is_worthwhile("auto", CPU, num_steps=10**6, batch_size=10**6)
     assert [record.message for record in caplog.records] == [
         "There is no compiler, so time loops run eagerly, about ten times slower."
     ]
     with pytest.raises(DependencyError, match="needs a C\\+\\+ compiler"):
-        is_worthwhile("always", 1, CPU)
+        is_worthwhile("always", CPU, num_steps=1, batch_size=1)
+
+
+class BranchingPendulum(Pendulum):
+    """Decides on a value of the state, which eager code may and compiled code may not."""
+
+    def accelerations(self, positions, velocities, actions, forces, constants):
+        if float(positions[0].detach().abs().max()) > 1e6:
+            forces = (0.0,)
+        return super().accelerations(positions, velocities, actions, forces, constants)
+
+
+@pytest.fixture
+def eager_to_compile(monkeypatch):
+    monkeypatch.setattr(compilation, "_COMPILE_SECONDS", 0.0)
+    compilation._log_once.cache_clear()
+    compilation._compile.cache_clear()
+
+
+def replay(simulator):
+    inputs = Inputs(
+        actions=torch.ones(2, 25, 1),
+        action_names=("torque",),
+        initial_readings=torch.zeros(2, 2),
+        initial_values=torch.zeros(2, 2),
+        initial_rates=None,
+        channel_names=("angle", "velocity"),
+        past_actions=torch.zeros(2, 0, 1),
+        time_step=0.02,
+        mask=torch.ones(2, 25, dtype=torch.bool),
+        rollout=torch.zeros(2, dtype=torch.long),
+        start=torch.tensor([0, 25]),
+    )
+    return simulator.simulate({}, inputs)
+
+
+def roll_out(simulator):
+    policy = Linear(("angle", "velocity"), ("torque",))
+    episodes = simulator.roll_out({}, policy, torch.ones(3, 2), 25, reward=lambda q, v, u: q[0])
+    return episodes.returns
+
+
+@needs_compiler
+@pytest.mark.parametrize("run", [replay, roll_out])
+def test_what_cannot_be_traced_runs_eagerly_and_says_so_once(run, eager_to_compile, caplog):
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            torch.testing.assert_close(run(BranchingPendulum()), run(Pendulum(compile="never")))
+    (record,) = caplog.records
+    assert record.message.startswith("Torch could not compile a time loop: ")
+    assert record.message.endswith("It runs eagerly instead, about ten times slower.")
+    assert "\n" not in record.message
+    with pytest.raises(CompilationError, match="Torch could not compile a time loop: "):
+        run(BranchingPendulum(compile="always"))
+
+
+@pytest.fixture
+def refusing_compiler(monkeypatch, tmp_path):
+    """A compiler that is there, and refuses whatever it is given; returns the log of its calls."""
+    log = tmp_path / "calls"
+    compiler = tmp_path / "g++"
+    compiler.write_text(
+        "#!/bin/sh\n"
+        'case "$*" in *--version*) exec g++ --version;; esac\n'
+        f"echo refused | tee -a '{log}' >&2\n"
+        "exit 1\n"
+    )
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
+    from torch._inductor import config
+
+    monkeypatch.setattr(config.cpp, "cxx", (None, str(compiler)))
+    has_compiler.cache_clear()
+    yield log
+    has_compiler.cache_clear()
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_code_that_the_compiler_refuses_runs_eagerly(refusing_compiler, eager_to_compile, caplog):
+    with caplog.at_level(logging.WARNING):
+        returns = roll_out(Pendulum())
+    torch.testing.assert_close(returns, roll_out(Pendulum(compile="never")))
+    messages = [record.message for record in caplog.records]
+    assert [message.endswith("about ten times slower.") for message in messages] == [True]
+    refused = refusing_compiler.read_text()
+    roll_out(Pendulum())  # does not wait for another attempt
+    assert refusing_compiler.read_text() == refused
+    with pytest.raises(CompilationError, match="refused"):
+        roll_out(Pendulum(compile="always"))
+    compilation._compile.cache_clear()
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings(
     "ignore:The .grad attribute:UserWarning"
 )  # torch's compiler, of itself
-@pytest.mark.skipif(not has_compiler("cpu"), reason="there is no C++ compiler")
+@needs_compiler
 def test_compiled_replay_agrees_with_the_eager_one_and_has_its_gradients():
     attached = (
         ActuatorLag("torque"),
