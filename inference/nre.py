@@ -143,7 +143,7 @@ class NRE(LikelihoodBackend):
     preconditioner_type: ClassVar[type[Preconditioner]] = RatioPreconditioner
 
     members: int = 1
-    epochs: int = 20
+    epochs: int = 40
     batch_size: int = 256
     hidden: tuple[int, ...] = (128, 128, 128)
     rank: int = 16
