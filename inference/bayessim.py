@@ -55,6 +55,7 @@ class BayesSim(MixtureBackend):
     summary: ClassVar[str] = "mixture density networks, neural or on Fourier features"
     continues: ClassVar[bool] = False
 
+    components: int = 10
     features: Literal["neural", "fourier"] = "neural"
     frequencies: int = 256
     kernel: Literal["rbf", "matern-3/2", "matern-5/2"] = "matern-5/2"

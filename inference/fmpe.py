@@ -74,7 +74,7 @@ class FMPE(TruncatedBackend):
     amortises: ClassVar[bool] = True
 
     members: int = 1
-    epochs: int = 10
+    epochs: int = 20
     batch_size: int = 256
     learning_rate: float = 1e-2
     hidden: int = 48

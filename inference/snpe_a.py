@@ -40,6 +40,7 @@ class SNPEA(MixtureBackend):
     name: ClassVar[str] = "snpe-a"
     summary: ClassVar[str] = "sequential neural posterior estimation with mixtures of Gaussians"
 
+    epochs: int = 60
     components: int = 8
 
     def init(self, problem: Problem) -> NeuralState:
