@@ -29,8 +29,10 @@ ABLATION = {
     "as it is": {},
     "recorded initial states": {"binding.initial_state": "recorded"},
     "decisions logged only": {"follows_decisions": False},
-    "point estimate": {"spread": 0.0, "num_domains": 1},
+    "point estimate": {"domains": "most likely", "spread": 0.0, "num_domains": 1},
+    "point estimate ± 10 %": {"domains": "most likely", "spread": 0.1},
     "posterior": {"spread": 0.0},
+    "posterior ± 10 %": {"spread": 0.1},
     "posterior ± 20 %": {"spread": 0.2},
     "nominal controller": {"internal_model": "nominal"},
     "latest rollout only": {"rollouts_used": "latest"},
@@ -63,6 +65,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=5)
     parser.add_argument("--ablation", action="store_true")
+    parser.add_argument("--variants", default="", help="of the ablation; all if not given")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -75,7 +78,10 @@ def main() -> None:
     sets = {"hard": HARD, "random": RANDOM}
     if arguments.rigs:
         sets = {"chosen": tuple(arguments.rigs.split(","))}
-    variants = ABLATION if arguments.ablation else {"": {}}
+    variants = {"": {}}
+    if arguments.ablation:
+        chosen = arguments.variants.split(",") if arguments.variants else list(ABLATION)
+        variants = {name: ABLATION[name] for name in chosen}
     methods = ["npdr with effects"] if arguments.ablation else arguments.methods.split(",")
     result = {}
     started = time.perf_counter()

@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
 
@@ -126,6 +125,12 @@ class NumpyPendulum:
         x = torque - self.arm_damping * theta_rate - arm
         return np.linalg.solve(mass, [x, -self.pole_damping * alpha_rate - pole])
 
+    def advance(self, voltage: float) -> None:
+        """Integrates over one step."""
+        acceleration = self.accelerations(voltage)
+        self.state[:2] += TIME_STEP * self.state[2:] + 0.5 * TIME_STEP**2 * acceleration
+        self.state[2:] += TIME_STEP * acceleration
+
     def step(self, command: np.ndarray) -> tuple[np.ndarray, float, bool]:
         """Advances by one step; returns state, reward and whether the episode ended."""
         error = self.target - self.state
@@ -133,9 +138,7 @@ class NumpyPendulum:
         cost = error @ self.weights @ error + WEIGHTS[4] * float(command @ command)
         reward = float(np.exp(-cost))
         voltage = float(np.clip(command, -4.0, 4.0)[0])
-        acceleration = self.accelerations(voltage)
-        self.state[:2] += TIME_STEP * self.state[2:] + 0.5 * TIME_STEP**2 * acceleration
-        self.state[2:] += TIME_STEP * acceleration
+        self.advance(voltage)
         return self.state.copy(), reward, bool(np.any(np.abs(self.state) > self.bounds))
 
 
@@ -164,19 +167,25 @@ class NumpyPolicy:
         return np.array([self.volts * np.clip(pumped, -5.0, 5.0)])
 
 
-def numpy_loop(episodes: Episodes, num_steps: int) -> np.ndarray:
+def numpy_loop(
+    environment: type[NumpyPendulum] = NumpyPendulum,
+) -> Callable[[Episodes, int], np.ndarray]:
     """One rollout after the other, one step after the other."""
-    returns = []
-    for parameters, domain, start in zip(*episodes.flat(), strict=True):
-        pendulum, policy = NumpyPendulum(domain), NumpyPolicy(parameters, domain)
-        state, total = pendulum.reset(start), 0.0
-        for _ in range(num_steps):
-            state, reward, is_over = pendulum.step(policy(state))
-            total += reward
-            if is_over:
-                break
-        returns.append(total)
-    return np.array(returns)
+
+    def run(episodes: Episodes, num_steps: int) -> np.ndarray:
+        returns = []
+        for parameters, domain, start in zip(*episodes.flat(), strict=True):
+            pendulum, policy = environment(domain), NumpyPolicy(parameters, domain)
+            state, total = pendulum.reset(start), 0.0
+            for _ in range(num_steps):
+                state, reward, is_over = pendulum.step(policy(state))
+                total += reward
+                if is_over:
+                    break
+            returns.append(total)
+        return np.array(returns)
+
+    return run
 
 
 def scalar_episode(p: Any, d: Any, x: Any, num_steps: int) -> Any:
@@ -236,6 +245,8 @@ def scalar_episode(p: Any, d: Any, x: Any, num_steps: int) -> Any:
 
 def numba_loop(fastmath: bool) -> Callable[..., np.ndarray]:
     """The scalar loop compiled, over all episodes on one thread."""
+    import numba
+
     episode = numba.njit(fastmath=fastmath)(scalar_episode)
 
     @numba.njit(fastmath=fastmath)
@@ -361,7 +372,7 @@ def main() -> None:
         Variant(f"compiled, batch {middle.size}", torch_loop("always"), middle, 500, 1e-3),
         Variant(f"compiled, batch {large.size}", torch_loop("always"), large, 500, 1e-3),
         Variant(f"eager, batch {middle.size}", torch_loop("never"), middle, 250, 1e-3),
-        Variant("(a) NumPy, one rollout at a time", numpy_loop, small, 500, 1e-6),
+        Variant("(a) NumPy, one rollout at a time", numpy_loop(), small, 500, 1e-6),
         Variant("(b) numba, scalar", numba_loop(False), middle, 250, 1e-3),
         Variant("(b) numba, scalar, fastmath", numba_loop(True), middle, 250, 1e-3),
         Variant("(c) mujoco.batch, RK4", mujoco_loop, make_episodes(10, 25, 4), 100, 1e-3, "rk4"),

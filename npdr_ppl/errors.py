@@ -2,6 +2,7 @@
 
 __all__ = [
     "BackendError",
+    "CompilationError",
     "DataError",
     "DependencyError",
     "IntractableError",
@@ -42,3 +43,7 @@ class BackendError(NpdrError, ValueError):
 
 class DependencyError(NpdrError, ImportError):
     """An optional package is needed and absent."""
+
+
+class CompilationError(NpdrError, RuntimeError):
+    """A time loop was to be compiled, and the compiler failed."""

@@ -15,6 +15,7 @@ from npdr_ppl.engines.compilation import (
     is_worthwhile,
     mark_sizes_dynamic,
     signature,
+    with_fallback,
 )
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.stepping import State, Stepper, Tables, flatten
@@ -100,9 +101,11 @@ class _Body:
     def __init__(self, stepper: Stepper, policy: FeedbackPolicy, reward: Reward | None) -> None:
         simulator = stepper.simulator
         self.stepper = stepper
-        # Without its parameters, so that a compiled body cannot hold on to some by mistake.
+        # Without its parameters and their defaults, so that a compiled body cannot hold on to some
+        # by mistake.
         self.policy = copy.copy(policy)
         del self.policy.parameters
+        vars(self.policy).pop("parameter_info", None)
         self.reward = reward
         sensors = [sensor.name for sensor in simulator.sensors]
         self.observed = tuple(sensors.index(name) for name in policy.observations)
@@ -193,26 +196,28 @@ def roll_out(
         policy.parameters.shape[:-1],
         initial_states.shape[:-1],
     )
-    steps = shape.numel() * num_steps * expected_calls
-    is_compiled = not record and is_worthwhile(compile or simulator.compile, steps, device)
-    tables, histories = simulator.tables(domain, shape, step, expand=is_compiled)
-    constants = flatten(policy.constants(domain), shape, expand=is_compiled)
-    body = _Body(Stepper(simulator, step, histories), policy, reward)
-    states = flatten(initial_states.to(dtype).unbind(-1), shape, expand=True)
-    loop = _start(body, states, tables)
-    if is_compiled:
+    mode = compile or simulator.compile
+    is_compiled = not record and is_worthwhile(
+        mode,
+        device,
+        num_steps=num_steps,
+        batch_size=shape.numel(),
+        expected_calls=expected_calls,
+    )
+
+    def run(is_compiled: bool) -> Episodes:
+        tables, histories = simulator.tables(domain, shape, step, expand=is_compiled)
+        constants = flatten(policy.constants(domain), shape, expand=is_compiled)
+        body = _Body(Stepper(simulator, step, histories), policy, reward)
+        states = flatten(initial_states.to(dtype).unbind(-1), shape, expand=True)
+        loop = _start(body, states, tables)
+        if not is_compiled:
+            return _run_eagerly(body, loop, tables, constants, num_steps, shape, record)
         loop = body.without_repetition(flatten(loop, loop.total.shape, expand=True))
         loop = _run_compiled(body, loop, tables, constants, num_steps)
         return _episodes(loop, shape, reward)
-    readings, commands = [loop.readings], []
-    for k in range(num_steps):
-        loop, chosen = body.step(loop, tables, constants, k * step)
-        if record:
-            readings.append(loop.readings)
-            commands.append(tuple(c.expand_as(loop.length) for c in chosen))
-    if not record:
-        return _episodes(loop, shape, reward)
-    return _episodes(loop, shape, reward, readings, commands)
+
+    return with_fallback(mode, is_compiled, run)
 
 
 def _check_channels(simulator: "ODESimulator", policy: FeedbackPolicy) -> None:
@@ -242,11 +247,33 @@ def _start(body: _Body, states: Components, tables: Tables) -> _Loop:
     return _Loop(state, readings, memory, torch.ones_like(zero, dtype=torch.bool), zero, zero)
 
 
+def _run_eagerly(
+    body: _Body,
+    loop: _Loop,
+    tables: Tables,
+    constants: Any,
+    num_steps: int,
+    shape: torch.Size,
+    record: bool,
+) -> Episodes:
+    """Runs all steps one by one, and records them if asked to."""
+    readings, commands = [loop.readings], []
+    for k in range(num_steps):
+        loop, chosen = body.step(loop, tables, constants, k * body.stepper.time_step)
+        if record:
+            readings.append(loop.readings)
+            commands.append(tuple(c.expand_as(loop.length) for c in chosen))
+    if not record:
+        return _episodes(loop, shape, body.reward)
+    return _episodes(loop, shape, body.reward, readings, commands)
+
+
 def _run_compiled(
     body: _Body, loop: _Loop, tables: Tables, constants: Any, num_steps: int
 ) -> _Loop:
     """Runs all steps block by block, and the few that do not fill a kernel call eagerly."""
-    run = compiled(body.signature, body.run)
+    key = body.signature, loop.total.dtype, loop.total.device.type
+    run = compiled(key, body.run)
     num_simulations = loop.total.shape[0]
     num_blocks = -(-num_simulations // _BLOCK)
     edges = [i * num_simulations // num_blocks for i in range(num_blocks + 1)]

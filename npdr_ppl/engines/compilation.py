@@ -1,4 +1,4 @@
-"""Compiling time loops: when it pays, how kernels are shared, and what happens without a compiler.
+"""Compiling time loops: when it pays, how kernels are shared, and what happens where it fails.
 
 A kernel is the loop body unrolled over a few steps, compiled by torch.compile for flat batches of
 any size. Kernels are shared between objects that are equal in all that the traced code can see,
@@ -14,23 +14,37 @@ import shutil
 import warnings
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from npdr_ppl.errors import DependencyError
+from npdr_ppl.errors import CompilationError, DependencyError
 
-__all__ = ["CompileMode", "compiled", "is_worthwhile", "mark_sizes_dynamic", "signature"]
+__all__ = [
+    "CompileMode",
+    "compiled",
+    "is_worthwhile",
+    "mark_sizes_dynamic",
+    "signature",
+    "with_fallback",
+]
 
 CompileMode = Literal["auto", "always", "never"]
 
+_T = TypeVar("_T")
+
 _LOGGER = logging.getLogger(__name__)
 
-# Compilation takes about ten seconds; compiled loops save some 20 ns per step and simulation
-# (38 against 335 million steps per second on one core). 10 s / 20 ns, rounded down.
-_STEPS_THAT_PAY_BACK = 400_000_000
+# What an eager loop costs per time step, for Python and for calling some forty operations, and on
+# top of that per simulation and time step; and what compiling the loop costs. Measured with the
+# Furuta swing-up, policy and reward included: processor time of one core, float32, batches of 200
+# to 200 000, nothing in the compiler's cache on disk. With dry friction or a Runge-Kutta method
+# all three are about twice as large, so that the comparison stands. Compiled loops take a tenth.
+_EAGER_SECONDS_PER_TIME_STEP = 150e-6
+_EAGER_SECONDS_PER_SIMULATION_STEP = 20e-9
+_COMPILE_SECONDS = 10.0
 
 # Shapes, types and devices that one kernel may specialise to. Beyond the limit torch raises,
 # because kernels are compiled with fullgraph=True; it would silently run eagerly otherwise.
@@ -39,17 +53,41 @@ _RECOMPILE_LIMIT = 64
 # One fused pass over memory per call, however long the unrolled body is; inputs are checked here.
 _OPTIONS = (("max_fusion_size", 100_000), ("size_asserts", False))
 
-# Attributes that traced code does not read: priors of effects, values of policy parameters.
-_INVISIBLE = frozenset({"_priors", "parameters", "compile"})
+# Attributes that traced code does not read: priors of effects, values and defaults of policies'
+# parameters.
+_INVISIBLE = frozenset({"_priors", "parameters", "parameter_info", "compile"})
+
+# Characters that an error quotes from each end of the compiler's own message: what failed comes
+# first, what the C++ compiler said last, and its command line fills pages between them.
+_QUOTED = 2_000
 
 
-def is_worthwhile(mode: CompileMode, num_steps: int, device: torch.device) -> bool:
-    """Returns whether to compile a computation of ``num_steps`` steps, summed over the batch.
+def is_worthwhile(
+    mode: CompileMode,
+    device: torch.device,
+    *,
+    num_steps: int,
+    batch_size: int,
+    expected_calls: int = 1,
+) -> bool:
+    """Returns whether to compile a time loop: whether running it eagerly would take longer.
+
+    Depends on nothing but the arguments and the compiler at hand, because compiled and eager
+    loops round differently, and a result should not depend on what ran before it.
+
+    Args:
+        mode: The caller's choice.
+        device: Device of the computation.
+        num_steps: Time steps of one call.
+        batch_size: Simulations that advance together.
+        expected_calls: How many calls of this size are to come.
 
     Raises:
         DependencyError: Compilation is demanded, but there is no compiler.
     """
-    if mode == "never" or (mode == "auto" and num_steps < _STEPS_THAT_PAY_BACK):
+    per_time_step = _EAGER_SECONDS_PER_TIME_STEP + batch_size * _EAGER_SECONDS_PER_SIMULATION_STEP
+    eager_seconds = expected_calls * num_steps * per_time_step
+    if mode == "never" or (mode == "auto" and eager_seconds < _COMPILE_SECONDS):
         return False
     if has_compiler(device.type):
         return True
@@ -60,6 +98,29 @@ def is_worthwhile(mode: CompileMode, num_steps: int, device: torch.device) -> bo
         )
     _log_once("There is no compiler, so time loops run eagerly, about ten times slower.")
     return False
+
+
+def with_fallback(mode: CompileMode, is_compiled: bool, run: Callable[[bool], _T]) -> _T:
+    """Returns ``run(is_compiled)``, or ``run(False)`` where ``auto`` meets a failing compiler.
+
+    Args:
+        mode: The caller's choice.
+        is_compiled: What :func:`is_worthwhile` made of it.
+        run: The computation, compiled or not; must start anew when it is called again.
+
+    Raises:
+        CompilationError: Compilation is demanded and fails.
+    """
+    if not is_compiled:
+        return run(False)
+    try:
+        return run(True)
+    except CompilationError as error:
+        if mode == "always":
+            raise
+        reason = str(error).splitlines()[0]
+    _log_once(f"{reason}. It runs eagerly instead, about ten times slower.")
+    return run(False)
 
 
 @functools.lru_cache
@@ -86,8 +147,11 @@ class _Kernel:
 def compiled(key: Hashable, function: Callable[..., Any]) -> Callable[..., Any]:
     """Returns ``function`` compiled, or what was compiled before under the same key.
 
+    What is returned raises a :class:`CompilationError` where compilation fails, the next time
+    without another attempt.
+
     Args:
-        key: Signature of everything that the function closes over.
+        key: Signature of everything that the function closes over, floating type and device.
         function: Pure function of nested tuples and dictionaries of tensors.
     """
     # The number of threads is fixed when code is generated.
@@ -100,14 +164,32 @@ def _compile(kernel: _Kernel) -> Callable[..., Any]:
         # Torch's code generator warns about torch's own modules when it is first imported.
         warnings.simplefilter("ignore", DeprecationWarning)
         importlib.import_module("torch._inductor.compile_fx")
+        from torch._dynamo.exc import TorchDynamoException
     # The stubs of torch.compile do not know its latest options.
-    return torch.compile(  # pyright: ignore[reportCallIssue]
+    function = torch.compile(  # pyright: ignore[reportCallIssue]
         kernel.function,
         fullgraph=True,
         options=dict(_OPTIONS),
         recompile_limit=_RECOMPILE_LIMIT,
         isolate_recompiles=True,
     )
+    # As text: the error itself would keep alive every tensor of the failed attempt.
+    failure: str | None = None
+
+    def run(*arguments: Any) -> Any:
+        nonlocal failure
+        if failure is not None:
+            raise CompilationError(failure)
+        try:
+            return function(*arguments)
+        except TorchDynamoException as error:
+            said = str(error).strip() or type(error).__name__
+            if len(said) > 2 * _QUOTED:
+                said = f"{said[:_QUOTED]}\n[…]\n{said[-_QUOTED:]}"
+            failure = f"Torch could not compile a time loop: {said}"
+            raise CompilationError(failure) from error
+
+    return run
 
 
 def mark_sizes_dynamic(tree: Any) -> None:

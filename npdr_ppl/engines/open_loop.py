@@ -8,7 +8,12 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.commands import CommandRecord, RecordedCommands
-from npdr_ppl.engines.compilation import compiled, is_worthwhile, mark_sizes_dynamic
+from npdr_ppl.engines.compilation import (
+    compiled,
+    is_worthwhile,
+    mark_sizes_dynamic,
+    with_fallback,
+)
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.stepping import State, Stepper, Tables, flatten
 from npdr_ppl.errors import ShapeError
@@ -37,7 +42,28 @@ def replay(simulator: "ODESimulator", parameters: Mapping[str, Tensor], inputs: 
     shape = torch.Size((*batch_shape, inputs.num_segments))
     # Behind the batch, an axis for the segments.
     domain = {name: value[..., None] for name, value in domain.items()}
-    is_compiled = is_worthwhile(simulator.compile, shape.numel() * inputs.num_steps, device)
+    is_compiled = is_worthwhile(
+        simulator.compile, device, num_steps=inputs.num_steps, batch_size=shape.numel()
+    )
+
+    def run(is_compiled: bool) -> Tensor:
+        return _replay(simulator, domain, inputs, shape, dtype, is_compiled)
+
+    trajectory = with_fallback(simulator.compile, is_compiled, run)
+    if bool(inputs.mask.all()):
+        return trajectory
+    return torch.where(inputs.mask[..., None], trajectory, torch.zeros_like(trajectory))
+
+
+def _replay(
+    simulator: "ODESimulator",
+    domain: Mapping[str, Tensor],
+    inputs: Inputs,
+    shape: torch.Size,
+    dtype: torch.dtype,
+    is_compiled: bool,
+) -> Tensor:
+    """Returns all trajectories, ``shape + (steps, sensors)``, padded steps included."""
     tables, histories = simulator.tables(domain, shape, inputs.time_step, expand=is_compiled)
     body = _Body(Stepper(simulator, inputs.time_step, histories))
     columns = {name: i for i, name in enumerate(inputs.action_names)}
@@ -66,12 +92,7 @@ def replay(simulator: "ODESimulator", parameters: Mapping[str, Tensor], inputs: 
         state = run_eagerly(state, 0, first)
         state = _run_compiled(body, state, tables, records, range(first, last), readings)
     run_eagerly(state, last, inputs.num_steps)
-    trajectory = torch.stack(readings, dim=-1).reshape(
-        *shape, inputs.num_steps, len(simulator.sensors)
-    )
-    if bool(inputs.mask.all()):
-        return trajectory
-    return torch.where(inputs.mask[..., None], trajectory, torch.zeros_like(trajectory))
+    return torch.stack(readings, dim=-1).reshape(*shape, inputs.num_steps, len(simulator.sensors))
 
 
 _View = tuple[Tensor, Tensor, Tensor | int, Tensor | int]
@@ -131,8 +152,10 @@ def _run_compiled(
     readings: list[Tensor],
 ) -> State:
     """Runs steps with the compiled body and appends their readings."""
-    run = compiled(("replay", body.stepper.signature), body.run)
-    state = flatten(state, state.positions[0].shape, expand=True)
+    position = state.positions[0]
+    key = "replay", body.stepper.signature, position.dtype, position.device.type
+    run = compiled(key, body.run)
+    state = flatten(state, position.shape, expand=True)
 
     for step in steps[::_STEPS_PER_CALL]:
         commands = tuple(

@@ -63,6 +63,8 @@ class LoopOptions:
             from the last posterior where the backend can and does.
         search: The policy search; one with options of its own if it is no name.
         search_iterations: Iterations of the policy search, each time.
+        domains: Whether the policy is trained in draws of the posterior or at its most likely
+            sample.
         num_domains: Domains that the policy is trained in.
         num_initial_states: Initial states in each.
         is_warm_start: Whether the search goes on from the last policy or begins anew.
@@ -92,6 +94,7 @@ class LoopOptions:
     start: Literal["prior", "posterior"] = "prior"
     search: str | PolicySearch[Any] = "power"
     search_iterations: int = 5
+    domains: Literal["posterior", "most likely"] = "posterior"
     num_domains: int = 50
     num_initial_states: int = 4
     is_warm_start: bool = True

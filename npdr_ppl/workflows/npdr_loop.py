@@ -386,11 +386,17 @@ class _Loop:
         if settled.action is Action.MIXED:
             from_prior = round(options.prior_share * number)
         seed = derived_seed(self.seed, "posterior domains", index)
-        z = settled.posterior.sample_mixture(number - from_prior, seed=seed)
+        posterior = settled.posterior
+        if options.domains == "posterior":
+            z = posterior.sample_mixture(number - from_prior, seed=seed)
+        else:
+            most_likely = posterior.most_likely(seed=self.seed)
+            z = posterior.prior.to_reference({k: v[None] for k, v in most_likely.items()})
+            z = z.expand(number - from_prior, -1)
         generator = torch.Generator().manual_seed(seed)
         # Where the model is wrong its posterior is too narrow, by how much nobody knows.
         spread = options.spread * (2.0 if settled.action in SPREAD_WIDER else 1.0)
-        domains = domains_at(settled.posterior.prior, z).spread(spread, generator)
+        domains = domains_at(posterior.prior, z).spread(spread, generator)
         if from_prior:
             domains = domains.followed_by(self._prior_domains(from_prior))
         return domains
