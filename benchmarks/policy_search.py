@@ -83,7 +83,7 @@ class Target(NamedTuple):
     @property
     def is_met(self) -> bool:
         """Whether the figure keeps its bound."""
-        return self.value <= self.bound if self.is_upper else self.value >= self.bound
+        return bool(self.value <= self.bound if self.is_upper else self.value >= self.bound)
 
 
 def compilation_start() -> float:
@@ -125,7 +125,7 @@ def power_iterations(with_effects: bool, num_repeats: int, num_domains: int) -> 
         task,
         Domains(simulator, parameters).spread(0.1, generator),
         search,
-        search.init(task.policy),
+        task.policy.parameters,
         iterations=num_repeats + 1,
         num_initial_states=4,
         seed=0,
@@ -236,7 +236,7 @@ def main() -> None:
             "compilation": {"start": start, **seconds},
             "targets": [{**target._asdict(), "is_met": target.is_met} for target in targets],
         }
-        options.out.write_text(json.dumps(figures, indent=2) + "\n")
+        options.out.write_text(json.dumps(figures, indent=2, default=float) + "\n")
 
 
 if __name__ == "__main__":

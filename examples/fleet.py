@@ -24,6 +24,7 @@ import pyro
 import pyro.distributions as dist
 import torch
 from pyro.infer import MCMC, NUTS
+from pyro.infer.autoguide.initialization import init_to_median
 from torch import Tensor
 
 import npdr_ppl as npdr
@@ -135,7 +136,13 @@ def run_nuts(
 ) -> Mapping[str, Tensor]:
     """Returns NUTS draws of a conditioned model by site."""
     with seeded(seed, "nuts"):
-        kernel = NUTS(model, max_tree_depth=6, full_mass=[("coordinates",)])
+        # Pyro's default start, anywhere within two of zero, can lie in another mode.
+        kernel = NUTS(
+            model,
+            max_tree_depth=6,
+            full_mass=[("coordinates",)],
+            init_strategy=init_to_median(num_samples=50),
+        )
         sampler = MCMC(
             kernel, num_samples=num_samples, warmup_steps=num_samples // 2, disable_progbar=True
         )
@@ -158,7 +165,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--fleets", type=int, default=1)
     parser.add_argument("--references", type=int, default=1, help="fleets compared with NUTS")
-    parser.add_argument("--simulations", type=int, default=60_000)
+    parser.add_argument("--simulations", type=int, default=120_000)
     parser.add_argument("--samples", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path)
