@@ -18,7 +18,7 @@ from npdr_ppl.rollouts import Rollouts
 if TYPE_CHECKING:
     from npdr_ppl.workflows.posterior import PosteriorBase
 
-__all__ = ["Domains", "domains_at", "prior_of", "simulator_of"]
+__all__ = ["Domains", "domains_at", "most_likely_domain", "prior_of", "simulator_of"]
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,6 @@ class Domains:
 
     def __len__(self) -> int:
         return len(next(iter(self.parameters.values())))
-
-    def __getitem__(self, rows: slice | Tensor) -> "Domains":
-        return Domains(self.simulator, {k: v[rows] for k, v in self.parameters.items()})
 
     def spread(self, share: float, generator: torch.Generator) -> "Domains":
         """Multiplies every parameter of every domain by a number uniform in 1 ± ``share``.
