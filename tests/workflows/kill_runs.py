@@ -55,6 +55,11 @@ def outcome(folder):
     }
 
 
+def written(folder):
+    """The names of the files that a run has on disk: how far it has come."""
+    return tuple(sorted(str(file.relative_to(folder)) for file in folder.rglob("*.*")))
+
+
 def main():
     root, num_kills, seed = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
     torch.set_num_threads(1)
@@ -64,27 +69,32 @@ def main():
     seconds = time.monotonic() - started
     expected = outcome(root / "undisturbed")
     kills = runs = 0
+    stages = set()
     while kills < num_kills:
         folder = root / f"run_{runs}"
         runs += 1
         is_done = False
+        # Short lives, so that a run is killed several times on its way; longer ones after each
+        # kill, so that it comes to its end also where the machine has become slower since.
+        longest = 0.4 * seconds
         while not is_done:
             child = fork(folder, seed)
-            # Short lives, so that a run is killed several times on its way.
-            time.sleep(moments.uniform(0.0, 0.5 * seconds))
+            time.sleep(moments.uniform(0.0, longest))
+            longest *= 1.1
             if kills < num_kills:
                 os.kill(child, signal.SIGKILL)
             _, status = os.waitpid(child, 0)
             is_done = status == 0
             if os.WIFSIGNALED(status):
                 kills += 1
+                stages.add(written(folder))
             elif status:
                 raise SystemExit(f"{folder}: a resumed run failed with status {status}")
         found = outcome(folder)
         for name, value in expected.items():
             if found[name] != value:
                 raise SystemExit(f"{folder}: {name} differ from those of the undisturbed run")
-    print(json.dumps({"kills": kills, "runs": runs, "seconds": seconds}))
+    print(json.dumps({"kills": kills, "runs": runs, "stages": len(stages), "seconds": seconds}))
 
 
 if __name__ == "__main__":
