@@ -14,6 +14,7 @@ class InitialState(StrEnum):
 
     ESTIMATED = "estimated"
     RECORDED = "recorded"
+    UNCERTAIN = "uncertain"
 
 
 class Precision(StrEnum):

@@ -117,7 +117,7 @@ class Simulator(ABC):
 
         A rate whose position is measured is taken from the estimated derivative of the position
         readings where the inputs carry one, otherwise from its own reading. At a rollout's first
-        sample the derivative sees one side only, and a reading of the rate is better.
+        sample the derivative sees one side only, and what was read of the rate is better.
 
         Raises:
             DataError: A component was neither recorded nor can be estimated.
@@ -128,8 +128,8 @@ class Simulator(ABC):
             if inputs.initial_rates is not None and state.rate_of in columns:
                 rate = inputs.initial_rates[..., columns[state.rate_of]]
                 if state.name in columns:
-                    reading = inputs.initial_readings[..., columns[state.name]]
-                    rate = torch.where(inputs.start.to(rate.device) == 0, reading, rate)
+                    value = inputs.initial_values[..., columns[state.name]]
+                    rate = torch.where(inputs.start.to(rate.device) == 0, value, rate)
                 result.append(rate)
             elif state.name in columns:
                 result.append(inputs.initial_values[..., columns[state.name]])
