@@ -9,9 +9,10 @@ from torch import Tensor
 
 from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward, roll_out
 from npdr_ppl.engines.compilation import CompileMode
+from npdr_ppl.engines.effect_chain import Tables, needed_histories
 from npdr_ppl.engines.integrators import Components, Integrator, integrator
 from npdr_ppl.engines.open_loop import replay
-from npdr_ppl.engines.stepping import Stepper, Tables, flatten
+from npdr_ppl.engines.stepping import flatten
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import EnvironmentEffect
 from npdr_ppl.language.inputs import Inputs
@@ -165,25 +166,6 @@ class ODESimulator(Simulator):
                 dtype = torch.promote_types(dtype, value.dtype)
         return dtype
 
-    def complete(
-        self, parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
-    ) -> dict[str, Tensor]:
-        """Returns all parameters, missing ones nominal and effects' included.
-
-        Args:
-            parameters: Some of the parameters, tensors or numbers.
-            dtype: Floating type of the result.
-            device: Device of the result.
-        """
-        values = {parameter.name: parameter.nominal for parameter in self.parameters}
-        for effect in self.effects:
-            nominal = [parameter.nominal for parameter in effect.parameters]
-            values |= dict(zip(effect.parameter_names, nominal, strict=True))
-        return {
-            name: torch.as_tensor(value, dtype=dtype, device=device)
-            for name, value in {**values, **parameters}.items()
-        }
-
     def tables(
         self,
         parameters: Mapping[str, Tensor],
@@ -207,7 +189,7 @@ class ODESimulator(Simulator):
                 quantity = environment[effect.port]
                 environment[effect.port] = effect.environment(quantity, values)
         constants = self.constants(parameters, environment)
-        histories = Stepper.needed_histories(self, effects, time_step)
+        histories = needed_histories(self.effects, effects, time_step)
         return flatten(Tables(constants, effects), shape, expand=expand), histories
 
 
