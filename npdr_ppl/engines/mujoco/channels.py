@@ -6,7 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from npdr_ppl.engines.mujoco.fields import did_you_mean, element_names, joint_units
+from npdr_ppl.engines.mujoco.fields import (
+    actuated_joint,
+    actuator_names,
+    did_you_mean,
+    element_names,
+    joint_units,
+)
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
 
@@ -144,13 +150,9 @@ def action_channels(model: Any, taken: Sequence[str]) -> tuple[Channel, ...]:
         model: A ``mujoco.MjModel``.
         taken: Names of states and sensors.
     """
-    joints, names = element_names(model, "joint"), []
-    for actuator, name in enumerate(element_names(model, "actuator")):
-        joint = actuated_joint(model, actuator)
-        if not model.actuator(actuator).name and joint is not None:
-            name = f"{joints[joint]}_command"
-        elif name in taken:
-            name = f"{name}_command"
+    names: list[str] = []
+    for actuator, name in enumerate(actuator_names(model)):
+        name = f"{name}_command" if name in taken else name
         while name in names or name in taken:
             name = f"{name}_{actuator}"
         names.append(name)
@@ -161,14 +163,6 @@ def action_channels(model: Any, taken: Sequence[str]) -> tuple[Channel, ...]:
             lower, upper = map(float, model.actuator_ctrlrange[actuator])
         result.append(Channel(name, _action_unit(model, actuator), lower, upper))
     return tuple(result)
-
-
-def actuated_joint(model: Any, actuator: int) -> int | None:
-    """Returns the joint that an actuator acts on directly; ``None`` if there is none."""
-    mujoco: Any = importlib.import_module("mujoco")
-    if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
-        return None
-    return int(model.actuator_trnid[actuator, 0])
 
 
 def _action_unit(model: Any, actuator: int) -> str:

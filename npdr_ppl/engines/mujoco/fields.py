@@ -16,7 +16,16 @@ import numpy as np
 
 from npdr_ppl.errors import ModelError
 
-__all__ = ["Entry", "Field", "did_you_mean", "element_names", "find_field", "joint_units"]
+__all__ = [
+    "Entry",
+    "Field",
+    "actuated_joint",
+    "actuator_names",
+    "did_you_mean",
+    "element_names",
+    "find_field",
+    "joint_units",
+]
 
 
 class Entry(NamedTuple):
@@ -99,6 +108,7 @@ _QUANTITIES: dict[str, dict[str, _Quantity]] = {
     "actuator": {
         "gain": _Quantity("actuator_gainprm", "1"),
         "bias": _Quantity("actuator_biasprm", "1", ("constant", "position", "velocity")),
+        "kp": _Quantity("actuator_gainprm", "{force}/{position}"),
         "gear": _Quantity("actuator_gear", "1"),
         "time_constant": _Quantity("actuator_dynprm", "s"),
         "force_range": _Quantity("actuator_forcerange", "1", ("lower", "upper")),
@@ -151,6 +161,17 @@ def element_names(model: Any, kind: str) -> list[str]:
     return [getattr(model, kind)(i).name or f"{kind}_{i}" for i in range(count)]
 
 
+def actuator_names(model: Any) -> list[str]:
+    """Returns the names of actuators; nameless ones are called after their joint."""
+    joints, names = element_names(model, "joint"), []
+    for actuator, name in enumerate(element_names(model, "actuator")):
+        joint = actuated_joint(model, actuator)
+        if not model.actuator(actuator).name and joint is not None:
+            name = f"{joints[joint]}_command"
+        names.append(f"{name}_{actuator}" if name in names else name)
+    return names
+
+
 def joint_units(model: Any, joint: int) -> dict[str, str]:
     """Returns the units of a joint's position, force and inertia."""
     mujoco: Any = importlib.import_module("mujoco")
@@ -182,18 +203,47 @@ def find_field(model: Any, text: str) -> Field:
     name, quantity, component = _split(kind, rest, text)
     if kind == "option":
         return _option(model, text, quantity, component)
-    names = element_names(model, kind)
+    names = actuator_names(model) if kind == "actuator" else element_names(model, kind)
     chosen = [i for i, n in enumerate(names) if n == name]
     chosen = chosen or [i for i, n in enumerate(names) if fnmatchcase(n, name)]
     if not chosen:
         raise ModelError(f"{text!r}: no {kind} is called {name!r}; {did_you_mean(name, names)}")
     info = _QUANTITIES[kind][quantity]
     unit = _UNITS.get((kind, quantity, component), info.unit)
-    units = {unit.format(**joint_units(model, i)) if kind == "joint" else unit for i in chosen}
+    units = {unit.format(**_joint_units_of(model, kind, i)) for i in chosen}
     if len(units) > 1:
         raise ModelError(f"{text!r} mixes the units {', '.join(sorted(units))}.")
     entries = [e for i in chosen for e in _entries(model, kind, i, info, component)]
+    if quantity == "kp":
+        # A position servo's force is kp (control − position): its gain and minus its bias.
+        bias = _QUANTITIES["actuator"]["bias"]
+        for e in [e for i in chosen for e in _entries(model, kind, i, bias, "position")]:
+            entries.append(e._replace(factor=-1.0))
+        if any(a.nominal != -b.nominal for a, b in zip(*_halves(entries), strict=True)):
+            raise ModelError(f"{text!r}: only position servos have a kp; bind gain and bias.")
     return Field(text, units.pop(), tuple(entries))
+
+
+def actuated_joint(model: Any, actuator: int) -> int | None:
+    """Returns the joint that an actuator acts on directly; ``None`` if there is none."""
+    mujoco: Any = importlib.import_module("mujoco")
+    if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+        return None
+    return int(model.actuator_trnid[actuator, 0])
+
+
+def _joint_units_of(model: Any, kind: str, element: int) -> dict[str, str]:
+    """Returns the units of the joint that an element is or acts on."""
+    joint = element if kind == "joint" else None
+    if kind == "actuator":
+        joint = actuated_joint(model, element)
+    if joint is None:
+        return {"position": "1", "force": "1", "inertia": "1"}
+    return joint_units(model, joint)
+
+
+def _halves(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
+    return entries[: len(entries) // 2], entries[len(entries) // 2 :]
 
 
 def _split(kind: str, rest: list[str], text: str) -> tuple[str, str, str]:

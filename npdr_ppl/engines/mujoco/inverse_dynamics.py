@@ -63,7 +63,7 @@ def bound_inverse_dynamics(simulator: "MujocoSimulator") -> InverseDynamics | No
     nominal = np.array([parameter.nominal for parameter in simulator.parameters])
 
     def inertial(values: Array) -> Array:
-        given = {n: torch.tensor(float(v)).double() for n, v in zip(names, values, strict=True)}
+        given = dict(zip(names, torch.from_numpy(values).unbind(), strict=True))
         changed = _written(model, bindings.assignments(given, given))
         return MujocoInverseDynamics(changed).nominal()
 

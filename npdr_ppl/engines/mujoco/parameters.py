@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.mujoco.fields import Field, find_field
+from npdr_ppl.engines.mujoco.fields import Field, did_you_mean, find_field
 from npdr_ppl.errors import ModelError, ShapeError
 from npdr_ppl.language.channels import Parameter
 
@@ -109,7 +109,8 @@ class Bindings:
             parameters: All parameters, nominal where not given.
 
         Raises:
-            ShapeError: A derivation returned something of another shape.
+            ModelError: A derivation asks for a parameter that does not exist.
+            ShapeError: It returned something of another shape.
         """
         result: Assignments = {}
         for name, value in given.items():
@@ -121,7 +122,13 @@ class Bindings:
                     result[entry.array, entry.place] = value * entry.nominal
         sizes = {value.numel() for value in parameters.values()} | {1}
         for field, rule in self._derived.items():
-            value = torch.as_tensor(rule(parameters), dtype=torch.float64)
+            try:
+                value = torch.as_tensor(rule(parameters), dtype=torch.float64)
+            except KeyError as error:
+                raise ModelError(
+                    f"The derivation of {field.text!r} asks for a parameter that does not exist: "
+                    f"no parameter {error}; {did_you_mean(str(error), parameters)}"
+                ) from error
             if value.ndim > 1 or value.numel() not in sizes:
                 raise ShapeError(
                     f"The derivation of {field.text!r} should return one value per simulation, "

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from npdr_ppl.engines.mujoco.channels import Component, Reading, actuated_joint
-from npdr_ppl.engines.mujoco.fields import element_names, joint_units
+from npdr_ppl.engines.mujoco.channels import Component, Reading
+from npdr_ppl.engines.mujoco.fields import actuated_joint, element_names, joint_units
 from npdr_ppl.language.channels import Channel, Port
 
 __all__ = ["ForcePort", "derive_ports", "force_ports"]

@@ -111,6 +111,8 @@ class MujocoSimulator(Simulator):
         self.ports = derive_ports(self.model, self.force_ports, self.actions, self.readings)
         self.bindings = Bindings(self.model, parameters or {}, derived or {})
         self.parameters = self.bindings.parameters
+        # Derivations that do not fit should say so now.
+        self.bindings.assignments({}, self.nominal())
         self.initial_positions = self._initial_positions(keyframe)
         self.inverse_dynamics = bound_inverse_dynamics(self)
 
@@ -189,7 +191,9 @@ class MujocoSimulator(Simulator):
         for effect, values in zip(self.effects, own, strict=True):
             if isinstance(effect, EnvironmentEffect):
                 gravity = tuple(
-                    assignments.get(("opt.gravity", i), torch.tensor(float(g)).double())
+                    assignments.get(
+                        ("opt.gravity", i), torch.tensor(float(g), dtype=torch.float64)
+                    )
                     for i, g in enumerate(self.model.opt.gravity)
                 )
                 changed = effect.environment(gravity, values)
