@@ -204,12 +204,12 @@ def test_furuta_declares_what_the_ode_model_declares():
 
 
 def test_furuta_follows_the_equations_to_integration_error():
-    domains, inputs = furuta_domains(), furuta_inputs()
+    domains, inputs = furuta_domains(), furuta_inputs(150)
     truth = Furuta(integrator="rk4", substeps=32, compile="never").simulate(domains, inputs)
     errors = []
     for substeps in (1, 2, 4):
         out = furuta_in_mujoco(substeps=substeps).simulate(domains, inputs)
-        assert out.shape == truth.shape == (4, 1, 250, 4)
+        assert out.shape == truth.shape == (4, 1, 150, 4)
         assert out.dtype == torch.float64
         errors.append(float((out - truth).abs().amax()))
     # Runge-Kutta of the fourth order: halving the step leaves a sixteenth.
@@ -241,7 +241,7 @@ def test_furuta_follows_the_equations_to_integration_error():
     ids=["dry friction", "viscous friction", "tilt", "delay", "sensors"],
 )
 def test_effects_are_those_of_the_ode_engine(attached, strengths, order):
-    inputs = furuta_inputs()
+    inputs = furuta_inputs(100)
     strengths = {name: value(strength) for name, strength in strengths.items()}
     ode = Furuta(integrator="rk4", substeps=32, compile="never")
     truth = ode.with_effects(*attached).simulate(strengths, inputs)

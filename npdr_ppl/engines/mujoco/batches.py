@@ -10,7 +10,7 @@ import numpy as np
 
 from npdr_ppl.engines.mujoco.parameters import Assignments
 
-__all__ = ["make_batch", "quiet", "with_crisp_friction"]
+__all__ = ["make_batch", "prepared_copy", "quiet", "state_view"]
 
 # MuJoCo's friction yields: it decays a joint's speed over the time constant of ``solref`` and lets
 # a stuck joint creep. These values are the hardest that it admits: the greatest impedance, and a
@@ -18,31 +18,36 @@ __all__ = ["make_batch", "quiet", "with_crisp_friction"]
 _CRISP_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 _CRISP_STEPS = 2.0
 
+# Up to so many simulations, giving each its own values is quicker than changing a model for all.
+_FEW = 64
+
 
 def make_batch(
     model: Any, assignments: Assignments, num_simulations: int, num_threads: int
 ) -> Any:
     """Returns a ``mujoco.batch.Batch`` whose models hold the assigned values.
 
-    Values that all simulations share are written into ``model``; the others are expanded.
-
     Args:
-        model: A ``mujoco.MjModel`` of the caller's own.
+        model: A ``mujoco.MjModel``, which is not changed.
         assignments: Values, numbers or ``(N,)``.
         num_simulations: N.
         num_threads: Threads to run on.
     """
     mujoco: Any = importlib.import_module("mujoco")
-    batch_module: Any = importlib.import_module("mujoco.batch")
-    shared = {key: float(value) for key, value in assignments.items() if value.numel() == 1}
+    module: Any = importlib.import_module("mujoco.batch")
     # Constants such as inverse inertias follow from some fields; deriving them costs microseconds
     # per simulation, so only where such a field was written.
     followed = set(getattr(mujoco.MjModel, "_setconst_inputs", ())) or {a for a, _ in assignments}
-    for (array, place), value in shared.items():
-        _write_shared(model, array, place, value)
-    if any(array in followed for array, _ in shared):
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-    batch = batch_module.Batch(model, num_simulations, num_threads)
+    shared = {}
+    if num_simulations > _FEW:
+        shared = {key: float(value) for key, value in assignments.items() if value.numel() == 1}
+    if shared:
+        model = copy.copy(model)
+        for (array, place), value in shared.items():
+            _write_shared(model, array, place, value)
+        if any(array in followed for array, _ in shared):
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+    batch = module.Batch(model, num_simulations, num_threads)
     own = {key: value for key, value in assignments.items() if key not in shared}
     for (array, place), value in own.items():
         batch.expand(array).reshape(num_simulations, -1)[:, place] = value.numpy()
@@ -50,39 +55,46 @@ def make_batch(
         # A simulation whose values have no such constants is lost, and its warnings say so.
         try:
             batch.set_const()
-        except batch_module.SimulationError:
+        except module.SimulationError:
             pass
     return batch
 
 
-def with_crisp_friction(model: Any, dofs: list[int], assignments: Assignments, step: float) -> Any:
-    """Makes dry friction as hard as the engine admits where the file has none of its own.
+def state_view(batch: Any, name: str) -> Any:
+    """Returns a live view of a part of a batch's states, ``(N, …)``.
 
-    Without friction nothing changes, so that an effect of no strength changes nothing.
+    As ``batch.bind``, which makes an ``MjData`` for it; that takes longer than a short simulation.
 
     Args:
-        model: A ``mujoco.MjModel`` of the caller's own.
-        dofs: Degrees of freedom at which effects add dry friction.
-        assignments: What is written into the model.
-        step: Seconds per engine step.
+        batch: A ``mujoco.batch.Batch``.
+        name: Ending of one of MuJoCo's ``mjSTATE_`` constants, in lower case.
     """
-    for dof in dofs:
-        if model.dof_frictionloss[dof] == 0.0 and ("dof_frictionloss", dof) not in assignments:
-            model.dof_solref[dof] = _CRISP_STEPS * step, 1.0
-            model.dof_solimp[dof] = _CRISP_IMPEDANCE
-    return model
+    mujoco: Any = importlib.import_module("mujoco")
+    whole = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    part = int(getattr(mujoco.mjtState, f"mjSTATE_{name.upper()}"))
+    first = mujoco.mj_stateSize(batch.model, whole & (part - 1))
+    return batch.state[:, first : first + mujoco.mj_stateSize(batch.model, part)]
 
 
-def private_copy(model: Any, step: float) -> Any:
-    """Returns a copy of a model with another time step.
+def prepared_copy(model: Any, step: float, crisp: tuple[int, ...]) -> Any:
+    """Returns a copy of a model, ready for a batch.
 
     Commands are limited before they pass the action effects, so the engine's own limit is off: a
     gain that is too high may well exceed it.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        step: Seconds per engine step.
+        crisp: Degrees of freedom whose dry friction is as hard as the engine admits; without
+            friction nothing changes, so that an effect of no strength changes nothing.
     """
     mujoco: Any = importlib.import_module("mujoco")
     own = copy.copy(model)
     own.opt.timestep = step
     own.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    for dof in crisp:
+        own.dof_solref[dof] = _CRISP_STEPS * step, 1.0
+        own.dof_solimp[dof] = _CRISP_IMPEDANCE
     return own
 
 

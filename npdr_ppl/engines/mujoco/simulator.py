@@ -13,7 +13,7 @@ from torch import Tensor
 from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward
 from npdr_ppl.engines.compilation import CompileMode
 from npdr_ppl.engines.effect_chain import Tables, needed_histories
-from npdr_ppl.engines.mujoco.batches import make_batch, private_copy, with_crisp_friction
+from npdr_ppl.engines.mujoco.batches import make_batch, prepared_copy
 from npdr_ppl.engines.mujoco.channels import (
     Component,
     Reading,
@@ -101,6 +101,7 @@ class MujocoSimulator(Simulator):
         if substeps is not None and substeps < 1:
             raise ModelError(f"MujocoSimulator needs at least one substep, got {substeps=}.")
         self.model: Any = load_mjcf(source)
+        self._models: dict[tuple[float, tuple[int, ...]], Any] = {}
         is_path = isinstance(source, str | PathLike)
         self._label = Path(source).name if is_path else "a model"
         self.substeps, self.num_threads = substeps, num_threads
@@ -198,17 +199,29 @@ class MujocoSimulator(Simulator):
                 )
                 changed = effect.environment(gravity, values)
                 assignments |= {("opt.gravity", i): g for i, g in enumerate(changed)}
-        step = time_step / self.num_substeps(time_step)
-        model = private_copy(self.model, step)
-        dofs = [
+        model = self._prepared(time_step / self.num_substeps(time_step), set(assignments))
+        num_threads = self.num_threads or torch.get_num_threads()
+        return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)
+
+    def _prepared(self, step: float, assigned: set[tuple[str, int]]) -> Any:
+        """Returns a model for batches; one that was made before serves again."""
+        dofs = {
             port.velocity
             for port in self.force_ports
             for effect in self.effects
             if isinstance(effect, ForceEffect) and effect.port == port.port.name
-        ]
-        with_crisp_friction(model, dofs, assignments, step)
-        num_threads = self.num_threads or torch.get_num_threads()
-        return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)
+        }
+        # Where the file has dry friction, or a parameter sets it, the file's solver stays.
+        crisp = tuple(
+            dof
+            for dof in sorted(dofs)
+            if self.model.dof_frictionloss[dof] == 0.0
+            and ("dof_frictionloss", dof) not in assigned
+        )
+        key = step, crisp
+        if key not in self._models:
+            self._models[key] = prepared_copy(self.model, step, crisp)
+        return self._models[key]
 
     def _declare_channels(
         self,

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
 from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.mujoco.batches import state_view
 from npdr_ppl.engines.mujoco.channels import Component, Reading
 
 if TYPE_CHECKING:
@@ -51,15 +52,15 @@ class MujocoStepper(EffectChain):
         self._engine_step = time_step / self.substeps
         self._batch = batch
         self._module: Any = importlib.import_module("mujoco.batch")
-        self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
-        self._ctrl = batch.bind("ctrl")
+        self._qpos, self._qvel = state_view(batch, "qpos"), state_view(batch, "qvel")
+        self._ctrl = state_view(batch, "ctrl")
         stages = {s.stage for s in simulator.readings if isinstance(s, Reading)}
         self._sensordata = batch.bind("sensordata") if stages else None
         # Position and velocity sensors lag an engine step behind the state until they are asked
         # for anew; sensors of accelerations report what acted during the last engine step.
         self._stage = max(stages - {ACCELERATION_STAGE}, default=0)
         self._has_accelerations = ACCELERATION_STAGE in stages
-        self._applied = batch.bind("qfrc_applied") if self.force_effects else None
+        self._applied = state_view(batch, "qfrc_applied") if self.force_effects else None
         self._friction: np.ndarray | None = None
         self._own_friction: np.ndarray | None = None
         self.is_lost = torch.zeros(batch.nsim, dtype=torch.bool)
@@ -80,7 +81,7 @@ class MujocoStepper(EffectChain):
         stages: Any = importlib.import_module("mujoco").mjtStage
         stage = stages.mjSTAGE_ACC if self._has_accelerations else stages.mjSTAGE_VEL
         # The solver's first guess belongs to the state; a reading must not change what follows.
-        guess = self._batch.bind("qacc_warmstart")
+        guess = state_view(self._batch, "warmstart")
         kept = guess.copy()
         self._guarded(self._batch.forward, stage=int(stage))
         guess[:] = kept
@@ -168,7 +169,7 @@ def place_states(simulator: "MujocoSimulator", batch: Any, components: tuple[Ten
         batch: A ``mujoco.batch.Batch`` of N simulations.
         components: Values of the simulator's states, ``(N,)`` each.
     """
-    qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
+    qpos, qvel = state_view(batch, "qpos"), state_view(batch, "qvel")
     qpos[:] = simulator.initial_positions
     for component, value in zip(simulator.components, components, strict=True):
         where = qvel if component.is_velocity else qpos
