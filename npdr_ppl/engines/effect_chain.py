@@ -143,11 +143,17 @@ class EffectChain(ABC):
             readings: What each sensor reported at the start, ``(N,)`` each; ``None`` for the
                 true value.
         """
-        true = self.true_readings(positions, velocities, tables)
-        reported = [
-            value if read is None else read for value, read in zip(true, readings, strict=True)
-        ]
-        joint_positions, joint_velocities = self.at_joints(positions, velocities)
+        # Only what some effect asks for is computed: short simulations start often.
+        true: Components = ()
+        reported: Components = ()
+        if self.sensor_effects:
+            true = self.true_readings(positions, velocities, tables)
+            reported = tuple(
+                value if read is None else read for value, read in zip(true, readings, strict=True)
+            )
+        joint_positions, joint_velocities = positions, velocities
+        if self.force_effects:
+            joint_positions, joint_velocities = self.at_joints(positions, velocities)
         return State(
             positions,
             velocities,

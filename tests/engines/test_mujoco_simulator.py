@@ -585,6 +585,22 @@ def test_rates_are_estimated_from_positions():
     assert simulator.simulate({}, rates).isfinite().all()
 
 
+def test_a_file_without_actuators_swings_by_itself():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -1" size="0.1"/></body></worldbody></mujoco>"""
+    )
+    simulator = MujocoSimulator(model)
+    assert [state.name for state in simulator.states] == ["joint_0", "joint_0_velocity"]
+    assert simulator.actions == ()
+    assert simulator.joints == ("joint_0_torque",)
+    inputs = random_inputs(simulator)
+    out = simulator.simulate({}, inputs)
+    assert (out[inputs.mask].abs().sum(-1) > 0.0).all()
+    effect = CoulombFriction("joint_0_torque")
+    assert torch.equal(simulator.with_effects(effect).simulate({}, inputs), out)
+
+
 # (d) Effects.
 
 

@@ -6,6 +6,7 @@ forces of effects have to be evaluated between engine steps.
 """
 
 import logging
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.commands import CommandRecord
 from npdr_ppl.engines.effect_chain import State, Tables
@@ -33,8 +33,6 @@ logger = logging.getLogger(__name__)
 
 CHUNK_BYTES = 1 << 28
 """Memory for the commands and records of the simulations that run at a time."""
-
-Records = tuple[CommandRecord, ...]
 
 
 def replay(
@@ -92,12 +90,11 @@ class _Replay:
         inputs: Inputs,
         shape: torch.Size,
     ) -> None:
-        self.simulator, self.given, self.inputs = simulator, given, inputs
-        columns = {name: i for i, name in enumerate(inputs.action_names)}
-        self.records = tuple(
-            CommandRecord(inputs, columns[a.name], shape, (a.lower, a.upper), torch.float64)
-            for a in simulator.actions
-        )
+        self.simulator, self.given = simulator, given
+        self.inputs, self.shape = inputs, shape
+        self.columns = [inputs.action_names.index(a.name) for a in simulator.actions]
+        self.limits = [(a.lower, a.upper) for a in simulator.actions]
+        self.commands, self.rows = self._commands(shape)
         self.start = recorded_start(simulator, inputs, shape)
         self.past = inputs.past_actions.shape[-2]
         self.histories = simulator.histories(given, inputs.time_step)
@@ -116,8 +113,9 @@ class _Replay:
         def part(value: Tensor) -> Tensor:
             return value[first:last] if value.ndim else value
 
-        given, (recorded, reported) = pytree.tree_map_only(Tensor, part, (self.given, self.start))
-        records = tuple(record.part(first, last) for record in self.records)
+        given = {name: part(value) for name, value in self.given.items()}
+        recorded = tuple(part(value) for value in self.start[0])
+        reported = tuple(None if value is None else part(value) for value in self.start[1])
         step = self.inputs.time_step
         with quiet():
             batch, tables = self.simulator.make_batch(given, last - first, step)
@@ -125,18 +123,19 @@ class _Replay:
             components = true_start(chain, tables, recorded)
             chain.place(components)
             chain.begin()
-            num_positions = chain.num_positions
+            positions = components[: chain.num_positions]
+            velocities = components[chain.num_positions :]
+            records = self._records(chain, first, last)
             state = chain.start(
-                components[:num_positions],
-                components[num_positions:],
+                positions,
+                velocities,
                 tables,
                 tuple(record.at(-1 - self.past) for record in records),
                 reported,
             )
-            state = with_past_commands(chain, state, tables, records, self.past)
+            controls = self._controls(chain, state, tables, records, first, last)
             if chain.force_effects:
-                return self._step_by_step(chain, state, tables, records)
-            controls = self._controls(chain, state, tables, records)
+                return self._step_by_step(chain, state, tables, controls)
             true = run_all_steps(batch, controls, chain.substeps, self.simulator.readings)
         readings = torch.from_numpy(true)
         if chain.sensor_effects:
@@ -145,42 +144,61 @@ class _Replay:
                 readings[:, k] = torch.stack(values, dim=-1)
         return readings
 
+    def _commands(self, shape: torch.Size) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Returns limited commands, ``(rows, steps, actions)``, and each simulation's row.
+
+        Rows are few, one per segment, that many simulations share.
+        """
+        actions = self.inputs.actions[..., self.columns]
+        lower, upper = torch.tensor(self.limits, dtype=torch.float64).reshape(-1, 2).unbind(-1)
+        commands = actions.clamp(lower, upper).numpy()
+        segments = commands.shape[:-2]
+        rows = np.arange(math.prod(segments)).reshape(segments)
+        return commands.reshape(-1, *commands.shape[-2:]), np.broadcast_to(rows, shape).reshape(-1)
+
+    def _records(self, chain: MujocoStepper, first: int, last: int) -> tuple[CommandRecord, ...]:
+        """Returns the commands of each action channel as action effects see them, if there are."""
+        if not chain.action_effects:
+            return ()
+        return tuple(
+            CommandRecord(self.inputs, column, self.shape, limits, torch.float64).part(first, last)
+            for column, limits in zip(self.columns, self.limits, strict=True)
+        )
+
+    def _controls(
+        self,
+        chain: MujocoStepper,
+        state: State,
+        tables: Tables,
+        records: tuple[CommandRecord, ...],
+        first: int,
+        last: int,
+    ) -> NDArray[np.float64]:
+        """Returns what reaches the dynamics in every step, ``(n, steps, actions)``."""
+        controls = self.commands[self.rows[first:last]]
+        if not chain.action_effects:
+            return controls
+        state = with_past_commands(chain, state, tables, records, self.past)
+        for k in range(self.inputs.num_steps):
+            commands = tuple(record.at(k) for record in records)
+            views = tuple(record.view(k) for record in records)
+            state, actions = chain.act(state, commands, tables, views)
+            for channel, action in enumerate(actions):
+                controls[:, k, channel] = action.numpy()
+        return controls
+
     def _step_by_step(
-        self, chain: MujocoStepper, state: State, tables: Tables, records: Records
+        self,
+        chain: MujocoStepper,
+        state: State,
+        tables: Tables,
+        controls: NDArray[np.float64],
     ) -> Tensor:
         """Runs one step after the other."""
         steps = []
         for k in range(self.inputs.num_steps):
-            state, actions = _act(chain, state, tables, records, k)
+            actions = torch.from_numpy(controls[:, k]).unbind(-1)
             state = chain.move(state, actions, tables)
             state, readings = chain.read(state, tables)
             steps.append(torch.stack(readings, dim=-1))
         return torch.stack(steps, dim=1)
-
-    def _controls(
-        self, chain: MujocoStepper, state: State, tables: Tables, records: Records
-    ) -> NDArray[np.float64]:
-        """Returns what reaches the dynamics in every step, ``(n, steps, actions)``."""
-        num_simulations, num_steps = chain.is_lost.numel(), self.inputs.num_steps
-        if not records:
-            return np.zeros((num_simulations, num_steps, 0))
-        if not chain.action_effects:
-            # A record has few rows, one per segment, that many simulations share.
-            first, rows = records[0].first, records[0].rows
-            tables_by_row = [r.table.reshape(-1, r.stride)[first:].T for r in records]
-            return torch.stack(tables_by_row, dim=-1)[rows].numpy()
-        steps = []
-        for k in range(num_steps):
-            state, actions = _act(chain, state, tables, records, k)
-            steps.append(torch.stack(torch.broadcast_tensors(*actions), dim=-1))
-        return torch.stack(steps, dim=1).numpy()
-
-
-def _act(
-    chain: MujocoStepper, state: State, tables: Tables, records: Records, step: int
-) -> tuple[State, tuple[Tensor, ...]]:
-    """Passes the recorded commands of a step through the action effects."""
-    commands = tuple(record.at(step) for record in records)
-    if not chain.action_effects:
-        return state, commands
-    return chain.act(state, commands, tables, tuple(record.view(step) for record in records))
