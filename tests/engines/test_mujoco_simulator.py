@@ -3,6 +3,7 @@
 import importlib.util
 import math
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -33,6 +34,9 @@ from npdr_ppl.models.effects import (
 )
 from npdr_ppl.models.furuta import Furuta, SwingUpReward
 from npdr_ppl.policies.furuta_swing_up import FurutaSwingUp
+from npdr_ppl.workflows.control_task import control_task
+from npdr_ppl.workflows.domains import Domains
+from npdr_ppl.workflows.policy_optimisation import returns_of
 
 ROOT = Path(__file__).parents[2]
 FURUTA_XML = ROOT / "models" / "furuta.xml"
@@ -797,6 +801,19 @@ def test_closed_loop_sees_readings_and_ends_at_bounds():
 def test_policies_that_do_not_fit_are_named():
     with pytest.raises(ModelError, match="do not fit together"):
         arm().roll_out({}, FurutaSwingUp(), torch.zeros(4), 3)
+
+
+def test_policies_are_trained_in_it():
+    task = replace(control_task("furuta-swing-up"), num_steps=60)
+    candidates = task.policy.parameters * torch.tensor([[1.0], [1.1]])
+    masses = {"pole_mass": torch.tensor([0.022, 0.026])}
+    states = task.initial_states(2, torch.Generator().manual_seed(0))
+    found = [
+        returns_of(task, Domains(simulator, masses), candidates, states)
+        for simulator in (furuta_in_mujoco(substeps=1), Furuta(integrator="rk4"))
+    ]
+    assert found[0].shape == (2, 2, 2)
+    torch.testing.assert_close(found[0].float(), found[1].float(), rtol=1e-3, atol=0.0)
 
 
 # (g) In a Pyro model.

@@ -37,7 +37,7 @@ def roll_out(
     time_step: float | None,
     record: bool,
 ) -> Episodes:
-    """Simulates episodes of policies in domains; see :meth:`ODESimulator.roll_out`."""
+    """Simulates episodes of policies in domains; see :meth:`ClosedLoopSimulator.roll_out`."""
     simulator.check_parameters(parameters)
     check_channels(simulator, policy)
     step = time_step or simulator.time_step

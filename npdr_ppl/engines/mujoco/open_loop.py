@@ -152,9 +152,9 @@ class _Replay:
         actions = self.inputs.actions[..., self.columns]
         lower, upper = torch.tensor(self.limits, dtype=torch.float64).reshape(-1, 2).unbind(-1)
         commands = actions.clamp(lower, upper).numpy()
-        segments = commands.shape[:-2]
-        rows = np.arange(math.prod(segments)).reshape(segments)
-        return commands.reshape(-1, *commands.shape[-2:]), np.broadcast_to(rows, shape).reshape(-1)
+        segments, num_rows = commands.shape[:-2], math.prod(commands.shape[:-2])
+        rows = np.broadcast_to(np.arange(num_rows).reshape(segments), shape).reshape(-1)
+        return commands.reshape(num_rows, *commands.shape[-2:]), rows
 
     def _records(self, chain: MujocoStepper, first: int, last: int) -> tuple[CommandRecord, ...]:
         """Returns the commands of each action channel as action effects see them, if there are."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward
+from npdr_ppl.engines.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.engines.compilation import CompileMode
 from npdr_ppl.engines.effect_chain import Tables, needed_histories
 from npdr_ppl.engines.mujoco.batches import make_batch, prepared_copy
@@ -34,12 +35,11 @@ from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.effects import EnvironmentEffect, ForceEffect
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["MujocoSimulator"]
 
 
-class MujocoSimulator(Simulator):
+class MujocoSimulator(ClosedLoopSimulator):
     """Any MJCF file as a simulator; channels, nominal values and ports are read from it.
 
     States are by default the position and the velocity of every hinge and slide, ``elbow`` and
@@ -150,10 +150,9 @@ class MujocoSimulator(Simulator):
         compile: CompileMode | None = None,
         expected_calls: int = 1,
     ) -> Episodes:
-        """Simulates closed-loop episodes of a batch of policies, domains and initial states.
+        """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`.
 
-        As :meth:`~npdr_ppl.engines.ode.ODESimulator.roll_out`, whose arguments for compilation it
-        takes and ignores: the engine is compiled.
+        The arguments for compilation change nothing: the engine is compiled.
         """
         return roll_out(
             self,

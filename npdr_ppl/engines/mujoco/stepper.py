@@ -61,8 +61,8 @@ class MujocoStepper(EffectChain):
         self._stage = max(stages - {ACCELERATION_STAGE}, default=0)
         self._has_accelerations = ACCELERATION_STAGE in stages
         self._applied = state_view(batch, "qfrc_applied") if self.force_effects else None
-        self._friction: np.ndarray | None = None
-        self._own_friction: np.ndarray | None = None
+        # The bounds of dry friction that the engine reads, and what they were without effects.
+        self._friction: tuple[np.ndarray, np.ndarray] | None = None
         self.is_lost = torch.zeros(batch.nsim, dtype=torch.bool)
 
     @property
@@ -135,11 +135,12 @@ class MujocoStepper(EffectChain):
                 self._applied[:, ports[joint].velocity] = force.numpy()
         for joint, bound in enumerate(self.dry_friction_bounds(state, tables)):
             if bound is not None:
-                if self._friction is None or self._own_friction is None:
-                    self._friction = self._batch.expand("dof_frictionloss")
-                    self._own_friction = np.array(self._friction)
+                if self._friction is None:
+                    bounds = self._batch.expand("dof_frictionloss")
+                    self._friction = bounds, bounds.copy()
+                bounds, own = self._friction
                 dof = ports[joint].velocity
-                self._friction[:, dof] = self._own_friction[:, dof] + bound.numpy()
+                bounds[:, dof] = own[:, dof] + bound.numpy()
         memory = self.next_force_memory(state, tables, self._engine_step)
         self._guarded(self._batch.step, stage=stage)
         return state._replace(force_memory=memory)
@@ -178,7 +179,7 @@ def place_states(simulator: "MujocoSimulator", batch: Any, components: tuple[Ten
 
 def lost_simulations(batch: Any) -> np.ndarray:
     """Returns which simulations the engine has warned of, ``(N,)``."""
-    return np.asarray(batch.warning)[..., 1].any(axis=1)
+    return np.asarray(np.asarray(batch.warning)[..., 1].any(axis=1))
 
 
 def _column(table: np.ndarray, column: int) -> Tensor:
