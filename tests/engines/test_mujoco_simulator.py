@@ -841,6 +841,11 @@ def test_inference_end_to_end():
     draws = posterior.sample(200)
     assert draws["hand"].mean() == pytest.approx(0.6, abs=0.1)
     assert draws["hand"].std() < 0.2
+    # Without simulations, because the file tells its inverse dynamics.
+    regressed = npdr.infer(model, rollouts, backend="bayesian-linear-regression", seed=0)
+    draws = regressed.sample(200)
+    assert draws["hand"].mean() == pytest.approx(0.6, abs=0.05)
+    assert draws["damping"].mean() == pytest.approx(0.08, abs=0.05)
 
 
 # Inverse dynamics, copies and threads.
