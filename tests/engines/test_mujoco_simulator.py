@@ -54,6 +54,13 @@ def shipped(package, folder):
 GYMNASIUM = shipped("gymnasium", "envs/mujoco/assets")
 needs_gymnasium = pytest.mark.skipif(GYMNASIUM is None, reason="gymnasium is not installed")
 
+
+@pytest.fixture(autouse=True)
+def elsewhere(monkeypatch, tmp_path):
+    """The engine writes its own warnings to a file in the present folder."""
+    monkeypatch.chdir(tmp_path)
+
+
 ARM = """
 <mujoco>
   <compiler angle="radian"/>
@@ -320,6 +327,13 @@ def test_channels_and_ports_of_files_of_others(name):
 
 
 @needs_gymnasium
+def test_warnings_about_a_file_are_logged(caplog, tmp_path):
+    MujocoSimulator(GYMNASIUM / "half_cheetah.xml")
+    assert all(record.name.startswith("npdr_ppl") for record in caplog.records)
+    assert not list(tmp_path.iterdir())
+
+
+@needs_gymnasium
 def test_free_joints_are_named_and_can_be_left_out():
     ant = MujocoSimulator(GYMNASIUM / "ant.xml")
     names = [state.name for state in ant.states]
@@ -553,8 +567,7 @@ def test_sensor_elements_describe_the_present_state(substeps, attached):
         np.testing.assert_allclose(out[0, step, :3].numpy(), expected, rtol=0, atol=1e-12)
 
 
-def test_divergence_costs_its_own_draw_only(caplog, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_divergence_costs_its_own_draw_only(caplog, tmp_path):
     simulator = arm(parameters={"damping": "joint shoulder damping"}, integrator="RK4")
     inputs = random_inputs(simulator)
     draws = torch.tensor([0.2, -1e7, 0.3], dtype=torch.float64)

@@ -2,7 +2,7 @@
 
 import copy
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -99,16 +99,20 @@ def prepared_copy(model: Any, step: float, crisp: tuple[int, ...]) -> Any:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Keeps the engine from printing a line, and writing one to a file, per lost simulation.
+def quiet(handler: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Hands the engine's warnings to a function, by default one that drops them.
 
-    A handler of the user's own stays.
+    Otherwise the engine prints each and writes it to a file in the present folder, one per lost
+    simulation and step; the batch counts those anyway. A handler of the user's own stays.
+
+    Args:
+        handler: What to do with a warning.
     """
     mujoco: Any = importlib.import_module("mujoco")
     if mujoco.get_mju_user_warning() is not None:
         yield
         return
-    mujoco.set_mju_user_warning(_ignore)
+    mujoco.set_mju_user_warning(handler or _ignore)
     try:
         yield
     finally:
@@ -116,7 +120,7 @@ def quiet() -> Iterator[None]:
 
 
 def _ignore(message: str) -> None:
-    """Does nothing with a warning; the batch counts them."""
+    """Does nothing with a warning."""
 
 
 def _write_shared(model: Any, array: str, place: int, value: float) -> None:

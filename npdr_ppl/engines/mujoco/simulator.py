@@ -1,5 +1,6 @@
 """Simulation of any MJCF file in MuJoCo, many parameter sets and segments at a time."""
 
+import logging
 import math
 from collections.abc import Mapping
 from os import PathLike
@@ -14,7 +15,7 @@ from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward
 from npdr_ppl.engines.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.engines.compilation import CompileMode
 from npdr_ppl.engines.effect_chain import Tables, needed_histories
-from npdr_ppl.engines.mujoco.batches import make_batch, prepared_copy
+from npdr_ppl.engines.mujoco.batches import make_batch, prepared_copy, quiet
 from npdr_ppl.engines.mujoco.channels import (
     Component,
     Reading,
@@ -37,6 +38,8 @@ from npdr_ppl.language.effects import EnvironmentEffect, ForceEffect
 from npdr_ppl.language.inputs import Inputs
 
 __all__ = ["MujocoSimulator"]
+
+logger = logging.getLogger(__name__)
 
 
 class MujocoSimulator(ClosedLoopSimulator):
@@ -100,7 +103,8 @@ class MujocoSimulator(ClosedLoopSimulator):
     ) -> None:
         if substeps is not None and substeps < 1:
             raise ModelError(f"MujocoSimulator needs at least one substep, got {substeps=}.")
-        self.model: Any = load_mjcf(source)
+        with quiet(logger.warning):
+            self.model: Any = load_mjcf(source)
         self._models: dict[tuple[float, tuple[int, ...]], Any] = {}
         is_path = isinstance(source, str | PathLike)
         self._label = Path(source).name if is_path else "a model"
