@@ -1,9 +1,8 @@
-"""MuJoCo as a simulator: against the equations, on files written by others, and by itself."""
+"""MuJoCo as a simulator of any MJCF file: channels, parameters, batches, inference."""
 
-import importlib.util
 import math
 import pickle
-from dataclasses import replace
+import sys
 from pathlib import Path
 
 import mujoco
@@ -21,38 +20,20 @@ from npdr_ppl.language.channels import Parameter
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.inverse_dynamics import Motion
 from npdr_ppl.models.effects import (
-    ActuatorGain,
-    ActuatorLag,
     Bias,
     CoulombFriction,
-    EncoderBias,
     InputDelay,
-    SensorLowPass,
-    Tilt,
-    ViscousFriction,
-    effects,
 )
-from npdr_ppl.models.furuta import Furuta, SwingUpReward
-from npdr_ppl.policies.furuta_swing_up import FurutaSwingUp
-from npdr_ppl.workflows.control_task import control_task
-from npdr_ppl.workflows.domains import Domains
-from npdr_ppl.workflows.policy_optimisation import returns_of
 
-ROOT = Path(__file__).parents[2]
-FURUTA_XML = ROOT / "models" / "furuta.xml"
-
-
-def shipped(package, folder):
-    """Returns a folder of files that another installed package ships."""
-    found = importlib.util.find_spec(package)
-    if found is None or not found.submodule_search_locations:
-        return None
-    path = Path(found.submodule_search_locations[0]) / folder
-    return path if path.is_dir() else None
-
-
-GYMNASIUM = shipped("gymnasium", "envs/mujoco/assets")
-needs_gymnasium = pytest.mark.skipif(GYMNASIUM is None, reason="gymnasium is not installed")
+sys.path.insert(0, str(Path(__file__).parent))
+from mujoco_files import (  # noqa: E402
+    ARM,
+    GYMNASIUM,
+    arm,
+    needs_gymnasium,
+    random_inputs,
+    value,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -61,217 +42,7 @@ def elsewhere(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
 
-ARM = """
-<mujoco>
-  <compiler angle="radian"/>
-  <option timestep="0.002" integrator="{integrator}" gravity="0 0 -9.81"/>
-  <worldbody>
-    <body name="upper">
-      <joint name="shoulder" axis="0 1 0" damping="0.2" frictionloss="{friction}" {solver}/>
-      <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" contype="0" conaffinity="0"/>
-      <body name="hand" pos="0 0 -0.3">
-        <joint name="elbow" axis="0 1 0" damping="0.05" armature="0.01" stiffness="0.5"
-               range="-2 2"/>
-        <geom type="capsule" fromto="0 0 0 0.05 0 -0.2" size="0.02" contype="0" conaffinity="0"/>
-        <site name="tip" pos="0 0 -0.2"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor name="motor" joint="shoulder" gear="2" ctrlrange="-3 3"/>
-    <position joint="elbow" kp="4" ctrlrange="-1 1"/>
-  </actuator>
-  <sensor>
-    <jointpos name="encoder" joint="shoulder"/>
-    <gyro name="gyro" site="tip"/>
-    <accelerometer name="imu" site="tip"/>
-  </sensor>
-  <keyframe><key name="raised" qpos="0.4 -0.3"/></keyframe>
-</mujoco>
-"""
-
-# The hardest dry friction that MuJoCo admits at its time step of 2 ms.
-HARD = 'solreffriction="0.004 1" solimpfriction="0.9999 0.9999 0.001 0.5 2"'
-
-
-def arm(*, integrator="Euler", friction=0.0, solver="", **options):
-    text = ARM.format(integrator=integrator, friction=friction, solver=solver)
-    return MujocoSimulator(mujoco.MjModel.from_xml_string(text), **options)
-
-
-def random_inputs(simulator, *, num_segments=3, num_steps=30, seed=0, past=6):
-    """Segments about the file's pose; the second is shorter, the third a single step."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def draw(*shape):
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    scale = [min(action.upper, 10.0) for action in simulator.actions]
-    states = 0.1 * draw(num_segments, len(simulator.states))
-    for i, component in enumerate(simulator.components):
-        if not component.is_velocity:
-            states[:, i] += float(simulator.initial_positions[component.address])
-    lengths = torch.tensor([num_steps, num_steps - 5, 1])[:num_segments, None]
-    num_actions = len(simulator.actions)
-    return Inputs(
-        actions=torch.tensor(scale).double() * draw(num_segments, num_steps, num_actions),
-        action_names=tuple(action.name for action in simulator.actions),
-        initial_readings=states + 0.01 * draw(*states.shape),
-        initial_values=states,
-        initial_rates=None,
-        channel_names=tuple(state.name for state in simulator.states),
-        past_actions=draw(num_segments, past, num_actions),
-        time_step=simulator.time_step,
-        mask=torch.arange(num_steps) < lengths,
-        rollout=torch.arange(num_segments),
-        start=torch.tensor([0, num_steps, 0])[:num_segments],
-    )
-
-
-def value(number):
-    return torch.tensor(number, dtype=torch.float64)
-
-
-# (a) Against the ODE Furuta pendulum.
-
-
-def furuta_in_mujoco(**options):
-    """The Furuta pendulum's parameters, bound to its file."""
-    info = {parameter.name: parameter for parameter in Furuta.parameters}
-
-    def rod(mass, length):
-        return lambda p: p[mass] * p[length] ** 2 / 12.0
-
-    def gain(p):
-        return p["motor_constant"] / p["motor_resistance"]
-
-    return MujocoSimulator(
-        FURUTA_XML,
-        {
-            "gravity": "option gravity",
-            "motor_resistance": info["motor_resistance"],
-            "motor_constant": info["motor_constant"],
-            "arm_mass": "body arm mass",
-            "arm_length": "body pole position x",
-            "pole_mass": "body pole mass",
-            "pole_length": info["pole_length"],
-            "arm_damping": "joint arm damping",
-            "pole_damping": "joint pole damping",
-        },
-        derived={
-            "body arm inertia y": rod("arm_mass", "arm_length"),
-            "body arm inertia z": rod("arm_mass", "arm_length"),
-            "joint pole armature": rod("pole_mass", "pole_length"),
-            # A point mass, as far as the engine admits one.
-            "body pole inertia": lambda p: 1e-14 * torch.ones_like(p["pole_mass"]),
-            "body pole centre z": lambda p: -0.5 * p["pole_length"],
-            "actuator voltage gain": gain,
-            "actuator voltage bias velocity": lambda p: -gain(p) * p["motor_constant"],
-        },
-        states={
-            "arm_angle": "arm",
-            "pole_angle": "pole",
-            "arm_velocity": "arm_velocity",
-            "pole_velocity": "pole_velocity",
-        },
-        units={"voltage": "V"},
-        bounds={state.name: (state.lower, state.upper) for state in Furuta.states},
-        time_step=Furuta.time_step,
-        **options,
-    )
-
-
-def furuta_inputs(num_steps=250):
-    time = 0.002 * torch.arange(num_steps, dtype=torch.float64)
-    return Inputs.single(
-        5.0 * torch.sin(9.0 * time)[:, None],
-        torch.tensor([0.2, 1.3, -0.5, 2.0], dtype=torch.float64),
-        action_names=("voltage",),
-        state_names=tuple(state.name for state in Furuta.states),
-        time_step=0.002,
-        history=20,
-    )
-
-
-def furuta_domains(num_domains=4):
-    generator = torch.Generator().manual_seed(3)
-    factors = 1.0 + 0.2 * torch.randn(9, num_domains, generator=generator).double()
-    return {p.name: p.nominal * f for p, f in zip(Furuta.parameters, factors, strict=True)}
-
-
-def test_furuta_declares_what_the_ode_model_declares():
-    simulator, ode = furuta_in_mujoco(), Furuta()
-    assert simulator.actions == ode.actions
-    assert simulator.states == ode.states
-    assert {p.name for p in simulator.ports} == {p.name for p in ode.ports}
-    for port in ode.ports:
-        derived = simulator.port(port.name)
-        assert (derived.kind, derived.unit) == (port.kind, port.unit)
-        assert derived.rated == pytest.approx(port.rated, rel=2.5)
-        assert 0.5 < derived.rated_speed / port.rated_speed < 2.0
-    for parameter, expected in zip(simulator.parameters, ode.parameters, strict=True):
-        assert (parameter.name, parameter.unit) == (expected.name, expected.unit)
-        assert parameter.nominal == pytest.approx(expected.nominal)
-
-
-def test_furuta_follows_the_equations_to_integration_error():
-    domains, inputs = furuta_domains(), furuta_inputs(150)
-    truth = Furuta(integrator="rk4", substeps=32, compile="never").simulate(domains, inputs)
-    errors = []
-    for substeps in (1, 2, 4):
-        out = furuta_in_mujoco(substeps=substeps).simulate(domains, inputs)
-        assert out.shape == truth.shape == (4, 1, 150, 4)
-        assert out.dtype == torch.float64
-        errors.append(float((out - truth).abs().amax()))
-    # Runge-Kutta of the fourth order: halving the step leaves a sixteenth.
-    assert errors[0] < 1e-3
-    assert errors[1] < errors[0] / 8.0
-    assert errors[2] < errors[1] / 8.0 or errors[2] < 2e-7
-
-
-@pytest.mark.parametrize(
-    ("attached", "strengths", "order"),
-    [
-        (
-            (CoulombFriction("arm"), CoulombFriction("pole")),
-            {"arm.coulomb_friction.magnitude": 1e-3, "pole.coulomb_friction.magnitude": 2e-4},
-            1,
-        ),
-        ((ViscousFriction("arm"),), {"arm.viscous_friction.damping": 2e-4}, 1),
-        ((Tilt("gravity"),), {"gravity.tilt.roll": 0.05, "gravity.tilt.pitch": -0.03}, 4),
-        ((InputDelay("voltage"),), {"voltage.input_delay.delay": 0.0073}, 4),
-        (
-            (SensorLowPass("arm_velocity,pole_velocity"), EncoderBias("pole_angle")),
-            {
-                "arm_velocity,pole_velocity.sensor_low_pass.time_constant": 0.01,
-                "pole_angle.encoder_bias.offset": 0.02,
-            },
-            4,
-        ),
-    ],
-    ids=["dry friction", "viscous friction", "tilt", "delay", "sensors"],
-)
-def test_effects_are_those_of_the_ode_engine(attached, strengths, order):
-    inputs = furuta_inputs(100)
-    strengths = {name: value(strength) for name, strength in strengths.items()}
-    ode = Furuta(integrator="rk4", substeps=32, compile="never")
-    truth = ode.with_effects(*attached).simulate(strengths, inputs)
-    size = (truth - ode.simulate({}, inputs)).abs().amax()
-    errors = []
-    for substeps in (2, 8):
-        simulator = furuta_in_mujoco(substeps=substeps).with_effects(*attached)
-        # All parameters as given, so that the derived fields take the ODE's values.
-        out = simulator.simulate(strengths, inputs)
-        errors.append(float((out - truth).abs().amax() / size))
-    # Forces of effects are held over an engine step: first order. The others are exact.
-    if order == 1:
-        assert errors[1] < 0.02
-        assert errors[1] < errors[0] / 3.0
-    else:
-        assert errors[1] < 1e-4
-
-
-# (b) On files that were not written for this simulator.
+# On files that were not written for this simulator.
 
 FILES = (
     "ant",
@@ -466,7 +237,7 @@ def test_files_and_inputs_that_do_not_fit(tmp_path):
         arm(parameters=unit, derived={"body hand mass": lambda p: p["b"]})
 
 
-# (c) Batches, segments and masks.
+# Batches, segments and masks.
 
 
 def test_batch_equals_a_loop(monkeypatch):
@@ -618,218 +389,7 @@ def test_a_file_without_actuators_swings_by_itself():
     assert torch.equal(simulator.with_effects(effect).simulate({}, inputs), out)
 
 
-# (d) Effects.
-
-
-def cases():
-    for effect in effects().values():
-        for kind, port in (
-            ("action", "motor"),
-            ("action", "elbow_command"),
-            ("force", "shoulder_torque"),
-            ("force", "elbow_torque"),
-            ("sensor", "shoulder"),
-            ("sensor", "shoulder_velocity,elbow_velocity"),
-            ("environment", "gravity"),
-        ):
-            if kind in effect.port_kinds:
-                yield pytest.param(effect(port), id=f"{effect.id}-{port}")
-
-
-CASES = tuple(cases())
-
-
-def no_strength(effect, shape=()):
-    return {
-        site: torch.full(shape, parameter.nominal, dtype=torch.float64)
-        for site, parameter in zip(effect.parameter_names, effect.parameters, strict=True)
-    }
-
-
-@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])
-@pytest.mark.parametrize("effect", CASES)
-def test_zero_strength_changes_no_bit(effect, integrator):
-    base = arm(integrator=integrator, friction=0.01, parameters={"hand": "body hand mass"})
-    inputs = random_inputs(base, num_steps=12)
-    expected = base.simulate({}, inputs)
-    changed = base.with_effects(effect)
-    assert torch.equal(changed.simulate({}, inputs), expected)
-    assert torch.equal(changed.simulate(no_strength(effect), inputs), expected)
-    batch = changed.simulate(no_strength(effect, (2, 1)), inputs)
-    assert torch.equal(batch, expected.expand(2, 1, *expected.shape))
-    heavy = {"hand": value([0.5, 1.0])}
-    assert torch.equal(
-        changed.simulate({**heavy, **no_strength(effect)}, inputs), base.simulate(heavy, inputs)
-    )
-
-
-@needs_gymnasium
-@pytest.mark.parametrize("name", ["hopper", "half_cheetah", "ant"])
-def test_zero_strength_changes_no_bit_in_files_of_others(name):
-    base = MujocoSimulator(GYMNASIUM / f"{name}.xml")
-    inputs = random_inputs(base, num_segments=1)
-    joint, action = base.joints[-1], base.actions[-1].name
-    sensor = base.sensors[-1].name
-    attached = (
-        Tilt("gravity"),
-        CoulombFriction(joint),
-        Bias(joint),
-        InputDelay(action),
-        ActuatorLag(action),
-        SensorLowPass(sensor),
-    )
-    zero = {}
-    for effect in attached:
-        zero |= no_strength(effect)
-    expected = base.simulate({}, inputs)
-    assert torch.equal(base.with_effects(*attached).simulate(zero, inputs), expected)
-
-
-@pytest.mark.parametrize("effect", CASES)
-def test_prior_draws_matter_and_stay_finite(effect):
-    base = arm()
-    changed = base.with_effects(effect)
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        draws = {
-            f"{effect.name}.{name}": prior.sample((20,)).double()
-            for name, prior in effect.priors(changed.port(effect.port)).items()
-        }
-    inputs = random_inputs(base, num_steps=100)
-    out = changed.simulate(draws, inputs)
-    assert out.isfinite().all()
-    assert (
-        (out - base.simulate({}, inputs)).abs().flatten(1).amax(1) > 1e-12
-    ).float().mean() > 0.9
-
-
-def test_dry_friction_is_the_engines_own():
-    """The effect equals the file's friction loss under the same solver parameters."""
-    inputs = random_inputs(arm())
-    effect = CoulombFriction("shoulder_torque")
-    magnitude = value([0.02, 0.3])
-    out = (
-        arm()
-        .with_effects(effect)
-        .simulate({"shoulder_torque.coulomb_friction.magnitude": magnitude}, inputs)
-    )
-    native = arm(solver=HARD, parameters={"friction": "joint shoulder frictionloss"})
-    assert torch.equal(out, native.simulate({"friction": magnitude}, inputs))
-    # It adds to the file's own, which keeps its solver parameters.
-    added = (
-        arm(friction=0.1)
-        .with_effects(effect)
-        .simulate({"shoulder_torque.coulomb_friction.magnitude": magnitude}, inputs)
-    )
-    native = arm(friction=0.1, parameters={"friction": "joint shoulder frictionloss"})
-    assert torch.equal(added, native.simulate({"friction": 0.1 + magnitude}, inputs))
-
-
-def test_dry_friction_holds_the_joint_at_rest():
-    inputs = random_inputs(arm(), num_segments=1, num_steps=100)
-    still = torch.tensor([[0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)
-    inputs = Inputs(**{**vars(inputs), "actions": 0 * inputs.actions, "initial_values": still})
-    effect = CoulombFriction("shoulder_torque")
-    strength = {f"{effect.name}.magnitude": value([0.0, 50.0])}
-    out = arm().with_effects(effect).simulate(strength, inputs)
-    assert (out[0, 0, :, 0] - 0.3).abs().max() > 0.1
-    assert (out[1, 0, :, 0] - 0.3).abs().max() < 1e-3
-
-
-def test_viscous_friction_converges_to_the_engines_damping():
-    errors = []
-    native = arm(integrator="RK4", parameters={"damping": "joint shoulder damping"})
-    inputs = random_inputs(native, num_segments=1, num_steps=100)
-    truth = arm(
-        integrator="RK4", parameters={"damping": "joint shoulder damping"}, substeps=8,
-        time_step=0.002,
-    ).simulate({"damping": value(0.5)}, inputs)  # fmt: skip
-    for substeps in (1, 4):
-        simulator = arm(integrator="RK4", substeps=substeps, time_step=0.002)
-        effect = ViscousFriction("shoulder_torque")
-        out = simulator.with_effects(effect).simulate(
-            {f"{effect.name}.damping": value(0.3)}, inputs
-        )
-        errors.append(float((out - truth).abs().max()))
-    assert errors[0] < 0.05 * float((truth - native.simulate({}, inputs)).abs().max())
-    assert errors[1] < errors[0] / 3.0
-
-
-def test_gains_may_exceed_the_control_range():
-    simulator = arm(parameters={"gear": "actuator motor gear"})
-    inputs = random_inputs(simulator)
-    gain = simulator.with_effects(ActuatorGain("motor"))
-    out = gain.simulate({"motor.actuator_gain.error": value(0.25)}, inputs)
-    torch.testing.assert_close(out, simulator.simulate({"gear": value(2.5)}, inputs))
-
-
-# (f) Closed loop.
-
-
-def test_closed_loop_follows_the_ode_engine():
-    states = value([[0.0, 0.1, 0.0, 0.0], [0.02, -0.05, 0.0, 0.1]])
-    domains = {"pole_mass": value([[0.022], [0.024], [0.026]])}
-    policy = FurutaSwingUp()
-    options = {"reward": SwingUpReward(), "record": True}
-    truth = Furuta(integrator="rk4", substeps=16, compile="never").roll_out(
-        domains, policy, states, 100, **options
-    )
-    out = furuta_in_mujoco(substeps=4).roll_out(domains, policy, states, 100, **options)
-    assert out.readings.shape == (3, 2, 101, 4)
-    assert torch.equal(out.lengths, truth.lengths)
-    torch.testing.assert_close(out.readings, truth.readings, rtol=0.0, atol=1e-5)
-    torch.testing.assert_close(out.returns, truth.returns, rtol=1e-6, atol=0.0)
-    # An episode of the loop replays in open loop.
-    inputs = Inputs.single(
-        out.commands[0, 0],
-        states[0],
-        action_names=("voltage",),
-        state_names=tuple(state.name for state in Furuta.states),
-        time_step=0.002,
-    )
-    replayed = furuta_in_mujoco(substeps=4).simulate({"pole_mass": value(0.022)}, inputs)
-    assert torch.equal(replayed[0], out.readings[0, 0, 1:])
-
-
-def test_closed_loop_sees_readings_and_ends_at_bounds():
-    simulator = furuta_in_mujoco(substeps=1)
-    states = value([[0.0, 0.1, 0.0, 0.0], [1.99, 0.1, 15.0, 0.0]])
-    policy = FurutaSwingUp()
-    plain = simulator.roll_out({}, policy, states, 60, record=True)
-    assert plain.returns is None
-    assert plain.lengths[0] == 60
-    assert plain.lengths[1] < 10
-    assert (plain.readings[1, int(plain.lengths[1]) + 1 :] == 0.0).all()
-    attached = (EncoderBias("pole_angle"), CoulombFriction("arm"), ActuatorLag("voltage"))
-    changed = simulator.with_effects(*attached)
-    same = changed.roll_out({}, policy, states, 60, record=True)
-    assert torch.equal(same.readings, plain.readings)
-    biased = {"pole_angle.encoder_bias.offset": value([0.0, 0.05])[:, None]}
-    out = changed.roll_out(biased, policy, states, 60, record=True)
-    assert out.readings.shape == (2, 2, 61, 4)
-    assert torch.equal(out.readings[0], plain.readings)
-    assert not torch.equal(out.commands[1, 0], out.commands[0, 0])
-
-
-def test_policies_that_do_not_fit_are_named():
-    with pytest.raises(ModelError, match="do not fit together"):
-        arm().roll_out({}, FurutaSwingUp(), torch.zeros(4), 3)
-
-
-def test_policies_are_trained_in_it():
-    task = replace(control_task("furuta-swing-up"), num_steps=60)
-    candidates = task.policy.parameters * torch.tensor([[1.0], [1.1]])
-    masses = {"pole_mass": torch.tensor([0.022, 0.026])}
-    states = task.initial_states(2, torch.Generator().manual_seed(0))
-    found = [
-        returns_of(task, Domains(simulator, masses), candidates, states)
-        for simulator in (furuta_in_mujoco(substeps=1), Furuta(integrator="rk4"))
-    ]
-    assert found[0].shape == (2, 2, 2)
-    torch.testing.assert_close(found[0].float(), found[1].float(), rtol=1e-3, atol=0.0)
-
-
-# (g) In a Pyro model.
+# In a Pyro model.
 
 
 def test_inference_end_to_end():
