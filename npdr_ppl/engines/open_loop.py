@@ -14,15 +14,17 @@ from npdr_ppl.engines.compilation import (
     mark_sizes_dynamic,
     with_fallback,
 )
+from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
 from npdr_ppl.engines.integrators import Components
-from npdr_ppl.engines.stepping import State, Stepper, Tables, flatten
+from npdr_ppl.engines.stepping import Stepper, flatten
 from npdr_ppl.errors import ShapeError
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.simulator import Simulator
 
 if TYPE_CHECKING:
     from npdr_ppl.engines.ode import ODESimulator
 
-__all__ = ["replay"]
+__all__ = ["recorded_start", "replay", "true_start", "with_past_commands"]
 
 # Steps per call of a compiled kernel; see closed_loop.
 _STEPS_PER_CALL = 10
@@ -184,39 +186,80 @@ def _start(
     """Returns the state at the segments' start, effects' memory included."""
     stepper = body.stepper
     simulator = stepper.simulator
-
-    def spread(value: Tensor) -> Tensor:
-        return value.expand(shape).reshape(-1)
-
-    components = [spread(value) for value in simulator.initial_states(inputs)]
+    recorded, reported = recorded_start(simulator, inputs, shape)
+    components = true_start(stepper, tables, recorded)
     num_joints = len(simulator.joints)
     if len(components) != 2 * num_joints:
         raise ShapeError(
             f"{simulator.name} has {num_joints} joints, so it should declare {2 * num_joints} "
             f"states, got {len(components)}."
         )
-    names = [state.name for state in simulator.states]
-    for place, effect, columns in stepper.sensor_effects:
-        for name in (simulator.sensors[column].name for column in columns):
-            if name in names:
-                i = names.index(name)
-                components[i] = effect.initial_value(components[i], tables.effects[place])
-    columns = {name: i for i, name in enumerate(inputs.channel_names)}
-    reported = tuple(
-        spread(inputs.initial_readings[..., columns[s.name]]) if s.name in columns else None
-        for s in simulator.sensors
-    )
     past = inputs.past_actions.shape[-2]
     state = stepper.start(
-        tuple(components[:num_joints]),
-        tuple(components[num_joints:]),
+        components[:num_joints],
+        components[num_joints:],
         tables,
         tuple(record.at(-1 - past) for record in records),
         reported,
     )
-    if stepper.action_effects:
-        # The effects' memory at the start is what the recorded past made of it.
-        for step in range(-past, 0):
+    return with_past_commands(stepper, state, tables, records, past)
+
+
+def recorded_start(
+    simulator: Simulator, inputs: Inputs, shape: torch.Size
+) -> tuple[Components, tuple[Tensor | None, ...]]:
+    """Returns the state at the segments' start as recorded, and what each sensor reported there.
+
+    Args:
+        simulator: The simulator.
+        inputs: The segments.
+        shape: Shape of the batch and the segments, of numel N.
+
+    Returns:
+        State components, ``(N,)`` each, and readings, ``(N,)`` each, ``None`` where none is known.
+    """
+
+    def spread(value: Tensor) -> Tensor:
+        return value.expand(shape).reshape(-1)
+
+    columns = {name: i for i, name in enumerate(inputs.channel_names)}
+    return tuple(spread(value) for value in simulator.initial_states(inputs)), tuple(
+        spread(inputs.initial_readings[..., columns[s.name]]) if s.name in columns else None
+        for s in simulator.sensors
+    )
+
+
+def true_start(chain: EffectChain, tables: Tables, recorded: Components) -> Components:
+    """Returns the true state behind what was recorded through the sensor effects."""
+    components = list(recorded)
+    names = [state.name for state in chain.simulator.states]
+    for place, effect, columns in chain.sensor_effects:
+        for name in (chain.simulator.sensors[column].name for column in columns):
+            if name in names:
+                i = names.index(name)
+                components[i] = effect.initial_value(components[i], tables.effects[place])
+    return tuple(components)
+
+
+def with_past_commands(
+    chain: EffectChain,
+    state: State,
+    tables: Tables,
+    records: tuple[CommandRecord, ...],
+    num_steps: int,
+) -> State:
+    """Returns the state with the action effects' memory as the recorded past made it.
+
+    Args:
+        chain: The effects.
+        state: State at the segments' start, as if the oldest command had been given for long.
+        tables: The effects' parameters.
+        records: Commands of each action channel.
+        num_steps: Steps of the past that are on record.
+    """
+    if chain.action_effects:
+        for step in range(-num_steps, 0):
             commands = tuple(record.at(step) for record in records)
-            state, _ = body.act(state, tables, commands, _views(records, step))
+            views = tuple(record.view(step) for record in records)
+            state, _ = chain.act(state, commands, tables, views)
     return state

@@ -147,3 +147,22 @@ class Simulator(ABC):
             parameter.name: torch.tensor(parameter.nominal, dtype=torch.float64)
             for parameter in self.parameters
         }
+
+    def complete(
+        self, parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
+    ) -> dict[str, Tensor]:
+        """Returns all parameters, missing ones nominal and effects' included.
+
+        Args:
+            parameters: Some of the parameters, tensors or numbers.
+            dtype: Floating type of the result.
+            device: Device of the result.
+        """
+        values = {parameter.name: parameter.nominal for parameter in self.parameters}
+        for effect in self.effects:
+            nominal = [parameter.nominal for parameter in effect.parameters]
+            values |= dict(zip(effect.parameter_names, nominal, strict=True))
+        return {
+            name: torch.as_tensor(value, dtype=dtype, device=device)
+            for name, value in {**values, **parameters}.items()
+        }
