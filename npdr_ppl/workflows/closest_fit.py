@@ -9,6 +9,7 @@ can be compressed into their score.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -16,17 +17,27 @@ from torch import Tensor
 
 from npdr_ppl.embeddings.score import Score
 from npdr_ppl.errors import DataError
+from npdr_ppl.inference.base import Density
+from npdr_ppl.inference.gaussian_mixture import GaussianMixture
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.evaluation import declares_noise
-from npdr_ppl.workflows.segment_fit import SegmentFit, SegmentModel, fit_segments
+from npdr_ppl.workflows.segment_fit import (
+    Linearisation,
+    SegmentFit,
+    SegmentModel,
+    fit_segments,
+)
 
 __all__ = ["ClosestFit", "Prepared", "closest_fit", "prepare", "score_embedding"]
 
 ITERATIONS, POPULATION = 6, 200
 """Of the cross-entropy search: enough to find the valley, not its bottom."""
+
+MARGIN = 0.1
+"""Least standard deviation of the neighbourhood of a fit, in the prior's."""
 
 NEGLIGIBLE = 1e-9
 """Standard deviation that no unit makes large."""
@@ -49,6 +60,23 @@ class ClosestFit:
         """Root-mean-square residual by channel, in the channel's unit."""
         return dict(zip(self.segments.channel_names, self.fit.scale.tolist(), strict=True))
 
+    @cached_property
+    def linearisation(self) -> Linearisation:
+        """Residuals and derivatives at the fit."""
+        return self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
+
+    def neighbourhood(self) -> GaussianMixture:
+        """Returns a normal density around the fit that is wider than the posterior should be.
+
+        Its covariance is that of Laplace's approximation, and ``MARGIN`` of the prior's standard
+        deviations more in every direction, for what is not linear and for what the model lacks.
+        """
+        information = self.linearisation.information()
+        eye = torch.eye(len(information), dtype=torch.float64)
+        covariance = torch.linalg.inv(information + eye) + MARGIN**2 * eye
+        one = torch.ones(1, dtype=torch.float64)
+        return GaussianMixture.from_moments(one, self.fit.z[None], covariance[None])
+
     @property
     def noise(self) -> dict[str, float]:
         """The scale as a site's noise; channels that were not measured get next to none."""
@@ -69,11 +97,13 @@ class Prepared:
         options: The options, with an embedding that can be applied.
         noise: Estimated standard deviation by channel, in its unit; ``None`` if the model keeps
             its own.
+        neighbourhood: Density around the closest fit, if one was asked for.
     """
 
     model: Callable[..., Any]
     options: BindingOptions
     noise: dict[str, float] | None
+    neighbourhood: Density | None = None
 
 
 def prepare(
@@ -82,6 +112,7 @@ def prepare(
     options: BindingOptions,
     *,
     noise: Literal["auto", "model"] = "auto",
+    wants_neighbourhood: bool = False,
     seed: int = 0,
 ) -> Prepared:
     """Gives a model the noise, and the embedding the point of expansion, that they lack.
@@ -92,18 +123,22 @@ def prepare(
         options: Segments, initial states, embedding and precision.
         noise: ``"auto"`` gives a model without noise that of the closest fit; ``"model"`` takes
             it as it is.
+        wants_neighbourhood: Whether inference is to start near the closest fit.
         seed: Seed of the search.
     """
     lacks_noise = noise == "auto" and not declares_noise(model, rollouts, options)
     lacks_point = options.embedding == "score"
-    if not lacks_noise and not lacks_point:
+    if not (lacks_noise or lacks_point or wants_neighbourhood):
         return Prepared(model, options, None)
     found = closest_fit(model, rollouts, options, seed=seed)
     if lacks_point:
         options = replace(options, embedding=score_embedding(found))
-    if not lacks_noise:
-        return Prepared(model, options, None)
-    return Prepared(with_noise(model, found.noise), options, found.scale)
+    return Prepared(
+        with_noise(model, found.noise) if lacks_noise else model,
+        options,
+        found.scale if lacks_noise else None,
+        found.neighbourhood() if wants_neighbourhood else None,
+    )
 
 
 def closest_fit(
@@ -158,18 +193,12 @@ def closest_fit(
 def score_embedding(found: ClosestFit) -> Score:
     """Returns the embedding that compresses trajectories into their score at the closest fit.
 
-    Initial states are integrated out: with their derivative G, the covariance is 1 + G Gᵀ in units
-    of the residuals' scale and the smoother's errors.
+    Initial states are integrated out.
     """
     segments, fit = found.segments, found.fit
-    now = segments.linearise(fit.z, fit.offsets, fit.scale)
-    by_z, by_start = now.by_parameters, now.by_starts
-    inner = by_start.mT @ by_start + torch.eye(by_start.shape[-1], dtype=torch.float64)
-    weights = by_z - by_start @ torch.linalg.solve(inner, by_start.mT @ by_z)
-    deviation = (by_z * weights).sum((0, 1)).sqrt()
+    now = found.linearisation
     # A parameter that does nothing has a score of zero.
-    deviation = deviation.clamp_min(1e-12)
-    shape = (*segments.observed.shape, by_z.shape[-1])
-    weights = weights.unflatten(1, shape[1:3]) / fit.scale[:, None]
+    deviation = now.information().diagonal().sqrt().clamp_min(1e-12)
+    weights = now.weights().unflatten(1, segments.observed.shape[1:]) / fit.scale[:, None]
     mean = segments.simulate(fit.z[None], fit.offsets[None])[0]
     return Score(mean, weights, deviation)

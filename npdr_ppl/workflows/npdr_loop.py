@@ -344,7 +344,14 @@ class _Loop:
         number = len(self.rollouts) if options.rollouts_used == "all" else options.rollouts
         data = _joined(self.rollouts[-number:])
         seed = derived_seed(self.seed, "inference", index, attempt)
-        prepared = prepare(self.model, data, options.binding, noise=options.noise, seed=seed)
+        prepared = prepare(
+            self.model,
+            data,
+            options.binding,
+            noise=options.noise,
+            wants_neighbourhood=options.start == "closest fit",
+            seed=seed,
+        )
         binding = prepared.options
         return infer(
             prepared.model,
@@ -357,14 +364,14 @@ class _Loop:
             segment_length=binding.segment_length,
             initial_state=binding.initial_state,
             precision=binding.precision,
-            start=self._start(index),
+            start=prepared.neighbourhood or self._start(index),
             checkpoint=self.folder.inference(index, attempt),
             progress=report,
         )
 
     def _start(self, index: int) -> Posterior | None:
         """Returns the last iteration's posterior if inference is to start from it."""
-        if self.options.start == "prior" or not self.backend.continues or index == 0:
+        if self.options.start != "posterior" or not self.backend.continues or index == 0:
             return None
         last = self.posterior
         if last is None or last.prior.num_parameters != self.prior.num_parameters:

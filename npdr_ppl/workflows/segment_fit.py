@@ -65,6 +65,20 @@ class Linearisation:
     by_parameters: Tensor
     by_starts: Tensor
 
+    def weights(self) -> Tensor:
+        """Returns C⁻¹ J, ``(S, N, d)``, with the initial states integrated out.
+
+        J is the derivative by the parameters and C = 1 + G Gᵀ the covariance of the residuals,
+        with the derivative G by the offsets, which are standard normal.
+        """
+        by_z, by_start = self.by_parameters, self.by_starts
+        inner = by_start.mT @ by_start + torch.eye(by_start.shape[-1], dtype=torch.float64)
+        return by_z - by_start @ torch.linalg.solve(inner, by_start.mT @ by_z)
+
+    def information(self) -> Tensor:
+        """Returns the Fisher information Jᵀ C⁻¹ J of the parameters, ``(d, d)``."""
+        return (self.by_parameters.mT @ self.weights()).sum(0)
+
 
 @dataclass(frozen=True)
 class SegmentFit:
