@@ -74,6 +74,9 @@ class LoopOptions:
         prior_share: Share of the domains drawn from the prior where the posterior is widened.
         internal_model: Parameters of the policy's own model on the target: the most likely
             sample's, or nominal.
+        deploys: Which policy the run ends with: the one with the best measured return, or the
+            last, which no real rollout has tried yet. Where no measured return reached the
+            task's threshold it is the last.
         follows_decisions: Whether diagnoses change what the loop does, or are logged only.
         stop_return: Mean real return of an iteration at which an accepted posterior ends the
             loop; ``None`` to use all iterations.
@@ -103,6 +106,7 @@ class LoopOptions:
     spread: float = 0.1
     prior_share: float = 0.2
     internal_model: Literal["most likely", "nominal"] = "most likely"
+    deploys: Literal["best measured", "last"] = "best measured"
     follows_decisions: bool = True
     stop_return: float | None = None
     thresholds: Thresholds = field(default_factory=Thresholds)

@@ -76,8 +76,10 @@ class Training:
     """What a training run came to.
 
     Attributes:
-        policy: The last policy.
+        policy: The policy to deploy.
         domain: Parameters of its internal model.
+        deployed: Number of the iteration whose rollouts measured it; ``None`` for the last
+            policy, which none has.
         iterations: The records of the iterations, as in ``train.json``.
         rollouts: All real rollouts.
         posterior: The last posterior; ``None`` if no iteration was computed in this process.
@@ -86,6 +88,7 @@ class Training:
 
     policy: Policy
     domain: dict[str, float]
+    deployed: int | None
     iterations: list[dict[str, Any]]
     rollouts: Rollouts
     posterior: Posterior | None
@@ -97,6 +100,7 @@ class Training:
         return {
             "iterations": self.iterations,
             "policy": dict(zip(self.policy.names, values, strict=True)),
+            "deployed": self.deployed,
             "internal_model": self.domain,
         }
 
@@ -172,6 +176,7 @@ class _Loop:
         self.policy = task.policy
         self.posterior: Posterior | None = None
         self.records: list[dict[str, Any]] = []
+        self.tried: list[_Tried] = []
 
     def run(self) -> Training:
         """Runs all iterations, or those that are left."""
@@ -197,14 +202,26 @@ class _Loop:
         return self._result()
 
     def _result(self) -> Training:
+        best = self._best_measured()
         return Training(
-            self.policy,
-            self.domain,
+            self.policy if best is None else self.tried[best].policy,
+            self.domain if best is None else self.tried[best].domain,
+            best,
             list(self.records),
             _joined(self.rollouts),
             self.posterior,
             self.model,
         )
+
+    def _best_measured(self) -> int | None:
+        """Returns the iteration of the policy to deploy, ``None`` for the last policy."""
+        if self.options.deploys == "last" or not self.tried:
+            return None
+        best = max(range(len(self.tried)), key=lambda index: self.tried[index].real_return)
+        threshold = self.task.success
+        if threshold is not None and self.tried[best].real_return < threshold:
+            return None
+        return best
 
     def _can_collect(self, number: int) -> bool:
         """Returns whether the target has so many episodes left."""
@@ -222,11 +239,13 @@ class _Loop:
         """Runs one iteration, or takes over what an earlier process made of it."""
         new = [self._collect(self.policy) for _ in range(self.options.rollouts)]
         returns = [float(rollout.rewards[0].sum()) for rollout in new if rollout.rewards]
+        real_return = sum(returns) / len(returns)
+        self.tried.append(_Tried(self.policy, self.domain, real_return))
         saved = self.folder.iteration(index)
         if saved is not None:
             self._take_over(index, saved, report)
             return saved
-        settled = self._infer_and_decide(index, sum(returns) / len(returns), report)
+        settled = self._infer_and_decide(index, real_return, report)
         self.posterior = settled.posterior
         last = settled.decisions[-1]
         is_last = _is_final({"decisions": settled.decisions})
@@ -235,7 +254,7 @@ class _Loop:
         record: dict[str, Any] = {
             "decision": last["decision"],
             "reason": last["reason"],
-            "real_return": sum(returns) / len(returns),
+            "real_return": real_return,
             "real_returns": returns,
             "num_rollouts": len(self.rollouts),
             "decisions": settled.decisions,
@@ -429,6 +448,15 @@ class _Loop:
             self.folder.save_policy(number, parameters, figures)
         self.policy = self.task.policy.with_parameters(parameters.to(self.task.policy.parameters))
         return figures
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """A policy that ran on the target, its internal model, and what it reached there."""
+
+    policy: Policy
+    domain: dict[str, float]
+    real_return: float
 
 
 @dataclass(frozen=True)

@@ -155,7 +155,7 @@ def test_a_model_to_be_revised_is_handed_over_once(tmp_path, monkeypatch):
     assert calls == [(1, "revision_0")]
     # The second time it is the revised model that does not fit: trained with more spread.
     assert actions(result) == [Action.REVISED, Action.SPREAD]
-    assert "hinge.coulomb_friction.magnitude" in result.domain
+    assert "hinge.coulomb_friction.magnitude" in result.iterations[-1]["internal_model"]
 
 
 def test_without_discovery_a_wrong_model_is_spread_wider(tmp_path, monkeypatch):
@@ -219,6 +219,26 @@ def test_more_iterations_continue_a_finished_run(tmp_path):
     longer = run(tmp_path, small_options(iterations=2))
     at_once = run(tmp_path / "other", small_options(iterations=2))
     assert longer.to_dict() == at_once.to_dict()
+
+
+def test_the_best_measured_policy_is_deployed(tmp_path):
+    measured = run(tmp_path / "measured", small_options(iterations=3))
+    returns = [record["real_return"] for record in measured.iterations]
+    best = returns.index(max(returns))
+    assert measured.deployed == best
+    saved = load_tensors(tmp_path / f"measured/run/policy_{best}.safetensors")["parameters"]
+    torch.testing.assert_close(measured.policy.parameters.double(), saved)
+    last = run(tmp_path / "last", small_options(iterations=3, deploys="last"))
+    assert last.deployed is None
+    saved = load_tensors(tmp_path / "last/run/policy_3.safetensors")["parameters"]
+    torch.testing.assert_close(last.policy.parameters.double(), saved)
+    assert last.domain == last.iterations[-1]["internal_model"]
+    # Resumed, nothing changes, and a threshold that nothing reached leaves the last.
+    assert run(tmp_path / "measured", small_options(iterations=3)).to_dict() == measured.to_dict()
+    hopeless = dataclasses.replace(small_task(), success=1e9)
+    target = HandmadePendulum()
+    found = train(pendulum, target, hopeless, small_options(iterations=1), progress=False)
+    assert found.deployed is None
 
 
 def test_inference_may_start_from_the_last_posterior_or_the_closest_fit(tmp_path):
