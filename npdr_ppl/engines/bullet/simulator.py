@@ -244,7 +244,7 @@ class BulletSimulator(PooledSimulator):
         unknown = [name for name in names if name not in possible]
         if unknown:
             raise ModelError(
-                f"{', '.join(unknown)} cannot be a state: states are sensors of joints and bodies, "
+                f"{', '.join(unknown)} cannot be a state: sensors of joints and bodies can, "
                 f"here {', '.join(possible) or 'none'}."
             )
         return tuple(possible[name] for name in names)

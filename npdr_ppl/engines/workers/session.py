@@ -37,6 +37,10 @@ class FaultCollector:
     def __init__(self) -> None:
         self.faults = Faults()
 
+    def counts(self) -> dict[str, int]:
+        """Returns counts by kind; empty where no worker was used."""
+        return self.faults.counts() if self.faults.num_draws else {}
+
 
 _WORKERS: ContextVar[Workers | None] = ContextVar("workers", default=None)
 _COLLECTORS: ContextVar[tuple[FaultCollector, ...]] = ContextVar("collectors", default=())
