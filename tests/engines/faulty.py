@@ -1,8 +1,13 @@
-"""Fault injection: a task that crashes, hangs and returns NaN on purpose, in native code too."""
+"""Fault injection: tasks that crash, hang and return NaN on purpose.
+
+Crashes are exits and segmentation faults, hangs sleep in Python or sit in a native call that holds
+the interpreter's lock; nothing is mocked.
+"""
 
 import ctypes
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,11 +34,9 @@ class FaultRates:
     nan: float = 0.03
     times: int = 1
 
-    def fault(self, draw: Draw) -> Fault | None:
-        """Returns what happens to a draw; depends on its seed, not on who runs it."""
-        if draw.attempt >= self.times:
-            return None
-        u = np.random.default_rng(derived_seed(draw.seed, "fault")).uniform()
+    def fault(self, key: int) -> Fault | None:
+        """Returns what happens to a draw; depends on the draw, not on who runs it."""
+        u = np.random.default_rng(key).uniform()
         for fault, share in (
             (Fault.CRASHED, self.crash),
             (Fault.HUNG, self.hang),
@@ -56,25 +59,32 @@ class Faulty(Task):
         return self.task.set_up()
 
     def run(self, workspace: Any, draw: Draw) -> np.ndarray:
-        fault = self.rates.fault(draw)
-        if fault is Fault.CRASHED:
-            crash(draw.index)
-        if fault is Fault.HUNG:
-            hang(draw.index)
-        result = self.task.run(workspace, draw)
-        return np.full_like(result, np.nan) if fault is Fault.NAN else result
+        fault = self.rates.fault(derived_seed(draw.seed, "fault"))
+        if draw.attempt >= self.rates.times:
+            fault = None
+        return fail(fault, draw.index, lambda: self.task.run(workspace, draw))
 
 
-def crash(index: int) -> None:
+def crash(number: int) -> None:
     """Ends the process: by itself, or by a segmentation fault in native code."""
-    if index % 2:
+    if number % 2:
         os._exit(3)
     ctypes.string_at(0)
 
 
-def hang(index: int) -> None:
+def hang(number: int) -> None:
     """Never returns: asleep in Python, or in a native call that holds the interpreter's lock."""
-    if index % 2:
+    if number % 2:
         while True:
             time.sleep(1.0)
     ctypes.PyDLL(None).pause()
+
+
+def fail(fault: Fault | None, number: int, run: Callable[[], np.ndarray]) -> np.ndarray:
+    """Runs what may fail, or fails."""
+    if fault is Fault.CRASHED:
+        crash(number)
+    if fault is Fault.HUNG:
+        hang(number)
+    result = run()
+    return np.full_like(result, np.nan) if fault is Fault.NAN else result

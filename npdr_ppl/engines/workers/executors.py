@@ -141,7 +141,7 @@ def _dask_client(options: WorkerOptions, stack: ExitStack) -> Any:
             LocalCluster(
                 n_workers=options.num_workers,
                 threads_per_worker=1,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",
                 silence_logs=logging.WARNING,
             )
         )
