@@ -122,19 +122,23 @@ def recording(tmp_path_factory):
 def test_inference_survives_faults_and_reports_them(recording, tmp_path):
     folder, rollouts = recording
     model = PendulumModel(folder / "pendulum.urdf")
+    log = tmp_path / "faults"
+    log.mkdir()
     options = {
         "backend": backend("snpe-c", members=1), "num_simulations": 300, "embedding": "all/10",
         "initial_state": "recorded", "seed": 1, "progress": False,
     }  # fmt: skip
     with npdr.workers("threads", 2, time_limit=3.0) as used:
         clean = npdr.infer(model, rollouts, **options)
-        faulty = FaultMessenger(FaultRates(0.02, 0.005, 0.03), tmp_path)(model)
-        cured = npdr.infer(faulty, rollouts, **options)
+        faulty = FaultMessenger(FaultRates(0.02, 0.005, 0.03), log)(model)
+        cured = npdr.infer(faulty, rollouts, checkpoint=tmp_path / "run", **options)
+        resumed = npdr.infer(faulty, rollouts, checkpoint=tmp_path / "run", **options)
         assert used.is_used and used.faults
     assert clean.provenance.faults == {
         "draws": 300, "crashed": 0, "hung": 0, "nan": 0, "raised": 0, "retried": 0, "lost": 0
     }  # fmt: skip
     counts = cured.provenance.faults
+    assert resumed.provenance.faults == counts
     assert counts["crashed"] and counts["nan"]
     assert counts["lost"] == 0
     # Every fault was cured by its retry, so inference saw the very same simulations.
@@ -185,7 +189,9 @@ def test_the_command_line_chooses_workers(monkeypatch, capsys, recording, tmp_pa
     code, out, errors = fit(f"{file}:model", "--executor", "threads", "--workers", "2")
     assert code == 0, errors
     assert "no effect" not in errors
-    faults = json.loads((out / "fit.json").read_text())["faults"]
+    written = json.loads((out / "fit.json").read_text())
+    assert written["engine"]["trajectory"]["solver_iterations"] == 50
+    faults = written["faults"]
     assert faults["draws"] >= 100 and faults["lost"] == 0
     code, out, errors = fit("pendulum", "--workers", "2")
     assert code == 0

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from npdr_ppl.engines.bullet.channels import Command, Sensor
+from npdr_ppl.engines.bullet.channels import JOINT_FIELDS, Command, Sensor
 from npdr_ppl.engines.bullet.client import connect, connected
 from npdr_ppl.engines.bullet.forces import JointForces, is_dry
 from npdr_ppl.engines.bullet.parameters import BoundParameter
@@ -103,7 +103,7 @@ class BulletSimulator(PooledSimulator):
         return f"{type(self).__name__}{file}"
 
     def recorded_settings(self) -> dict[str, Any]:
-        """Returns the settings of the engine, for JSON."""
+        """Returns the settings of the engine."""
         return {"engine": "bullet", **asdict(self.settings)}
 
     def with_effects(self, *effects: Effect) -> Self:
@@ -173,10 +173,9 @@ class BulletSimulator(PooledSimulator):
             else:
                 bodies.setdefault(body, {})[sensor.place.field] = value
         for joint, values in joints.items():
-            position, velocity = scene.client.getJointState(*joint)[:2]
-            scene.place_joint(
-                joint, values.get("position", position), values.get("velocity", velocity)
-            )
+            present = dict(zip(JOINT_FIELDS, scene.client.getJointState(*joint)[:2], strict=True))
+            values = {**present, **values}
+            scene.place_joint(joint, values["position"], values["velocity"])
         for body, values in bodies.items():
             scene.place_body(body, values)
 
@@ -233,7 +232,8 @@ class BulletSimulator(PooledSimulator):
             values = {n: torch.tensor(parameters[n]).double() for n in effect.parameter_names}
             gravity = effect.environment(gravity, effect.own_parameters(values))
         if effects:
-            scene.gravity = tuple(float(component) for component in gravity)
+            x, y, z = (float(component) for component in gravity)
+            scene.gravity = (x, y, z)
             scene.client.setGravity(*scene.gravity)
 
     def _chosen_states(self, names: Sequence[str] | None) -> tuple[Sensor, ...]:

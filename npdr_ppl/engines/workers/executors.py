@@ -69,21 +69,22 @@ class _Joblib(ChunkExecutor):
         crew: Crew | None = None,
         is_streaming: bool = True,
     ) -> None:
-        from joblib import Parallel, parallel_config
+        from joblib import Parallel, effective_n_jobs, parallel_config
 
         # Names of clusters are known to the configuration only, which counts for what is made
         # inside the block.
         with parallel_config(backend=backend, n_jobs=num_workers or -1, **settings):
-            parallel = Parallel(
+            self.num_workers = max(1, effective_n_jobs(num_workers or -1))
+            # Chunks are batches already, and small enough to travel as they are.
+            parallel: Any = Parallel(
                 return_as="generator_unordered" if is_streaming else "list",
-                batch_size=1,  # chunks are batches already
+                batch_size=1,  # pyright: ignore[reportArgumentType]
                 pre_dispatch="2*n_jobs",
                 max_nbytes=None,
             )
         self._crew = crew
         self._parallel = stack.enter_context(parallel)
         self._stack = ExitStack()
-        self.num_workers = max(1, self._parallel._effective_n_jobs())
 
     def run(self, chunks: Iterable[Chunk]) -> Iterator[ChunkResult]:
         from joblib import delayed

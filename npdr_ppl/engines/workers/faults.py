@@ -44,6 +44,21 @@ class Faults:
     lost: tuple[int, ...] = ()
     example: str = ""
 
+    @classmethod
+    def of(cls, fault: Fault, index: int, *, is_retried: bool, example: str = "") -> "Faults":
+        """Returns what one failed draw amounts to.
+
+        Args:
+            fault: How it failed.
+            index: Which draw it was.
+            is_retried: Whether it is run again; if not, it is lost.
+            example: What its error said.
+        """
+        kinds: dict[str, tuple[int, ...]] = dict.fromkeys(_KINDS, ())
+        kinds[fault.value] = (index,)
+        kinds["retried" if is_retried else "lost"] = (index,)
+        return cls(0, *(kinds[name] for name in _KINDS), example=example)
+
     def __add__(self, other: "Faults") -> "Faults":
         """Returns the faults of both."""
         return Faults(

@@ -42,6 +42,9 @@ _ONE_THREAD = {
 }  # fmt: skip
 
 
+_CRASHED: tuple[Any, Any] = Fault.CRASHED, ""
+
+
 @dataclass(frozen=True)
 class Chunk:
     """Draws that travel together.
@@ -126,7 +129,7 @@ class Supervisor:
                 self._data, is_sent = self._start(chunk), False
             if not is_sent:
                 is_sent = self._send(queue)
-            fault, value = self._receive(chunk.time_limit) if is_sent else (Fault.CRASHED, "")
+            fault, value = self._receive(chunk.time_limit) if is_sent else _CRASHED
             draw = queue.popleft()
             if fault is None:
                 values[draw.index] = value
@@ -135,12 +138,7 @@ class Supervisor:
                 raise value
             self._end_child()
             is_again = draw.attempt < chunk.retries
-            faults += Faults(
-                **{fault.value: (draw.index,)},
-                retried=(draw.index,) if is_again else (),
-                lost=() if is_again else (draw.index,),
-                example=value,
-            )
+            faults += Faults.of(fault, draw.index, is_retried=is_again, example=value)
             if is_again:
                 queue.append(replace(draw, attempt=draw.attempt + 1))
             else:
@@ -164,7 +162,7 @@ class Supervisor:
                 return Fault.HUNG, ""
             return self._data.recv()
         except (EOFError, OSError):
-            return Fault.CRASHED, ""
+            return _CRASHED
 
     def _start(self, chunk: Chunk) -> Connection:
         """Forks a process that has set up the task.
