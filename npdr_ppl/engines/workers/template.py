@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from npdr_ppl.engines.workers.faults import Fault
-from npdr_ppl.engines.workers.task import Task
+from npdr_ppl.engines.workers.task import Draw, Task
 from npdr_ppl.errors import NpdrError
 
 __all__ = ["IDLE_SECONDS", "main"]
@@ -98,7 +98,8 @@ def _simulate(task: Task | None, data: Connection) -> None:
     """Runs groups of draws in a child, and never returns.
 
     Every draw is answered as soon as it is done, so that the supervisor knows which one a crash
-    or a hang belongs to.
+    or a hang belongs to. After a failure the process ends, because nobody knows what state it was
+    left in.
     """
     code = 0
     try:
@@ -111,12 +112,10 @@ def _simulate(task: Task | None, data: Connection) -> None:
             return
         while True:
             for draw in data.recv():
-                try:
-                    value = np.asarray(task.run(workspace, draw))
-                    is_finite = bool(np.isfinite(value).all())
-                    data.send((None, value) if is_finite else (Fault.NAN, ""))
-                except Exception as error:
-                    data.send(_failure(error))
+                answer = _answer(task, workspace, draw)
+                data.send(answer)
+                if answer[0] is not None:
+                    return
     except (EOFError, OSError):
         pass
     except BaseException:
@@ -126,6 +125,15 @@ def _simulate(task: Task | None, data: Connection) -> None:
         # Without the template's own clean-up, which is not the child's business.
         sys.stderr.flush()
         os._exit(code)
+
+
+def _answer(task: Task, workspace: Any, draw: Draw) -> tuple[Any, Any]:
+    """Returns what went wrong with a draw, or nothing and its value."""
+    try:
+        value = np.asarray(task.run(workspace, draw))
+        return (None, value) if bool(np.isfinite(value).all()) else (Fault.NAN, "")
+    except Exception as error:
+        return _failure(error)
 
 
 def _failure(error: Exception) -> tuple[Any, Any]:
