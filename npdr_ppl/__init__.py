@@ -35,10 +35,12 @@ __all__ = [
     "train",
     "with_likelihood",
     "with_noise",
+    "workers",
 ]
 
 if TYPE_CHECKING:
     from npdr_ppl.engines.mujoco import MujocoSimulator
+    from npdr_ppl.engines.workers import workers
     from npdr_ppl.errors import NpdrError
     from npdr_ppl.language.channels import Channel, Parameter, Port
     from npdr_ppl.language.effects import Effect
@@ -82,6 +84,7 @@ _HOMES = {
     "train": "workflows.npdr_loop",
     "with_likelihood": "workflows.learned_likelihood",
     "with_noise": "language.handlers",
+    "workers": "engines.workers",
 }
 
 

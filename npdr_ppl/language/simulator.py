@@ -3,7 +3,7 @@
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -140,6 +140,13 @@ class Simulator(ABC):
                     f"{state.rate_of or state.name}."
                 )
         return tuple(result)
+
+    def recorded_settings(self) -> dict[str, Any]:
+        """Returns settings of the engine that are a part of the model, for reports.
+
+        Empty by default; values have to be what JSON can hold.
+        """
+        return {}
 
     def nominal(self) -> dict[str, Tensor]:
         """Returns the nominal parameters as scalar float64 tensors."""

@@ -3,13 +3,14 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from npdr_ppl.models.furuta import Furuta, furuta
 from npdr_ppl.models.furuta_mujoco import FurutaRig
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.segments import InitialState
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.fit import fit
 from npdr_ppl.workflows.posterior import Posterior
@@ -57,7 +58,7 @@ def run_demo(
     out: Path,
     *,
     data: Path | None = None,
-    initial_state: Literal["estimated", "recorded"] = "estimated",
+    initial_state: InitialState = "estimated",
     seed: int = 0,
     progress: bool | None = None,
 ) -> Demonstration:

@@ -1,13 +1,16 @@
 """`npdr fit` as a function: infer, evaluate, diagnose, draw, and write it all down."""
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from npdr_ppl.engines.workers import collect_faults
 from npdr_ppl.inference.base import Backend
+from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.closest_fit import prepare
@@ -60,7 +63,8 @@ def fit(
     Returns:
         The posterior and the content of ``fit.json``.
     """
-    prepared = prepare(model, train, options or BindingOptions(), noise=noise, seed=seed)
+    with collect_faults() as before:
+        prepared = prepare(model, train, options or BindingOptions(), noise=noise, seed=seed)
     options = prepared.options
     posterior = infer(
         prepared.model,
@@ -78,11 +82,16 @@ def fit(
         progress=progress,
     )
     started = time.perf_counter()
-    most_likely = posterior.most_likely(seed=seed)
-    data = posterior.to_arviz(seed=seed)
-    sampled = time.perf_counter() - started
-    evaluated = train if test is None else test
-    metrics = score(model, evaluated, most_likely, options)
+    with collect_faults() as after:
+        most_likely = posterior.most_likely(seed=seed)
+        data = posterior.to_arviz(seed=seed)
+        sampled = time.perf_counter() - started
+        evaluated = train if test is None else test
+        metrics = score(model, evaluated, most_likely, options)
+    # A resumed run knows the faults of its finished rounds from disk.
+    faults = Counter(posterior.provenance.faults)
+    for part in (before, after):
+        faults.update(part.counts())
     result = {
         "backend": posterior.backend.name,
         **describe(data),
@@ -99,6 +108,10 @@ def fit(
         "diagnosis": diagnose(data).to_dict(),
         "units": parameter_units(posterior),
     }
+    if faults:
+        result["faults"] = dict(faults)
+    if settings := _engine_settings(posterior):
+        result["engine"] = settings
     if out is not None:
         from npdr_ppl.workflows.arviz_module import to_netcdf
 
@@ -122,6 +135,16 @@ def describe(data: "Data") -> dict[str, Any]:
             "hdi_94": _plain(intervals[name]),
         }
     return {"parameters": parameters}
+
+
+def _engine_settings(posterior: Posterior) -> dict[str, Any]:
+    """Returns the settings of the simulators' engines by site, where there are any."""
+    settings = {
+        name: box.simulator.recorded_settings()
+        for name, box in posterior.prior.black_boxes.items()
+        if isinstance(box, SimulatorBlackBox)
+    }
+    return {name: values for name, values in settings.items() if values}
 
 
 def _plain(value: Any) -> Any:

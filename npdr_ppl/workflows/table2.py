@@ -6,7 +6,7 @@ with the state re-synchronised to the recording every 200 steps of 2 ms as in th
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from torch import Tensor
 from npdr_ppl import metrics
 from npdr_ppl.models.furuta import Furuta, furuta
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.segments import InitialState
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.candidates import available, candidates
 from npdr_ppl.workflows.compare import compare
@@ -93,7 +94,7 @@ def reproduce_table2(
     backends: Sequence[str] | None = None,
     rounds: int | None = None,
     num_simulations: int | None = None,
-    initial_state: Literal["estimated", "recorded"] = "recorded",
+    initial_state: InitialState = "recorded",
     seed: int = 0,
     progress: bool | None = None,
 ) -> tuple[Comparison, dict[str, Any]]:
