@@ -54,9 +54,11 @@ def effects(as_json: Json = False) -> None:
     rows = [
         {
             "name": name,
-            "summary": _first_line(effect),
             "attaches to": list(effect.port_kinds),
+            "law": effect.law or _first_line(effect),
             "parameters": [f"{p.name} [{p.unit}]" for p in effect.parameters],
+            "not told from": [c.name for c in effect.equivalence],
+            "revealed by": effect.excitation,
         }
         for name, effect in catalogue().items()
     ]

@@ -13,7 +13,7 @@ from npdr_ppl.engines.integrators import Components, Integrator, integrator
 from npdr_ppl.engines.open_loop import replay
 from npdr_ppl.engines.stepping import Stepper, Tables, flatten
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.effects import EnvironmentEffect
+from npdr_ppl.language.effects import EnvironmentEffect, ParameterEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 
@@ -184,6 +184,20 @@ class ODESimulator(Simulator):
             for name, value in {**values, **parameters}.items()
         }
 
+    def changed(self, parameters: Mapping[str, Tensor], time: Tensor) -> dict[str, Tensor]:
+        """Returns all parameters, the domain's as parameter effects change them.
+
+        Args:
+            parameters: What :meth:`complete` returned.
+            time: Seconds from the rollout's beginning to each segment's middle.
+        """
+        result = dict(parameters)
+        for effect in self.effects:
+            if isinstance(effect, ParameterEffect):
+                own = effect.own_parameters(parameters)
+                result[effect.port] = effect.change(result[effect.port], own, time)
+        return result
+
     def tables(
         self,
         parameters: Mapping[str, Tensor],
@@ -192,7 +206,7 @@ class ODESimulator(Simulator):
         *,
         expand: bool = False,
     ) -> tuple[Tables, tuple[int, ...]]:
-        """Returns the constants of a simulation, flat, and the lengths of command histories.
+        """Returns the constants of a simulation, flat, and the lengths of effects' histories.
 
         Args:
             parameters: What :meth:`complete` returned, each broadcasting to ``shape``.

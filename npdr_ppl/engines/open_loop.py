@@ -15,6 +15,7 @@ from npdr_ppl.engines.compilation import (
     with_fallback,
 )
 from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.reading_times import catch_up, sensor_leads
 from npdr_ppl.engines.stepping import State, Stepper, Tables, flatten
 from npdr_ppl.errors import ShapeError
 from npdr_ppl.language.inputs import Inputs
@@ -42,6 +43,8 @@ def replay(simulator: "ODESimulator", parameters: Mapping[str, Tensor], inputs: 
     shape = torch.Size((*batch_shape, inputs.num_segments))
     # Behind the batch, an axis for the segments.
     domain = {name: value[..., None] for name, value in domain.items()}
+    begin = inputs.start.to(device=device, dtype=dtype) * inputs.time_step
+    domain = simulator.changed(domain, begin + 0.5 * inputs.num_steps * inputs.time_step)
     is_compiled = is_worthwhile(
         simulator.compile, device, num_steps=inputs.num_steps, batch_size=shape.numel()
     )
@@ -195,24 +198,24 @@ def _start(
             f"{simulator.name} has {num_joints} joints, so it should declare {2 * num_joints} "
             f"states, got {len(components)}."
         )
-    names = [state.name for state in simulator.states]
-    for place, effect, columns in stepper.sensor_effects:
-        for name in (simulator.sensors[column].name for column in columns):
-            if name in names:
-                i = names.index(name)
-                components[i] = effect.initial_value(components[i], tables.effects[place])
     columns = {name: i for i, name in enumerate(inputs.channel_names)}
+    past = inputs.past_actions.shape[-2]
+    time = spread(inputs.start.to(components[0]) * inputs.time_step)
+    if stepper.sensor_effects:
+        last = tuple(record.at(-1 if past else 0) for record in records)
+        components = _behind_readings(stepper, components, tables, inputs, last, time)
     reported = tuple(
         spread(inputs.initial_readings[..., columns[s.name]]) if s.name in columns else None
         for s in simulator.sensors
     )
-    past = inputs.past_actions.shape[-2]
     state = stepper.start(
         tuple(components[:num_joints]),
         tuple(components[num_joints:]),
         tables,
         tuple(record.at(-1 - past) for record in records),
         reported,
+        time,
+        past if stepper.action_effects else 0,
     )
     if stepper.action_effects:
         # The effects' memory at the start is what the recorded past made of it.
@@ -220,3 +223,43 @@ def _start(
             commands = tuple(record.at(step) for record in records)
             state, _ = body.act(state, tables, commands, _views(records, step))
     return state
+
+
+def _behind_readings(
+    stepper: Stepper,
+    components: list[Tensor],
+    tables: Tables,
+    inputs: Inputs,
+    commands: Components,
+    time: Tensor,
+) -> list[Tensor]:
+    """Returns the true state behind the readings at the segments' start.
+
+    A velocity that was derived from readings of its position has that sensor's timing, and none of
+    the offset or scale of the sensor for velocities.
+    """
+    simulator = stepper.simulator
+    sensors = {sensor.name: i for i, sensor in enumerate(simulator.sensors)}
+    sources: list[int | None] = []
+    derived = []
+    for state in simulator.states:
+        is_derived = inputs.initial_rates is not None and state.rate_of in inputs.channel_names
+        derived.append(is_derived)
+        sources.append(sensors.get((state.rate_of or "") if is_derived else state.name))
+    true = list(components)
+    for place, effect, columns in stepper.sensor_effects:
+        for i, state in enumerate(simulator.states):
+            if sensors.get(state.name) not in columns:
+                continue
+            value = effect.initial_value(true[i], tables.effects[place])
+            # At a rollout's first sample velocities are read; see Simulator.initial_states.
+            true[i] = torch.where(time == 0.0, value, true[i]) if derived[i] else value
+    leads = sensor_leads(stepper.sensor_effects, tables.effects, time)
+    if not leads:
+        return true
+    split = len(simulator.joints)
+    late = tuple(None if source is None else leads.get(source) for source in sources)
+    q, v = catch_up(
+        simulator, tuple(true[:split]), tuple(true[split:]), commands, tables.constants, late
+    )
+    return [*q, *v]

@@ -10,7 +10,10 @@ from torch.utils import _pytree as pytree
 from npdr_ppl.engines.commands import RecentCommands
 from npdr_ppl.engines.compilation import signature
 from npdr_ppl.engines.dry_friction import solve_dry_friction
+from npdr_ppl.engines.drive import drive_forces, inverse_inertia
 from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.reading_times import sensor_rates
+from npdr_ppl.language.effect_context import Joint, Start
 from npdr_ppl.language.effects import ActionEffect, Commands, ForceEffect, SensorEffect
 
 if TYPE_CHECKING:
@@ -60,7 +63,8 @@ class Stepper:
     Args:
         simulator: The system and its effects.
         time_step: Seconds per step.
-        histories: Past commands that each action effect may ask for; see :meth:`histories`.
+        histories: Past commands that each action effect may ask for, then past values of each
+            sensor effect; see :meth:`needed_histories`.
     """
 
     def __init__(
@@ -83,9 +87,11 @@ class Stepper:
             elif isinstance(effect, ActionEffect):
                 self.action_effects.append((place, effect, actions.index(effect.port)))
             elif isinstance(effect, SensorEffect):
-                channels = simulator.port(effect.port).channels
+                port = simulator.port(effect.port)
+                channels = sensors if port.kind == "clock" else port.channels
                 columns = tuple(sensors.index(name) for name in channels)
                 self.sensor_effects.append((place, effect, columns))
+        self._needs_joints = any(effect.needs_joint for _, effect, _ in self.force_effects)
 
     @property
     def signature(self) -> Hashable:
@@ -96,11 +102,12 @@ class Stepper:
     def needed_histories(
         simulator: "ODESimulator", effects: tuple[Mapping[str, Tensor], ...], time_step: float
     ) -> tuple[int, ...]:
-        """Returns how many past commands each action effect may ask for, rounded up."""
+        """Returns how much of the past action and then sensor effects ask for, rounded up."""
         needed = [
             effect.history(effects[place], time_step)
+            for kind in (ActionEffect, SensorEffect)
             for place, effect in enumerate(simulator.effects)
-            if isinstance(effect, ActionEffect)
+            if isinstance(effect, kind)
         ]
         return tuple(-(-number // _HISTORY_GRAIN) * _HISTORY_GRAIN for number in needed)
 
@@ -111,6 +118,8 @@ class Stepper:
         tables: Tables,
         commands: Components,
         readings: tuple[Tensor | None, ...],
+        time: Tensor,
+        num_past: int = 0,
     ) -> State:
         """Returns the state at the start of an episode or segment.
 
@@ -121,7 +130,21 @@ class Stepper:
             commands: What each action channel saw for long before the start, ``(N,)`` each.
             readings: What each sensor reported at the start, ``(N,)`` each; ``None`` for the
                 true value.
+            time: Seconds since the rollout began, ``(N,)``.
+            num_past: Steps before the start that the action effects are to be taken through.
         """
+        rates: dict[int, tuple[Tensor, ...]] = {}
+        if any(effect.needs_rates for _, effect, _ in self.sensor_effects):
+            rates = sensor_rates(
+                self.simulator, positions, velocities, commands, tables.constants
+            )
+
+        def start(place: int, time_step: float, history: int = 0, sensor: int = -1) -> Start:
+            known = rates.get(sensor, ())
+            return Start(time, time_step, tables.effects[place], history, known)
+
+        earlier = time - num_past * self.time_step
+
         true = self.simulator.readings(positions, velocities, tables.constants)
         reported = [
             value if read is None else read for value, read in zip(true, readings, strict=True)
@@ -130,22 +153,36 @@ class Stepper:
             positions,
             velocities,
             tuple(
-                effect.initial_memory(positions[joint], velocities[joint])
-                for _, effect, joint in self.force_effects
+                effect.initial_memory(
+                    positions[joint], velocities[joint], start(place, self._substep)
+                )
+                for place, effect, joint in self.force_effects
             ),
             tuple(
-                effect.initial_memory(commands[channel])
-                for _, effect, channel in self.action_effects
+                effect.initial_memory(
+                    commands[channel],
+                    start(place, self.time_step, length)._replace(time=earlier),
+                )
+                for (place, effect, channel), length in zip(
+                    self.action_effects, self.histories, strict=False
+                )
             ),
             tuple(
                 (commands[channel],) * length
                 for (_, _, channel), length in zip(
-                    self.action_effects, self.histories, strict=True
+                    self.action_effects, self.histories, strict=False
                 )
             ),
             tuple(
-                tuple(effect.initial_memory(true[c], reported[c]) for c in columns)
-                for _, effect, columns in self.sensor_effects
+                tuple(
+                    effect.initial_memory(
+                        true[c], reported[c], start(place, self.time_step, length, c)
+                    )
+                    for c in columns
+                )
+                for (place, effect, columns), length in zip(
+                    self.sensor_effects, self.histories[len(self.action_effects) :], strict=True
+                )
             ),
         )
 
@@ -217,6 +254,8 @@ class Stepper:
 
     def _move_once(self, state: State, actions: Components, tables: Tables) -> State:
         """Advances the dynamics by one substep."""
+        if self._needs_joints:
+            state = self._begin_step(state, actions, tables)
         simulator, constants = self.simulator, tables.constants
         start = state.positions, state.velocities
         dry: tuple[Any, ...] = (0.0,) * len(state.positions)
@@ -230,9 +269,7 @@ class Stepper:
         has_dry_friction = any(bound is not None for bound in bounds)
         if has_dry_friction:
             forces = self._forces(*start, state, tables, dry)
-            inertia = simulator.inverse_inertia(*start, constants) or _probe_inverse_inertia(
-                simulator, *start, actions, forces, constants, first
-            )
+            inertia = inverse_inertia(simulator, *start, actions, forces, constants, first)
             dry = solve_dry_friction(bounds, state.velocities, first, inertia, self._substep)
             # Accelerations are affine in the forces, so the first evaluation is not repeated.
             first = tuple(
@@ -259,6 +296,23 @@ class Stepper:
         )
         return state._replace(positions=q, velocities=v, force_memory=memory)
 
+    def _begin_step(self, state: State, actions: Components, tables: Tables) -> State:
+        """Shows the joints to the force effects that ask for them."""
+        simulator, constants = self.simulator, tables.constants
+        q, v = state.positions, state.velocities
+        forces = self._forces(q, v, state, tables, (0.0,) * len(q), before_step=True)
+        acceleration = simulator.accelerations(q, v, actions, forces, constants)
+        inertia = inverse_inertia(simulator, q, v, actions, forces, constants, acceleration)
+        drive = drive_forces(simulator, q, v, actions, forces, constants, acceleration, inertia)
+        memory = list(state.force_memory)
+        for k, (place, effect, i) in enumerate(self.force_effects):
+            if effect.needs_joint:
+                joint = Joint(q[i], v[i], acceleration[i], inertia[i][i], drive[i])
+                memory[k] = effect.begin_step(
+                    joint, tables.effects[place], memory[k], self._substep
+                )
+        return state._replace(force_memory=tuple(memory))
+
     def _forces(
         self,
         positions: Components,
@@ -266,10 +320,17 @@ class Stepper:
         state: State,
         tables: Tables,
         dry: tuple[Any, ...],
+        *,
+        before_step: bool = False,
     ) -> tuple[Any, ...]:
-        """Returns the smooth forces in a state of the integrator, on top of the dry ones."""
+        """Returns the smooth forces in a state of the integrator, on top of the dry ones.
+
+        Before a step has begun, without the effects that have not seen their joint yet.
+        """
         forces = list(dry)
         for k, (place, effect, joint) in enumerate(self.force_effects):
+            if before_step and effect.needs_joint:
+                continue
             force = effect.force(
                 positions[joint], velocities[joint], tables.effects[place], state.force_memory[k]
             )
@@ -291,24 +352,6 @@ class Stepper:
                 present = bounds[joint]
                 bounds[joint] = bound if present is None else present + bound
         return tuple(bounds)
-
-
-def _probe_inverse_inertia(
-    simulator: "ODESimulator",
-    positions: Components,
-    velocities: Components,
-    actions: Components,
-    forces: tuple[Any, ...],
-    constants: Any,
-    accelerations: Components,
-) -> tuple[Components, ...]:
-    """Returns the rows of W by applying a unit force at one joint after the other."""
-    columns = []
-    for joint in range(len(positions)):
-        pushed = tuple(f + 1.0 if i == joint else f for i, f in enumerate(forces))
-        moved = simulator.accelerations(positions, velocities, actions, pushed, constants)
-        columns.append(tuple(b - a for a, b in zip(accelerations, moved, strict=True)))
-    return tuple(zip(*columns, strict=True))
 
 
 def flatten(tree: Any, shape: torch.Size, *, expand: bool = False) -> Any:
