@@ -71,8 +71,8 @@ class Pendulum(ODESimulator):
 
     m l²/3 · θ̈ = τ − m g (l/2) sin θ − d θ̇, with torque τ, mass m, length l, damping d.
 
-    A payload is a point mass at the rod's end. The hinge's axis is the base's y axis, so the pendulum swings in the x-z plane and a tilt
-    about y changes it.
+    The hinge's axis is the base's y axis, so the pendulum swings in the x-z plane and a tilt
+    about y changes it. A payload is a point mass at the rod's end.
     """
 
     states = (

@@ -18,8 +18,8 @@ from npdr_ppl.models.effects.equivalence import (
     LATENCY,
     OVERALL_SCALE,
 )
-from npdr_ppl.models.effects.references import JANOT_2019, LJUNG_1999, MUJOCO, TAO_1996
 from npdr_ppl.models.effects.lag import remaining
+from npdr_ppl.models.effects.references import JANOT_2019, LJUNG_1999, MUJOCO, TAO_1996
 
 __all__ = ["ActuatorGain", "ActuatorLag", "DeadZone", "InputDelay", "Saturation", "SupplySag"]
 

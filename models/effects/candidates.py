@@ -1,7 +1,7 @@
 """Every effect at every port of a simulator where it makes sense."""
 
 from npdr_ppl.language.channels import Port
-from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.effects import Effect, SensorEffect
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.models.effects.registry import effects
 
@@ -47,8 +47,19 @@ def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
             if port.kind not in effect.port_kinds:
                 continue
             attached = effect(port.name)
-            # A group mixes units: what suits it has to suit each of its channels.
-            members = (simulator.port(name) for name in port.channels)
-            if attached.name not in present and all(attached.suits(port) for port in members):
+            members = tuple(simulator.port(name) for name in port.channels)
+            if (
+                attached.name not in present
+                and all(attached.suits(member) for member in members)
+                and (len(members) == 1 or _is_one_device(attached, members))
+            ):
                 found.append(attached)
     return tuple(found)
+
+
+def _is_one_device(effect: Effect, channels: tuple[Port, ...]) -> bool:
+    """Returns whether one device may have the effect on all channels, in the same size."""
+    has_unit = any("{port}" in parameter.unit for parameter in effect.parameters)
+    has_one_unit = len({channel.unit for channel in channels}) == 1
+    is_shared = isinstance(effect, SensorEffect) and effect.is_shared
+    return is_shared and (has_one_unit or not has_unit)

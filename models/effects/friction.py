@@ -113,7 +113,9 @@ class StribeckFriction(ForceEffect):
     id = "stribeck_friction"
     parameters = (
         Parameter("excess", "{port}", 0.0, "static minus sliding friction ΔF"),
-        Parameter("speed", "{coordinate}/s", 0.1, "Stribeck velocity v_s in the joint's coordinate"),
+        Parameter(
+            "speed", "{coordinate}/s", 0.1, "Stribeck velocity v_s in the joint's coordinate"
+        ),
     )
     strength = ("excess",)
     law = "−ΔF exp(−|v/v_s|) sign v"

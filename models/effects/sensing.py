@@ -12,8 +12,8 @@ from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Start
 from npdr_ppl.language.effects import SensorEffect
 from npdr_ppl.models.effects.equivalence import ANGLE_OFFSET, FIRST_ORDER_LAG, POSITION_SCALE
-from npdr_ppl.models.effects.references import LJUNG_1999, MUJOCO
 from npdr_ppl.models.effects.lag import remaining
+from npdr_ppl.models.effects.references import LJUNG_1999, MUJOCO
 
 __all__ = ["EncoderBias", "EncoderScale", "Quantisation", "SensorLowPass"]
 
@@ -54,6 +54,7 @@ class EncoderBias(SensorEffect):
 
     id = "encoder_bias"
     parameters = (Parameter("offset", "{port}", 0.0, "offset β of the reading"),)
+    is_shared = False
     law = "q + β"
     equivalence = (ANGLE_OFFSET,)
     excitation = "slow_ramp"
@@ -83,6 +84,7 @@ class EncoderScale(SensorEffect):
 
     id = "encoder_scale"
     parameters = (Parameter("error", "1", 0.0, "relative scale error s"),)
+    is_shared = False
     law = "(1 + s) q"
     equivalence = (POSITION_SCALE,)
     excitation = "wide_range"

@@ -1,9 +1,9 @@
 """Readings that are late or early: the state behind them at the start of a segment.
 
-A segment starts from what was read there. If the sensors lag by d, that is the state d ago, and the
-segment starts from the state extrapolated over d with the simulator's own accelerations. That is
-exact to second order in d for positions and to first order for velocities, under the command that
-was given last.
+A segment starts from what was read there. If the sensors lag by d, that is the state d ago, and
+the segment starts from the state extrapolated over d with the simulator's own accelerations. That
+is exact to second order in d for positions and to first order for velocities, under the command
+that was given last.
 """
 
 from collections.abc import Mapping
@@ -66,8 +66,8 @@ def sensor_leads(
     leads: dict[int, Tensor] = {}
     for place, effect, columns in effects:
         lead = effect.lead(parameters[place], time)
-        for column in columns if lead is not None else ():
-            leads[column] = leads.get(column, 0.0) + lead
+        if lead is not None:
+            leads |= {column: leads.get(column, 0.0) + lead for column in columns}
     return leads
 
 

@@ -9,8 +9,8 @@ from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.commands import RecentCommands
 from npdr_ppl.engines.compilation import signature
-from npdr_ppl.engines.dry_friction import solve_dry_friction
 from npdr_ppl.engines.drive import drive_forces, inverse_inertia
+from npdr_ppl.engines.dry_friction import solve_dry_friction
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.reading_times import sensor_rates
 from npdr_ppl.language.effect_context import Joint, Start
@@ -135,9 +135,7 @@ class Stepper:
         """
         rates: dict[int, tuple[Tensor, ...]] = {}
         if any(effect.needs_rates for _, effect, _ in self.sensor_effects):
-            rates = sensor_rates(
-                self.simulator, positions, velocities, commands, tables.constants
-            )
+            rates = sensor_rates(self.simulator, positions, velocities, commands, tables.constants)
 
         def start(place: int, time_step: float, history: int = 0, sensor: int = -1) -> Start:
             known = rates.get(sensor, ())

@@ -1,4 +1,4 @@
-"""What an engine tells effects about the moment they act in, and what effects say of themselves."""
+"""What an engine tells effects of the moment they act in, and what they say of themselves."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ Excitation = Literal[
     "payload",
     "long_run",
 ]
-"""The experiments that reveal effects: speeds near zero; many reversals of the motion; steps of the
-command; a chirp through the resonances; standing still under load; all of the range of motion and
-commands; one constant speed; the same motion with an extra mass; minutes on end."""
+"""The experiments that reveal effects: speeds near zero; many reversals of the motion; steps of
+the command; a chirp through the resonances; standing still under load; all of the range of motion
+and commands; one constant speed; the same motion with an extra mass; minutes on end."""
 
 
 @dataclass(frozen=True)

@@ -258,11 +258,13 @@ class SensorEffect(Effect):
     """An effect between the true value of a channel and its reading.
 
     Attributes:
-        needs_rates: Whether :attr:`Start.rates` are needed; always so with a :meth:`lead`.
+        needs_rates: Whether its memory starts from :attr:`Start.rates`.
+        is_shared: Whether one device may have it on several channels with the same parameters.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
     needs_rates: ClassVar[bool] = False
+    is_shared: ClassVar[bool] = True
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
         """Returns the number of past true values that the memory is to hold."""
