@@ -27,7 +27,8 @@ def _past(value: Tensor, start: Start) -> tuple[Tensor, ...]:
 class SensorDelay(SensorEffect):
     """y(t) = x(t − d) with a delay d that need not be a whole number of steps.
 
-    Between steps x is taken as linear. Attach it to the channels that are late together.
+    Between steps of length h, x is taken as linear: y_k = Σ_j max(0, 1 − |d/h − j|) x_{k−j}.
+    Attach it to the channels that are late together.
 
     What was read at a segment's start is the state d earlier, so the segment starts from the state
     extrapolated by d, and what the sensor reports until d has passed is the extrapolation back.
@@ -56,26 +57,30 @@ class SensorDelay(SensorEffect):
         """Returns −d."""
         return -parameters["delay"]
 
-    def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> tuple[Tensor, ...]:
-        """Returns past values, latest first, the present one included."""
-        return (value, *_past(value, start)[:-1])
+    def initial_memory(
+        self, value: Tensor, reading: Tensor, start: Start
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """Returns the weights of x_k, x_{k−1}, …, and the past values, latest first."""
+        steps = start.parameters["delay"] / start.time_step
+        weights = tuple(
+            (1.0 - (steps - j).abs()).clamp_min(0.0).expand(value.shape)
+            for j in range(start.history + 1)
+        )
+        return weights, (value, *_past(value, start)[:-1])
 
     def read(
         self,
         value: Tensor,
         parameters: Mapping[str, Tensor],
-        memory: tuple[Tensor, ...],
+        memory: tuple[tuple[Tensor, ...], tuple[Tensor, ...]],
         time_step: float,
-    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+    ) -> tuple[Tensor, tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]:
         """Returns the value d ago."""
-        steps = parameters["delay"] / time_step
-        whole = torch.floor(steps.detach())
-        fraction = steps - whole
-        values = torch.stack((value, *memory))
-        later = whole.long().expand(value.shape)
-        ages = torch.stack((later, later + 1)).clamp_max(len(memory))
-        near, far = values.gather(0, ages)
-        return (1.0 - fraction) * near + fraction * far, (value, *memory[:-1])
+        weights, past = memory
+        reading = weights[0] * value
+        for weight, earlier in zip(weights[1:], past, strict=True):
+            reading = torch.addcmul(reading, weight, earlier)
+        return reading, (weights, (value, *past[:-1]))
 
 
 class ClockSkew(SensorEffect):

@@ -54,8 +54,8 @@ def effects(as_json: Json = False) -> None:
     rows = [
         {
             "name": name,
+            "summary": effect.law or _first_line(effect),
             "attaches to": list(effect.port_kinds),
-            "law": effect.law or _first_line(effect),
             "parameters": [f"{p.name} [{p.unit}]" for p in effect.parameters],
             "not told from": [c.name for c in effect.equivalence],
             "revealed by": effect.excitation,
