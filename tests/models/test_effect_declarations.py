@@ -1,5 +1,6 @@
 """What effects declare: classes, ports, units, probes; the registry; where they may attach."""
 
+import doctest
 from importlib import import_module
 from importlib.metadata import EntryPoint
 from typing import get_args
@@ -114,3 +115,9 @@ def test_other_packages_add_effects_by_an_entry_point(monkeypatch):
         effect_class("nothing")
     with pytest.raises(ModelError, match="did you mean 'coulomb_friction'"):
         effect_class("coulomb_frction")
+
+
+@pytest.mark.parametrize("name", ["candidates", "registry"])
+def test_docstring_examples_run(name):
+    found = doctest.testmod(import_module(f"npdr_ppl.models.effects.{name}"))
+    assert found.attempted and not found.failed
