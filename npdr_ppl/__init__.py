@@ -17,6 +17,7 @@ __all__ = [
     "Effect",
     "Inputs",
     "LoopOptions",
+    "MujocoSimulator",
     "NpdrError",
     "Parameter",
     "Port",
@@ -37,6 +38,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from npdr_ppl.engines.mujoco import MujocoSimulator
     from npdr_ppl.errors import NpdrError
     from npdr_ppl.language.channels import Channel, Parameter, Port
     from npdr_ppl.language.effects import Effect
@@ -62,6 +64,7 @@ _HOMES = {
     "Effect": "language.effects",
     "Inputs": "language.inputs",
     "LoopOptions": "workflows.loop_options",
+    "MujocoSimulator": "engines.mujoco",
     "NpdrError": "errors",
     "Parameter": "language.channels",
     "Port": "language.channels",

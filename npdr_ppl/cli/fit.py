@@ -14,6 +14,7 @@ class InitialState(StrEnum):
 
     ESTIMATED = "estimated"
     RECORDED = "recorded"
+    UNCERTAIN = "uncertain"
 
 
 class Precision(StrEnum):
@@ -43,7 +44,7 @@ def fit(
         list[str] | None, typer.Option(help="Effect to attach, port.effect; may be repeated.")
     ] = None,
     embedding: Annotated[
-        str, typer.Option(help="Trajectory features: bayessim, all/50, gru/10, ...")
+        str, typer.Option(help="Trajectory features: bayessim, score, all/50, gru/10, ...")
     ] = "bayessim",
     segment_length: Annotated[
         int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from npdr_ppl.cli.fit import InitialState
+
 __all__ = ["train"]
 
 INTERRUPTED = 130
@@ -56,14 +58,17 @@ def train(
         ),
     ] = None,
     embedding: Annotated[
-        str, typer.Option(help="Trajectory features: bayessim, all/50, gru/10, ...")
-    ] = "all/50",
+        str, typer.Option(help="Trajectory features: bayessim, score, all/50, gru/10, ...")
+    ] = "score",
     segment_length: Annotated[
         int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")
-    ] = 200,
+    ] = 50,
+    initial_state: Annotated[
+        InitialState, typer.Option(help="State at a segment's start.")
+    ] = InitialState.UNCERTAIN,
     search_iterations: Annotated[
         int, typer.Option(min=1, help="Iterations of the policy search, each time.")
-    ] = 5,
+    ] = 20,
     domains: Annotated[
         int, typer.Option(min=1, help="Domains that the policy is trained in.")
     ] = 50,
@@ -135,7 +140,7 @@ def train(
         backend=resolve_backend(backend),
         rounds=rounds,
         num_simulations=simulations,
-        binding=BindingOptions(embedding, segment_length or None, "estimated", "float32"),
+        binding=BindingOptions(embedding, segment_length or None, initial_state.value, "float32"),
         search=resolve_search(search),
         search_iterations=search_iterations,
         num_domains=domains,

@@ -3,6 +3,7 @@
 from npdr_ppl.embeddings.base import Embedding
 from npdr_ppl.embeddings.networks import Convolutional, Recurrent
 from npdr_ppl.embeddings.registry import embedding_by_name, embedding_names
+from npdr_ppl.embeddings.score import Score
 from npdr_ppl.embeddings.statistics import AllSteps, BayesSimStatistic, Differences, LastStep
 from npdr_ppl.embeddings.wrappers import Averaged, Masked, Strided
 
@@ -16,6 +17,7 @@ __all__ = [
     "LastStep",
     "Masked",
     "Recurrent",
+    "Score",
     "Strided",
     "embedding_by_name",
     "embedding_names",

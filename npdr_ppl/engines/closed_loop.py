@@ -17,14 +17,25 @@ from npdr_ppl.engines.compilation import (
     signature,
     with_fallback,
 )
+from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
 from npdr_ppl.engines.integrators import Components
-from npdr_ppl.engines.stepping import State, Stepper, Tables, flatten
+from npdr_ppl.engines.stepping import Stepper, flatten
 from npdr_ppl.errors import ModelError
+from npdr_ppl.language.simulator import Simulator
 
 if TYPE_CHECKING:
     from npdr_ppl.engines.ode import ODESimulator
 
-__all__ = ["Episodes", "FeedbackPolicy", "Reward", "roll_out"]
+__all__ = [
+    "Episodes",
+    "FeedbackPolicy",
+    "LoopBody",
+    "Reward",
+    "begin",
+    "check_channels",
+    "roll_out",
+    "run_eagerly",
+]
 
 Reward = Callable[[Components, Components, Components], Tensor]
 """Maps positions and velocities at a step's start and its commands, before any limit, to the
@@ -95,10 +106,12 @@ class _Loop(NamedTuple):
     length: Tensor
 
 
-class _Body:
+class LoopBody:
     """The loop's body; everything in it is fixed before the first step."""
 
-    def __init__(self, stepper: Stepper, policy: FeedbackPolicy, reward: Reward | None) -> None:
+    def __init__(
+        self, stepper: EffectChain, policy: FeedbackPolicy, reward: Reward | None
+    ) -> None:
         simulator = stepper.simulator
         self.stepper = stepper
         # Without its parameters and their defaults, so that a compiled body cannot hold on to some
@@ -123,8 +136,8 @@ class _Body:
     ) -> tuple[_Loop, Components]:
         """Advances the loop by one step; also returns the commands before any limit."""
         state, stepper = loop.state, self.stepper
-        readings = loop.readings or stepper.simulator.readings(
-            state.positions, state.velocities, tables.constants
+        readings = loop.readings or stepper.true_readings(
+            state.positions, state.velocities, tables
         )
         observation = tuple(readings[i] for i in self.observed)
         chosen, memory = self.policy.act(observation, time, loop.policy_memory, policy_constants)
@@ -183,7 +196,7 @@ def roll_out(
 ) -> Episodes:
     """Simulates episodes of policies in domains; see :meth:`ODESimulator.roll_out`."""
     simulator.check_parameters(parameters)
-    _check_channels(simulator, policy)
+    check_channels(simulator, policy)
     step = time_step or simulator.time_step
     dtype = simulator.common_dtype(parameters, initial_states)
     dtype = torch.promote_types(dtype, policy.parameters.dtype)
@@ -210,11 +223,11 @@ def roll_out(
         present = simulator.changed(domain, middle)
         tables, histories = simulator.tables(present, shape, step, expand=is_compiled)
         constants = flatten(policy.constants(domain), shape, expand=is_compiled)
-        body = _Body(Stepper(simulator, step, histories), policy, reward)
+        body = LoopBody(Stepper(simulator, step, histories), policy, reward)
         states = flatten(initial_states.to(dtype).unbind(-1), shape, expand=True)
-        loop = _start(body, states, tables)
+        loop = begin(body, states, tables)
         if not is_compiled:
-            return _run_eagerly(body, loop, tables, constants, num_steps, shape, record)
+            return run_eagerly(body, loop, tables, constants, num_steps, shape, record)
         loop = body.without_repetition(flatten(loop, loop.total.shape, expand=True))
         loop = _run_compiled(body, loop, tables, constants, num_steps)
         return _episodes(loop, shape, reward)
@@ -222,7 +235,7 @@ def roll_out(
     return with_fallback(mode, is_compiled, run)
 
 
-def _check_channels(simulator: "ODESimulator", policy: FeedbackPolicy) -> None:
+def check_channels(simulator: Simulator, policy: FeedbackPolicy) -> None:
     """Raises a ModelError where the policy's channels are not the simulator's."""
     sensors = [sensor.name for sensor in simulator.sensors]
     missing = [name for name in policy.observations if name not in sensors]
@@ -234,23 +247,22 @@ def _check_channels(simulator: "ODESimulator", policy: FeedbackPolicy) -> None:
         )
 
 
-def _start(body: _Body, states: Components, tables: Tables) -> _Loop:
+def begin(body: LoopBody, states: Components, tables: Tables) -> _Loop:
     """Returns the loop before its first step, at rest with respect to commands."""
     zero = torch.zeros_like(states[0])
-    num_joints = len(states) // 2
-    positions, velocities = states[:num_joints], states[num_joints:]
-    simulator = body.stepper.simulator
+    simulator, num_positions = body.stepper.simulator, body.stepper.num_positions
+    positions, velocities = states[:num_positions], states[num_positions:]
     no_readings = (None,) * len(simulator.sensors)
     state = body.stepper.start(
         positions, velocities, tables, (zero,) * len(simulator.actions), no_readings, zero
     )
-    readings = simulator.readings(positions, velocities, tables.constants)
+    readings = body.stepper.true_readings(positions, velocities, tables)
     memory = body.policy.initial_memory(tuple(readings[i] for i in body.observed))
     return _Loop(state, readings, memory, torch.ones_like(zero, dtype=torch.bool), zero, zero)
 
 
-def _run_eagerly(
-    body: _Body,
+def run_eagerly(
+    body: LoopBody,
     loop: _Loop,
     tables: Tables,
     constants: Any,
@@ -271,7 +283,7 @@ def _run_eagerly(
 
 
 def _run_compiled(
-    body: _Body, loop: _Loop, tables: Tables, constants: Any, num_steps: int
+    body: LoopBody, loop: _Loop, tables: Tables, constants: Any, num_steps: int
 ) -> _Loop:
     """Runs all steps block by block, and the few that do not fill a kernel call eagerly."""
     key = body.signature, loop.total.dtype, loop.total.device.type

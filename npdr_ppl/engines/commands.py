@@ -1,5 +1,7 @@
 """Commands given so far, as action effects see them: recorded ones and those of a live loop."""
 
+import copy
+
 import torch
 from torch import Tensor
 
@@ -36,7 +38,7 @@ class CommandRecord:
         before = torch.where(inputs.start == 0, torch.zeros_like(known[..., 0]), known[..., 0])
         # Time first, so that the commands of one step lie side by side.
         self._table = torch.cat((before[..., None], known), dim=-1).movedim(-1, 0).contiguous()
-        self._batch_shape = batch_shape
+        self._batch_shape: torch.Size | None = batch_shape
         segments = self._table.shape[1:]
         row = torch.arange(segments.numel(), device=known.device).reshape(segments)
         self.rows = row.expand(batch_shape).reshape(-1)
@@ -54,7 +56,23 @@ class CommandRecord:
 
     def at(self, step: int) -> Tensor:
         """Returns the command of each simulation at a step, ``(N,)``; steps before 0 are past."""
-        return self._table[self.first + step].expand(self._batch_shape).reshape(-1)
+        present = self._table[self.first + step]
+        if self._batch_shape is None:
+            return present.reshape(-1)[self.rows]
+        return present.expand(self._batch_shape).reshape(-1)
+
+    def view(self, step: int) -> "RecordedCommands":
+        """Returns the record as it is seen at a step."""
+        return RecordedCommands(
+            self.at(step), self.table, self.rows, self.first + step, self.stride
+        )
+
+    def part(self, first: int, last: int) -> "CommandRecord":
+        """Returns the record of some of the N simulations."""
+        part = copy.copy(self)
+        part.rows = self.rows[first:last]
+        part._batch_shape = None
+        return part
 
 
 class RecordedCommands(Commands):

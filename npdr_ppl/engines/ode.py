@@ -8,14 +8,15 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward, roll_out
+from npdr_ppl.engines.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.engines.compilation import CompileMode
+from npdr_ppl.engines.effect_chain import Tables, needed_histories
 from npdr_ppl.engines.integrators import Components, Integrator, integrator
 from npdr_ppl.engines.open_loop import replay
-from npdr_ppl.engines.stepping import Stepper, Tables, flatten
+from npdr_ppl.engines.stepping import flatten
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.effects import EnvironmentEffect, ParameterEffect
+from npdr_ppl.language.effects import EnvironmentEffect
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["Forces", "ODESimulator"]
 
@@ -23,7 +24,7 @@ Forces = tuple[Tensor | float, ...]
 """Generalised forces to add, one per joint; 0.0 where no effect acts."""
 
 
-class ODESimulator(Simulator):
+class ODESimulator(ClosedLoopSimulator):
     """A second-order mechanical system q̈ = a(q, q̇, u, f), simulated for a whole batch at once.
 
     A subclass declares channels, parameters and ports, and writes :meth:`accelerations`. The
@@ -125,25 +126,7 @@ class ODESimulator(Simulator):
         compile: CompileMode | None = None,
         expected_calls: int = 1,
     ) -> Episodes:
-        """Simulates closed-loop episodes of a batch of policies, domains and initial states.
-
-        The batch shape B is what the three broadcast to: keep policies on one axis, domains on
-        another and states on a third. Commands are limited to the channels' bounds, then pass the
-        action effects; policies see readings, and the first reading is true. Before the start
-        commands were zero.
-
-        Args:
-            parameters: Domain and effect parameters; missing ones are nominal.
-            policy: The policies; ``policy.parameters`` has the shape ``(..., parameters)``.
-            initial_states: True states at the start, ``(..., states)``.
-            num_steps: Greatest number of steps.
-            reward: Reward of a step.
-            time_step: Seconds per step; ``None`` for the simulator's.
-            record: Whether to return readings and commands; recording is not compiled.
-            compile: Replaces the simulator's choice.
-            expected_calls: How many calls of this size are to come, so that ``auto`` can tell
-                whether compilation pays back.
-        """
+        """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`."""
         return roll_out(
             self,
             parameters,
@@ -164,39 +147,6 @@ class ODESimulator(Simulator):
             if isinstance(value, Tensor) and value.is_floating_point():
                 dtype = torch.promote_types(dtype, value.dtype)
         return dtype
-
-    def complete(
-        self, parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
-    ) -> dict[str, Tensor]:
-        """Returns all parameters, missing ones nominal and effects' included.
-
-        Args:
-            parameters: Some of the parameters, tensors or numbers.
-            dtype: Floating type of the result.
-            device: Device of the result.
-        """
-        values = {parameter.name: parameter.nominal for parameter in self.parameters}
-        for effect in self.effects:
-            nominal = [parameter.nominal for parameter in effect.parameters]
-            values |= dict(zip(effect.parameter_names, nominal, strict=True))
-        return {
-            name: torch.as_tensor(value, dtype=dtype, device=device)
-            for name, value in {**values, **parameters}.items()
-        }
-
-    def changed(self, parameters: Mapping[str, Tensor], time: Tensor) -> dict[str, Tensor]:
-        """Returns all parameters, the domain's as parameter effects change them.
-
-        Args:
-            parameters: What :meth:`complete` returned.
-            time: Seconds from the rollout's beginning to each segment's middle.
-        """
-        result = dict(parameters)
-        for effect in self.effects:
-            if isinstance(effect, ParameterEffect):
-                own = effect.own_parameters(parameters)
-                result[effect.port] = effect.change(result[effect.port], own, time)
-        return result
 
     def tables(
         self,
@@ -221,7 +171,7 @@ class ODESimulator(Simulator):
                 quantity = environment[effect.port]
                 environment[effect.port] = effect.environment(quantity, values)
         constants = self.constants(parameters, environment)
-        histories = Stepper.needed_histories(self, effects, time_step)
+        histories = needed_histories(self.effects, effects, time_step)
         return flatten(Tables(constants, effects), shape, expand=expand), histories
 
 

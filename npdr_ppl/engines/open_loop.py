@@ -14,9 +14,10 @@ from npdr_ppl.engines.compilation import (
     mark_sizes_dynamic,
     with_fallback,
 )
+from npdr_ppl.engines.effect_chain import State, Tables
 from npdr_ppl.engines.integrators import Components
-from npdr_ppl.engines.reading_times import catch_up, sensor_leads
-from npdr_ppl.engines.stepping import State, Stepper, Tables, flatten
+from npdr_ppl.engines.segment_start import recorded_start, true_start, with_past_commands
+from npdr_ppl.engines.stepping import Stepper, flatten
 from npdr_ppl.errors import ShapeError
 from npdr_ppl.language.inputs import Inputs
 
@@ -187,79 +188,24 @@ def _start(
     """Returns the state at the segments' start, effects' memory included."""
     stepper = body.stepper
     simulator = stepper.simulator
-
-    def spread(value: Tensor) -> Tensor:
-        return value.expand(shape).reshape(-1)
-
-    components = [spread(value) for value in simulator.initial_states(inputs)]
+    recorded = recorded_start(simulator, inputs, shape)
     num_joints = len(simulator.joints)
-    if len(components) != 2 * num_joints:
+    if len(recorded.states) != 2 * num_joints:
         raise ShapeError(
             f"{simulator.name} has {num_joints} joints, so it should declare {2 * num_joints} "
-            f"states, got {len(components)}."
+            f"states, got {len(recorded.states)}."
         )
-    columns = {name: i for i, name in enumerate(inputs.channel_names)}
     past = inputs.past_actions.shape[-2]
-    time = spread(inputs.start.to(components[0]) * inputs.time_step)
-    if stepper.sensor_effects:
-        last = tuple(record.at(-1 if past else 0) for record in records)
-        components = _behind_readings(stepper, components, tables, inputs, last, time)
-    reported = tuple(
-        spread(inputs.initial_readings[..., columns[s.name]]) if s.name in columns else None
-        for s in simulator.sensors
-    )
+    latest = tuple(record.at(-1 if past else 0) for record in records)
+    components = true_start(stepper, tables, recorded, latest)
     state = stepper.start(
-        tuple(components[:num_joints]),
-        tuple(components[num_joints:]),
+        components[:num_joints],
+        components[num_joints:],
         tables,
         tuple(record.at(-1 - past) for record in records),
-        reported,
-        time,
-        past if stepper.action_effects else 0,
+        recorded.readings,
+        recorded.time,
+        latest=latest,
+        num_past=past if stepper.action_effects else 0,
     )
-    if stepper.action_effects:
-        # The effects' memory at the start is what the recorded past made of it.
-        for step in range(-past, 0):
-            commands = tuple(record.at(step) for record in records)
-            state, _ = body.act(state, tables, commands, _views(records, step))
-    return state
-
-
-def _behind_readings(
-    stepper: Stepper,
-    components: list[Tensor],
-    tables: Tables,
-    inputs: Inputs,
-    commands: Components,
-    time: Tensor,
-) -> list[Tensor]:
-    """Returns the true state behind the readings at the segments' start.
-
-    A velocity that was derived from readings of its position has that sensor's timing, and none of
-    the offset or scale of the sensor for velocities.
-    """
-    simulator = stepper.simulator
-    sensors = {sensor.name: i for i, sensor in enumerate(simulator.sensors)}
-    sources: list[int | None] = []
-    derived = []
-    for state in simulator.states:
-        is_derived = inputs.initial_rates is not None and state.rate_of in inputs.channel_names
-        derived.append(is_derived)
-        sources.append(sensors.get((state.rate_of or "") if is_derived else state.name))
-    true = list(components)
-    for place, effect, columns in stepper.sensor_effects:
-        for i, state in enumerate(simulator.states):
-            if sensors.get(state.name) not in columns:
-                continue
-            value = effect.initial_value(true[i], tables.effects[place])
-            # At a rollout's first sample velocities are read; see Simulator.initial_states.
-            true[i] = torch.where(time == 0.0, value, true[i]) if derived[i] else value
-    leads = sensor_leads(stepper.sensor_effects, tables.effects, time)
-    if not leads:
-        return true
-    split = len(simulator.joints)
-    late = tuple(None if source is None else leads.get(source) for source in sources)
-    q, v = catch_up(
-        simulator, tuple(true[:split]), tuple(true[split:]), commands, tables.constants, late
-    )
-    return [*q, *v]
+    return with_past_commands(stepper, state, tables, records, past)

@@ -7,47 +7,40 @@ that was given last.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.language.effects import SensorEffect
-
-if TYPE_CHECKING:
-    from npdr_ppl.engines.ode import ODESimulator
+from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["catch_up", "sensor_leads", "sensor_rates"]
 
 
 def sensor_rates(
-    simulator: "ODESimulator",
-    positions: Components,
-    velocities: Components,
-    actions: Components,
-    constants: Any,
+    simulator: Simulator, velocities: Components, accelerations: Components
 ) -> dict[int, tuple[Tensor, ...]]:
     """Returns first and second derivative of the sensor channels, zero unless they read states.
 
+    A position's first derivative is the velocity that is declared as its rate.
+
     Args:
         simulator: The system, whose effects are left out.
-        positions: Positions, ``(N,)`` each.
-        velocities: Velocities, ``(N,)`` each.
-        actions: What each action channel saw last, ``(N,)`` each.
-        constants: The system's constants.
+        velocities: Velocities among its states, ``(N,)`` each.
+        accelerations: Their rates.
     """
-    zero = torch.zeros_like(positions[0])
-    accelerations = _accelerations(simulator, positions, velocities, actions, constants)
-    derivatives = [
-        *zip(velocities, accelerations, strict=True),
-        *((acceleration, zero) for acceleration in accelerations),
-    ]
-    names = (state.name for state in simulator.states)
-    by_name = dict(zip(names, derivatives, strict=True))
+    num_positions = len(simulator.states) - len(velocities)
+    by_name: dict[str, tuple[Tensor, ...]] = {}
+    for state, velocity, acceleration in zip(
+        simulator.states[num_positions:], velocities, accelerations, strict=True
+    ):
+        by_name[state.name] = acceleration, torch.zeros_like(velocity)
+        if state.rate_of is not None:
+            by_name[state.rate_of] = velocity, acceleration
+    none = tuple(torch.zeros_like(v) for v in (*velocities, *velocities)[:2])
     return {
-        column: by_name.get(sensor.name, (zero, zero))
-        for column, sensor in enumerate(simulator.sensors)
+        column: by_name.get(sensor.name, none) for column, sensor in enumerate(simulator.sensors)
     }
 
 
@@ -72,41 +65,31 @@ def sensor_leads(
 
 
 def catch_up(
-    simulator: "ODESimulator",
-    positions: Components,
-    velocities: Components,
-    actions: Components,
-    constants: Any,
+    simulator: Simulator,
+    states: Components,
+    accelerations: Components,
     leads: tuple[Tensor | None, ...],
-) -> tuple[Components, Components]:
+) -> Components:
     """Returns the state now behind one that was read too early or too late.
+
+    A position whose rate is no state stays as it was read.
 
     Args:
         simulator: The system, whose effects are left out.
-        positions: Positions as read, ``(N,)`` each.
-        velocities: Velocities as read, or derived from positions, ``(N,)`` each.
-        actions: What each action channel saw last, ``(N,)`` each.
-        constants: The system's constants.
-        leads: By how many seconds each position, then each velocity is ahead.
+        states: Positions as read, then velocities as read or derived from positions, ``(N,)``.
+        accelerations: Rates of the velocities, ``(N,)`` each.
+        leads: By how many seconds each state's reading is ahead.
     """
-    accelerations = _accelerations(simulator, positions, velocities, actions, constants)
-    q, v = list(positions), list(velocities)
-    for i, acceleration in enumerate(accelerations):
-        lead, rate_lead = leads[i], leads[len(q) + i]
+    result = list(states)
+    num_positions = len(states) - len(accelerations)
+    places = {state.name: i for i, state in enumerate(simulator.states)}
+    for j, acceleration in enumerate(accelerations, start=num_positions):
+        rate_lead = leads[j]
         if rate_lead is not None:
-            v[i] = velocities[i] - rate_lead * acceleration
-        if lead is not None:
+            result[j] = states[j] - rate_lead * acceleration
+        i = places.get(simulator.states[j].rate_of or "")
+        lead = None if i is None else leads[i]
+        if i is not None and lead is not None:
             # Back from the velocity now, which has just been found.
-            q[i] = positions[i] - lead * v[i] - 0.5 * lead * lead * acceleration
-    return tuple(q), tuple(v)
-
-
-def _accelerations(
-    simulator: "ODESimulator",
-    positions: Components,
-    velocities: Components,
-    actions: Components,
-    constants: Any,
-) -> Components:
-    none = (0.0,) * len(positions)
-    return simulator.accelerations(positions, velocities, actions, none, constants)
+            result[i] = states[i] - lead * result[j] - 0.5 * lead * lead * acceleration
+    return tuple(result)

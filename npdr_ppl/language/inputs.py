@@ -1,6 +1,6 @@
 """What a simulator is told: actions, time step and how each segment starts."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -9,6 +9,14 @@ from torch import Tensor
 from npdr_ppl.errors import ShapeError
 
 __all__ = ["Inputs"]
+
+_STARTS = (
+    "initial_readings",
+    "initial_values",
+    "initial_rates",
+    "initial_value_errors",
+    "initial_rate_errors",
+)
 
 
 @dataclass(frozen=True)
@@ -26,8 +34,6 @@ class Inputs:
         initial_readings: What the sensors reported at each segment's start, ``(..., S, C)``.
         initial_values: Best value of each channel at the start: the reading itself (``recorded``)
             or a smoother's estimate (``estimated``), ``(..., S, C)``.
-        initial_rates: Estimated time derivative of each channel at the start, in units per
-            second, ``(..., S, C)``; ``None`` where recorded states are taken as true.
         channel_names: Names of the C channels.
         past_actions: Commands of the H steps before each segment, oldest first, zero before the
             rollout began, ``(..., S, H, A)``; delays need them.
@@ -35,19 +41,27 @@ class Inputs:
         mask: True for steps that exist, ``(S, K)``.
         rollout: Index of the rollout that each segment comes from, ``(S,)``.
         start: Step of the rollout at which each segment starts, ``(S,)``.
+        initial_rates: Estimated time derivative of each channel at the start, in units per
+            second, ``(..., S, C)``; ``None`` where recorded states are taken as true.
+        initial_value_errors: Standard deviations of the initial values' errors, ``(..., S, C)``;
+            ``None`` where the values are taken as true. With errors, every simulation starts from
+            a draw of its own.
+        initial_rate_errors: Those of the initial rates.
     """
 
     actions: Tensor
     action_names: tuple[str, ...]
     initial_readings: Tensor
     initial_values: Tensor
-    initial_rates: Tensor | None
     channel_names: tuple[str, ...]
     past_actions: Tensor
     time_step: float
     mask: Tensor
     rollout: Tensor
     start: Tensor
+    initial_rates: Tensor | None = None
+    initial_value_errors: Tensor | None = None
+    initial_rate_errors: Tensor | None = None
 
     def __post_init__(self) -> None:
         """Checks that the shapes fit each other."""
@@ -102,7 +116,6 @@ class Inputs:
             action_names=action_names,
             initial_readings=state,
             initial_values=state,
-            initial_rates=None,
             channel_names=state_names,
             past_actions=actions.new_zeros(1, history, actions.shape[-1]),
             time_step=time_step,
@@ -126,6 +139,36 @@ class Inputs:
         """Leading dimensions, empty unless devices were given different inputs."""
         return self.actions.shape[:-3]
 
+    @property
+    def is_start_uncertain(self) -> bool:
+        """Whether simulations start from draws of their own."""
+        return self.initial_value_errors is not None
+
+    def with_drawn_start(self, batch_shape: torch.Size) -> "Inputs":
+        """Returns the inputs with starts drawn for every element of a batch.
+
+        Args:
+            batch_shape: Shape of the batch; the inputs' own broadcasts to it.
+        """
+        if self.initial_value_errors is None:
+            return self
+
+        def drawn(mean: Tensor | None, error: Tensor | None) -> Tensor | None:
+            if mean is None or error is None:
+                return mean
+            shape = batch_shape + mean.shape[-2:]
+            return mean + error * torch.randn(shape, dtype=mean.dtype, device=mean.device)
+
+        values = drawn(self.initial_values, self.initial_value_errors)
+        assert values is not None
+        return replace(
+            self,
+            initial_values=values,
+            initial_rates=drawn(self.initial_rates, self.initial_rate_errors),
+            initial_value_errors=None,
+            initial_rate_errors=None,
+        )
+
     def to(
         self, *, dtype: torch.dtype | None = None, device: str | torch.device | None = None
     ) -> "Inputs":
@@ -140,13 +183,10 @@ class Inputs:
 
     def segments(self, index: Tensor | slice | list[int]) -> "Inputs":
         """Returns the inputs of the chosen segments only."""
-        rates = self.initial_rates
         return replace(
             self,
+            **self._starts(lambda value: value[..., index, :]),
             actions=self.actions[..., index, :, :],
-            initial_readings=self.initial_readings[..., index, :],
-            initial_values=self.initial_values[..., index, :],
-            initial_rates=None if rates is None else rates[..., index, :],
             past_actions=self.past_actions[..., index, :, :],
             mask=self.mask[index],
             rollout=self.rollout[index],
@@ -156,13 +196,8 @@ class Inputs:
     def select_channels(self, names: Sequence[str]) -> "Inputs":
         """Returns the inputs with only these channels, in this order."""
         columns = [self.channel_names.index(name) for name in names]
-        rates = self.initial_rates
         return replace(
-            self,
-            initial_readings=self.initial_readings[..., columns],
-            initial_values=self.initial_values[..., columns],
-            initial_rates=None if rates is None else rates[..., columns],
-            channel_names=tuple(names),
+            self, **self._starts(lambda value: value[..., columns]), channel_names=tuple(names)
         )
 
     def element(self, index: int) -> "Inputs":
@@ -170,16 +205,19 @@ class Inputs:
         if not self.batch_shape:
             return self
         depth = len(self.batch_shape)
-        changed = {}
-        for name in (
-            "actions",
-            "past_actions",
-            "initial_readings",
-            "initial_values",
-            "initial_rates",
-        ):
-            value = getattr(self, name)
-            if value is not None:
-                event = value.shape[depth:]
-                changed[name] = value.expand(self.batch_shape + event).flatten(0, depth - 1)[index]
-        return replace(self, **changed)
+
+        def chosen(value: Tensor) -> Tensor:
+            event = value.shape[depth:]
+            return value.expand(self.batch_shape + event).flatten(0, depth - 1)[index]
+
+        return replace(
+            self,
+            **self._starts(chosen),
+            actions=chosen(self.actions),
+            past_actions=chosen(self.past_actions),
+        )
+
+    def _starts(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
+        """Returns what is known of the segments' starts, changed, without what is ``None``."""
+        values = {name: getattr(self, name) for name in _STARTS}
+        return {name: change(value) for name, value in values.items() if value is not None}

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port, find_port
-from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.effects import Effect, ParameterEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.inverse_dynamics import InverseDynamics
 
@@ -135,7 +135,7 @@ class Simulator(ABC):
 
         A rate whose position is measured is taken from the estimated derivative of the position
         readings where the inputs carry one, otherwise from its own reading. At a rollout's first
-        sample the derivative sees one side only, and a reading of the rate is better.
+        sample the derivative sees one side only, and what was read of the rate is better.
 
         Raises:
             DataError: A component was neither recorded nor can be estimated.
@@ -146,8 +146,8 @@ class Simulator(ABC):
             if inputs.initial_rates is not None and state.rate_of in columns:
                 rate = inputs.initial_rates[..., columns[state.rate_of]]
                 if state.name in columns:
-                    reading = inputs.initial_readings[..., columns[state.name]]
-                    rate = torch.where(inputs.start.to(rate.device) == 0, reading, rate)
+                    value = inputs.initial_values[..., columns[state.name]]
+                    rate = torch.where(inputs.start.to(rate.device) == 0, value, rate)
                 result.append(rate)
             elif state.name in columns:
                 result.append(inputs.initial_values[..., columns[state.name]])
@@ -165,3 +165,36 @@ class Simulator(ABC):
             parameter.name: torch.tensor(parameter.nominal, dtype=torch.float64)
             for parameter in self.parameters
         }
+
+    def complete(
+        self, parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
+    ) -> dict[str, Tensor]:
+        """Returns all parameters, missing ones nominal and effects' included.
+
+        Args:
+            parameters: Some of the parameters, tensors or numbers.
+            dtype: Floating type of the result.
+            device: Device of the result.
+        """
+        values = {parameter.name: parameter.nominal for parameter in self.parameters}
+        for effect in self.effects:
+            nominal = [parameter.nominal for parameter in effect.parameters]
+            values |= dict(zip(effect.parameter_names, nominal, strict=True))
+        return {
+            name: torch.as_tensor(value, dtype=dtype, device=device)
+            for name, value in {**values, **parameters}.items()
+        }
+
+    def changed(self, parameters: Mapping[str, Tensor], time: Tensor) -> dict[str, Tensor]:
+        """Returns all parameters, the domain's as parameter effects change them.
+
+        Args:
+            parameters: What :meth:`complete` returned.
+            time: Seconds from the rollout's beginning to each segment's middle.
+        """
+        result = dict(parameters)
+        for effect in self.effects:
+            if isinstance(effect, ParameterEffect):
+                own = effect.own_parameters(parameters)
+                result[effect.port] = effect.change(result[effect.port], own, time)
+        return result

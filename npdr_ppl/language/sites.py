@@ -124,6 +124,11 @@ class BlackBox(TorchDistribution):
         """Whether the declared noise gives a density with gradients."""
 
     @property
+    def has_density(self) -> bool:
+        """Whether the declared noise gives a density."""
+        return self.noise is not None and self._is_deterministic
+
+    @property
     def _channel_names(self) -> tuple[str, ...] | None:
         return None
 
@@ -199,7 +204,8 @@ class BlackBox(TorchDistribution):
         if not self._is_deterministic:
             raise IntractableError(
                 f"The density of site {self.site!r} is intractable, because its simulator is "
-                "random beyond the declared noise; use a likelihood-free backend (npdr.infer)."
+                "random beyond the declared noise, or starts from an uncertain state; use a "
+                "likelihood-free backend (npdr.infer)."
             )
         output = self._run(self.batch_shape)
         event_dim = output.dim() - len(self.batch_shape)
@@ -254,12 +260,12 @@ class SimulatorBlackBox(BlackBox):
 
     @property
     def _is_deterministic(self) -> bool:
-        return self.simulator.is_deterministic
+        return self.simulator.is_deterministic and not self.inputs.is_start_uncertain
 
     @property
     def is_differentiable(self) -> bool:
         """Whether the declared noise gives a density with gradients."""
-        return self.simulator.is_deterministic and self.simulator.is_differentiable
+        return self._is_deterministic and self.simulator.is_differentiable
 
     @property
     def _channel_names(self) -> tuple[str, ...]:
@@ -287,7 +293,8 @@ class SimulatorBlackBox(BlackBox):
         if not self.simulator.is_deterministic:
             # Every element of the batch deserves its own randomness.
             parameters = {name: value.expand(batch_shape) for name, value in parameters.items()}
-        output = self.simulator.simulate(parameters, self.inputs)
+        inputs = self.inputs.with_drawn_start(batch_shape)
+        output = self.simulator.simulate(parameters, inputs)
         if output.shape[-3:] != self.event_shape:
             raise SimulationError(
                 f"{self.simulator.name} returned a trajectory of shape {tuple(output.shape)}; "

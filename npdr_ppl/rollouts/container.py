@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -390,7 +390,7 @@ class Rollouts:
     def inputs(
         self,
         segment_length: int | None = None,
-        initial_state: Literal["estimated", "recorded"] = "estimated",
+        initial_state: segments.InitialState = "estimated",
         *,
         history: int = segments.DEFAULT_HISTORY,
         dtype: torch.dtype = torch.float64,
@@ -401,7 +401,9 @@ class Rollouts:
             segment_length: Steps after which the simulation is re-synchronised with the data;
                 ``None`` for whole rollouts. The last segment of a rollout may be shorter.
             initial_state: ``"estimated"`` smooths the readings around each segment's start and
-                differentiates them; ``"recorded"`` takes the readings as the truth.
+                differentiates them; ``"recorded"`` takes the readings as the truth;
+                ``"uncertain"`` adds the smoother's error to the estimate, and every simulation
+                starts from a draw of its own.
             history: Steps of commands before each segment to hand over, for delays.
             dtype: Floating-point type of the tensors.
 

@@ -1,7 +1,8 @@
 """Segments: rollouts cut into stretches that are simulated from re-synchronised states."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from dataclasses import fields
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import torch
@@ -10,12 +11,17 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError, ShapeError
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.rollouts.states import estimate_states
+from npdr_ppl.rollouts.states import StateEstimate, estimate_states
 
 if TYPE_CHECKING:
     from npdr_ppl.rollouts.container import Rollouts
 
-__all__ = ["DEFAULT_HISTORY", "columns_of", "inputs", "observation", "stitch"]
+__all__ = ["DEFAULT_HISTORY", "InitialState", "columns_of", "inputs", "observation", "stitch"]
+
+InitialState = Literal["estimated", "recorded", "uncertain"]
+"""How the state at a segment's start is found: the readings are smoothed and differentiated, or
+taken as the truth, or smoothed and every simulation starts from a draw within the smoother's
+error."""
 
 DEFAULT_HISTORY = 64
 """Steps of past commands handed over by default: 64 ms at 1 kHz, beyond any input delay of a
@@ -40,13 +46,14 @@ def inputs(
     rollouts: "Rollouts",
     *,
     segment_length: int | None,
-    initial_state: Literal["estimated", "recorded"],
+    initial_state: InitialState,
     history: int,
     dtype: torch.dtype,
 ) -> Inputs:
     """Cuts rollouts into segments; see :meth:`Rollouts.inputs`."""
-    if initial_state not in ("estimated", "recorded"):
-        raise DataError(f"initial_state is 'estimated' or 'recorded', not {initial_state!r}.")
+    if initial_state not in get_args(InitialState):
+        known = ", ".join(repr(name) for name in get_args(InitialState))
+        raise DataError(f"initial_state is one of {known}, not {initial_state!r}.")
     if segment_length is not None and segment_length < 1:
         raise DataError(f"a segment has at least one step, but {segment_length=}.")
     if history < 0:
@@ -64,21 +71,24 @@ def inputs(
         past[row, history - known :] = rollouts.actions[rollout][start - known : start]
         mask[row, : stop - start] = True
         readings[row] = rollouts.readings[rollout][start]
-    values, rates = readings, None
-    if initial_state == "estimated":
-        values, rates = _estimated(rollouts, layout)
+    starts: dict[str, NDArray[np.float64]] = {"initial_values": readings}
+    if initial_state != "recorded":
+        estimate = _estimated(rollouts, layout)
+        starts = {"initial_values": estimate.values, "initial_rates": estimate.rates}
+        if initial_state == "uncertain":
+            starts["initial_value_errors"] = estimate.value_errors
+            starts["initial_rate_errors"] = estimate.rate_errors
     return Inputs(
         actions=torch.tensor(actions, dtype=dtype),
         action_names=rollouts.action_names,
         initial_readings=torch.tensor(readings, dtype=dtype),
-        initial_values=torch.tensor(values, dtype=dtype),
-        initial_rates=None if rates is None else torch.tensor(rates, dtype=dtype),
         channel_names=rollouts.channel_names,
         past_actions=torch.tensor(past, dtype=dtype),
         time_step=rollouts.time_step,
         mask=torch.tensor(mask),
         rollout=torch.tensor([rollout for rollout, _, _ in layout]),
         start=torch.tensor([start for _, start, _ in layout]),
+        **{name: torch.tensor(value, dtype=dtype) for name, value in starts.items()},
     )
 
 
@@ -155,14 +165,15 @@ def _layout(lengths: Sequence[int], segment_length: int | None) -> list[tuple[in
     ]
 
 
-def _estimated(
-    rollouts: "Rollouts", layout: Sequence[tuple[int, int, int]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns values and rates at the segments' starts, ``(S, C)`` each."""
-    values, rates = [], []
+def _estimated(rollouts: "Rollouts", layout: Sequence[tuple[int, int, int]]) -> StateEstimate:
+    """Returns the estimate at the segments' starts, ``(S, C)``."""
+    parts = []
     for index, readings in enumerate(rollouts.readings):
         starts = np.array([start for rollout, start, _ in layout if rollout == index])
-        value, rate = estimate_states(readings, starts, rollouts.time_step)
-        values.append(value)
-        rates.append(rate)
-    return np.concatenate(values), np.concatenate(rates)
+        parts.append(estimate_states(readings, starts, rollouts.time_step))
+    return StateEstimate(
+        *(
+            np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(StateEstimate)
+        )
+    )

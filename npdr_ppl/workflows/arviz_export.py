@@ -126,7 +126,7 @@ def segment_log_likelihood(
     """
     observation = posterior.bound.observations[name]
     residual = (predictive - observation.value).double()
-    if posterior.prior.black_boxes[name].noise is not None:
+    if posterior.prior.black_boxes[name].has_density:
         log_prob = posterior.prior.pointwise_log_prob(name, observation.value, z).double()
         error_model = "declared noise"
     else:

@@ -1,7 +1,7 @@
 """A model bound to measured data: what every backend and every workflow starts from."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.differentiation import Smoothing
+from npdr_ppl.rollouts.segments import InitialState
 from npdr_ppl.workflows.linear_regression import regression_of
 
 __all__ = ["BindingOptions", "BoundModel", "Data", "bind", "problem_of"]
@@ -69,19 +70,29 @@ class BindingOptions:
             or an embedding of one's own. Plain functions have none.
         segment_length: Steps between re-synchronisations; ``None`` for whole rollouts.
         initial_state: How the state at a segment's start is found: ``"estimated"`` by a smoother,
-            or ``"recorded"``.
+            ``"recorded"``, or ``"uncertain"``, which draws it within the smoother's error.
         precision: ``"float64"`` or ``"float32"``, of the simulation.
     """
 
     embedding: str | Embedding | None = "bayessim"
     segment_length: int | None = None
-    initial_state: Literal["estimated", "recorded"] = "estimated"
+    initial_state: InitialState = "estimated"
     precision: Literal["float64", "float32"] = "float64"
 
     @property
     def dtype(self) -> torch.dtype:
         """The precision as torch's type."""
         return {"float64": torch.float64, "float32": torch.float32}[self.precision]
+
+    def inputs(self, rollouts: Rollouts) -> Inputs:
+        """Returns the inputs of rollouts, prepared like this."""
+        return rollouts.inputs(self.segment_length, self.initial_state, dtype=self.dtype)
+
+    def with_certain_start(self) -> "BindingOptions":
+        """Returns the options that start every simulation from the best estimate."""
+        if self.initial_state != "uncertain":
+            return self
+        return replace(self, initial_state="estimated")
 
 
 @dataclass(frozen=True)
@@ -160,12 +171,7 @@ def bind(
     named: Mapping[str, Rollouts | Tensor] | None = data if isinstance(data, Mapping) else None
     every: list[Rollouts | Tensor] = [data] if not isinstance(data, Mapping) else [*data.values()]
     recorded = [part for part in every if isinstance(part, Rollouts)]
-    layout = [
-        part.inputs(options.segment_length, options.initial_state, dtype=options.dtype).to(
-            device=device
-        )
-        for part in recorded
-    ]
+    layout = [options.inputs(part).to(device=device) for part in recorded]
     args: tuple[Any, ...] = ()
     if len(layout) == 1:
         args = (layout[0],)

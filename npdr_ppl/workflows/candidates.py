@@ -119,7 +119,7 @@ def _candidate(value: str | Backend | Candidate) -> tuple[str, Candidate]:
     label, _, rest = value.rpartition("=") if "(" not in value else _label(value)
     name, options = name_and_options(rest)
     embedding = options.pop("embedding", None)
-    if embedding is not None:
+    if embedding not in (None, "score"):
         embedding_by_name(embedding)  # says so now if there is none of this name
     try:
         method = backend_by_name(name, **options)

@@ -106,7 +106,9 @@ def compare(
         "elpd": "PSIS-LOO" if test is None else "held-out segments",
     }
     error_model = find_error_model(model, train, options, noise=noise, seed=seed)
-    exact = dataclasses.replace(options, precision="float64")
+    exact = dataclasses.replace(options.with_certain_start(), precision="float64")
+    if exact.embedding == "score":  # posteriors are judged without features
+        exact = dataclasses.replace(exact, embedding="bayessim")
     judge = _Judge(
         error_model,
         judged_by,

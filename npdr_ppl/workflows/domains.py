@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.ode import ODESimulator
+from npdr_ppl.engines.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.prior import Prior
@@ -31,7 +31,7 @@ class Domains:
             missing ones are nominal.
     """
 
-    simulator: ODESimulator
+    simulator: ClosedLoopSimulator
     parameters: Mapping[str, Tensor]
 
     def __len__(self) -> int:
@@ -85,7 +85,7 @@ def prior_of(
     return Prior(model, (at_rest.inputs(None, "recorded"),))
 
 
-def simulator_of(prior: Prior) -> ODESimulator:
+def simulator_of(prior: Prior) -> ClosedLoopSimulator:
     """Returns the simulator of a model's only black-box site, its effects attached.
 
     Raises:
@@ -97,10 +97,12 @@ def simulator_of(prior: Prior) -> ODESimulator:
             f"{len(prior.black_boxes)}."
         )
     (box,) = prior.black_boxes.values()
-    if not isinstance(box, SimulatorBlackBox) or not isinstance(box.simulator, ODESimulator):
+    if not isinstance(box, SimulatorBlackBox) or not isinstance(
+        box.simulator, ClosedLoopSimulator
+    ):
         raise ModelError(
             "Policies are trained in simulators with batched closed-loop rollouts "
-            f"(ODESimulator); site {box.site!r} has none."
+            f"(ClosedLoopSimulator); site {box.site!r} has none."
         )
     return box.simulator
 

@@ -26,7 +26,8 @@ from npdr_ppl.language.prior import Prior
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.arviz_export import effective_share
 from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data
-from npdr_ppl.workflows.evaluation import closest_fit, declares_noise, replay
+from npdr_ppl.workflows.closest_fit import closest_fit
+from npdr_ppl.workflows.evaluation import declares_noise, replay
 from npdr_ppl.workflows.infer import MAX_READINGS_PER_CHUNK
 
 __all__ = ["ErrorModel", "find_error_model", "segment_log_likelihood"]
@@ -88,7 +89,7 @@ def find_error_model(
     observed = train.observation(replayed.inputs, channels=replayed.channel_names)
     residual = (replayed.trajectory[0] - observed).double().cpu()
     share = effective_share(residual, replayed.inputs.mask.cpu())
-    noisy = model if declared else with_noise(model, closest.scale)
+    noisy = model if declared else with_noise(model, closest.noise)
     return ErrorModel(
         noisy if noise == "auto" else model,
         noisy,

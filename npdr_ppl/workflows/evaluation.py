@@ -13,18 +13,14 @@ from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
-from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts, stitch
 from npdr_ppl.workflows.binding import BindingOptions
 
 __all__ = [
-    "ClosestFit",
     "Replay",
-    "closest_fit",
     "declares_noise",
     "nominal_parameters",
     "replay",
-    "residual_noise",
     "score",
 ]
 
@@ -65,7 +61,7 @@ def replay(
     Raises:
         DataError: The model has several black-box sites, or no channel was measured.
     """
-    inputs = rollouts.inputs(options.segment_length, options.initial_state, dtype=options.dtype)
+    inputs = options.with_certain_start().inputs(rollouts)
     prior = Prior(with_noise(model, None), (inputs,))
     if len(prior.black_boxes) != 1:
         raise DataError(f"The model has {len(prior.black_boxes)} black-box sites; expected one.")
@@ -124,97 +120,5 @@ def nominal_parameters(model: Callable[..., Any], inputs: Inputs) -> dict[str, T
 
 def declares_noise(model: Callable[..., Any], rollouts: Rollouts, options: BindingOptions) -> bool:
     """Returns whether a model gives its readings noise of its own."""
-    inputs = rollouts.inputs(options.segment_length, options.initial_state, dtype=options.dtype)
+    inputs = options.with_certain_start().inputs(rollouts)
     return any(box.noise is not None for box in Prior(model, (inputs,)).black_boxes.values())
-
-
-def residual_noise(
-    model: Callable[..., Any],
-    rollouts: Rollouts,
-    options: BindingOptions,
-    *,
-    iterations: int = 6,
-    population: int = 200,
-    seed: int = 0,
-) -> dict[str, float]:
-    """Returns a noise scale per channel at which the model can explain the recording.
-
-    It is the ``scale`` of :func:`closest_fit`, which has the arguments and errors.
-    """
-    fitted = closest_fit(
-        model, rollouts, options, iterations=iterations, population=population, seed=seed
-    )
-    return fitted.scale
-
-
-@dataclass(frozen=True)
-class ClosestFit:
-    """How near a model can come to a recording.
-
-    Attributes:
-        scale: Root-mean-square residual by channel, in the channel's unit.
-        parameters: The parameters that leave it, ``(1,) + site.shape`` by latent site.
-    """
-
-    scale: dict[str, float]
-    parameters: dict[str, Tensor]
-
-
-def closest_fit(
-    model: Callable[..., Any],
-    rollouts: Rollouts,
-    options: BindingOptions,
-    *,
-    iterations: int = 6,
-    population: int = 200,
-    seed: int = 0,
-) -> ClosestFit:
-    """Searches for the parameters of least residual along a recording.
-
-    A simulator that lacks an effect never reproduces a recording exactly; without noise of the
-    size of what is left, the recording is unlike every simulation and a likelihood-free posterior
-    is extrapolation. The scale is the root-mean-square residual of the best parameters that a
-    short cross-entropy search (Rubinstein 1999) over the prior's reference coordinates finds.
-
-    Args:
-        model: The Pyro model.
-        rollouts: The recording to be fitted; never the held-out one.
-        options: Segments, initial states and precision.
-        iterations: Iterations of the search.
-        population: Parameter sets of each iteration.
-        seed: Seed of the search.
-
-    Raises:
-        DataError: No parameters could be simulated along the recording.
-    """
-    inputs = rollouts.inputs(options.segment_length, options.initial_state, dtype=options.dtype)
-    prior = Prior(model, (inputs,))
-    centre = torch.zeros(prior.num_parameters, dtype=torch.float64)
-    spread = torch.ones_like(centre)
-    best_error, best, best_z = float("inf"), torch.empty(0), centre
-    names: tuple[str, ...] = ()
-    for iteration in range(iterations):
-        with seeded(seed, "residual noise", iteration):
-            z = prior.sample(population) if iteration == 0 else torch.randn(
-                population, prior.num_parameters, dtype=torch.float64
-            ) * spread + centre  # fmt: skip
-        replayed = replay(model, rollouts, prior.to_parameters(z), options)
-        names = replayed.channel_names
-        residual, error = _residuals(replayed, rollouts)
-        elite = error.argsort()[: max(2, population // 10)]
-        centre, spread = z[elite].mean(0), z[elite].std(0)
-        if float(error[elite[0]]) < best_error:
-            best_error, best, best_z = float(error[elite[0]]), residual[elite[0]], z[elite[0]]
-    if not torch.isfinite(torch.tensor(best_error)):
-        raise DataError("No parameters of the prior could be simulated along the recording.")
-    scale = {name: max(float(v), 1e-9) for name, v in zip(names, best, strict=True)}
-    return ClosestFit(scale, prior.to_parameters(best_z[None]))
-
-
-def _residuals(replayed: Replay, rollouts: Rollouts) -> tuple[Tensor, Tensor]:
-    """Returns the residuals' RMS per channel, ``(n, C)``, and their mean in units of the range."""
-    observed = rollouts.observation(replayed.inputs, channels=replayed.channel_names)
-    mask = replayed.inputs.mask[..., None]
-    square = ((replayed.trajectory - observed) * mask).square().sum(dim=(1, 2)) / mask.sum()
-    scale = (observed * mask).abs().amax(dim=(0, 1)).clamp_min(torch.finfo(square.dtype).tiny)
-    return square.sqrt(), (square.sqrt() / scale).mean(-1).nan_to_num(torch.inf)

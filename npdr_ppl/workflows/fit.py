@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from npdr_ppl.inference.base import Backend
-from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.closest_fit import prepare
 from npdr_ppl.workflows.diagnostics import diagnose
-from npdr_ppl.workflows.evaluation import declares_noise, residual_noise, score
+from npdr_ppl.workflows.evaluation import score
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.posterior import Posterior
 from npdr_ppl.workflows.run_folder import write_json
@@ -53,20 +53,17 @@ def fit(
         seed: Seed of everything random.
         options: How the data are prepared.
         noise: ``"auto"`` gives a model without noise the scale of
-            :func:`~npdr_ppl.workflows.evaluation.residual_noise`; ``"model"`` takes it as it is.
+            :func:`~npdr_ppl.workflows.closest_fit.closest_fit`; ``"model"`` takes it as it is.
         device: Where the backend trains.
         progress: Whether to show progress; ``None`` shows it on a terminal.
 
     Returns:
         The posterior and the content of ``fit.json``.
     """
-    options = options or BindingOptions()
-    used_noise = None
-    if noise == "auto" and not declares_noise(model, train, options):
-        used_noise = residual_noise(model, train, options, seed=seed)
-    noisy = model if used_noise is None else with_noise(model, used_noise)
+    prepared = prepare(model, train, options or BindingOptions(), noise=noise, seed=seed)
+    options = prepared.options
     posterior = infer(
-        noisy,
+        prepared.model,
         train,
         backend=backend,
         rounds=rounds,
@@ -97,7 +94,7 @@ def fit(
             "dtw_per_rollout": metrics["dtw"].tolist(),
             "evaluated_on": "fitted" if test is None else "held-out",
         },
-        "noise": used_noise,
+        "noise": prepared.noise,
         "seconds": {**posterior.provenance.seconds, "sample": sampled},
         "diagnosis": diagnose(data).to_dict(),
         "units": parameter_units(posterior),

@@ -10,12 +10,15 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.embeddings import Embedding
-from npdr_ppl.errors import BackendError, NpdrError
-from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
+from npdr_ppl.errors import BackendError, DataError, NpdrError
+from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
 from npdr_ppl.inference.mixture import Mixture
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.randomness import seeded
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.segments import InitialState
 from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data, bind, problem_of
+from npdr_ppl.workflows.closest_fit import prepare
 from npdr_ppl.workflows.posterior import Posterior, PosteriorBase, Provenance
 from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.run_folder import RunFolder
@@ -37,10 +40,10 @@ def infer(
     seed: int = 0,
     embedding: str | Embedding | None = "bayessim",
     segment_length: int | None = None,
-    initial_state: Literal["estimated", "recorded"] = "estimated",
+    initial_state: InitialState = "estimated",
     precision: Literal["float64", "float32"] = "float64",
     device: str | torch.device = "cpu",
-    start: PosteriorBase | None = None,
+    start: PosteriorBase | Density | None = None,
     checkpoint: str | PathLike[str] | None = None,
     progress: bool | Reporter | None = None,
 ) -> Posterior:
@@ -55,14 +58,16 @@ def infer(
             has its posterior after one.
         num_simulations: Simulations of each round.
         seed: Seed of everything random.
-        embedding: Maps trajectories to features; see :mod:`npdr_ppl.embeddings`.
+        embedding: Maps trajectories to features; see :mod:`npdr_ppl.embeddings`. ``"score"`` is
+            that of :func:`~npdr_ppl.workflows.closest_fit.score_embedding`.
         segment_length: Steps between re-synchronisations; ``None`` for whole rollouts.
-        initial_state: State at a segment's start: ``"estimated"`` or ``"recorded"``.
+        initial_state: State at a segment's start: ``"estimated"``, ``"recorded"`` or
+            ``"uncertain"``; see :class:`~npdr_ppl.workflows.binding.BindingOptions`.
         precision: Floating-point type of the simulation.
         device: Where trajectories are simulated and the backend trains.
-        start: Posterior of the same model given other data. A backend that can correct for it
-            simulates the prior in that region only; if the new posterior lies elsewhere it is not
-            found.
+        start: Posterior of the same model given other data, or another density over its
+            reference coordinates. A backend that can correct for it simulates the prior in that
+            region only; if the new posterior lies elsewhere it is not found.
         checkpoint: Folder to save every round in; an interrupted run continues from there.
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
@@ -93,6 +98,10 @@ def infer(
     if not method.uses_simulations:
         rounds = 1
     options = BindingOptions(embedding, segment_length, initial_state, precision)
+    if embedding == "score":
+        if not isinstance(data, Rollouts):
+            raise DataError("The embedding 'score' is for models whose only site has rollouts.")
+        options = prepare(model, data, options, noise="model", seed=seed).options
     bound = bind(model, data, options, device)
     problem = problem_of(bound, device)
     states = [method.init(problem)]
@@ -133,7 +142,7 @@ def run_round(
     seed: int,
     report: Reporter,
     label: str = "",
-    start: PosteriorBase | None = None,
+    start: PosteriorBase | Density | None = None,
     store: RunFolder | None = None,
 ) -> tuple[State, RoundInfo, dict[str, float]]:
     """Proposes, simulates and trains once.
@@ -148,7 +157,7 @@ def run_round(
         seed: Seed of the run.
         report: Where to report progress.
         label: Words for the progress bar.
-        start: An earlier posterior to propose from, if the backend can.
+        start: An earlier posterior, or another density, to propose from if the backend can.
         store: Where the round's simulations are kept, if anywhere.
 
     Returns:
@@ -159,7 +168,8 @@ def run_round(
     with seeded(seed, "propose", index):
         z = None
         if start is not None:
-            z = method.ask_near(problem, Mixture(start.densities), num_simulations)
+            region = start if isinstance(start, Density) else Mixture(start.densities)
+            z = method.ask_near(problem, region, num_simulations)
         z = (method.ask(problem, state, num_simulations) if z is None else z).cpu()
     x = None if store is None else store.simulations(index, z)
     if x is None:

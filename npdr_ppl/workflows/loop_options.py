@@ -59,8 +59,9 @@ class LoopOptions:
         binding: How rollouts are prepared for inference.
         noise: ``"auto"`` gives a model without noise that of the closest fit's residuals;
             ``"model"`` takes it as it is.
-        start: Where inference starts in later iterations: from the prior, or, as in the paper,
-            from the last posterior where the backend can and does.
+        start: Where inference starts: from the prior; in the neighbourhood of the closest fit; or
+            in later iterations, as in the paper, from the last posterior. Backends that cannot
+            start elsewhere start from the prior.
         search: The policy search; one with options of its own if it is no name.
         search_iterations: Iterations of the policy search, each time.
         domains: Whether the policy is trained in draws of the posterior or at its most likely
@@ -88,12 +89,12 @@ class LoopOptions:
     extra_rounds: int = 2
     num_simulations: int = 5_000
     binding: BindingOptions = field(
-        default_factory=lambda: BindingOptions("all/50", 200, "estimated", "float32")
+        default_factory=lambda: BindingOptions("score", 50, "uncertain", "float32")
     )
     noise: Literal["auto", "model"] = "auto"
-    start: Literal["prior", "posterior"] = "prior"
+    start: Literal["prior", "closest fit", "posterior"] = "closest fit"
     search: str | PolicySearch[Any] = "power"
-    search_iterations: int = 5
+    search_iterations: int = 20
     domains: Literal["posterior", "most likely"] = "posterior"
     num_domains: int = 50
     num_initial_states: int = 4

@@ -28,12 +28,12 @@ import torch
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.inference.registry import backend as backend_by_name
-from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.policies.base import Policy
 from npdr_ppl.policies.search_registry import policy_search
 from npdr_ppl.randomness import derived_seed, seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.targets.base import TargetDomain
+from npdr_ppl.workflows.closest_fit import prepare
 from npdr_ppl.workflows.control_task import ControlTask
 from npdr_ppl.workflows.diagnostics import Decision, diagnose
 from npdr_ppl.workflows.domains import (
@@ -43,7 +43,6 @@ from npdr_ppl.workflows.domains import (
     prior_of,
     simulator_of,
 )
-from npdr_ppl.workflows.evaluation import declares_noise, residual_noise
 from npdr_ppl.workflows.fit import describe
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.loop_folder import LoopFolder
@@ -342,15 +341,20 @@ class _Loop:
     def _infer(self, index: int, attempt: int, rounds: int, report: Reporter) -> Posterior:
         """Infers the posterior; rounds that are on disk are not repeated."""
         options = self.options
-        binding = options.binding
         number = len(self.rollouts) if options.rollouts_used == "all" else options.rollouts
         data = _joined(self.rollouts[-number:])
         seed = derived_seed(self.seed, "inference", index, attempt)
-        model = self.model
-        if options.noise == "auto" and not declares_noise(model, data, binding):
-            model = with_noise(model, residual_noise(model, data, binding, seed=seed))
+        prepared = prepare(
+            self.model,
+            data,
+            options.binding,
+            noise=options.noise,
+            wants_neighbourhood=options.start == "closest fit",
+            seed=seed,
+        )
+        binding = prepared.options
         return infer(
-            model,
+            prepared.model,
             data,
             backend=self.backend,
             rounds=rounds,
@@ -360,14 +364,14 @@ class _Loop:
             segment_length=binding.segment_length,
             initial_state=binding.initial_state,
             precision=binding.precision,
-            start=self._start(index),
+            start=prepared.neighbourhood or self._start(index),
             checkpoint=self.folder.inference(index, attempt),
             progress=report,
         )
 
     def _start(self, index: int) -> Posterior | None:
         """Returns the last iteration's posterior if inference is to start from it."""
-        if self.options.start == "prior" or not self.backend.continues or index == 0:
+        if self.options.start != "posterior" or not self.backend.continues or index == 0:
             return None
         last = self.posterior
         if last is None or last.prior.num_parameters != self.prior.num_parameters:

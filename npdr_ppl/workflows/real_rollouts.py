@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from npdr_ppl.engines.ode import ODESimulator
+from npdr_ppl.engines.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.errors import DataError
 from npdr_ppl.policies.base import Policy
 from npdr_ppl.rollouts import Rollouts
@@ -36,7 +36,7 @@ class RealRollouts:
         self,
         target: TargetDomain,
         task: ControlTask,
-        simulator: ODESimulator,
+        simulator: ClosedLoopSimulator,
         folder: Path | None = None,
     ) -> None:
         self.target = target
@@ -147,7 +147,7 @@ class RealRollouts:
 
 
 def rewards_of(
-    task: ControlTask, simulator: ODESimulator, rollout: Rollouts, commands: Array
+    task: ControlTask, simulator: ClosedLoopSimulator, rollout: Rollouts, commands: Array
 ) -> NDArray[np.float64]:
     """Returns the reward of every step, ``(T,)``, from readings, as a device can know it.
 

@@ -99,7 +99,10 @@ def test_observation_of_chosen_segments_and_channels():
     [
         ({"segment_length": 0}, "at least one step"),
         ({"history": -1}, "cannot be negative"),
-        ({"initial_state": "guessed"}, "'estimated' or 'recorded', not 'guessed'"),
+        (
+            {"initial_state": "guessed"},
+            "one of .*, 'uncertain', not 'guessed'",
+        ),
     ],
 )
 def test_wrong_arguments(small, arguments, sentence):

@@ -35,13 +35,31 @@ def test_velocity_from_a_quantised_encoder(swing, rate, noise, fraction):
     angle, velocity = swing(time)
     readings = COUNT * np.round((angle + noise * rng.normal(size=time.size)) / COUNT)
     steps = np.arange(10, time.size - 10, 7)
-    value, slope = estimate_states(readings[:, None], steps, 1 / rate)
+    estimate = estimate_states(readings[:, None], steps, 1 / rate)
+    value, slope = estimate.values, estimate.rates
     naive = np.gradient(readings, 1 / rate)[steps]
     error = np.sqrt(np.mean((slope[:, 0] - velocity[steps]) ** 2))
     assert error < fraction * np.sqrt(np.mean((naive - velocity[steps]) ** 2))
     # Rounding alone has an error of COUNT / √12.
     value_error = np.sqrt(np.mean((value[:, 0] - angle[steps]) ** 2))
     assert value_error < np.hypot(COUNT / np.sqrt(12), noise)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("rate", [250, 500, 1000])
+def test_errors_are_as_large_as_they_say(swing, rate, noise):
+    """Within a factor of two, for values and rates, whatever the sampling and the noise."""
+    rng = np.random.default_rng(0)
+    time = np.arange(5 * rate + 1) / rate
+    angle, velocity = swing(time)
+    readings = COUNT * np.round(angle / COUNT + noise * rng.normal(size=time.size))
+    steps = np.arange(10, time.size - 10, 7)
+    estimate = estimate_states(readings[:, None], steps, 1 / rate)
+    value = (estimate.values[:, 0] - angle[steps]) / estimate.value_errors[:, 0]
+    slope = (estimate.rates[:, 0] - velocity[steps]) / estimate.rate_errors[:, 0]
+    for score in (value, slope):
+        assert 0.5 < np.sqrt(np.mean(score**2)) < 2.0
+        assert np.quantile(np.abs(score), 0.95) < 3.0
 
 
 def test_the_ends_of_a_rollout(swing):
@@ -51,7 +69,7 @@ def test_the_ends_of_a_rollout(swing):
     for begin in np.arange(0, 4, 0.1):
         angle, velocity = swing(begin + time)
         readings = COUNT * np.round(angle / COUNT)
-        _, slope = estimate_states(readings[:, None], np.array([0, 300]), 1 / 500)
+        slope = estimate_states(readings[:, None], np.array([0, 300]), 1 / 500).rates
         errors += list(slope[:, 0] - velocity[[0, -1]])
         naive += list(np.diff(readings)[[0, -1]] * 500 - velocity[[0, -1]])
     assert np.sqrt(np.mean(np.square(errors))) < 0.5 * np.sqrt(np.mean(np.square(naive)))
@@ -61,7 +79,7 @@ def test_a_slow_motion_below_one_count_per_window():
     """Readings that stay on a count for many samples repeat one error; it is not averaged."""
     time = np.arange(2001) / 1000
     readings = COUNT * np.round(0.05 * time / COUNT)
-    _, slope = estimate_states(readings[:, None], np.arange(200, 1800, 20), 1e-3)
+    slope = estimate_states(readings[:, None], np.arange(200, 1800, 20), 1e-3).rates
     assert np.abs(slope - 0.05).max() < 0.05
 
 
@@ -70,18 +88,26 @@ def test_smooth_data_are_differentiated_exactly():
     cubic = 1 + 2 * time - 3 * time**2 + 0.5 * time**3
     channels = np.stack([cubic, np.zeros_like(time), 7 * np.ones_like(time)], axis=1)
     steps = np.array([0, 1, 50, 100])
-    value, slope = estimate_states(channels, steps, 0.01)
-    np.testing.assert_allclose(value, channels[steps], atol=1e-12)
+    estimate = estimate_states(channels, steps, 0.01)
+    slope = estimate.rates
+    np.testing.assert_allclose(estimate.values, channels[steps], atol=1e-12)
     np.testing.assert_allclose(slope[:, 0], (2 - 6 * time + 1.5 * time**2)[steps], atol=1e-9)
     np.testing.assert_allclose(slope[:, 1:], 0, atol=1e-10)
+
+
+def test_a_reading_that_fades_away():
+    """A low-pass that comes to rest ends in differences too small to divide by."""
+    readings = np.exp(-np.arange(2_000.0))[:, None]
+    estimate = estimate_states(readings, np.array([0, 1_000]), 0.01)
+    assert np.isfinite(estimate.values).all() and np.isfinite(estimate.value_errors).all()
 
 
 @pytest.mark.parametrize("num_rows", [2, 3, 4, 5])
 def test_very_short_rollouts(num_rows):
     readings = (3.0 + 2.0 * np.arange(num_rows))[:, None]
-    value, slope = estimate_states(readings, np.arange(num_rows), 0.5)
-    np.testing.assert_allclose(value, readings, atol=1e-12)
-    np.testing.assert_allclose(slope, 4.0, atol=1e-10)
+    estimate = estimate_states(readings, np.arange(num_rows), 0.5)
+    np.testing.assert_allclose(estimate.values, readings, atol=1e-12)
+    np.testing.assert_allclose(estimate.rates, 4.0, atol=1e-10)
 
 
 def test_channels_and_steps_do_not_influence_each_other(swing):
@@ -91,8 +117,9 @@ def test_channels_and_steps_do_not_influence_each_other(swing):
     steps = np.arange(0, 1000, 50)
     together = estimate_states(readings, steps, 0.004)
     alone = estimate_states(readings[:, 1:], steps[3:4], 0.004)
-    np.testing.assert_allclose(together[0][3, 1:], alone[0][0], rtol=1e-12)
-    np.testing.assert_allclose(together[1][3, 1:], alone[1][0], rtol=1e-12)
+    for name in ("values", "rates", "value_errors", "rate_errors"):
+        ours, own = getattr(together, name), getattr(alone, name)
+        np.testing.assert_allclose(ours[3, 1:], own[0], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +135,7 @@ def test_recorded_velocities_are_the_estimates_low_passed(shared, name, error):
     decay = np.exp(-50 * rollouts.time_step)
     for readings in rollouts.readings[:2]:
         steps = np.arange(len(readings))
-        _, rates = estimate_states(readings[:, :2], steps, rollouts.time_step)
+        rates = estimate_states(readings[:, :2], steps, rollouts.time_step).rates
         lagged = lfilter([1 - decay], [1, -decay], rates, axis=0)
         lag_error = np.sqrt(np.mean((rates - readings[:, 2:]) ** 2, axis=0))
         rest = np.sqrt(np.mean((lagged - readings[:, 2:]) ** 2, axis=0))

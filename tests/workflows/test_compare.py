@@ -19,8 +19,8 @@ from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.workflows import infer as infer_module
 from npdr_ppl.workflows.binding import BindingOptions, bind
+from npdr_ppl.workflows.closest_fit import closest_fit
 from npdr_ppl.workflows.error_model import find_error_model, segment_log_likelihood
-from npdr_ppl.workflows.evaluation import residual_noise
 from npdr_ppl.workflows.memory import STATM, sampled_memory
 from npdr_ppl.workflows.predictive_scores import loo_elpd, predictive_elpd
 
@@ -160,7 +160,7 @@ def test_failed_draws_cost_density_and_nothing_else():
 def test_the_error_model_is_that_of_the_fitted_recording(recording):
     train = recording[[0]]
     found = find_error_model(pendulum, train, OPTIONS, seed=1)
-    assert found.noise == residual_noise(pendulum, train, OPTIONS, seed=1)
+    assert found.noise == closest_fit(pendulum, train, OPTIONS, seed=1).scale
     assert set(found.share) == {"angle", "velocity"}
     assert all(1 / 25 <= share <= 1 for share in found.share.values())
     # A model with noise keeps it; one that is to stay as it is, is judged with noise all the same.

@@ -221,19 +221,21 @@ def test_more_iterations_continue_a_finished_run(tmp_path):
     assert longer.to_dict() == at_once.to_dict()
 
 
-def test_inference_may_start_from_the_last_posterior(tmp_path):
-    options = small_options(iterations=2, num_simulations=200)
+def test_inference_may_start_from_the_last_posterior_or_the_closest_fit(tmp_path):
+    options = small_options(iterations=2, num_simulations=200, start="prior")
     anew = run(tmp_path / "anew", options)
+    run(tmp_path / "nearby", dataclasses.replace(options, start="closest fit"))
     options = dataclasses.replace(options, start="posterior")
     onward = run(tmp_path / "onward", options)
     spreads = [
         load_tensors(tmp_path / name / "run/inference_1_0/round_0_simulations.safetensors")["z"]
         .std(0)
         .mean()
-        for name in ("anew", "onward")
+        for name in ("anew", "onward", "nearby")
     ]
     assert spreads[0] == pytest.approx(1.0, abs=0.15)  # the prior is N(0, I)
     assert spreads[1] < 0.8 * spreads[0]
+    assert spreads[2] < 0.5 * spreads[0]
     assert anew.iterations[0] == onward.iterations[0]
     # Nothing was simulated again, and the posterior is there, where a finished run is resumed.
     again = run(tmp_path / "onward", options)

@@ -1,0 +1,50 @@
+"""Simulators that run policies in closed loop, in batches."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward
+from npdr_ppl.engines.compilation import CompileMode
+from npdr_ppl.language.simulator import Simulator
+
+__all__ = ["ClosedLoopSimulator"]
+
+
+class ClosedLoopSimulator(Simulator):
+    """A simulator in which policies can be trained."""
+
+    @abstractmethod
+    def roll_out(
+        self,
+        parameters: Mapping[str, Tensor],
+        policy: FeedbackPolicy,
+        initial_states: Tensor,
+        num_steps: int,
+        *,
+        reward: Reward | None = None,
+        time_step: float | None = None,
+        record: bool = False,
+        compile: CompileMode | None = None,
+        expected_calls: int = 1,
+    ) -> Episodes:
+        """Simulates closed-loop episodes of a batch of policies, domains and initial states.
+
+        The batch shape B is what the three broadcast to: keep policies on one axis, domains on
+        another and states on a third. Commands are limited to the channels' bounds, then pass the
+        action effects; policies see readings, and the first reading is true. Before the start
+        commands were zero.
+
+        Args:
+            parameters: Domain and effect parameters; missing ones are nominal.
+            policy: The policies; ``policy.parameters`` has the shape ``(..., parameters)``.
+            initial_states: True states at the start, ``(..., states)``.
+            num_steps: Greatest number of steps.
+            reward: Reward of a step.
+            time_step: Seconds per step; ``None`` for the simulator's.
+            record: Whether to return readings and commands; recording is not compiled.
+            compile: Replaces the simulator's choice; an engine that is compiled ignores it.
+            expected_calls: How many calls of this size are to come, so that ``auto`` can tell
+                whether compilation pays back.
+        """

@@ -1,0 +1,134 @@
+"""Batches of MuJoCo simulations whose parameters differ."""
+
+import copy
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from npdr_ppl.engines.mujoco.parameters import Assignments
+
+__all__ = ["make_batch", "prepared_copy", "quiet", "state_view"]
+
+# MuJoCo's friction yields: it decays a joint's speed over the time constant of ``solref`` and lets
+# a stuck joint creep. These values are the hardest that it admits: the greatest impedance, and a
+# time constant of two steps, with which the speed is gone after one.
+_CRISP_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+_CRISP_STEPS = 2.0
+
+# Up to so many simulations, giving each its own values is quicker than changing a model for all.
+_FEW = 64
+
+
+def make_batch(
+    model: Any, assignments: Assignments, num_simulations: int, num_threads: int
+) -> Any:
+    """Returns a ``mujoco.batch.Batch`` whose models hold the assigned values.
+
+    Args:
+        model: A ``mujoco.MjModel``, which is not changed.
+        assignments: Values, numbers or ``(N,)``.
+        num_simulations: N.
+        num_threads: Threads to run on.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    module: Any = importlib.import_module("mujoco.batch")
+    # Constants such as inverse inertias follow from some fields; deriving them costs microseconds
+    # per simulation, so only where such a field was written.
+    followed = set(getattr(mujoco.MjModel, "_setconst_inputs", ())) or {a for a, _ in assignments}
+    shared = {}
+    if num_simulations > _FEW:
+        shared = {key: float(value) for key, value in assignments.items() if value.numel() == 1}
+    if shared:
+        model = copy.copy(model)
+        for (array, place), value in shared.items():
+            _write_shared(model, array, place, value)
+        if any(array in followed for array, _ in shared):
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+    batch = module.Batch(model, num_simulations, num_threads)
+    own = {key: value for key, value in assignments.items() if key not in shared}
+    for (array, place), value in own.items():
+        batch.expand(array).reshape(num_simulations, -1)[:, place] = value.numpy()
+    if any(array in followed for array, _ in own):
+        # A simulation whose values have no such constants is lost, and its warnings say so.
+        try:
+            batch.set_const()
+        except module.SimulationError:
+            pass
+    return batch
+
+
+def state_view(batch: Any, name: str) -> Any:
+    """Returns a live view of a part of a batch's states, ``(N, …)``.
+
+    As ``batch.bind``, which makes an ``MjData`` for it; that takes longer than a short simulation.
+
+    Args:
+        batch: A ``mujoco.batch.Batch``.
+        name: Ending of one of MuJoCo's ``mjSTATE_`` constants, in lower case.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    whole = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    part = int(getattr(mujoco.mjtState, f"mjSTATE_{name.upper()}"))
+    first = mujoco.mj_stateSize(batch.model, whole & (part - 1))
+    return batch.state[:, first : first + mujoco.mj_stateSize(batch.model, part)]
+
+
+def prepared_copy(model: Any, step: float, crisp: tuple[int, ...]) -> Any:
+    """Returns a copy of a model, ready for a batch.
+
+    Commands are limited before they pass the action effects, so the engine's own limit is off: a
+    gain that is too high may well exceed it.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        step: Seconds per engine step.
+        crisp: Degrees of freedom whose dry friction is as hard as the engine admits; without
+            friction nothing changes, so that an effect of no strength changes nothing.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    own = copy.copy(model)
+    own.opt.timestep = step
+    own.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    for dof in crisp:
+        own.dof_solref[dof] = _CRISP_STEPS * step, 1.0
+        own.dof_solimp[dof] = _CRISP_IMPEDANCE
+    return own
+
+
+@contextmanager
+def quiet(handler: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Hands the engine's warnings to a function, by default one that drops them.
+
+    Otherwise the engine prints each and writes it to a file in the present folder, one per lost
+    simulation and step; the batch counts those anyway. A handler of the user's own stays.
+
+    Args:
+        handler: What to do with a warning.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    if mujoco.get_mju_user_warning() is not None:
+        yield
+        return
+    mujoco.set_mju_user_warning(handler or _ignore)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(None)
+
+
+def _ignore(message: str) -> None:
+    """Does nothing with a warning."""
+
+
+def _write_shared(model: Any, array: str, place: int, value: float) -> None:
+    if not array.startswith("opt."):
+        getattr(model, array).reshape(-1)[place] = value
+        return
+    name = array.removeprefix("opt.")
+    if isinstance(getattr(model.opt, name), np.ndarray):
+        getattr(model.opt, name)[place] = value
+    else:
+        setattr(model.opt, name, value)

@@ -1,0 +1,303 @@
+"""Readable names for the numbers of a MuJoCo model, e.g. ``"body hand mass"``.
+
+They have the form *element name quantity component*, as in ``"geom floor friction sliding"``. The
+name may be a pattern (``"geom * friction sliding"``), and options have none (``"option gravity"``,
+the vector's magnitude).
+"""
+
+import difflib
+import importlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from npdr_ppl.errors import ModelError
+
+__all__ = [
+    "Entry",
+    "Field",
+    "actuated_joint",
+    "actuator_names",
+    "did_you_mean",
+    "element_names",
+    "find_field",
+    "joint_units",
+]
+
+
+class Entry(NamedTuple):
+    """One number of a model.
+
+    Attributes:
+        array: The array of the ``MjModel`` that holds it, ``"opt.…"`` for options.
+        place: Its place in the flat array.
+        factor: What it is per unit of the field.
+        nominal: Its value in the file.
+    """
+
+    array: str
+    place: int
+    factor: float
+    nominal: float
+
+
+@dataclass(frozen=True)
+class Field:
+    """A quantity of a model, one number or several.
+
+    Attributes:
+        text: The name it was found by.
+        unit: Its unit.
+        entries: The numbers that it stands for.
+    """
+
+    text: str
+    unit: str
+    entries: tuple[Entry, ...]
+
+    @property
+    def nominal(self) -> float | None:
+        """Value of all its entries in the file; ``None`` if they differ."""
+        values = [entry.nominal / entry.factor for entry in self.entries if entry.factor]
+        spread = max(values) - min(values)
+        return values[0] if spread <= 1e-9 * max(map(abs, values)) else None
+
+
+class _Quantity(NamedTuple):
+    """Where a quantity of an element is kept.
+
+    The unit may name that of a joint's force, position or inertia; see :func:`joint_units`.
+    """
+
+    array: str
+    unit: str
+    components: tuple[str, ...] = ()
+    first: int = 0
+
+
+_XYZ = ("x", "y", "z")
+_CONTACT = ("time_constant", "damping_ratio")
+
+_QUANTITIES: dict[str, dict[str, _Quantity]] = {
+    "body": {
+        "mass": _Quantity("body_mass", "kg"),
+        "inertia": _Quantity("body_inertia", "kg m²", _XYZ),
+        "centre": _Quantity("body_ipos", "m", _XYZ),
+        "position": _Quantity("body_pos", "m", _XYZ),
+        "gravity_compensation": _Quantity("body_gravcomp", "1"),
+    },
+    "joint": {
+        "damping": _Quantity("dof_damping", "{force} s/{position}"),
+        "frictionloss": _Quantity("dof_frictionloss", "{force}"),
+        "armature": _Quantity("dof_armature", "{inertia}"),
+        "stiffness": _Quantity("jnt_stiffness", "{force}/{position}"),
+        "rest": _Quantity("qpos_spring", "{position}"),
+        "position": _Quantity("jnt_pos", "m", _XYZ),
+        "range": _Quantity("jnt_range", "{position}", ("lower", "upper")),
+    },
+    "geom": {
+        "friction": _Quantity("geom_friction", "1", ("sliding", "torsional", "rolling")),
+        "size": _Quantity("geom_size", "m", _XYZ),
+        "position": _Quantity("geom_pos", "m", _XYZ),
+        "contact": _Quantity("geom_solref", "1", _CONTACT),
+    },
+    "site": {"position": _Quantity("site_pos", "m", _XYZ)},
+    "actuator": {
+        "gain": _Quantity("actuator_gainprm", "1"),
+        "bias": _Quantity("actuator_biasprm", "1", ("constant", "position", "velocity")),
+        "kp": _Quantity("actuator_gainprm", "{force}/{position}"),
+        "gear": _Quantity("actuator_gear", "1"),
+        "time_constant": _Quantity("actuator_dynprm", "s"),
+        "force_range": _Quantity("actuator_forcerange", "1", ("lower", "upper")),
+    },
+    "tendon": {
+        "stiffness": _Quantity("tendon_stiffness", "N/m"),
+        "damping": _Quantity("tendon_damping", "N s/m"),
+        "frictionloss": _Quantity("tendon_frictionloss", "N"),
+        "armature": _Quantity("tendon_armature", "kg"),
+    },
+    "option": {
+        "gravity": _Quantity("opt.gravity", "m/s²", _XYZ),
+        "wind": _Quantity("opt.wind", "m/s", _XYZ),
+        "density": _Quantity("opt.density", "kg/m³"),
+        "viscosity": _Quantity("opt.viscosity", "Pa s"),
+    },
+}
+
+# Components whose unit is not their quantity's.
+_UNITS = {
+    ("geom", "friction", "torsional"): "m",
+    ("geom", "friction", "rolling"): "m",
+    ("geom", "contact", "time_constant"): "s",
+}
+
+_COUNTS = {
+    "body": "nbody",
+    "joint": "njnt",
+    "geom": "ngeom",
+    "site": "nsite",
+    "actuator": "nu",
+    "tendon": "ntendon",
+    "sensor": "nsensor",
+    "key": "nkey",
+}
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Returns the end of a message about an unknown word: the nearest known one, or all."""
+    known = list(known)
+    close = difflib.get_close_matches(word, known, n=1)
+    if close:
+        return f"did you mean {close[0]!r}?"
+    return f"there {'is' if len(known) == 1 else 'are'} {', '.join(known) or 'none'}."
+
+
+def element_names(model: Any, kind: str) -> list[str]:
+    """Returns the names of a model's elements of a kind; nameless ones are ``<kind>_<number>``."""
+    count = int(getattr(model, _COUNTS[kind]))
+    return [getattr(model, kind)(i).name or f"{kind}_{i}" for i in range(count)]
+
+
+def actuator_names(model: Any) -> list[str]:
+    """Returns the names of actuators; nameless ones are called after their joint."""
+    joints, names = element_names(model, "joint"), []
+    for actuator, name in enumerate(element_names(model, "actuator")):
+        joint = actuated_joint(model, actuator)
+        if not model.actuator(actuator).name and joint is not None:
+            name = f"{joints[joint]}_command"
+        names.append(f"{name}_{actuator}" if name in names else name)
+    return names
+
+
+def joint_units(model: Any, joint: int) -> dict[str, str]:
+    """Returns the units of a joint's position, force and inertia."""
+    mujoco: Any = importlib.import_module("mujoco")
+    kind = int(model.jnt_type[joint])
+    if kind == int(mujoco.mjtJoint.mjJNT_SLIDE):
+        return {"position": "m", "force": "N", "inertia": "kg"}
+    if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+        return {"position": "1", "force": "1", "inertia": "1"}
+    return {"position": "rad", "force": "N m", "inertia": "kg m²"}
+
+
+def find_field(model: Any, text: str) -> Field:
+    """Returns the field that a name stands for.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        text: The name; see the module's text.
+
+    Raises:
+        ModelError: The model has no such element or quantity; the message names the nearest.
+    """
+    words = text.split()
+    if not words or words[0] not in _QUANTITIES:
+        raise ModelError(
+            f"A field is called 'element name quantity', e.g. 'body hand mass'; got {text!r}: "
+            + did_you_mean(words[0] if words else "", _QUANTITIES)
+        )
+    kind, rest = words[0], words[1:]
+    name, quantity, component = _split(kind, rest, text)
+    if kind == "option":
+        return _option(model, text, quantity, component)
+    names = actuator_names(model) if kind == "actuator" else element_names(model, kind)
+    chosen = [i for i, n in enumerate(names) if n == name]
+    chosen = chosen or [i for i, n in enumerate(names) if fnmatchcase(n, name)]
+    if not chosen:
+        raise ModelError(f"{text!r}: no {kind} is called {name!r}; {did_you_mean(name, names)}")
+    info = _QUANTITIES[kind][quantity]
+    unit = _UNITS.get((kind, quantity, component), info.unit)
+    units = {unit.format(**_joint_units_of(model, kind, i)) for i in chosen}
+    if len(units) > 1:
+        raise ModelError(f"{text!r} mixes the units {', '.join(sorted(units))}.")
+    entries = [e for i in chosen for e in _entries(model, kind, i, info, component)]
+    if quantity == "kp":
+        # A position servo's force is kp (control − position): its gain and minus its bias.
+        bias = _QUANTITIES["actuator"]["bias"]
+        for e in [e for i in chosen for e in _entries(model, kind, i, bias, "position")]:
+            entries.append(e._replace(factor=-1.0))
+        if any(a.nominal != -b.nominal for a, b in zip(*_halves(entries), strict=True)):
+            raise ModelError(f"{text!r}: only position servos have a kp; bind gain and bias.")
+    return Field(text, units.pop(), tuple(entries))
+
+
+def actuated_joint(model: Any, actuator: int) -> int | None:
+    """Returns the joint that an actuator acts on directly; ``None`` if there is none."""
+    mujoco: Any = importlib.import_module("mujoco")
+    if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+        return None
+    return int(model.actuator_trnid[actuator, 0])
+
+
+def _joint_units_of(model: Any, kind: str, element: int) -> dict[str, str]:
+    """Returns the units of the joint that an element is or acts on."""
+    joint = element if kind == "joint" else None
+    if kind == "actuator":
+        joint = actuated_joint(model, element)
+    if joint is None:
+        return {"position": "1", "force": "1", "inertia": "1"}
+    return joint_units(model, joint)
+
+
+def _halves(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
+    return entries[: len(entries) // 2], entries[len(entries) // 2 :]
+
+
+def _split(kind: str, rest: list[str], text: str) -> tuple[str, str, str]:
+    """Splits the words behind the element into name, quantity and component (or nothing)."""
+    quantities = _QUANTITIES[kind]
+    for size in (1, 2):
+        if len(rest) < size or (len(rest) == size and kind != "option"):
+            continue
+        tail = rest[len(rest) - size :]
+        if tail[0] in quantities:
+            name, component = " ".join(rest[: len(rest) - size]), " ".join(tail[1:])
+            known = (*quantities[tail[0]].components, *(["magnitude"] * (kind == "option")))
+            if component and component not in known:
+                raise ModelError(
+                    f"{text!r}: {tail[0]} has no component {component!r}; "
+                    + did_you_mean(component, known)
+                )
+            return name, tail[0], component
+    raise ModelError(
+        f"{text!r}: a {kind} has no such quantity; "
+        + did_you_mean(rest[-1] if rest else "", quantities)
+    )
+
+
+def _option(model: Any, text: str, quantity: str, component: str) -> Field:
+    info = _QUANTITIES["option"][quantity]
+    values = np.atleast_1d(getattr(model.opt, info.array.removeprefix("opt.")))
+    if component in info.components:
+        place = info.components.index(component)
+        return Field(text, info.unit, (Entry(info.array, place, 1.0, float(values[place])),))
+    if len(values) == 1:
+        return Field(text, info.unit, (Entry(info.array, 0, 1.0, float(values[0])),))
+    # The vector's magnitude: its direction stays.
+    size = float(np.linalg.norm(values))
+    if size == 0.0:
+        raise ModelError(f"{text!r} is zero in the file, so only its components can be set.")
+    entries = [Entry(info.array, i, float(v) / size, float(v)) for i, v in enumerate(values)]
+    return Field(text, info.unit, tuple(entries))
+
+
+def _entries(model: Any, kind: str, element: int, info: _Quantity, component: str) -> list[Entry]:
+    """Returns the numbers of one element's quantity."""
+    array = np.asarray(getattr(model, info.array))
+    width = array[0].size if array.ndim > 1 else 1
+    rows = [element]
+    if info.array.startswith("dof_"):
+        rows = np.flatnonzero(model.dof_jntid == element).tolist()
+    elif info.array == "qpos_spring":
+        rows = [int(model.jnt_qposadr[element])]
+    columns = [0]
+    if component:
+        columns = [info.components.index(component)]
+    elif info.components:
+        columns = list(range(len(info.components)))
+    flat = array.reshape(-1)
+    places = [row * width + column for row in rows for column in columns]
+    return [Entry(info.array, place, 1.0, float(flat[place])) for place in places]

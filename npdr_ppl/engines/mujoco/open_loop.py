@@ -1,0 +1,206 @@
+"""Open loop in MuJoCo: recorded commands replayed, in one native call where nothing is in the way.
+
+Action effects depend on commands alone and sensor effects on readings alone, so that commands pass
+the former before, and readings the latter after, the engine has run all steps on its own. Only
+forces of effects have to be evaluated between engine steps.
+"""
+
+import logging
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npdr_ppl.engines.commands import CommandRecord
+from npdr_ppl.engines.effect_chain import State, Tables
+from npdr_ppl.engines.mujoco.batches import quiet
+from npdr_ppl.engines.mujoco.native import run_all_steps
+from npdr_ppl.engines.mujoco.stepper import MujocoStepper
+from npdr_ppl.engines.segment_start import recorded_start, true_start, with_past_commands
+from npdr_ppl.engines.stepping import flatten
+from npdr_ppl.language.inputs import Inputs
+
+if TYPE_CHECKING:
+    from npdr_ppl.engines.mujoco.simulator import MujocoSimulator
+
+__all__ = ["CHUNK_BYTES", "replay"]
+
+logger = logging.getLogger(__name__)
+
+CHUNK_BYTES = 1 << 28
+"""Memory for the commands and records of the simulations that run at a time."""
+
+
+def replay(
+    simulator: "MujocoSimulator", parameters: Mapping[str, Tensor], inputs: Inputs
+) -> Tensor:
+    """Simulates all parameters, segments and steps; see :meth:`Simulator.simulate`."""
+    simulator.check_parameters(parameters)
+    simulator.check_inputs(inputs)
+    device, mask = inputs.actions.device, inputs.mask
+    inputs = inputs.to(dtype=torch.float64, device="cpu")
+    given = {
+        name: torch.as_tensor(value).detach().to(dtype=torch.float64, device="cpu")
+        for name, value in parameters.items()
+    }
+    batch_shape = torch.broadcast_shapes(
+        inputs.batch_shape, *(value.shape for value in given.values())
+    )
+    shape = torch.Size((*batch_shape, inputs.num_segments))
+    # Behind the batch, an axis for the segments.
+    given = flatten({name: value[..., None] for name, value in given.items()}, shape)
+    run = _Replay(simulator, given, inputs, shape)
+    size, step = shape.numel(), run.chunk_size
+    output = torch.empty(size, inputs.num_steps, len(simulator.sensors), dtype=torch.float64)
+    for first in range(0, size, step):
+        last = min(first + step, size)
+        output[first:last] = run.chunk(first, last)
+    output = output.reshape(*shape, *output.shape[1:]).to(device)
+    if not bool(mask.all()):
+        output = torch.where(mask[..., None], output, torch.zeros_like(output))
+    num_lost = int(output.isnan().flatten(-2).any(-1).sum())
+    if num_lost:
+        logger.warning(
+            "%d of %d simulations of %s diverged; they are NaN from there on.",
+            num_lost,
+            size,
+            simulator.name,
+        )
+    return output
+
+
+class _Replay:
+    """What all chunks of a replay share.
+
+    Args:
+        simulator: The simulator.
+        given: Given parameters, ``(N,)`` or numbers.
+        inputs: The segments.
+        shape: Shape of the batch and the segments, of numel N.
+    """
+
+    def __init__(
+        self,
+        simulator: "MujocoSimulator",
+        given: dict[str, Tensor],
+        inputs: Inputs,
+        shape: torch.Size,
+    ) -> None:
+        self.simulator, self.given = simulator, given
+        self.inputs, self.shape = inputs, shape
+        self.columns = [inputs.action_names.index(a.name) for a in simulator.actions]
+        self.limits = [(a.lower, a.upper) for a in simulator.actions]
+        self.commands, self.rows = self._commands(shape)
+        self.start = recorded_start(simulator, inputs, shape)
+        self.past = inputs.past_actions.shape[-2]
+        self.histories = simulator.histories(given, inputs.time_step)
+
+    @property
+    def chunk_size(self) -> int:
+        """How many simulations run at a time."""
+        model = self.simulator.model
+        num_steps = self.inputs.num_steps * self.simulator.num_substeps(self.inputs.time_step)
+        width = 1 + model.nq + model.nv + model.nu + model.nsensordata
+        return max(1, CHUNK_BYTES // (8 * width * (num_steps + 1)))
+
+    def chunk(self, first: int, last: int) -> Tensor:
+        """Returns the readings of some of the simulations, ``(n, steps, sensors)``."""
+
+        def part(value: Tensor) -> Tensor:
+            return value[first:last] if value.ndim else value
+
+        given = {name: part(value) for name, value in self.given.items()}
+        recorded = self.start.part(first, last)
+        step = self.inputs.time_step
+        with quiet():
+            middle = recorded.time + 0.5 * self.inputs.num_steps * step
+            batch, tables = self.simulator.make_batch(given, last - first, step, middle)
+            chain = MujocoStepper(self.simulator, batch, step, self.histories)
+            records = self._records(chain, first, last)
+            latest = tuple(record.at(-1 if self.past else 0) for record in records)
+            components = true_start(chain, tables, recorded, latest)
+            chain.place(components)
+            chain.begin()
+            state = chain.start(
+                components[: chain.num_positions],
+                components[chain.num_positions :],
+                tables,
+                tuple(record.at(-1 - self.past) for record in records),
+                recorded.readings,
+                recorded.time,
+                latest=latest,
+                num_past=self.past if chain.action_effects else 0,
+            )
+            controls = self._controls(chain, state, tables, records, first, last)
+            if chain.force_effects:
+                return self._step_by_step(chain, state, tables, controls)
+            true = run_all_steps(batch, controls, chain.substeps, self.simulator.readings)
+        readings = torch.from_numpy(true)
+        if chain.sensor_effects:
+            for k in range(self.inputs.num_steps):
+                state, values = chain.report(state, readings[:, k].unbind(-1), tables)
+                readings[:, k] = torch.stack(values, dim=-1)
+        return readings
+
+    def _commands(self, shape: torch.Size) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Returns limited commands, ``(rows, steps, actions)``, and each simulation's row.
+
+        Rows are few, one per segment, that many simulations share.
+        """
+        actions = self.inputs.actions[..., self.columns]
+        lower, upper = torch.tensor(self.limits, dtype=torch.float64).reshape(-1, 2).unbind(-1)
+        commands = actions.clamp(lower, upper).numpy()
+        segments, num_rows = commands.shape[:-2], math.prod(commands.shape[:-2])
+        rows = np.broadcast_to(np.arange(num_rows).reshape(segments), shape).reshape(-1)
+        return commands.reshape(num_rows, *commands.shape[-2:]), rows
+
+    def _records(self, chain: MujocoStepper, first: int, last: int) -> tuple[CommandRecord, ...]:
+        """Returns the commands of each action channel, if an effect looks at them."""
+        if not (chain.action_effects or chain.sensor_effects):
+            return ()
+        return tuple(
+            CommandRecord(self.inputs, column, self.shape, limits, torch.float64).part(first, last)
+            for column, limits in zip(self.columns, self.limits, strict=True)
+        )
+
+    def _controls(
+        self,
+        chain: MujocoStepper,
+        state: State,
+        tables: Tables,
+        records: tuple[CommandRecord, ...],
+        first: int,
+        last: int,
+    ) -> NDArray[np.float64]:
+        """Returns what reaches the dynamics in every step, ``(n, steps, actions)``."""
+        controls = self.commands[self.rows[first:last]]
+        if not chain.action_effects:
+            return controls
+        state = with_past_commands(chain, state, tables, records, self.past)
+        for k in range(self.inputs.num_steps):
+            commands = tuple(record.at(k) for record in records)
+            views = tuple(record.view(k) for record in records)
+            state, actions = chain.act(state, commands, tables, views)
+            for channel, action in enumerate(actions):
+                controls[:, k, channel] = action.numpy()
+        return controls
+
+    def _step_by_step(
+        self,
+        chain: MujocoStepper,
+        state: State,
+        tables: Tables,
+        controls: NDArray[np.float64],
+    ) -> Tensor:
+        """Runs one step after the other."""
+        steps = []
+        for k in range(self.inputs.num_steps):
+            actions = torch.from_numpy(controls[:, k]).unbind(-1)
+            state = chain.move(state, actions, tables)
+            state, readings = chain.read(state, tables)
+            steps.append(torch.stack(readings, dim=-1))
+        return torch.stack(steps, dim=1)

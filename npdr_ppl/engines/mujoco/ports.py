@@ -1,0 +1,176 @@
+"""Ports of a MuJoCo model, rated by what its actuators, masses and ranges allow."""
+
+import importlib
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.engines.mujoco.channels import Component, Reading
+from npdr_ppl.engines.mujoco.fields import actuated_joint, element_names, joint_units
+from npdr_ppl.language.channels import Channel, Port
+
+__all__ = ["ForcePort", "derive_ports", "driven_dofs", "force_ports"]
+
+Array = NDArray[np.float64]
+
+
+class ForcePort:
+    """A hinge or slide as a place where forces act.
+
+    Attributes:
+        port: The port, rated.
+        joint: Number of the joint.
+        position: Its place in qpos.
+        velocity: Its place in qvel.
+    """
+
+    def __init__(self, port: Port, joint: int, position: int, velocity: int) -> None:
+        self.port = port
+        self.joint = joint
+        self.position = position
+        self.velocity = velocity
+
+
+def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
+    """Returns the force ports of all hinges and slides.
+
+    A port is called like its joint, or ``<joint>_torque`` (``_force`` for slides) where a channel
+    has that name. It is rated by the greatest force of the actuators at the joint, or else by the
+    weight that the joint carries in the file's pose; the rated speed is what the rated force would
+    give the joint over a radian (half the range, or a metre), less where damping ends it sooner.
+    A joint is driven if an actuator moves it in the file's pose, through tendons and sites too.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        taken: Names of channels.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    actuated, driven = _actuator_ratings(model), driven_dofs(model)
+    result = []
+    for joint, name in enumerate(element_names(model, "joint")):
+        is_slide = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+        if not is_slide and int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_HINGE):
+            continue
+        dof = int(model.jnt_dofadr[joint])
+        inertia, damping = float(mass[dof, dof]), float(model.dof_damping[dof])
+        rated = actuated.get(joint) or _weight(model, data, joint, is_slide) or inertia
+        travel = 1.0
+        if is_slide and model.jnt_limited[joint]:
+            travel = _half_range(model, joint)
+        speed = math.sqrt(2.0 * rated * travel / max(inertia, 1e-12))
+        if damping > 0.0:
+            speed = min(speed, rated / damping)
+        if name in taken:
+            name = f"{name}_{'force' if is_slide else 'torque'}"
+        units = joint_units(model, joint)
+        port = Port(
+            name,
+            "force",
+            units["force"],
+            rated,
+            speed,
+            travel if is_slide else min(travel, _half_range(model, joint)),
+            units["position"],
+            bool(driven[dof]),
+        )
+        result.append(ForcePort(port, joint, int(model.jnt_qposadr[joint]), dof))
+    return tuple(result)
+
+
+def derive_ports(
+    model: Any,
+    joints: Sequence[ForcePort],
+    actions: Sequence[Channel],
+    sensors: Sequence[Component | Reading],
+) -> tuple[Port, ...]:
+    """Returns the ports of actions, joints and sensors."""
+    by_position = {joint.position: joint for joint in joints}
+    by_velocity = {joint.velocity: joint for joint in joints}
+    ports = [Port(a.name, "action", a.unit, _largest(a)) for a in actions]
+    ports += [joint.port for joint in joints]
+    for sensor in sensors:
+        rated = 1.0
+        if isinstance(sensor, Component) and sensor.is_velocity:
+            joint = by_velocity.get(sensor.address)
+            rated = joint.port.rated_speed if joint else 1.0
+        elif isinstance(sensor, Component):
+            rated = _travel(model, by_position.get(sensor.address))
+        elif sensor.channel.unit == "m/s²":
+            rated = 9.81
+        ports.append(Port(sensor.channel.name, "sensor", sensor.channel.unit, rated))
+    return tuple(ports)
+
+
+def _largest(channel: Channel) -> float:
+    """Returns the greatest magnitude of a channel, 1 if it has no bounds."""
+    bound = max(abs(channel.lower), abs(channel.upper))
+    return bound if math.isfinite(bound) and bound > 0.0 else 1.0
+
+
+def _travel(model: Any, joint: ForcePort | None) -> float:
+    """Returns a typical position of a joint: half its range, or π for a free hinge."""
+    if joint is None:
+        return 1.0
+    if model.jnt_limited[joint.joint]:
+        return _half_range(model, joint.joint)
+    return math.pi if joint.port.unit == "N m" else 1.0
+
+
+def _half_range(model: Any, joint: int) -> float:
+    """Returns half the range of a joint, 1 if it has none."""
+    if not model.jnt_limited[joint]:
+        return 1.0
+    return 0.5 * float(np.ptp(model.jnt_range[joint])) or 1.0
+
+
+def driven_dofs(model: Any) -> NDArray[np.bool_]:
+    """Returns which degrees of freedom actuators move in the file's pose, ``(nv,)``."""
+    mujoco: Any = importlib.import_module("mujoco")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    moment = np.zeros((model.nu, model.nv))
+    if model.nu:
+        mujoco.mju_sparse2dense(
+            moment,
+            data.actuator_moment.reshape(-1),
+            data.moment_rownnz,
+            data.moment_rowadr,
+            data.moment_colind.reshape(-1),
+        )
+    return np.any(moment != 0.0, axis=0)
+
+
+def _actuator_ratings(model: Any) -> dict[int, float]:
+    """Returns the greatest summed force of the actuators at each joint that has some."""
+    ratings: dict[int, float] = {}
+    for actuator in range(model.nu):
+        joint = actuated_joint(model, actuator)
+        if joint is None:
+            continue
+        if model.actuator_forcelimited[actuator]:
+            force = float(np.abs(model.actuator_forcerange[actuator]).max())
+        elif model.actuator_ctrllimited[actuator]:
+            control = float(np.abs(model.actuator_ctrlrange[actuator]).max())
+            force = abs(float(model.actuator_gainprm[actuator, 0])) * control
+        else:
+            continue
+        gear = abs(float(model.actuator_gear[actuator, 0]))
+        ratings[joint] = ratings.get(joint, 0.0) + force * gear
+    return {joint: rating for joint, rating in ratings.items() if rating > 0.0}
+
+
+def _weight(model: Any, data: Any, joint: int, is_slide: bool) -> float:
+    """Returns the force that the subtree's weight could at most put on a joint."""
+    body = int(model.jnt_bodyid[joint])
+    weight = float(model.body_subtreemass[body] * np.linalg.norm(model.opt.gravity))
+    if is_slide:
+        return weight
+    arm = data.subtree_com[body] - data.xanchor[joint]
+    return weight * float(np.linalg.norm(np.cross(arm, data.xaxis[joint])))

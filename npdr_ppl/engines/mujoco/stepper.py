@@ -1,0 +1,235 @@
+"""A batch of MuJoCo simulations, one control step at a time, with effects."""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
+from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.mujoco.batches import state_view
+from npdr_ppl.engines.mujoco.channels import Component, Reading
+from npdr_ppl.engines.mujoco.joints import JointStates
+
+if TYPE_CHECKING:
+    from npdr_ppl.engines.mujoco.simulator import MujocoSimulator
+
+__all__ = ["ACCELERATION_STAGE", "MujocoStepper", "lost_simulations"]
+
+ACCELERATION_STAGE = 3
+"""Stage of sensors that depend on accelerations."""
+
+
+class MujocoStepper(EffectChain):
+    """Advances a batch that holds the physical state itself.
+
+    Forces of effects are generalised forces, constant over an engine step and evaluated at its
+    start; dry friction is the engine's own friction loss, whose bound is rewritten before every
+    engine step.
+
+    Args:
+        simulator: The system and its effects.
+        batch: A ``mujoco.batch.Batch`` of N simulations, or ``None`` where only commands and
+            readings are to pass through effects.
+        time_step: Seconds per control step.
+        histories: Past commands that each action effect may ask for, then past values of each
+            sensor effect.
+
+    Attributes:
+        is_lost: Simulations that the engine warned of, ``(N,)``; they report NaN.
+    """
+
+    def __init__(
+        self,
+        simulator: "MujocoSimulator",
+        batch: Any,
+        time_step: float,
+        histories: tuple[int, ...],
+    ) -> None:
+        super().__init__(simulator, simulator.joints, time_step, histories)
+        self.simulator: MujocoSimulator = simulator
+        self.substeps = simulator.num_substeps(time_step)
+        self._engine_step = time_step / self.substeps
+        self._batch = batch
+        self._module: Any = importlib.import_module("mujoco.batch")
+        self._qpos, self._qvel = state_view(batch, "qpos"), state_view(batch, "qvel")
+        self._ctrl = state_view(batch, "ctrl")
+        stages = {s.stage for s in simulator.readings if isinstance(s, Reading)}
+        self._sensordata = batch.bind("sensordata") if stages else None
+        # Position and velocity sensors lag an engine step behind the state until they are asked
+        # for anew; sensors of accelerations report what acted during the last engine step.
+        self._stage = max(stages - {ACCELERATION_STAGE}, default=0)
+        self._has_accelerations = ACCELERATION_STAGE in stages
+        self._applied = state_view(batch, "qfrc_applied") if self.force_effects else None
+        # The bounds of dry friction that the engine reads, and what they were without effects.
+        self._friction: tuple[np.ndarray, np.ndarray] | None = None
+        self._joints = JointStates(batch, simulator.force_ports) if self.needs_joints else None
+        self.is_lost = torch.zeros(batch.nsim, dtype=torch.bool)
+
+    @property
+    def force_step(self) -> float:
+        """Seconds per engine step."""
+        return self._engine_step
+
+    @property
+    def num_positions(self) -> int:
+        """How many of the simulator's states are positions."""
+        return sum(not component.is_velocity for component in self.simulator.components)
+
+    def place(self, components: tuple[Tensor, ...]) -> None:
+        """Puts the simulations into states, ``(N,)`` per component of the simulator's state."""
+        place_states(self.simulator, self._batch, components)
+
+    def begin(self) -> None:
+        """Computes what the sensors report before the first step."""
+        if self._sensordata is None:
+            return
+        stages: Any = importlib.import_module("mujoco").mjtStage
+        self._look(stages.mjSTAGE_ACC if self._has_accelerations else stages.mjSTAGE_VEL)
+
+    def accelerations(
+        self, positions: Components, velocities: Components, actions: Components, tables: Tables
+    ) -> Components:
+        """Returns the rate of each velocity among the states, without any effect.
+
+        Leaves the simulations in the state that is asked about.
+        """
+        self.place((*positions, *velocities))
+        self._command(actions)
+        result = self._batch.bind("qacc")
+        self._look(ACCELERATION_STAGE)
+        columns = [c.address for c in self.simulator.components if c.is_velocity]
+        return tuple(_column(result, column) for column in columns)
+
+    def _look(self, stage: int) -> None:
+        """Computes forward stages in the present state, which stays as it is."""
+        # The solver's first guess belongs to the state; a look must not change what follows.
+        guess = state_view(self._batch, "warmstart")
+        kept = guess.copy()
+        self._guarded(self._batch.forward, stage=int(stage))
+        guess[:] = kept
+
+    def _command(self, actions: Components) -> None:
+        for i, action in enumerate(actions):
+            self._ctrl[:, i] = action.numpy()
+
+    def at_joints(
+        self, positions: Components, velocities: Components
+    ) -> tuple[Components, Components]:
+        """Returns position and velocity of every hinge and slide."""
+        ports = self.simulator.force_ports
+        return (
+            tuple(_column(self._qpos, port.position) for port in ports),
+            tuple(_column(self._qvel, port.velocity) for port in ports),
+        )
+
+    def true_readings(
+        self, positions: Components, velocities: Components, tables: Tables
+    ) -> Components:
+        """Returns the true value of every sensor channel."""
+        return tuple(self._read(sensor) for sensor in self.simulator.readings)
+
+    def state(self) -> tuple[Components, Components]:
+        """Returns the positions and velocities among the simulator's states."""
+        components = self.simulator.components
+        return (
+            tuple(self._read(c) for c in components if not c.is_velocity),
+            tuple(self._read(c) for c in components if c.is_velocity),
+        )
+
+    def move(self, state: State, actions: Components, tables: Tables) -> State:
+        """Advances all simulations by one control step under constant actions."""
+        self._command(actions)
+        if self.force_effects:
+            for k in range(self.substeps):
+                is_last = k == self.substeps - 1
+                state = self._move_once(state, tables, self._stage if is_last else 0)
+        else:
+            self._guarded(self._batch.step, nstep=self.substeps, stage=self._stage)
+        positions, velocities = self.state()
+        return state._replace(positions=positions, velocities=velocities)
+
+    def _move_once(self, state: State, tables: Tables, stage: int) -> State:
+        """Advances all simulations by one engine step under the force effects."""
+        positions, velocities = self.at_joints((), ())
+        state = state._replace(positions=positions, velocities=velocities)
+        if self._joints is not None:
+            self._apply(state, tables, before_step=True)
+            self._look(ACCELERATION_STAGE)
+            state = self.begin_step(state, self._joints.read(positions, velocities), tables)
+        self._apply(state, tables)
+        memory = self.next_force_memory(state, tables)
+        self._guarded(self._batch.step, stage=stage)
+        return state._replace(force_memory=memory)
+
+    def _apply(self, state: State, tables: Tables, *, before_step: bool = False) -> None:
+        """Hands the effects' forces to the engine; see :meth:`applied_forces`.
+
+        Before a step has begun without their dry friction.
+        """
+        assert self._applied is not None
+        ports = self.simulator.force_ports
+        forces = self.applied_forces(
+            state.positions, state.velocities, state, tables, before_step=before_step
+        )
+        if before_step:
+            # What effects that have to see their joint first exerted in the step before.
+            self._applied[:] = 0.0
+        for port, force in zip(ports, forces, strict=True):
+            if force is not None:
+                self._applied[:, port.velocity] = force.numpy()
+        if before_step:
+            if self._friction is not None:
+                present, own = self._friction
+                present[:] = own
+            return
+        for port, bound in zip(ports, self.dry_friction_bounds(state, tables), strict=True):
+            if bound is not None:
+                if self._friction is None:
+                    bounds = self._batch.expand("dof_frictionloss")
+                    self._friction = bounds, bounds.copy()
+                present, own = self._friction
+                present[:, port.velocity] = own[:, port.velocity] + bound.numpy()
+
+    def _guarded(self, run: Any, **options: int) -> None:
+        """Runs a method of the batch and notes the simulations that were lost."""
+        try:
+            run(**options)
+        except self._module.SimulationError as error:
+            self.is_lost[torch.as_tensor(np.array(error.ids), dtype=torch.long)] = True
+        self.is_lost |= torch.from_numpy(lost_simulations(self._batch))
+
+    def _read(self, what: Component | Reading) -> Tensor:
+        if isinstance(what, Reading):
+            assert self._sensordata is not None
+            values = _column(self._sensordata, what.address)
+        else:
+            values = _column(self._qvel if what.is_velocity else self._qpos, what.address)
+        return torch.where(self.is_lost, torch.nan, values)
+
+
+def place_states(simulator: "MujocoSimulator", batch: Any, components: tuple[Tensor, ...]) -> None:
+    """Puts a batch into states; components that are no states of the simulator's stay put.
+
+    Args:
+        simulator: The simulator.
+        batch: A ``mujoco.batch.Batch`` of N simulations.
+        components: Values of the simulator's states, ``(N,)`` each.
+    """
+    qpos, qvel = state_view(batch, "qpos"), state_view(batch, "qvel")
+    qpos[:] = simulator.initial_positions
+    for component, value in zip(simulator.components, components, strict=True):
+        where = qvel if component.is_velocity else qpos
+        where[:, component.address] = value.numpy()
+
+
+def lost_simulations(batch: Any) -> np.ndarray:
+    """Returns which simulations the engine has warned of, ``(N,)``."""
+    return np.asarray(np.asarray(batch.warning)[..., 1].any(axis=1))
+
+
+def _column(table: np.ndarray, column: int) -> Tensor:
+    # A copy: the table changes with the next step.
+    return torch.from_numpy(table[:, column].copy())

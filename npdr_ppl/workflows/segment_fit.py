@@ -1,0 +1,296 @@
+"""Least-squares fits of parameters and of the segments' initial states to a recording.
+
+The state at a segment's start is only known within the smoother's error, and an unstable motion
+multiplies that error until it drowns what the parameters do. Here both are fitted: parameters z
+in the prior's reference coordinates, shared by all segments, and for each segment the offset δ of
+its initial state in standard deviations of the smoother's error. With whitened residuals r, what
+is minimised is
+
+    Σ_s |r_s(z, δ_s)|² + |δ_s|² + |z|²
+
+by damped Gauss-Newton steps (Levenberg 1944, Marquardt 1963) whose linear systems are reduced to
+the parameters segment by segment. Derivatives are finite differences, one batch of simulations
+for all parameters, all segments and all components of their initial states: the simulator stays a
+black box.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.handlers import with_noise
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.binding import BindingOptions
+
+__all__ = ["Linearisation", "SegmentFit", "SegmentModel", "fit_segments"]
+
+PARAMETER_STEP = 1e-2
+"""Half the width of finite differences, in standard deviations of the prior: more than what
+single precision and dry friction blur."""
+
+START_STEP = 0.1
+"""The same for initial states, in standard deviations of the smoother's error."""
+
+DAMPINGS = torch.logspace(-6, 2, 9, dtype=torch.float64)
+"""Dampings tried at each step, relative to the mean curvature."""
+
+LARGEST_STEP = 1.0
+"""Greatest change of a coordinate in one step, in standard deviations."""
+
+MAX_COORDINATE = 3.0
+"""How far from the prior's centre a fit may lie, in standard deviations."""
+
+LEAST_GAIN = 1e-3
+"""Relative reduction of the objective below which steps end."""
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Residuals and their derivatives; S segments of N readings, d parameters, m offsets.
+
+    Attributes:
+        residual: What was measured less what was simulated, ``(S, N)``.
+        by_parameters: Derivative of the simulation by parameters, ``(S, N, d)``.
+        by_starts: Derivative by the offsets of each segment's own initial state, ``(S, N, m)``.
+    """
+
+    residual: Tensor
+    by_parameters: Tensor
+    by_starts: Tensor
+
+    def weights(self) -> Tensor:
+        """Returns C⁻¹ J, ``(S, N, d)``, with the initial states integrated out.
+
+        J is the derivative by the parameters and C = 1 + G Gᵀ the covariance of the residuals,
+        with the derivative G by the offsets, which are standard normal.
+        """
+        by_z, by_start = self.by_parameters, self.by_starts
+        inner = by_start.mT @ by_start + torch.eye(by_start.shape[-1], dtype=torch.float64)
+        return by_z - by_start @ torch.linalg.solve(inner, by_start.mT @ by_z)
+
+    def information(self) -> Tensor:
+        """Returns the Fisher information Jᵀ C⁻¹ J of the parameters, ``(d, d)``."""
+        return (self.by_parameters.mT @ self.weights()).sum(0)
+
+
+@dataclass(frozen=True)
+class SegmentFit:
+    """What a fit came to.
+
+    Attributes:
+        z: Parameters in reference coordinates, ``(d,)``.
+        offsets: Offsets of the initial states, in standard deviations of the smoother's error,
+            ``(S, m)``.
+        scale: Root-mean-square residual per channel, in its unit, ``(C,)``.
+    """
+
+    z: Tensor
+    offsets: Tensor
+    scale: Tensor
+
+
+class SegmentModel:
+    """A model with one black-box site, simulated along a recording from shifted initial states.
+
+    Args:
+        model: The Pyro model.
+        rollouts: The recording.
+        options: Segments, initial states and precision; where initial states are ``"uncertain"``
+            they can be shifted, otherwise m is zero.
+
+    Attributes:
+        prior: The model's prior.
+        inputs: The segments.
+        sensor_names: The channels that the simulator reports.
+        channel_names: The C of them that were measured.
+        observed: What was measured, ``(S, K, C)``.
+    """
+
+    def __init__(
+        self, model: Callable[..., Any], rollouts: Rollouts, options: BindingOptions
+    ) -> None:
+        self.inputs = options.inputs(rollouts)
+        self.prior = Prior(with_noise(model, None), (self.inputs,))
+        boxes = self.prior.black_boxes
+        if len(boxes) != 1:
+            raise DataError(f"The model has {len(boxes)} black-box sites; expected one.")
+        self._site, box = next(iter(boxes.items()))
+        if not isinstance(box, SimulatorBlackBox):
+            raise DataError(f"Site {self._site!r} is a plain function and has no trajectory.")
+        self.sensor_names = names = tuple(sensor.name for sensor in box.simulator.sensors)
+        self.channel_names = tuple(name for name in names if name in rollouts.channel_names)
+        self._columns = [names.index(name) for name in self.channel_names]
+        self.observed = rollouts.observation(self.inputs, channels=self.channel_names)
+        self._offsets = _uncertain_components(self.inputs)
+
+    @property
+    def num_offsets(self) -> int:
+        """Number m of components of an initial state that are uncertain."""
+        return len(self._offsets)
+
+    def simulate(self, z: Tensor, offsets: Tensor) -> Tensor:
+        """Returns readings after each step, ``(n, S, K, C)``.
+
+        Args:
+            z: Parameters, ``(n, d)``.
+            offsets: Offsets of the initial states, ``(n, S, m)``.
+        """
+        box = self.prior.black_boxes_at(z)[self._site]
+        assert isinstance(box, SimulatorBlackBox)
+        inputs = self._shifted(offsets)
+        simulated = box.simulator.simulate(box.parameters, inputs)[..., self._columns]
+        return simulated.expand(len(z), *self.observed.shape)
+
+    def residuals(self, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
+        """Returns whitened residuals, ``(n, S, K · C)`` float64, zero where nothing was measured.
+
+        Args:
+            z: Parameters, ``(n, d)``.
+            offsets: Offsets of the initial states, ``(n, S, m)``.
+            scale: Standard deviation of each channel's residuals, ``(C,)``.
+        """
+        difference = (self.observed - self.simulate(z, offsets)).double()
+        return (difference * self.inputs.mask[..., None] / scale).flatten(-2)
+
+    def scale_of(self, z: Tensor, offsets: Tensor) -> Tensor:
+        """Returns the root-mean-square residual per channel, ``(C,)``, at ``(d,)``, ``(S, m)``."""
+        ones = torch.ones(len(self.channel_names), dtype=torch.float64)
+        residual = self.residuals(z[None], offsets[None], ones)[0]
+        square = residual.square().unflatten(-1, (-1, len(ones))).sum((0, 1))
+        return (square / self.inputs.mask.sum()).sqrt().clamp_min(1e-9)
+
+    def linearise(self, z: Tensor, offsets: Tensor, scale: Tensor) -> Linearisation:
+        """Returns residuals and derivatives at one point, ``(d,)`` and ``(S, m)``."""
+        d, m = len(z), self.num_offsets
+        shifts = PARAMETER_STEP * torch.eye(d, dtype=torch.float64)
+        moves = START_STEP * torch.eye(m, dtype=torch.float64)[:, None]
+        points = z + torch.cat((shifts, -shifts, torch.zeros(2 * m + 1, d, dtype=torch.float64)))
+        still = torch.zeros(2 * d, 1, m, dtype=torch.float64)
+        last = torch.zeros(1, 1, m, dtype=torch.float64)
+        starts = offsets + torch.cat((still, moves, -moves, last))
+        residual = self.residuals(points, starts, scale)
+        up, down, right, left, here = residual.split((d, d, m, m, 1))
+        return Linearisation(
+            here[0],
+            ((down - up) / (2 * PARAMETER_STEP)).permute(1, 2, 0),
+            ((left - right) / (2 * START_STEP)).permute(1, 2, 0),
+        )
+
+    def _shifted(self, offsets: Tensor) -> Inputs:
+        """Returns the inputs with their initial states shifted, a batch of n."""
+        changed = {
+            "initial_values": self.inputs.initial_values,
+            "initial_rates": self.inputs.initial_rates,
+        }
+        for k, (name, column, error) in enumerate(self._offsets):
+            value = changed[name]
+            assert value is not None
+            shift = torch.zeros_like(value)
+            shift[..., column] = 1.0
+            changed[name] = value + shift * (offsets[..., k] * error).to(value)[..., None]
+        return replace(self.inputs, **changed, initial_value_errors=None, initial_rate_errors=None)
+
+
+def fit_segments(
+    segments: SegmentModel, z: Tensor, *, max_steps: int = 12, max_rescalings: int = 4
+) -> SegmentFit:
+    """Fits parameters and initial states, and finds the scale of what is left.
+
+    The scale is part of the problem: it weighs the channels against each other and the recording
+    against prior and smoother. It is that of the residuals at the start, and again each time the
+    steps have converged.
+
+    Args:
+        segments: The model and the recording.
+        z: Where to begin, ``(d,)``.
+        max_steps: Greatest number of steps for one scale.
+        max_rescalings: Greatest number of scales.
+
+    Raises:
+        DataError: The simulation fails where the search begins.
+    """
+    z = z.double()
+    offsets = torch.zeros(segments.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
+    scale = segments.scale_of(z, offsets)
+    if not bool(scale.isfinite().all()):
+        raise DataError("The simulation fails at the parameters that the fit begins with.")
+    for _ in range(max_rescalings):
+        before = scale
+        z, offsets = _steps(segments, z, offsets, scale, max_steps)
+        scale = segments.scale_of(z, offsets)
+        if bool((scale > 0.95 * before).all()):
+            break
+    return SegmentFit(z, offsets, scale)
+
+
+def _steps(
+    segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor, max_steps: int
+) -> tuple[Tensor, Tensor]:
+    """Takes steps at one scale until they gain little."""
+
+    def objective(residual: Tensor, points: Tensor, starts: Tensor) -> Tensor:
+        sides = starts.square().sum((-1, -2)) + points.square().sum(-1)
+        return (residual.square().sum((-1, -2)) + sides).nan_to_num(torch.inf)
+
+    for _ in range(max_steps):
+        now = segments.linearise(z, offsets, scale)
+        if not all(bool(part.isfinite().all()) for part in (now.by_parameters, now.by_starts)):
+            break
+        present = float(objective(now.residual, z, offsets))
+        points, starts = zip(
+            *(_step(now, z, offsets, float(damping)) for damping in DAMPINGS), strict=True
+        )
+        tried, begun = torch.stack(points), torch.stack(starts)
+        outcome = objective(segments.residuals(tried, begun, scale), tried, begun)
+        best = int(outcome.argmin())
+        gain = 1.0 - float(outcome[best]) / present
+        if gain <= 0.0:
+            break
+        z, offsets = tried[best], begun[best]
+        if gain < LEAST_GAIN:
+            break
+    return z, offsets
+
+
+def _step(now: Linearisation, z: Tensor, offsets: Tensor, damping: float) -> tuple[Tensor, Tensor]:
+    """Returns parameters and offsets after one damped Gauss-Newton step."""
+    by_z, by_start = now.by_parameters, now.by_starts
+    d, m = by_z.shape[-1], by_start.shape[-1]
+    # Each segment's offsets are eliminated: they meet no other segment's readings.
+    inner = by_start.mT @ by_start + (1.0 + damping) * torch.eye(m, dtype=torch.float64)
+    pull = (by_start.mT @ now.residual[..., None])[..., 0] - offsets
+    cross = by_start.mT @ by_z  # (S, m, d)
+    solved = torch.linalg.solve(inner, torch.cat((cross, pull[..., None]), dim=-1))
+    hessian = (by_z.mT @ by_z - cross.mT @ solved[..., :d]).sum(0)
+    gradient = (by_z.mT @ now.residual[..., None] - cross.mT @ solved[..., d:]).sum(0)[:, 0] - z
+    curvature = hessian.diagonal().mean().clamp_min(1.0)
+    hessian = hessian + (1.0 + damping * curvature) * torch.eye(d, dtype=torch.float64)
+    change = torch.linalg.solve(hessian, gradient)
+    change = change * min(1.0, LARGEST_STEP / float(change.abs().max().clamp_min(1e-12)))
+    moved = solved[..., d] - (solved[..., :d] @ change)
+    return (
+        (z + change).clamp(-MAX_COORDINATE, MAX_COORDINATE),
+        (offsets + moved.clamp(-LARGEST_STEP, LARGEST_STEP)),
+    )
+
+
+def _uncertain_components(inputs: Inputs) -> list[tuple[str, int, Tensor]]:
+    """Returns field, channel and standard deviations ``(S,)`` of what may be off at a start."""
+    found = []
+    for name, errors in (
+        ("initial_values", inputs.initial_value_errors),
+        ("initial_rates", inputs.initial_rate_errors),
+    ):
+        if errors is not None:
+            for column in range(errors.shape[-1]):
+                error = errors[..., column].double()
+                if bool((error > 0).any()):
+                    found.append((name, column, error))
+    return found
