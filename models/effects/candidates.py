@@ -1,35 +1,25 @@
 """Every effect at every port of a simulator where it makes sense."""
 
+from collections.abc import Iterator
+
 from npdr_ppl.language.channels import Port
+from npdr_ppl.language.effect_context import SensorSpan
 from npdr_ppl.language.effects import Effect, SensorEffect
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.models.effects.registry import effects
 
-__all__ = ["candidate_effects", "candidate_ports"]
+__all__ = ["candidate_effects", "sensor_groups"]
 
-
-def candidate_ports(simulator: Simulator) -> tuple[Port, ...]:
-    """Returns all ports, and groups of sensors that may be one device's.
-
-    The groups are all channels that report positions, all that report rates (one driver derives
-    them), and all channels together (one bus delays them).
-    """
-    sensors = tuple(port for port in simulator.ports if port.kind == "sensor")
-    rates = {channel.name for channel in simulator.sensors if channel.rate_of is not None}
-    groups = (
-        tuple(port.name for port in sensors if port.name not in rates),
-        tuple(port.name for port in sensors if port.name in rates),
-        tuple(port.name for port in sensors),
-    )
-    # A group of one is that channel, and a group may be all channels.
-    names = dict.fromkeys(",".join(group) for group in groups if len(group) > 1)
-    return (*simulator.all_ports, *(simulator.port(name) for name in names))
+# Lengths, masses and inertias stay what they are during a rollout.
+_LASTING_UNITS = ("m", "kg", "kg m²")
 
 
 def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
     """Returns each effect of the catalogue at each port where it makes sense.
 
-    Effects that the simulator has already are left out.
+    A sensor effect attaches to the channels that one device may have it on; see
+    :class:`~npdr_ppl.language.effects.SensorEffect`. Parameters drift that neither last nor are
+    nominally zero. Effects that the simulator has already are left out.
 
     Args:
         simulator: The simulator, whose ports say what passes through them.
@@ -40,26 +30,59 @@ def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
         ['hinge.viscous_friction', 'hinge.coulomb_friction']
     """
     present = {effect.name for effect in simulator.effects}
-    ports = candidate_ports(simulator)
     found = []
     for effect in effects().values():
-        for port in ports:
-            if port.kind not in effect.port_kinds:
-                continue
-            attached = effect(port.name)
-            members = tuple(simulator.port(name) for name in port.channels)
-            if (
-                attached.name not in present
-                and all(attached.suits(member) for member in members)
-                and (len(members) == 1 or _is_one_device(attached, members))
-            ):
+        for port in _ports(simulator, effect):
+            attached = effect(port)
+            members = (simulator.port(name) for name in simulator.port(port).channels)
+            if attached.name not in present and all(map(attached.suits, members)):
                 found.append(attached)
     return tuple(found)
 
 
-def _is_one_device(effect: Effect, channels: tuple[Port, ...]) -> bool:
-    """Returns whether one device may have the effect on all channels, in the same size."""
-    has_unit = any("{port}" in parameter.unit for parameter in effect.parameters)
-    has_one_unit = len({channel.unit for channel in channels}) == 1
-    is_shared = isinstance(effect, SensorEffect) and effect.is_shared
-    return is_shared and (has_one_unit or not has_unit)
+def sensor_groups(simulator: Simulator, span: SensorSpan) -> tuple[tuple[str, ...], ...]:
+    """Returns the sensor channels that one device may read, by name.
+
+    Args:
+        simulator: The simulator.
+        span: What a device reads.
+    """
+    ports = {port.name for port in simulator.ports if port.kind == "sensor"}
+    channels = [channel for channel in simulator.sensors if channel.name in ports]
+    rates = tuple(channel.name for channel in channels if channel.rate_of is not None)
+    positions = tuple(channel.name for channel in channels if channel.rate_of is None)
+    if span in ("position", "rate"):
+        return tuple((name,) for name in (positions if span == "position" else rates))
+    if span == "joint":
+        rate_of = {channel.rate_of: channel.name for channel in channels if channel.rate_of}
+        joints = [(name, rate_of[name]) if name in rate_of else (name,) for name in positions]
+        alone = [(rate,) for position, rate in rate_of.items() if position not in positions]
+        return (*joints, *alone)
+    group = {"positions": positions, "rates": rates}.get(span, (*positions, *rates))
+    return (group,) if group else ()
+
+
+def _ports(simulator: Simulator, effect: type[Effect]) -> Iterator[str]:
+    """Returns the names of ports and groups of ports that an effect may attach to."""
+    kinds = set(effect.port_kinds)
+    if issubclass(effect, SensorEffect) and "sensor" in kinds:
+        kinds.remove("sensor")
+        groups = [g for span in effect.spans for g in sensor_groups(simulator, span)]
+        if any("{port}" in parameter.unit for parameter in effect.parameters):
+            groups = [part for group in groups for part in _by_unit(simulator, group)]
+        yield from dict.fromkeys(",".join(group) for group in groups)
+    lasting = {p.name for p in simulator.parameters if not _may_drift(p.unit, p.nominal)}
+    for port in simulator.all_ports:
+        if port.kind in kinds and not (port.kind == "parameter" and port.name in lasting):
+            yield port.name
+
+
+def _by_unit(simulator: Simulator, group: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Returns a group cut into groups of one unit each."""
+    ports: list[Port] = [simulator.port(name) for name in group]
+    units = dict.fromkeys(port.unit for port in ports)
+    return [tuple(port.name for port in ports if port.unit == unit) for unit in units]
+
+
+def _may_drift(unit: str, nominal: float) -> bool:
+    return nominal != 0.0 and unit not in _LASTING_UNITS

@@ -28,6 +28,7 @@ class SensorLowPass(SensorEffect):
 
     id = "sensor_low_pass"
     parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
+    spans = ("joint", "rate", "rates", "all")
     law = "ẏ = (x − y)/T"
     equivalence = (FIRST_ORDER_LAG,)
     excitation = "chirp"
@@ -54,7 +55,7 @@ class EncoderBias(SensorEffect):
 
     id = "encoder_bias"
     parameters = (Parameter("offset", "{port}", 0.0, "offset β of the reading"),)
-    is_shared = False
+    spans = ("position",)
     law = "q + β"
     equivalence = (ANGLE_OFFSET,)
     excitation = "slow_ramp"
@@ -84,7 +85,7 @@ class EncoderScale(SensorEffect):
 
     id = "encoder_scale"
     parameters = (Parameter("error", "1", 0.0, "relative scale error s"),)
-    is_shared = False
+    spans = ("position",)
     law = "(1 + s) q"
     equivalence = (POSITION_SCALE,)
     excitation = "wide_range"

@@ -40,6 +40,7 @@ class SensorDelay(SensorEffect):
     parameters = (Parameter("delay", "s", 0.0, "delay d"),)
     is_smooth = False
     needs_rates = True
+    spans = ("joint", "rates", "all")
     law = "y(t − d)"
     equivalence = (LATENCY,)
     excitation = "chirp"

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor
 
-__all__ = ["EquivalenceClass", "Excitation", "Joint", "Start"]
+__all__ = ["EquivalenceClass", "Excitation", "Joint", "SensorSpan", "Start"]
 
 Excitation = Literal[
     "slow_ramp",
@@ -22,6 +22,12 @@ Excitation = Literal[
 """The experiments that reveal effects: speeds near zero; many reversals of the motion; steps of
 the command; a chirp through the resonances; standing still under load; all of the range of motion
 and commands; one constant speed; the same motion with an extra mass; minutes on end."""
+
+
+SensorSpan = Literal["position", "rate", "joint", "positions", "rates", "all"]
+"""The sensor channels that one device may have an effect on, with the same parameters: one
+position, or what is no rate; one rate; a position with its rate, or a channel that stands alone;
+all positions; all rates; all channels."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +74,8 @@ class Joint(NamedTuple):
         acceleration: Acceleration under the actions and all smooth forces, dry friction and the
             effects that ask for this left out.
         inverse_inertia: Acceleration per unit force at the joint, all joints free to move.
-        drive: Generalised force that the actions exert at the joint, e.g. a motor's torque
-            without its back-EMF.
+        drive: Generalised force that the drive exerts at the joint. Where the equations alone are
+            known, the part that depends on the actions: a motor's torque without its back-EMF.
     """
 
     position: Tensor

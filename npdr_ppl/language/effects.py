@@ -14,7 +14,13 @@ from torch.distributions import Distribution
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Parameter, Port, PortKind
-from npdr_ppl.language.effect_context import EquivalenceClass, Excitation, Joint, Start
+from npdr_ppl.language.effect_context import (
+    EquivalenceClass,
+    Excitation,
+    Joint,
+    SensorSpan,
+    Start,
+)
 
 __all__ = [
     "ActionEffect",
@@ -259,12 +265,12 @@ class SensorEffect(Effect):
 
     Attributes:
         needs_rates: Whether its memory starts from :attr:`Start.rates`.
-        is_shared: Whether one device may have it on several channels with the same parameters.
+        spans: The channels that one device may have it on, with the same parameters.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
     needs_rates: ClassVar[bool] = False
-    is_shared: ClassVar[bool] = True
+    spans: ClassVar[tuple[SensorSpan, ...]] = ("position", "rate", "positions", "rates")
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
         """Returns the number of past true values that the memory is to hold."""

@@ -67,17 +67,24 @@ def test_units_are_those_of_the_port():
 def test_candidates_are_where_they_make_sense():
     names = {effect.name for effect in candidate_effects(Furuta())}
     assert "arm.backlash" in names and "pole.backlash" not in names
-    assert "arm_velocity,pole_velocity.sensor_low_pass" in names
-    assert "arm_angle,pole_angle.quantisation" in names
+    assert {n.removesuffix(".sensor_delay") for n in names if n.endswith("sensor_delay")} == {
+        "arm_angle,arm_velocity",
+        "pole_angle,pole_velocity",
+        "arm_velocity,pole_velocity",
+        "arm_angle,pole_angle,arm_velocity,pole_velocity",
+    }
+    assert {"arm_velocity,pole_velocity.sensor_low_pass", "arm_velocity.sensor_low_pass"} < names
+    assert {"arm_angle,pole_angle.quantisation", "arm_angle.quantisation"} < names
+    assert "arm_angle,pole_angle,arm_velocity,pole_velocity.quantisation" not in names
     assert "arm_angle,pole_angle.encoder_bias" not in names
     assert "arm_velocity.encoder_bias" not in names
-    everything = "arm_angle,pole_angle,arm_velocity,pole_velocity"
-    assert f"{everything}.sensor_delay" in names
-    assert f"{everything}.quantisation" not in names
     assert {"gravity.tilt", "payload.payload", "clock.clock_skew"} < names
     assert "gravity.payload" not in names and "payload.tilt" not in names
-    assert "pole_mass.parameter_drift" in names and "gravity.parameter_drift" not in names
+    assert "motor_resistance.parameter_drift" in names
+    assert not {"pole_mass.parameter_drift", "gravity.parameter_drift"} & names
     on_rails = {effect.name for effect in candidate_effects(CartPole())}
+    assert {"cart_velocity.quantisation", "pole_velocity.quantisation"} < on_rails
+    assert "cart_velocity,pole_velocity.quantisation" not in on_rails
     assert "hinge.unbalance" in on_rails and "rail.unbalance" not in on_rails
     attached = Furuta().with_effects(*candidate_effects(Furuta())[:3])
     assert len(candidate_effects(attached)) == len(names) - 3

@@ -16,6 +16,7 @@ from npdr_ppl.models.effects import (
     CoulombFriction,
     EncoderBias,
     InputDelay,
+    ParameterDrift,
     SensorLowPass,
     Tilt,
     candidate_effects,
@@ -29,13 +30,15 @@ SIMULATORS = (Pendulum, Furuta, CartPole, Emps)
 
 
 def cases():
-    """Every candidate but the drift of all parameters except two."""
+    """Every candidate but the drift of all parameters except two; masses may drift on demand."""
     for simulator in SIMULATORS:
-        drifting = [parameter.name for parameter in simulator.parameters[:2]]
-        for effect in candidate_effects(simulator()):
-            if not isinstance(effect, ParameterEffect) or effect.port in drifting:
+        candidates = candidate_effects(simulator())
+        drifting = [e for e in candidates if isinstance(e, ParameterEffect)][:2]
+        for effect in candidates:
+            if not isinstance(effect, ParameterEffect) or effect in drifting:
                 name = f"{simulator.__name__}-{effect.name}"
                 yield pytest.param(simulator, type(effect), effect.port, id=name)
+    yield pytest.param(Pendulum, ParameterDrift, "mass", id="Pendulum-mass.parameter_drift")
 
 
 CASES = list(cases())
@@ -134,9 +137,7 @@ def test_prior_draws_matter_and_stay_finite(simulator, effect, port):
     assert out.isfinite().all()
     assert (out[..., ~inputs.mask, :] == 0.0).all()
     matters = ((out - base).abs().flatten(1).amax(1) > 1e-12).float().mean()
-    # Drift of a parameter that is nominally zero is none.
-    zero = [parameter.name for parameter in simulator.parameters if parameter.nominal == 0.0]
-    if is_symmetry(effect, port) or port in zero:
+    if is_symmetry(effect, port):
         assert matters == 0.0
     else:
         assert matters > 0.9
@@ -240,10 +241,7 @@ def test_delay_longer_than_the_segment_sees_the_recorded_past():
 
 def one_port_each(simulator):
     """One candidate per effect: that at the last port, so groups of sensors are among them."""
-    zero = {parameter.name for parameter in simulator.parameters if parameter.nominal == 0.0}
-    last = {
-        effect.id: effect for effect in candidate_effects(simulator) if effect.port not in zero
-    }
+    last = {effect.id: effect for effect in candidate_effects(simulator)}
     return [pytest.param(simulator, e, id=f"{simulator.name}-{e.name}") for e in last.values()]
 
 
@@ -279,9 +277,7 @@ def test_a_probe_switches_the_effect_on_and_its_shapes_alone_do_not(simulator, e
     given = {f"{attached.name}.{name}": torch.tensor(x).double() for name, x in probe.items()}
     out = changed.simulate(given, inputs)
     assert out.isfinite().all()
-    # What drifts in a parameter of no size does not drift, and see above for symmetries.
-    zero = [parameter.name for parameter in simulator.parameters if parameter.nominal == 0.0]
-    if (port not in zero) and not is_symmetry(effect, port):
+    if not is_symmetry(effect, port):
         assert not torch.equal(out, base)
     priors = attached.priors(changed.port(port))
     nominal = {parameter.name: parameter.nominal for parameter in attached.parameters}
