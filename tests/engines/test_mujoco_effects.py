@@ -14,8 +14,12 @@ from npdr_ppl.models.effects import (
     ActuatorGain,
     ActuatorLag,
     Bias,
+    Contact,
     CoulombFriction,
     InputDelay,
+    JointElasticity,
+    Payload,
+    SensorDelay,
     SensorLowPass,
     Tilt,
     ViscousFriction,
@@ -103,6 +107,10 @@ def test_zero_strength_changes_no_bit_in_files_of_others(name):
         InputDelay(action),
         ActuatorLag(action),
         SensorLowPass(sensor),
+        SensorDelay(",".join(channel.name for channel in base.sensors)),
+        JointElasticity(joint),
+        *(Payload(p.name) for p in base.ports if p.unit == "kg"),
+        Contact("contact"),
     )
     zero = {}
     for effect in attached:

@@ -140,11 +140,14 @@ class _Replay:
                 return self._step_by_step(chain, state, tables, controls)
             true = run_all_steps(batch, controls, chain.substeps, self.simulator.readings)
         readings = torch.from_numpy(true)
-        if chain.sensor_effects:
-            for k in range(self.inputs.num_steps):
-                state, values = chain.report(state, readings[:, k].unbind(-1), tables)
-                readings[:, k] = torch.stack(values, dim=-1)
-        return readings
+        if not chain.sensor_effects:
+            return readings
+        # Into a table of its own: effects remember true values.
+        reported = torch.empty_like(readings)
+        for k in range(self.inputs.num_steps):
+            state, values = chain.report(state, readings[:, k].unbind(-1), tables)
+            reported[:, k] = torch.stack(values, dim=-1)
+        return reported
 
     def _commands(self, shape: torch.Size) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Returns limited commands, ``(rows, steps, actions)``, and each simulation's row.
