@@ -117,6 +117,8 @@ class Stepper(EffectChain):
         before_step: bool = False,
     ) -> tuple[Any, ...]:
         """Returns the smooth forces in a state of the integrator, on top of the dry ones."""
+        if not self.force_effects:
+            return dry
         smooth = self.applied_forces(positions, velocities, state, tables, before_step=before_step)
         return tuple(d if f is None else d + f for d, f in zip(dry, smooth, strict=True))
 
