@@ -65,6 +65,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--iterations", type=int, default=5)
     parser.add_argument("--search-iterations", type=int, default=LoopOptions.search_iterations)
+    parser.add_argument("--search", default=LoopOptions.search)
     parser.add_argument("--ablation", action="store_true")
     parser.add_argument("--variants", default="", help="of the ablation; all if not given")
     parser.add_argument("--out", type=Path, required=True)
@@ -75,6 +76,7 @@ def main() -> None:
         iterations=arguments.iterations,
         rounds=arguments.rounds,
         num_simulations=arguments.simulations,
+        search=arguments.search,
         search_iterations=arguments.search_iterations,
     )
     sets = {"hard": HARD, "random": RANDOM}

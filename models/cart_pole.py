@@ -115,7 +115,8 @@ class CartPole(ODESimulator):
         (M + m) ẍ + (m l/2) (cos θ θ̈ − sin θ θ̇²) = F − c ẋ
         (m l/2) cos θ ẍ + (m l²/3) θ̈ + m g (l/2) sin θ = −d θ̇
 
-    The rail is the base's x axis, and the pole swings in the x-z plane.
+    A payload is a point mass at the pole's end. The rail is the base's x axis, and the pole swings
+    in the x-z plane.
     """
 
     states = (
@@ -138,21 +139,22 @@ class CartPole(ODESimulator):
     ports = (
         Port("force", "action", "N", rated=20.0),
         # A push of middling strength, and the pole's greatest gravity torque.
-        Port("rail", "force", "N", rated=10.0, rated_speed=1.0),
-        Port("hinge", "force", "N m", rated=0.6, rated_speed=5.0),
+        Port("rail", "force", "N", rated=10.0, rated_speed=1.0, coordinate="m"),
+        Port("hinge", "force", "N m", rated=0.6, rated_speed=5.0, is_driven=False),
         Port("cart_position", "sensor", "m", rated=1.0),
         Port("pole_angle", "sensor", "rad", rated=math.pi),
         Port("cart_velocity", "sensor", "m/s", rated=1.0),
         Port("pole_velocity", "sensor", "rad/s", rated=5.0),
         Port("gravity", "environment", "m/s²", rated=9.81),
+        Port("payload", "environment", "kg", rated=0.2),
     )
     time_step = 0.01
     default_integrator = "semi-implicit-euler"
     inverse_dynamics = CartPoleInverseDynamics()
 
     def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Returns the gravity vector."""
-        return {"gravity": downward(parameters["gravity"])}
+        """Returns the gravity vector and the payload."""
+        return {"gravity": downward(parameters["gravity"]), "payload": 0.0}
 
     def constants(
         self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]
@@ -161,12 +163,18 @@ class CartPole(ODESimulator):
         p = parameters
         moment = 0.5 * p["pole_mass"] * p["pole_length"]
         total_mass = p["cart_mass"] + p["pole_mass"]
+        inertia = moment * p["pole_length"] / 1.5
+        payload = environment["payload"]
+        if isinstance(payload, Tensor):
+            total_mass = total_mass + payload
+            moment = moment + payload * p["pole_length"]
+            inertia = inertia + payload * p["pole_length"] * p["pole_length"]
         along, _, up = environment["gravity"]
         lateral = (total_mass * along, moment * along) if isinstance(along, Tensor) else None
         return CartPoleConstants(
             total_mass=total_mass,
             moment=moment,
-            inertia=moment * p["pole_length"] / 1.5,
+            inertia=inertia,
             gravity=moment * up,
             cart_damping=p["cart_damping"],
             pole_damping=p["pole_damping"],

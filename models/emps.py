@@ -1,6 +1,7 @@
 """EMPS, an electro-mechanical positioning system: a motor, a ball screw and a carriage."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
@@ -82,13 +83,32 @@ class Emps(ODESimulator):
     joints = ("carriage",)
     ports = (
         Port("voltage", "action", "V", rated=5.0),
-        Port("carriage", "force", "N", rated=175.0, rated_speed=0.1),
+        Port(
+            "carriage",
+            "force",
+            "N",
+            rated=175.0,
+            rated_speed=0.1,
+            rated_position=0.2,
+            coordinate="m",
+        ),
         Port("position", "sensor", "m", rated=0.2),
         Port("velocity", "sensor", "m/s", rated=0.1),
+        Port("payload", "environment", "kg", rated=95.1),
     )
     time_step = 0.001
     default_integrator = "semi-implicit-euler"
     inverse_dynamics = EmpsInverseDynamics()
+
+    def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Returns the payload."""
+        return {"payload": 0.0}
+
+    def constants(
+        self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]
+    ) -> dict[str, Tensor]:
+        """Adds the payload to the mass."""
+        return {**parameters, "mass": parameters["mass"] + environment["payload"]}
 
     def accelerations(
         self,

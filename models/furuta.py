@@ -61,6 +61,9 @@ class Furuta(ODESimulator):
 
         Q_θ = M_p (L_r t − (L_p/2) sin α r)·g,    Q_α = M_p (L_p/2)(cos α t + sin α z)·g.
 
+    A payload is a point mass m at the pole's end: it adds m L_r² to c₀, m L_p² to c₁ and c₃,
+    m L_p L_r to c₂ and m L_p to M_p L_p/2.
+
     Reference: Muratore et al., Neural Posterior Domain Randomization, CoRL 2021.
     """
 
@@ -88,20 +91,21 @@ class Furuta(ODESimulator):
         Port("voltage", "action", "V", rated=4.0),
         # The motor's stall torque at 4 V, and the pole's greatest gravity torque.
         Port("arm", "force", "N m", rated=0.02, rated_speed=10.0),
-        Port("pole", "force", "N m", rated=0.015, rated_speed=20.0),
+        Port("pole", "force", "N m", rated=0.015, rated_speed=20.0, is_driven=False),
         Port("arm_angle", "sensor", "rad", rated=1.0),
         Port("pole_angle", "sensor", "rad", rated=math.pi),
         Port("arm_velocity", "sensor", "rad/s", rated=10.0),
         Port("pole_velocity", "sensor", "rad/s", rated=20.0),
         Port("gravity", "environment", "m/s²", rated=9.81),
+        Port("payload", "environment", "kg", rated=0.024),
     )
     time_step = 0.002
     default_integrator = "constant-acceleration"
     inverse_dynamics = FurutaInverseDynamics()
 
     def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Returns the gravity vector."""
-        return {"gravity": downward(parameters["gravity"])}
+        """Returns the gravity vector and the payload."""
+        return {"gravity": downward(parameters["gravity"]), "payload": 0.0}
 
     def constants(
         self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]
@@ -111,20 +115,29 @@ class Furuta(ODESimulator):
         pole_mass, arm_length = p["pole_mass"], p["arm_length"]
         moment = 0.5 * pole_mass * p["pole_length"]  # M_p L_p/2
         c1 = 0.5 * moment * p["pole_length"]
-        c2 = moment * arm_length
         inverse_c3 = 0.75 / c1
+        end_mass = pole_mass  # what the arm's end carries
+        payload = environment["payload"]
+        if isinstance(payload, Tensor):
+            extra = payload * p["pole_length"]
+            end_mass = end_mass + payload
+            moment = moment + extra
+            c1 = c1 + extra * p["pole_length"]
+            # As a factor, which without payload is exactly 1.
+            inverse_c3 = inverse_c3 / (1.0 + extra * p["pole_length"] * inverse_c3)
+        c2 = moment * arm_length
         motor_gain = p["motor_constant"] / p["motor_resistance"]
         x, y, z = environment["gravity"]
         lateral = None
         if isinstance(x, Tensor) or isinstance(y, Tensor):
-            arm = pole_mass * arm_length
+            arm = end_mass * arm_length
             x, y = torch.as_tensor(x).to(arm), torch.as_tensor(y).to(arm)
             pole = (moment * x, moment * y)
             lateral = (arm * x, arm * y, *pole, pole[0] * inverse_c3, pole[1] * inverse_c3)
         return FurutaConstants(
             motor_gain=motor_gain,
             arm_drag=motor_gain * p["motor_constant"] + p["arm_damping"],
-            c0=(p["arm_mass"] / 12.0 + pole_mass) * arm_length * arm_length,
+            c0=(p["arm_mass"] / 12.0 + end_mass) * arm_length * arm_length,
             c1=c1,
             c2=c2,
             coupling=c2 * inverse_c3,

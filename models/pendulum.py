@@ -72,7 +72,7 @@ class Pendulum(ODESimulator):
     m l²/3 · θ̈ = τ − m g (l/2) sin θ − d θ̇, with torque τ, mass m, length l, damping d.
 
     The hinge's axis is the base's y axis, so the pendulum swings in the x-z plane and a tilt
-    about y changes it.
+    about y changes it. A payload is a point mass at the rod's end.
     """
 
     states = (
@@ -94,14 +94,15 @@ class Pendulum(ODESimulator):
         Port("angle", "sensor", "rad", rated=1.0),
         Port("velocity", "sensor", "rad/s", rated=5.0),
         Port("gravity", "environment", "m/s²", rated=9.81),
+        Port("payload", "environment", "kg", rated=1.0),
     )
     time_step = 0.02
     default_integrator = "semi-implicit-euler"
     inverse_dynamics = PendulumInverseDynamics()
 
     def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Returns the gravity vector."""
-        return {"gravity": downward(parameters["gravity"])}
+        """Returns the gravity vector and the payload."""
+        return {"gravity": downward(parameters["gravity"]), "payload": 0.0}
 
     def constants(
         self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]
@@ -111,6 +112,12 @@ class Pendulum(ODESimulator):
         forward, _, up = environment["gravity"]
         inverse = 3.0 / (mass * length * length)
         lever = 1.5 / length
+        payload = environment["payload"]
+        if isinstance(payload, Tensor):
+            # As factors, which without payload are exactly 1.
+            share = payload / mass
+            inverse = inverse / (1.0 + 3.0 * share)
+            lever = lever * ((1.0 + 2.0 * share) / (1.0 + 3.0 * share))
         constants = {
             "inverse_inertia": inverse,
             "damping": parameters["damping"] * inverse,

@@ -1,13 +1,21 @@
 """The catalogue of effects: physical causes that a simulator may miss."""
 
-from npdr_ppl.language.effects import Effect
 from npdr_ppl.models.effects.actuation import (
     ActuatorGain,
     ActuatorLag,
     DeadZone,
     InputDelay,
+    Saturation,
     SupplySag,
 )
+from npdr_ppl.models.effects.candidates import candidate_effects
+from npdr_ppl.models.effects.disturbances import (
+    Cogging,
+    ParameterDrift,
+    PeriodicDisturbance,
+    Wind,
+)
+from npdr_ppl.models.effects.equivalence import EQUIVALENCE_CLASSES
 from npdr_ppl.models.effects.forces import Bias, HardeningSpring, Spring, Unbalance
 from npdr_ppl.models.effects.friction import (
     AsymmetricCoulombFriction,
@@ -16,21 +24,49 @@ from npdr_ppl.models.effects.friction import (
     StribeckFriction,
     ViscousFriction,
 )
-from npdr_ppl.models.effects.sensing import EncoderBias, EncoderScale, SensorLowPass
-from npdr_ppl.models.effects.surroundings import Tilt
+from npdr_ppl.models.effects.friction_with_state import (
+    FrictionDrift,
+    LoadDependentFriction,
+    PreslidingFriction,
+)
+from npdr_ppl.models.effects.registry import effect_class, effects
+from npdr_ppl.models.effects.sensing import (
+    EncoderBias,
+    EncoderScale,
+    Quantisation,
+    SensorLowPass,
+)
+from npdr_ppl.models.effects.surroundings import Contact, Payload, Tilt
+from npdr_ppl.models.effects.timing import ClockSkew, SensorDelay
+from npdr_ppl.models.effects.transmission import Backlash, JointElasticity
 
 __all__ = [
+    "EQUIVALENCE_CLASSES",
     "ActuatorGain",
     "ActuatorLag",
     "AsymmetricCoulombFriction",
+    "Backlash",
     "Bias",
+    "ClockSkew",
+    "Cogging",
+    "Contact",
     "CoulombFriction",
     "DeadZone",
     "EncoderBias",
     "EncoderScale",
+    "FrictionDrift",
     "HardeningSpring",
     "InputDelay",
+    "JointElasticity",
+    "LoadDependentFriction",
+    "ParameterDrift",
+    "Payload",
+    "PeriodicDisturbance",
+    "PreslidingFriction",
     "QuadraticDrag",
+    "Quantisation",
+    "Saturation",
+    "SensorDelay",
     "SensorLowPass",
     "Spring",
     "StribeckFriction",
@@ -38,36 +74,8 @@ __all__ = [
     "Tilt",
     "Unbalance",
     "ViscousFriction",
+    "Wind",
+    "candidate_effects",
+    "effect_class",
     "effects",
 ]
-
-_CATALOGUE: tuple[type[Effect], ...] = (
-    ViscousFriction,
-    CoulombFriction,
-    AsymmetricCoulombFriction,
-    StribeckFriction,
-    QuadraticDrag,
-    InputDelay,
-    ActuatorLag,
-    SensorLowPass,
-    SupplySag,
-    DeadZone,
-    ActuatorGain,
-    Bias,
-    Spring,
-    HardeningSpring,
-    Unbalance,
-    Tilt,
-    EncoderBias,
-    EncoderScale,
-)
-
-
-def effects() -> dict[str, type[Effect]]:
-    """Returns every effect of the catalogue by its id.
-
-    Example:
-        >>> effects()["coulomb_friction"]("arm")
-        CoulombFriction(port='arm')
-    """
-    return {effect.id: effect for effect in _CATALOGUE}

@@ -10,10 +10,18 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
+from npdr_ppl.language.effect_context import Start
 from npdr_ppl.language.effects import ActionEffect, Commands
+from npdr_ppl.models.effects.equivalence import (
+    COMMAND_LIMIT,
+    FIRST_ORDER_LAG,
+    LATENCY,
+    OVERALL_SCALE,
+)
 from npdr_ppl.models.effects.lag import remaining
+from npdr_ppl.models.effects.references import JANOT_2019, LJUNG_1999, MUJOCO, TAO_1996
 
-__all__ = ["ActuatorGain", "ActuatorLag", "DeadZone", "InputDelay", "SupplySag"]
+__all__ = ["ActuatorGain", "ActuatorLag", "DeadZone", "InputDelay", "Saturation", "SupplySag"]
 
 
 class InputDelay(ActionEffect):
@@ -25,6 +33,11 @@ class InputDelay(ActionEffect):
 
     id = "input_delay"
     parameters = (Parameter("delay", "s", 0.0, "delay d"),)
+    is_smooth = False
+    law = "u(t − d)"
+    equivalence = (LATENCY,)
+    excitation = "chirp"
+    reference = LJUNG_1999
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Uniform up to 30 ms."""
@@ -50,12 +63,16 @@ class ActuatorLag(ActionEffect):
 
     id = "actuator_lag"
     parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
+    law = "τ̇ = (u − τ)/T"
+    equivalence = (FIRST_ORDER_LAG,)
+    excitation = "steps"
+    reference = MUJOCO
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Uniform up to 50 ms."""
         return {"time_constant": dist.Uniform(0.0, 0.05)}
 
-    def initial_memory(self, command: Tensor) -> Tensor:
+    def initial_memory(self, command: Tensor, start: Start) -> Tensor:
         """Returns the settled output."""
         return command
 
@@ -79,6 +96,10 @@ class ActuatorGain(ActionEffect):
 
     id = "actuator_gain"
     parameters = (Parameter("error", "1", 0.0, "relative gain error ε"),)
+    law = "(1 + ε) u"
+    equivalence = (OVERALL_SCALE,)
+    excitation = "payload"
+    reference = JANOT_2019
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Normal; 7 %."""
@@ -96,6 +117,10 @@ class SupplySag(ActionEffect):
 
     id = "supply_sag"
     parameters = (Parameter("sag", "1/({port})", 0.0, "relative loss of gain per command a"),)
+    law = "(1 − a|u|) u"
+    equivalence = (COMMAND_LIMIT,)
+    excitation = "wide_range"
+    reference = TAO_1996
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Half-normal; 10 % at the rated command."""
@@ -109,11 +134,42 @@ class SupplySag(ActionEffect):
         return (1.0 - parameters["sag"] * command.abs()) * command, memory
 
 
+class Saturation(ActionEffect):
+    """clip(u, ±u_max): a limit below the one that the channel declares."""
+
+    id = "saturation"
+    parameters = (Parameter("limit", "{port}", math.inf, "greatest command u_max"),)
+    is_smooth = False
+    law = "clip(u, ±u_max)"
+    equivalence = (COMMAND_LIMIT,)
+    excitation = "wide_range"
+    reference = TAO_1996
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Uniform; 50 to 100 % of the rated command."""
+        return {"limit": dist.Uniform(0.5 * port.rated, port.rated)}
+
+    def probe(self, port: Port) -> dict[str, float]:
+        """Returns 80 % of the rated command."""
+        return {"limit": 0.8 * port.rated}
+
+    def act(
+        self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns the clipped command."""
+        limit = parameters["limit"]
+        return commands.now().clamp(-limit, limit), memory
+
+
 class DeadZone(ActionEffect):
     """sign(u) max(|u| − δ, 0)."""
 
     id = "dead_zone"
     parameters = (Parameter("width", "{port}", 0.0, "half width δ"),)
+    is_smooth = False
+    law = "sign(u) max(|u| − δ, 0)"
+    excitation = "slow_ramp"
+    reference = TAO_1996
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Half-normal; 3 % of the rated command."""

@@ -10,6 +10,12 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effects import LinearForceEffect
+from npdr_ppl.models.effects.equivalence import (
+    ANGLE_OFFSET,
+    DIRECTIONAL_FRICTION,
+    POSITION_SCALE,
+)
+from npdr_ppl.models.effects.references import BITTENCOURT_2012, JANOT_2019, MUJOCO
 
 __all__ = ["Bias", "HardeningSpring", "Spring", "Unbalance"]
 
@@ -19,6 +25,10 @@ class Bias(LinearForceEffect):
 
     id = "bias"
     parameters = (Parameter("offset", "{port}", 0.0, "constant force c"),)
+    law = "c"
+    equivalence = (DIRECTIONAL_FRICTION,)
+    excitation = "reversals"
+    reference = JANOT_2019
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Normal; 2 % of the rated force."""
@@ -40,15 +50,20 @@ class Spring(LinearForceEffect):
 
     id = "spring"
     parameters = (
-        Parameter("stiffness", "{port}/rad", 0.0, "stiffness k"),
-        Parameter("rest", "rad", 0.0, "position q₀ without force"),
+        Parameter("stiffness", "{port}/{coordinate}", 0.0, "stiffness k"),
+        Parameter("rest", "{coordinate}", 0.0, "position q₀ without force"),
     )
+    strength = ("stiffness",)
+    law = "−k (q − q₀)"
+    equivalence = (POSITION_SCALE,)
+    excitation = "wide_range"
+    reference = MUJOCO
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
-        """Stiffness half-normal, 5 % of the rated force per radian; rest normal, 0.5 rad."""
+        """Stiffness half-normal, 5 % of rated at rated position; rest normal, half of that."""
         return {
-            "stiffness": dist.HalfNormal(0.05 * port.rated),
-            "rest": dist.Normal(0.0, 0.5),
+            "stiffness": dist.HalfNormal(0.05 * port.rated / port.rated_position),
+            "rest": dist.Normal(0.0, 0.5 * port.rated_position),
         }
 
     def force(
@@ -75,11 +90,14 @@ class HardeningSpring(LinearForceEffect):
     """−k₃ q³."""
 
     id = "hardening_spring"
-    parameters = (Parameter("stiffness", "{port}/rad³", 0.0, "cubic stiffness k₃"),)
+    parameters = (Parameter("stiffness", "{port}/{coordinate}³", 0.0, "cubic stiffness k₃"),)
+    law = "−k₃ q³"
+    excitation = "wide_range"
+    reference = MUJOCO
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
-        """Half-normal; 5 % of the rated force at one radian."""
-        return {"stiffness": dist.HalfNormal(0.05 * port.rated)}
+        """Half-normal; 5 % of the rated force at the rated position."""
+        return {"stiffness": dist.HalfNormal(0.05 * port.rated / port.rated_position**3)}
 
     def force(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
@@ -100,11 +118,19 @@ class Unbalance(LinearForceEffect):
         Parameter("sine", "{port}", 0.0, "force a at q = 90°"),
         Parameter("cosine", "{port}", 0.0, "force b at q = 0"),
     )
+    law = "a sin q + b cos q"
+    equivalence = (ANGLE_OFFSET,)
+    excitation = "slow_ramp"
+    reference = BITTENCOURT_2012
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Normal; 3 % of the rated force each."""
         scale = 0.03 * port.rated
         return {"sine": dist.Normal(0.0, scale), "cosine": dist.Normal(0.0, scale)}
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the joint turns."""
+        return port.coordinate == "rad"
 
     def force(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any

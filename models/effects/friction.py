@@ -10,6 +10,8 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effects import ForceEffect, LinearForceEffect
+from npdr_ppl.models.effects.equivalence import DIRECTIONAL_FRICTION, VELOCITY_FEEDBACK
+from npdr_ppl.models.effects.references import ARMSTRONG_1994, JANOT_2019, MUJOCO
 
 __all__ = [
     "AsymmetricCoulombFriction",
@@ -24,7 +26,11 @@ class ViscousFriction(LinearForceEffect):
     """−b v with damping b; not to be told from a motor's back-EMF."""
 
     id = "viscous_friction"
-    parameters = (Parameter("damping", "{port} s", 0.0, "force per speed b"),)
+    parameters = (Parameter("damping", "{port} s/{coordinate}", 0.0, "force per speed b"),)
+    law = "−b v"
+    equivalence = (VELOCITY_FEEDBACK,)
+    excitation = "wide_range"
+    reference = ARMSTRONG_1994
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Half-normal; 10 % of the rated force at rated speed."""
@@ -46,6 +52,10 @@ class CoulombFriction(LinearForceEffect):
 
     id = "coulomb_friction"
     parameters = (Parameter("magnitude", "{port}", 0.0, "dry friction F"),)
+    law = "−F sign v; at rest up to F"
+    equivalence = (DIRECTIONAL_FRICTION,)
+    excitation = "reversals"
+    reference = JANOT_2019
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Half-normal; 5 % of the rated force."""
@@ -70,6 +80,10 @@ class AsymmetricCoulombFriction(LinearForceEffect):
         Parameter("forward", "{port}", 0.0, "dry friction F₊ in forward motion"),
         Parameter("backward", "{port}", 0.0, "dry friction F₋ in backward motion"),
     )
+    law = "−F₊ for v > 0, +F₋ for v < 0"
+    equivalence = (DIRECTIONAL_FRICTION,)
+    excitation = "reversals"
+    reference = ARMSTRONG_1994
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Half-normal; 5 % of the rated force each."""
@@ -99,8 +113,14 @@ class StribeckFriction(ForceEffect):
     id = "stribeck_friction"
     parameters = (
         Parameter("excess", "{port}", 0.0, "static minus sliding friction ΔF"),
-        Parameter("speed", "1/s", 0.1, "Stribeck velocity v_s in the joint's coordinate"),
+        Parameter(
+            "speed", "{coordinate}/s", 0.1, "Stribeck velocity v_s in the joint's coordinate"
+        ),
     )
+    strength = ("excess",)
+    law = "−ΔF exp(−|v/v_s|) sign v"
+    excitation = "slow_ramp"
+    reference = ARMSTRONG_1994
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Excess half-normal, 3 % of the rated force; speed log-normal about 0.1 per second."""
@@ -120,7 +140,10 @@ class QuadraticDrag(LinearForceEffect):
     """−c v|v| with drag c."""
 
     id = "quadratic_drag"
-    parameters = (Parameter("drag", "{port} s²", 0.0, "force per squared speed c"),)
+    parameters = (Parameter("drag", "{port} s²/{coordinate}²", 0.0, "force per squared speed c"),)
+    law = "−c v|v|"
+    excitation = "wide_range"
+    reference = MUJOCO
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Half-normal; 10 % of the rated force at rated speed."""

@@ -4,14 +4,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import pyro.distributions as dist
+import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
+from npdr_ppl.language.effect_context import Start
 from npdr_ppl.language.effects import SensorEffect
+from npdr_ppl.models.effects.equivalence import ANGLE_OFFSET, FIRST_ORDER_LAG, POSITION_SCALE
 from npdr_ppl.models.effects.lag import remaining
+from npdr_ppl.models.effects.references import LJUNG_1999, MUJOCO
 
-__all__ = ["EncoderBias", "EncoderScale", "SensorLowPass"]
+__all__ = ["EncoderBias", "EncoderScale", "Quantisation", "SensorLowPass"]
 
 
 class SensorLowPass(SensorEffect):
@@ -24,12 +28,17 @@ class SensorLowPass(SensorEffect):
 
     id = "sensor_low_pass"
     parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
+    spans = ("joint", "rate", "rates", "all")
+    law = "ẏ = (x − y)/T"
+    equivalence = (FIRST_ORDER_LAG,)
+    excitation = "chirp"
+    reference = LJUNG_1999
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Uniform up to 30 ms."""
         return {"time_constant": dist.Uniform(0.0, 0.03)}
 
-    def initial_memory(self, value: Tensor, reading: Tensor) -> Tensor:
+    def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> Tensor:
         """Returns the reading."""
         return reading
 
@@ -46,10 +55,19 @@ class EncoderBias(SensorEffect):
 
     id = "encoder_bias"
     parameters = (Parameter("offset", "{port}", 0.0, "offset β of the reading"),)
+    spans = ("position",)
+    law = "q + β"
+    equivalence = (ANGLE_OFFSET,)
+    excitation = "slow_ramp"
+    reference = MUJOCO
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Normal; 1 % of the rated value."""
         return {"offset": dist.Normal(0.0, 0.01 * port.rated)}
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether a position is read, and no rate."""
+        return not port.unit.endswith("/s")
 
     def initial_value(self, reading: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
         """Takes the offset out."""
@@ -67,10 +85,19 @@ class EncoderScale(SensorEffect):
 
     id = "encoder_scale"
     parameters = (Parameter("error", "1", 0.0, "relative scale error s"),)
+    spans = ("position",)
+    law = "(1 + s) q"
+    equivalence = (POSITION_SCALE,)
+    excitation = "wide_range"
+    reference = MUJOCO
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Normal; 1 %."""
         return {"error": dist.Normal(0.0, 0.01)}
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether a position is read, and no rate."""
+        return not port.unit.endswith("/s")
 
     def initial_value(self, reading: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
         """Takes the scale error out."""
@@ -81,3 +108,28 @@ class EncoderScale(SensorEffect):
     ) -> tuple[Tensor, Any]:
         """Returns (1 + s) q."""
         return (1.0 + parameters["error"]) * value, memory
+
+
+class Quantisation(SensorEffect):
+    """round(x/Δ) Δ: a reading in whole counts of Δ, usually known from the device."""
+
+    id = "quantisation"
+    parameters = (Parameter("count", "{port}", 0.0, "size of a count Δ"),)
+    is_smooth = False
+    law = "round(x/Δ) Δ"
+    excitation = "slow_ramp"
+    reference = LJUNG_1999
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal; 0.5 % of the rated value."""
+        return {"count": dist.HalfNormal(0.005 * port.rated)}
+
+    def read(
+        self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns the nearest multiple of Δ, or the value itself for Δ = 0."""
+        count = parameters["count"]
+        is_coarse = count > 0.0
+        divisor = torch.where(is_coarse, count, torch.ones_like(count))
+        # The number of counts has no gradient; that of the reading in Δ is this number.
+        return torch.where(is_coarse, torch.round(value / divisor).detach() * count, value), memory

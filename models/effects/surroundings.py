@@ -11,8 +11,10 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effects import EnvironmentEffect
+from npdr_ppl.models.effects.equivalence import ANGLE_OFFSET, OVERALL_SCALE
+from npdr_ppl.models.effects.references import JANOT_2019, MUJOCO
 
-__all__ = ["Tilt"]
+__all__ = ["Contact", "Payload", "Tilt"]
 
 
 class Tilt(EnvironmentEffect):
@@ -26,11 +28,19 @@ class Tilt(EnvironmentEffect):
         Parameter("roll", "rad", 0.0, "turn of gravity about the base's x axis"),
         Parameter("pitch", "rad", 0.0, "turn of gravity about the base's y axis"),
     )
+    law = "R_y(pitch) R_x(roll) g"
+    equivalence = (ANGLE_OFFSET,)
+    excitation = "slow_ramp"
+    reference = MUJOCO
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Normal; 2° each."""
         scale = math.radians(2.0)
         return {"roll": dist.Normal(0.0, scale), "pitch": dist.Normal(0.0, scale)}
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the port is gravity."""
+        return port.unit == "m/s²"
 
     def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
         """Returns the turned vector.
@@ -46,3 +56,60 @@ class Tilt(EnvironmentEffect):
         sin, cos = torch.sin(parameters["pitch"]), torch.cos(parameters["pitch"])
         x, z = cos * x + sin * z, cos * z - sin * x
         return torch.stack(torch.broadcast_tensors(x, y, z), dim=-1) if is_tensor else (x, y, z)
+
+
+class Payload(EnvironmentEffect):
+    """An extra mass Δm where the port says, with all of its inertia and weight."""
+
+    id = "payload"
+    parameters = (Parameter("mass", "{port}", 0.0, "extra mass Δm"),)
+    law = "m + Δm"
+    equivalence = (OVERALL_SCALE,)
+    excitation = "payload"
+    reference = JANOT_2019
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal; 20 % of the mass that the port is rated at."""
+        return {"mass": dist.HalfNormal(0.2 * port.rated)}
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the port is a mass."""
+        return port.unit == "kg"
+
+    def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
+        """Returns the mass on board, more by Δm."""
+        return value + parameters["mass"]
+
+
+class Contact(EnvironmentEffect):
+    """Contact coefficients c exp(ε): friction, restitution, compliance, rolling resistance.
+
+    The port's quantity is a mapping of the coefficients that the engine has, by these names; the
+    others have no effect. A relative change keeps every coefficient positive.
+    """
+
+    id = "contact"
+    parameters = (
+        Parameter("friction", "1", 0.0, "logarithmic change of sliding friction"),
+        Parameter("restitution", "1", 0.0, "logarithmic change of restitution"),
+        Parameter("compliance", "1", 0.0, "logarithmic change of compliance"),
+        Parameter("rolling", "1", 0.0, "logarithmic change of rolling resistance"),
+    )
+    law = "c exp(ε)"
+    excitation = "wide_range"
+    reference = MUJOCO
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Normal; 0.5 each, a factor of 1.6."""
+        return {parameter.name: dist.Normal(0.0, 0.5) for parameter in self.parameters}
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the port is contact."""
+        return port.name.split(".")[-1] == "contact"
+
+    def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
+        """Returns the changed coefficients by name."""
+        return {
+            name: coefficient * torch.exp(parameters[name]) if name in parameters else coefficient
+            for name, coefficient in value.items()
+        }

@@ -54,9 +54,11 @@ def effects(as_json: Json = False) -> None:
     rows = [
         {
             "name": name,
-            "summary": _first_line(effect),
+            "summary": effect.law or _first_line(effect),
             "attaches to": list(effect.port_kinds),
-            "parameters": [f"{p.name} [{p.unit}]" for p in effect.parameters],
+            "parameters": [f"{p.name} [{_unit(p.unit)}]" for p in effect.parameters],
+            "not told from": [c.name for c in effect.equivalence],
+            "revealed by": effect.excitation,
         }
         for name, effect in catalogue().items()
     ]
@@ -116,6 +118,11 @@ def searches(as_json: Json = False) -> None:
     from npdr_ppl.policies.search_registry import policy_searches
 
     _show([{"name": n, "summary": s} for n, s in policy_searches().items()], as_json)
+
+
+def _unit(template: str) -> str:
+    """Returns an effect's unit in words where it depends on the port."""
+    return template.format(port="port", coordinate="coordinate")
 
 
 def _first_line(documented: object) -> str:

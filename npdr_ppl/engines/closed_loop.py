@@ -219,7 +219,9 @@ def roll_out(
     )
 
     def run(is_compiled: bool) -> Episodes:
-        tables, histories = simulator.tables(domain, shape, step, expand=is_compiled)
+        middle = torch.tensor(0.5 * num_steps * step, dtype=dtype, device=device)
+        present = simulator.changed(domain, middle)
+        tables, histories = simulator.tables(present, shape, step, expand=is_compiled)
         constants = flatten(policy.constants(domain), shape, expand=is_compiled)
         body = LoopBody(Stepper(simulator, step, histories), policy, reward)
         states = flatten(initial_states.to(dtype).unbind(-1), shape, expand=True)
@@ -252,7 +254,7 @@ def begin(body: LoopBody, states: Components, tables: Tables) -> _Loop:
     positions, velocities = states[:num_positions], states[num_positions:]
     no_readings = (None,) * len(simulator.sensors)
     state = body.stepper.start(
-        positions, velocities, tables, (zero,) * len(simulator.actions), no_readings
+        positions, velocities, tables, (zero,) * len(simulator.actions), no_readings, zero
     )
     readings = body.stepper.true_readings(positions, velocities, tables)
     memory = body.policy.initial_memory(tuple(readings[i] for i in body.observed))

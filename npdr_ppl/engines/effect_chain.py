@@ -1,7 +1,7 @@
 """Effects on their way through a step, whatever engine moves the state in between."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -9,6 +9,8 @@ from torch import Tensor
 from npdr_ppl.engines.commands import RecentCommands
 from npdr_ppl.engines.compilation import signature
 from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.reading_times import sensor_rates
+from npdr_ppl.language.effect_context import Joint, Start
 from npdr_ppl.language.effects import (
     ActionEffect,
     Commands,
@@ -65,13 +67,14 @@ class EffectChain(ABC):
         simulator: The system and its effects.
         joints: Names of the force ports, in the order of the coordinates that they act on.
         time_step: Seconds per step.
-        histories: Past commands that each action effect may ask for; see
-            :func:`needed_histories`.
+        histories: Past commands that each action effect may ask for, then past values of each
+            sensor effect; see :func:`needed_histories`.
 
     Attributes:
         force_effects: Place in ``Tables.effects``, effect and joint of each force effect.
         action_effects: Place, effect and action channel of each action effect.
         sensor_effects: Place, effect and sensor channels of each sensor effect.
+        needs_joints: Whether a force effect asks for :class:`Joint` before every step.
     """
 
     def __init__(
@@ -95,9 +98,16 @@ class EffectChain(ABC):
             elif isinstance(effect, ActionEffect):
                 self.action_effects.append((place, effect, actions.index(effect.port)))
             elif isinstance(effect, SensorEffect):
-                channels = simulator.port(effect.port).channels
+                port = simulator.port(effect.port)
+                channels = sensors if port.kind == "clock" else port.channels
                 columns = tuple(sensors.index(name) for name in channels)
                 self.sensor_effects.append((place, effect, columns))
+        self.needs_joints = any(effect.needs_joint for _, effect, _ in self.force_effects)
+
+    @property
+    def force_step(self) -> float:
+        """Seconds between two evaluations of the force effects."""
+        return self.time_step
 
     @property
     def signature(self) -> Hashable:
@@ -116,6 +126,19 @@ class EffectChain(ABC):
         """Returns the true value of every sensor channel, ``(N,)`` each."""
 
     @abstractmethod
+    def accelerations(
+        self, positions: Components, velocities: Components, actions: Components, tables: Tables
+    ) -> Components:
+        """Returns the rate of each velocity among the states, without any effect.
+
+        Args:
+            positions: Positions among the states, ``(N,)`` each.
+            velocities: Velocities among the states, ``(N,)`` each.
+            actions: What reaches the dynamics, ``(N,)`` each.
+            tables: Constants of the simulation.
+        """
+
+    @abstractmethod
     def move(self, state: State, actions: Components, tables: Tables) -> State:
         """Advances the dynamics by one time step under constant actions."""
 
@@ -132,6 +155,10 @@ class EffectChain(ABC):
         tables: Tables,
         commands: Components,
         readings: tuple[Tensor | None, ...],
+        time: Tensor,
+        *,
+        latest: Components | None = None,
+        num_past: int = 0,
     ) -> State:
         """Returns the state at the start of an episode or segment.
 
@@ -139,18 +166,16 @@ class EffectChain(ABC):
             positions: Positions, ``(N,)`` each.
             velocities: Velocities, ``(N,)`` each.
             tables: Constants of the simulation.
-            commands: What each action channel saw for long before the start, ``(N,)`` each.
+            commands: What each action channel saw for long before the start, or before the past
+                that the action effects are still to be taken through, ``(N,)`` each.
             readings: What each sensor reported at the start, ``(N,)`` each; ``None`` for the
                 true value.
+            time: Seconds since the rollout began, ``(N,)``.
+            latest: What each action channel saw last; ``None`` for ``commands``.
+            num_past: Steps before the start that the action effects are to be taken through.
         """
-        # Only what some effect asks for is computed: short simulations start often.
-        true: Components = ()
-        reported: Components = ()
-        if self.sensor_effects:
-            true = self.true_readings(positions, velocities, tables)
-            reported = tuple(
-                value if read is None else read for value, read in zip(true, readings, strict=True)
-            )
+        step, split = self.time_step, len(self.action_effects)
+        earlier = time - num_past * step
         joint_positions, joint_velocities = positions, velocities
         if self.force_effects:
             joint_positions, joint_velocities = self.at_joints(positions, velocities)
@@ -158,23 +183,59 @@ class EffectChain(ABC):
             positions,
             velocities,
             tuple(
-                effect.initial_memory(joint_positions[joint], joint_velocities[joint])
-                for _, effect, joint in self.force_effects
+                effect.initial_memory(
+                    joint_positions[joint],
+                    joint_velocities[joint],
+                    Start(time, self.force_step, tables.effects[place]),
+                )
+                for place, effect, joint in self.force_effects
             ),
             tuple(
-                effect.initial_memory(commands[channel])
-                for _, effect, channel in self.action_effects
+                effect.initial_memory(
+                    commands[channel], Start(earlier, step, tables.effects[place], length)
+                )
+                for (place, effect, channel), length in zip(
+                    self.action_effects, self.histories[:split], strict=True
+                )
             ),
             tuple(
                 (commands[channel],) * length
                 for (_, _, channel), length in zip(
-                    self.action_effects, self.histories, strict=True
+                    self.action_effects, self.histories[:split], strict=True
                 )
             ),
+            self._sensor_memory(positions, velocities, tables, latest or commands, readings, time),
+        )
+
+    def _sensor_memory(
+        self,
+        positions: Components,
+        velocities: Components,
+        tables: Tables,
+        latest: Components,
+        readings: tuple[Tensor | None, ...],
+        time: Tensor,
+    ) -> tuple[tuple[Any, ...], ...]:
+        """Returns the sensor effects' own state at the start; see :meth:`start`."""
+        # Only what some effect asks for is computed: short simulations start often.
+        if not self.sensor_effects:
+            return ()
+        true = self.true_readings(positions, velocities, tables)
+        rates: dict[int, tuple[Tensor, ...]] = {}
+        if any(effect.needs_rates for _, effect, _ in self.sensor_effects):
+            accelerations = self.accelerations(positions, velocities, latest, tables)
+            rates = sensor_rates(self.simulator, velocities, accelerations)
+        lengths = self.histories[len(self.action_effects) :]
+        return tuple(
             tuple(
-                tuple(effect.initial_memory(true[c], reported[c]) for c in columns)
-                for _, effect, columns in self.sensor_effects
-            ),
+                effect.initial_memory(
+                    true[c],
+                    true[c] if (reported := readings[c]) is None else reported,
+                    Start(time, self.time_step, tables.effects[place], length, rates.get(c, ())),
+                )
+                for c in columns
+            )
+            for (place, effect, columns), length in zip(self.sensor_effects, lengths, strict=True)
         )
 
     def act(
@@ -239,20 +300,52 @@ class EffectChain(ABC):
             memories.append(tuple(changed))
         return state._replace(sensor_memory=tuple(memories)), tuple(readings)
 
-    def applied_force(self, joint: int, state: State, tables: Tables) -> Tensor | None:
-        """Returns the smooth force of all effects at one joint; ``None`` where there is none."""
-        total: Tensor | None = None
-        for k, (place, effect, where) in enumerate(self.force_effects):
-            if where == joint:
-                force = effect.force(
-                    state.positions[joint],
-                    state.velocities[joint],
-                    tables.effects[place],
-                    state.force_memory[k],
+    def applied_forces(
+        self,
+        positions: Components,
+        velocities: Components,
+        state: State,
+        tables: Tables,
+        *,
+        before_step: bool = False,
+    ) -> tuple[Tensor | None, ...]:
+        """Returns the smooth force of all effects at each joint; ``None`` where there is none.
+
+        Args:
+            positions: Position of each joint, ``(N,)`` each.
+            velocities: Their rates.
+            state: Holds the effects' memory.
+            tables: Constants of the simulation.
+            before_step: Whether to leave out the effects that have not seen their joint yet.
+        """
+        forces: list[Tensor | None] = [None] * len(positions)
+        for k, (place, effect, joint) in enumerate(self.force_effects):
+            if before_step and effect.needs_joint:
+                continue
+            force = effect.force(
+                positions[joint], velocities[joint], tables.effects[place], state.force_memory[k]
+            )
+            if force is not None:
+                present = forces[joint]
+                forces[joint] = force if present is None else present + force
+        return tuple(forces)
+
+    def begin_step(self, state: State, joints: Sequence[Joint | None], tables: Tables) -> State:
+        """Shows the joints to the force effects that ask for them.
+
+        Args:
+            state: State at the step's start.
+            joints: Each joint; ``None`` where no effect asks.
+            tables: Constants of the simulation.
+        """
+        memory = list(state.force_memory)
+        for k, (place, effect, joint) in enumerate(self.force_effects):
+            seen = joints[joint]
+            if effect.needs_joint and seen is not None:
+                memory[k] = effect.begin_step(
+                    seen, tables.effects[place], memory[k], self.force_step
                 )
-                if force is not None:
-                    total = force if total is None else total + force
-        return total
+        return state._replace(force_memory=tuple(memory))
 
     def dry_friction_bounds(self, state: State, tables: Tables) -> tuple[Tensor | None, ...]:
         """Returns the summed bounds of dry friction per joint."""
@@ -269,15 +362,15 @@ class EffectChain(ABC):
                 bounds[joint] = bound if present is None else present + bound
         return tuple(bounds)
 
-    def next_force_memory(self, state: State, tables: Tables, step: float) -> tuple[Any, ...]:
-        """Returns the force effects' own state a step of some seconds later."""
+    def next_force_memory(self, state: State, tables: Tables) -> tuple[Any, ...]:
+        """Returns the force effects' own state at their next evaluation."""
         return tuple(
             effect.next_memory(
                 state.positions[joint],
                 state.velocities[joint],
                 tables.effects[place],
                 state.force_memory[k],
-                step,
+                self.force_step,
             )
             for k, (place, effect, joint) in enumerate(self.force_effects)
         )
@@ -286,7 +379,7 @@ class EffectChain(ABC):
 def needed_histories(
     effects: tuple[Effect, ...], parameters: tuple[Mapping[str, Tensor], ...], time_step: float
 ) -> tuple[int, ...]:
-    """Returns how many past commands each action effect may ask for, rounded up.
+    """Returns how much of the past action and then sensor effects ask for, rounded up.
 
     Args:
         effects: The effects attached to a simulator.
@@ -295,7 +388,8 @@ def needed_histories(
     """
     needed = [
         effect.history(values, time_step)
+        for kind in (ActionEffect, SensorEffect)
         for effect, values in zip(effects, parameters, strict=True)
-        if isinstance(effect, ActionEffect)
+        if isinstance(effect, kind)
     ]
     return tuple(-(-number // _HISTORY_GRAIN) * _HISTORY_GRAIN for number in needed)

@@ -156,7 +156,7 @@ class ODESimulator(ClosedLoopSimulator):
         *,
         expand: bool = False,
     ) -> tuple[Tables, tuple[int, ...]]:
-        """Returns the constants of a simulation, flat, and the lengths of command histories.
+        """Returns the constants of a simulation, flat, and the lengths of effects' histories.
 
         Args:
             parameters: What :meth:`complete` returned, each broadcasting to ``shape``.

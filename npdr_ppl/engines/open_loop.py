@@ -14,17 +14,17 @@ from npdr_ppl.engines.compilation import (
     mark_sizes_dynamic,
     with_fallback,
 )
-from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
+from npdr_ppl.engines.effect_chain import State, Tables
 from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.segment_start import recorded_start, true_start, with_past_commands
 from npdr_ppl.engines.stepping import Stepper, flatten
 from npdr_ppl.errors import ShapeError
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.language.simulator import Simulator
 
 if TYPE_CHECKING:
     from npdr_ppl.engines.ode import ODESimulator
 
-__all__ = ["recorded_start", "replay", "true_start", "with_past_commands"]
+__all__ = ["replay"]
 
 # Steps per call of a compiled kernel; see closed_loop.
 _STEPS_PER_CALL = 10
@@ -44,6 +44,8 @@ def replay(simulator: "ODESimulator", parameters: Mapping[str, Tensor], inputs: 
     shape = torch.Size((*batch_shape, inputs.num_segments))
     # Behind the batch, an axis for the segments.
     domain = {name: value[..., None] for name, value in domain.items()}
+    begin = inputs.start.to(device=device, dtype=dtype) * inputs.time_step
+    domain = simulator.changed(domain, begin + 0.5 * inputs.num_steps * inputs.time_step)
     is_compiled = is_worthwhile(
         simulator.compile, device, num_steps=inputs.num_steps, batch_size=shape.numel()
     )
@@ -186,80 +188,24 @@ def _start(
     """Returns the state at the segments' start, effects' memory included."""
     stepper = body.stepper
     simulator = stepper.simulator
-    recorded, reported = recorded_start(simulator, inputs, shape)
-    components = true_start(stepper, tables, recorded)
+    recorded = recorded_start(simulator, inputs, shape)
     num_joints = len(simulator.joints)
-    if len(components) != 2 * num_joints:
+    if len(recorded.states) != 2 * num_joints:
         raise ShapeError(
             f"{simulator.name} has {num_joints} joints, so it should declare {2 * num_joints} "
-            f"states, got {len(components)}."
+            f"states, got {len(recorded.states)}."
         )
     past = inputs.past_actions.shape[-2]
+    latest = tuple(record.at(-1 if past else 0) for record in records)
+    components = true_start(stepper, tables, recorded, latest)
     state = stepper.start(
         components[:num_joints],
         components[num_joints:],
         tables,
         tuple(record.at(-1 - past) for record in records),
-        reported,
+        recorded.readings,
+        recorded.time,
+        latest=latest,
+        num_past=past if stepper.action_effects else 0,
     )
     return with_past_commands(stepper, state, tables, records, past)
-
-
-def recorded_start(
-    simulator: Simulator, inputs: Inputs, shape: torch.Size
-) -> tuple[Components, tuple[Tensor | None, ...]]:
-    """Returns the state at the segments' start as recorded, and what each sensor reported there.
-
-    Args:
-        simulator: The simulator.
-        inputs: The segments.
-        shape: Shape of the batch and the segments, of numel N.
-
-    Returns:
-        State components, ``(N,)`` each, and readings, ``(N,)`` each, ``None`` where none is known.
-    """
-
-    def spread(value: Tensor) -> Tensor:
-        return value.expand(shape).reshape(-1)
-
-    columns = {name: i for i, name in enumerate(inputs.channel_names)}
-    return tuple(spread(value) for value in simulator.initial_states(inputs)), tuple(
-        spread(inputs.initial_readings[..., columns[s.name]]) if s.name in columns else None
-        for s in simulator.sensors
-    )
-
-
-def true_start(chain: EffectChain, tables: Tables, recorded: Components) -> Components:
-    """Returns the true state behind what was recorded through the sensor effects."""
-    components = list(recorded)
-    names = [state.name for state in chain.simulator.states]
-    for place, effect, columns in chain.sensor_effects:
-        for name in (chain.simulator.sensors[column].name for column in columns):
-            if name in names:
-                i = names.index(name)
-                components[i] = effect.initial_value(components[i], tables.effects[place])
-    return tuple(components)
-
-
-def with_past_commands(
-    chain: EffectChain,
-    state: State,
-    tables: Tables,
-    records: tuple[CommandRecord, ...],
-    num_steps: int,
-) -> State:
-    """Returns the state with the action effects' memory as the recorded past made it.
-
-    Args:
-        chain: The effects.
-        state: State at the segments' start, as if the oldest command had been given for long.
-        tables: The effects' parameters.
-        records: Commands of each action channel.
-        num_steps: Steps of the past that are on record.
-    """
-    if chain.action_effects:
-        for step in range(-num_steps, 0):
-            commands = tuple(record.at(step) for record in records)
-            views = tuple(record.view(step) for record in records)
-            state, _ = chain.act(state, commands, tables, views)
-    return state

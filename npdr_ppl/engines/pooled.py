@@ -3,17 +3,17 @@
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.signals import Signals
+from npdr_ppl.engines.signals import Signals, needs_accelerations
 from npdr_ppl.engines.workers.session import run_on_workers
 from npdr_ppl.engines.workers.task import Draw, Task
-from npdr_ppl.errors import SimulationError
-from npdr_ppl.language.effects import EnvironmentEffect, ForceEffect
+from npdr_ppl.errors import ModelError, SimulationError
+from npdr_ppl.language.effects import Effect, EnvironmentEffect, ForceEffect, SensorEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 
@@ -29,11 +29,13 @@ class Segment:
         actions: What reaches the dynamics during each step, ``(steps, actions)``: limited
             commands, changed by action effects.
         time_step: Seconds per step.
+        start_time: Seconds from the rollout's beginning to the segment's start.
     """
 
     initial_state: np.ndarray
     actions: np.ndarray
     time_step: float
+    start_time: float
 
 
 class PooledSimulator(Simulator):
@@ -44,8 +46,8 @@ class PooledSimulator(Simulator):
     worker per core. A simulation that crashes, hangs, raises an error or returns NaN is run once
     more; one that is lost for good has NaN for a trajectory.
 
-    Effects on commands and readings are applied outside of the engine. Those on forces and on the
-    environment are up to :meth:`simulate_one`, which gets their parameters.
+    Effects on commands, readings and domain parameters are applied outside of the engine. Those on
+    forces and on the environment are up to :meth:`simulate_one`, which gets their parameters.
 
     The simulator travels to workers, so it has to be picklable; connections to an engine belong
     into :meth:`set_up`.
@@ -81,6 +83,21 @@ class PooledSimulator(Simulator):
         with torch.no_grad():
             return _simulate(self, parameters, inputs)
 
+    def with_effects(self, *effects: Effect) -> Self:
+        """Returns a copy with effects attached; see :meth:`Simulator.with_effects`.
+
+        Raises:
+            ModelError: A sensor effect needs accelerations, which such an engine does not give.
+        """
+        changed = super().with_effects(*effects)
+        for effect in effects:
+            if isinstance(effect, SensorEffect) and needs_accelerations(effect):
+                raise ModelError(
+                    f"{effect.id} cannot attach to {effect.port!r} of {self.name}: it needs "
+                    "accelerations at a segment's start, which the engine does not give."
+                )
+        return changed
+
     @property
     def inner_effects(self) -> tuple[ForceEffect | EnvironmentEffect, ...]:
         """The attached effects that :meth:`simulate_one` applies."""
@@ -95,6 +112,7 @@ class _OneSimulation:
         parameters: Values in the order of the task's names, ``(parameters,)``.
         initial_state: True state at the start, ``(states,)``.
         segment: Row of the task's table of actions.
+        start_time: Seconds from the rollout's beginning to the segment's start.
         num_steps: Steps that exist.
         actions: The actions themselves, where no two draws share them.
     """
@@ -102,6 +120,7 @@ class _OneSimulation:
     parameters: np.ndarray
     initial_state: np.ndarray
     segment: int
+    start_time: float
     num_steps: int
     actions: np.ndarray | None = None
 
@@ -130,7 +149,9 @@ class _Simulate(Task):
         """Returns the trajectory, ``(steps, sensors)``."""
         one: _OneSimulation = draw.payload
         actions = self.actions[one.segment] if one.actions is None else one.actions
-        segment = Segment(one.initial_state, actions[: one.num_steps], self.time_step)
+        segment = Segment(
+            one.initial_state, actions[: one.num_steps], self.time_step, one.start_time
+        )
         parameters = dict(zip(self.names, one.parameters.tolist(), strict=True))
         result = self.simulator.simulate_one(workspace, parameters, segment, draw.seed)
         expected = (one.num_steps, len(self.simulator.sensors))
@@ -157,6 +178,8 @@ def _simulate(
     )
     shape = torch.Size((*batch_shape, inputs.num_segments))
     domain = {name: value[..., None] for name, value in domain.items()}
+    begin = inputs.start.to(torch.float64) * inputs.time_step
+    domain = simulator.changed(domain, begin + 0.5 * inputs.num_steps * inputs.time_step)
     signals = Signals(simulator, domain, inputs, shape)
     initial_states = signals.initial_states()
     task, payloads = _task_and_payloads(simulator, domain, inputs, shape, signals, initial_states)
@@ -184,14 +207,15 @@ def _task_and_payloads(
     names = tuple(p.name for p in simulator.parameters) + tuple(sorted(inner))
     matrix = torch.stack([domain[name].expand(shape).reshape(-1) for name in names], dim=-1)
     num_steps = inputs.mask.long().sum(-1).expand(shape).reshape(-1).tolist()
+    times = signals.start_times.tolist()
     own = signals.actions().numpy() if signals.has_action_effects else None
     table = _limited_actions(simulator, inputs).numpy()
     segments = torch.arange(len(table)).reshape((*inputs.batch_shape, inputs.num_segments))
     rows = segments.expand(shape).reshape(-1).tolist()
     payloads = [
-        _OneSimulation(values, state, row, steps, None if own is None else own[index])
-        for index, (values, state, row, steps) in enumerate(
-            zip(matrix.numpy(), initial_states.numpy(), rows, num_steps, strict=True)
+        _OneSimulation(values, state, row, time, steps, None if own is None else own[index])
+        for index, (values, state, row, time, steps) in enumerate(
+            zip(matrix.numpy(), initial_states.numpy(), rows, times, num_steps, strict=True)
         )
     ]
     if own is not None:

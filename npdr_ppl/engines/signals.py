@@ -11,15 +11,21 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.commands import CommandRecord, RecordedCommands
+from npdr_ppl.engines.commands import CommandRecord
 from npdr_ppl.engines.effect_chain import EffectChain, State, Tables, needed_histories
 from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.segment_start import recorded_start, true_start, with_past_commands
 from npdr_ppl.engines.stepping import flatten
 from npdr_ppl.language.effects import ActionEffect, SensorEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 
-__all__ = ["Signals"]
+__all__ = ["Signals", "needs_accelerations"]
+
+
+def needs_accelerations(effect: SensorEffect) -> bool:
+    """Returns whether an effect starts from rates of the state, which such engines do not give."""
+    return effect.needs_rates or type(effect).lead is not SensorEffect.lead
 
 
 class Signals:
@@ -30,21 +36,30 @@ class Signals:
         domain: All parameters, each broadcasting to ``shape``.
         inputs: The segments, float64.
         shape: The batch shape and the segments, of numel N.
+
+    Attributes:
+        start_times: Seconds from the rollout's beginning to each segment's start, ``(N,)``.
     """
 
     def __init__(
         self, simulator: Simulator, domain: Mapping[str, Tensor], inputs: Inputs, shape: torch.Size
     ) -> None:
-        self._simulator = simulator
         self._inputs = inputs
-        self._shape = shape
-        chosen = tuple(e for e in simulator.effects if isinstance(e, ActionEffect | SensorEffect))
-        without_forces = copy.copy(simulator)
-        without_forces.effects = chosen
-        effects = tuple(effect.own_parameters(domain) for effect in chosen)
-        histories = needed_histories(chosen, effects, inputs.time_step)
-        self._chain = _SignalChain(without_forces, (), inputs.time_step, histories)
-        self._effects = flatten(effects, shape)
+        self._recorded = recorded_start(simulator, inputs, shape)
+        self.start_times = self._recorded.time
+
+        def chain(
+            kind: type[ActionEffect] | type[SensorEffect],
+        ) -> tuple[_SignalChain, tuple[dict[str, Tensor], ...]]:
+            part = copy.copy(simulator)
+            part.effects = tuple(e for e in simulator.effects if isinstance(e, kind))
+            effects = tuple(effect.own_parameters(domain) for effect in part.effects)
+            histories = needed_histories(part.effects, effects, inputs.time_step)
+            return _SignalChain(part, (), inputs.time_step, histories), flatten(effects, shape)
+
+        # Commands are all known before the engine runs, and readings only after.
+        self._action_chain, self._action_parameters = chain(ActionEffect)
+        self._sensor_chain, self._sensor_parameters = chain(SensorEffect)
         columns = {name: i for i, name in enumerate(inputs.action_names)}
         self._records = tuple(
             CommandRecord(inputs, columns[a.name], shape, (a.lower, a.upper), torch.float64)
@@ -54,57 +69,32 @@ class Signals:
     @property
     def has_action_effects(self) -> bool:
         """Whether what reaches the engine differs between simulations of the same segment."""
-        return bool(self._chain.action_effects)
+        return bool(self._action_chain.action_effects)
 
     def initial_states(self) -> Tensor:
         """Returns the true state at each segment's start, ``(N, states)``.
 
         An offset or a wrong scale of a sensor is taken out of what was read there.
         """
-        simulator = self._simulator
-        components = {
-            state.name: value.expand(self._shape).reshape(-1)
-            for state, value in zip(
-                simulator.states, simulator.initial_states(self._inputs), strict=True
-            )
-        }
-        for place, effect, columns in self._chain.sensor_effects:
-            for name in (simulator.sensors[column].name for column in columns):
-                if name in components:
-                    components[name] = effect.initial_value(components[name], self._effects[place])
+        tables = Tables(None, self._sensor_parameters)
+        components = true_start(self._sensor_chain, tables, self._recorded, ())
         if not components:
-            return torch.zeros(self._shape.numel(), 0, dtype=torch.float64)
-        return torch.stack(list(components.values()), dim=-1)
+            return torch.zeros(len(self.start_times), 0, dtype=torch.float64)
+        return torch.stack(components, dim=-1)
 
     def actions(self) -> Tensor:
         """Returns what reaches the engine, ``(N, steps, actions)``."""
-        empty = Tables(None, self._effects)
+        chain, tables = self._action_chain, Tables(None, self._action_parameters)
         past = self._inputs.past_actions.shape[-2]
         settled = tuple(record.at(-1 - past) for record in self._records)
-        state = State(
-            (),
-            (),
-            action_memory=tuple(
-                effect.initial_memory(settled[channel])
-                for _, effect, channel in self._chain.action_effects
-            ),
-            past_commands=tuple(
-                (settled[channel],) * length
-                for (_, _, channel), length in zip(
-                    self._chain.action_effects, self._chain.histories, strict=True
-                )
-            ),
-        )
+        state = chain.start((), (), tables, settled, (), self.start_times, num_past=past)
+        state = with_past_commands(chain, state, tables, self._records, past)
         steps = []
-        for step in range(-past, self._inputs.num_steps):
+        for step in range(self._inputs.num_steps):
             commands = tuple(record.at(step) for record in self._records)
-            views = tuple(
-                RecordedCommands(command, r.table, r.rows, r.first + step, r.stride)
-                for command, r in zip(commands, self._records, strict=True)
-            )
-            state, reached = self._chain.act(state, commands, empty, views)
-            if step >= 0:
-                steps.append(torch.stack([x.expand_as(commands[0]) for x in reached], dim=-1))
+            views = tuple(record.view(step) for record in self._records)
+            state, reached = chain.act(state, commands, tables, views)
+            steps.append(torch.stack([x.expand_as(commands[0]) for x in reached], dim=-1))
         return torch.stack(steps, dim=-2)
 
     def readings(self, values: Tensor, initial_states: Tensor) -> Tensor:
@@ -114,52 +104,44 @@ class Signals:
             values: True values, ``(N, steps, sensors)``.
             initial_states: True states at the start, ``(N, states)``.
         """
-        if not self._chain.sensor_effects:
+        chain, effects = self._sensor_chain, self._sensor_parameters
+        if not chain.sensor_effects:
             return values
-        true, reported = self._at_start(values, initial_states)
-        state = State(
-            (),
-            (),
-            sensor_memory=tuple(
-                tuple(effect.initial_memory(true[c], reported[c]) for c in columns)
-                for _, effect, columns in self._chain.sensor_effects
-            ),
-        )
+        tables = Tables(self._true_at_start(values, initial_states), effects)
+        state = chain.start((), (), tables, (), self._recorded.readings, self.start_times)
         steps = []
         for present in values.unbind(-2):
-            tables = Tables(present.unbind(-1), self._effects)
-            state, read = self._chain.read(state, tables)
+            state, read = chain.report(state, present.unbind(-1), tables)
             steps.append(torch.stack(read, dim=-1))
         return torch.stack(steps, dim=-2)
 
-    def _at_start(
-        self, values: Tensor, initial_states: Tensor
-    ) -> tuple[list[Tensor], list[Tensor]]:
-        """Returns each sensor's true value and its reading at the segments' start."""
-        inputs = self._inputs
-        states = {s.name: initial_states[:, i] for i, s in enumerate(self._simulator.states)}
-        columns = {name: i for i, name in enumerate(inputs.channel_names)}
-        true, reported = [], []
-        for place, sensor in enumerate(self._simulator.sensors):
-            reading = None
-            if sensor.name in columns:
-                recorded = inputs.initial_readings[..., columns[sensor.name]]
-                reading = recorded.expand(self._shape).reshape(-1)
-            # A value that is neither a state nor recorded is that after the first step.
-            value = states.get(sensor.name, values[:, 0, place] if reading is None else reading)
-            true.append(value)
-            reported.append(value if reading is None else reading)
-        return true, reported
+    def _true_at_start(self, values: Tensor, initial_states: Tensor) -> Components:
+        """Returns each sensor's true value at the segments' start."""
+        simulator = self._sensor_chain.simulator
+        states = {s.name: initial_states[:, i] for i, s in enumerate(simulator.states)}
+        # A value that is neither a state nor recorded is that after the first step.
+        return tuple(
+            states.get(sensor.name, values[:, 0, place] if reading is None else reading)
+            for place, (sensor, reading) in enumerate(
+                zip(simulator.sensors, self._recorded.readings, strict=True)
+            )
+        )
 
 
 class _SignalChain(EffectChain):
-    """Effects between a command and the engine, and between the engine and a reading."""
+    """Effects between a command and the engine, or between the engine and a reading."""
 
     def true_readings(
         self, positions: Components, velocities: Components, tables: Tables
     ) -> Components:
-        """Returns the true values, which are the step's constants here."""
+        """Returns the true values at the start, which are the constants here."""
         return tables.constants
+
+    def accelerations(
+        self, positions: Components, velocities: Components, actions: Components, tables: Tables
+    ) -> Components:
+        """Is the engine's own matter; effects that need it are not attached."""
+        raise NotImplementedError
 
     def move(self, state: State, actions: Components, tables: Tables) -> State:
         """Is the engine's own matter."""

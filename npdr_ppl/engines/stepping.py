@@ -6,9 +6,11 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from npdr_ppl.engines.drive import drive_forces, inverse_inertia
 from npdr_ppl.engines.dry_friction import solve_dry_friction
 from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
 from npdr_ppl.engines.integrators import Components
+from npdr_ppl.language.effect_context import Joint
 
 if TYPE_CHECKING:
     from npdr_ppl.engines.ode import ODESimulator
@@ -22,7 +24,8 @@ class Stepper(EffectChain):
     Args:
         simulator: The system and its effects.
         time_step: Seconds per step.
-        histories: Past commands that each action effect may ask for.
+        histories: Past commands that each action effect may ask for, then past values of each
+            sensor effect.
     """
 
     def __init__(
@@ -32,11 +35,23 @@ class Stepper(EffectChain):
         self.simulator: ODESimulator = simulator
         self._substep = time_step / simulator.substeps
 
+    @property
+    def force_step(self) -> float:
+        """Seconds per integration step."""
+        return self._substep
+
     def true_readings(
         self, positions: Components, velocities: Components, tables: Tables
     ) -> Components:
         """Returns the true value of every sensor channel."""
         return self.simulator.readings(positions, velocities, tables.constants)
+
+    def accelerations(
+        self, positions: Components, velocities: Components, actions: Components, tables: Tables
+    ) -> Components:
+        """Returns the accelerations without any effect."""
+        none = (0.0,) * len(positions)
+        return self.simulator.accelerations(positions, velocities, actions, none, tables.constants)
 
     def move(self, state: State, actions: Components, tables: Tables) -> State:
         """Advances the dynamics by one time step under constant actions."""
@@ -46,6 +61,8 @@ class Stepper(EffectChain):
 
     def _move_once(self, state: State, actions: Components, tables: Tables) -> State:
         """Advances the dynamics by one substep."""
+        if self.needs_joints:
+            state = self.begin_step(state, self._joints(state, actions, tables), tables)
         simulator, constants = self.simulator, tables.constants
         start = state.positions, state.velocities
         dry: tuple[Any, ...] = (0.0,) * len(state.positions)
@@ -59,9 +76,7 @@ class Stepper(EffectChain):
         has_dry_friction = any(bound is not None for bound in bounds)
         if has_dry_friction:
             forces = self._forces(*start, state, tables, dry)
-            inertia = simulator.inverse_inertia(*start, constants) or _probe_inverse_inertia(
-                simulator, *start, actions, forces, constants, first
-            )
+            inertia = inverse_inertia(simulator, *start, actions, forces, constants, first)
             dry = solve_dry_friction(bounds, state.velocities, first, inertia, self._substep)
             # Accelerations are affine in the forces, so the first evaluation is not repeated.
             first = tuple(
@@ -76,8 +91,20 @@ class Stepper(EffectChain):
                 vi if b is None else torch.where(f.abs() < b, 0.0, vi)
                 for vi, f, b in zip(v, dry, bounds, strict=True)
             )
-        memory = self.next_force_memory(state, tables, self._substep)
+        memory = self.next_force_memory(state, tables)
         return state._replace(positions=q, velocities=v, force_memory=memory)
+
+    def _joints(self, state: State, actions: Components, tables: Tables) -> tuple[Joint, ...]:
+        """Returns the joints as they are before the effects that ask for them act."""
+        simulator, constants = self.simulator, tables.constants
+        q, v = state.positions, state.velocities
+        forces = self._forces(q, v, state, tables, (0.0,) * len(q), before_step=True)
+        acceleration = simulator.accelerations(q, v, actions, forces, constants)
+        inertia = inverse_inertia(simulator, q, v, actions, forces, constants, acceleration)
+        drive = drive_forces(simulator, q, v, actions, forces, constants, acceleration, inertia)
+        return tuple(
+            Joint(q[i], v[i], acceleration[i], inertia[i][i], drive[i]) for i in range(len(q))
+        )
 
     def _forces(
         self,
@@ -86,34 +113,14 @@ class Stepper(EffectChain):
         state: State,
         tables: Tables,
         dry: tuple[Any, ...],
+        *,
+        before_step: bool = False,
     ) -> tuple[Any, ...]:
         """Returns the smooth forces in a state of the integrator, on top of the dry ones."""
-        forces = list(dry)
-        for k, (place, effect, joint) in enumerate(self.force_effects):
-            force = effect.force(
-                positions[joint], velocities[joint], tables.effects[place], state.force_memory[k]
-            )
-            if force is not None:
-                forces[joint] = forces[joint] + force
-        return tuple(forces)
-
-
-def _probe_inverse_inertia(
-    simulator: "ODESimulator",
-    positions: Components,
-    velocities: Components,
-    actions: Components,
-    forces: tuple[Any, ...],
-    constants: Any,
-    accelerations: Components,
-) -> tuple[Components, ...]:
-    """Returns the rows of W by applying a unit force at one joint after the other."""
-    columns = []
-    for joint in range(len(positions)):
-        pushed = tuple(f + 1.0 if i == joint else f for i, f in enumerate(forces))
-        moved = simulator.accelerations(positions, velocities, actions, pushed, constants)
-        columns.append(tuple(b - a for a, b in zip(accelerations, moved, strict=True)))
-    return tuple(zip(*columns, strict=True))
+        if not self.force_effects:
+            return dry
+        smooth = self.applied_forces(positions, velocities, state, tables, before_step=before_step)
+        return tuple(d if f is None else d + f for d, f in zip(dry, smooth, strict=True))
 
 
 def flatten(tree: Any, shape: torch.Size, *, expand: bool = False) -> Any:

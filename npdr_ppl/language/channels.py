@@ -8,7 +8,7 @@ from npdr_ppl.errors import ModelError
 
 __all__ = ["Channel", "Parameter", "Port", "PortKind"]
 
-PortKind = Literal["force", "action", "sensor", "environment"]
+PortKind = Literal["force", "action", "sensor", "environment", "clock", "parameter"]
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,15 @@ class Port:
         name: Name in sites and JSON. A group of sensor channels that one device reads joins their
             names with commas: ``"arm_velocity,pole_velocity"``.
         kind: What passes through: a generalised force at a joint, an action on its way to the
-            dynamics, a sensor's reading, or the environment's own quantities.
+            dynamics, a sensor's reading, the environment's own quantities, the clock that stamps
+            all readings, or a domain parameter.
         unit: SI unit of what passes through.
         rated: Typical magnitude, in ``unit``; effects scale their priors by it.
         rated_speed: Typical speed of a joint that a force acts on, in its coordinate per second.
+        rated_position: Typical excursion of such a joint, in its coordinate.
+        coordinate: Unit of the position of a joint that a force acts on: ``"rad"`` where it turns,
+            ``"m"`` where it slides.
+        is_driven: Whether an actuator drives the joint that a force acts on.
     """
 
     name: str
@@ -67,6 +72,9 @@ class Port:
     unit: str
     rated: float = 1.0
     rated_speed: float = 1.0
+    rated_position: float = 1.0
+    coordinate: str = "rad"
+    is_driven: bool = True
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -14,6 +14,13 @@ from torch.distributions import Distribution
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Parameter, Port, PortKind
+from npdr_ppl.language.effect_context import (
+    EquivalenceClass,
+    Excitation,
+    Joint,
+    SensorSpan,
+    Start,
+)
 
 __all__ = [
     "ActionEffect",
@@ -22,6 +29,7 @@ __all__ = [
     "EnvironmentEffect",
     "ForceEffect",
     "LinearForceEffect",
+    "ParameterEffect",
     "SensorEffect",
 ]
 
@@ -39,12 +47,27 @@ class Effect(ABC):
     Attributes:
         id: Name in code and JSON, e.g. ``"coulomb_friction"``.
         port_kinds: Kinds of port the effect can attach to.
-        parameters: Its parameters; ``{port}`` in a unit stands for the port's unit.
+        parameters: Its parameters; ``{port}`` in a unit stands for the port's unit,
+            ``{coordinate}`` for that of the joint's position.
+        strength: Names of the parameters that scale the effect from zero; the others give it its
+            shape, and their nominal values are those of a typical device. Empty for all.
+        is_smooth: Whether trajectories are differentiable in the strengths at zero. Where they
+            are not, sensitivities take finite steps of the size that :meth:`probe` gives.
+        law: The law in one formula.
+        equivalence: Causes that it may not be told from.
+        excitation: The experiment that reveals it best.
+        reference: Where the law is from.
     """
 
     id: ClassVar[str]
     port_kinds: ClassVar[tuple[PortKind, ...]]
     parameters: ClassVar[tuple[Parameter, ...]]
+    strength: ClassVar[tuple[str, ...]] = ()
+    is_smooth: ClassVar[bool] = True
+    law: ClassVar[str] = ""
+    equivalence: ClassVar[tuple[EquivalenceClass, ...]] = ()
+    excitation: ClassVar[Excitation] = "wide_range"
+    reference: ClassVar[str] = ""
 
     def __init__(self, port: str, *, priors: Mapping[str, Distribution] | None = None) -> None:
         self.port = port
@@ -64,9 +87,32 @@ class Effect(ABC):
         """Returns the priors of all parameters, the user's where given."""
         return {**self.default_priors(port), **self._priors}
 
+    def probe(self, port: Port) -> dict[str, float]:
+        """Returns a typical value of every parameter: the effect switched on.
+
+        Strengths are as far from zero strength as the priors expect (root mean square), shapes
+        are nominal.
+        """
+        priors = self.default_priors(port)
+        result = {}
+        for parameter in self.parameters:
+            result[parameter.name] = parameter.nominal
+            if parameter.name in (self.strength or (parameter.name,)):
+                prior = priors[parameter.name]
+                offset = prior.mean - parameter.nominal
+                result[parameter.name] += float((prior.variance + offset**2).sqrt())
+        return result
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the law makes sense at a port of the right kind."""
+        return True
+
     def units(self, port: Port) -> dict[str, str]:
         """Returns the unit of each parameter at a port."""
-        return {p.name: p.unit.format(port=port.unit) for p in self.parameters}
+        return {
+            p.name: p.unit.format(port=port.unit, coordinate=port.coordinate)
+            for p in self.parameters
+        }
 
     @property
     def name(self) -> str:
@@ -93,13 +139,30 @@ class Effect(ABC):
 
 
 class ForceEffect(Effect):
-    """An effect at a joint: a generalised force, a dry friction, or both."""
+    """An effect at a joint: a generalised force, a dry friction, or both.
+
+    Attributes:
+        needs_joint: Whether :meth:`begin_step` is called, which costs the engine two evaluations
+            of the accelerations per step.
+    """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("force",)
+    needs_joint: ClassVar[bool] = False
 
-    def initial_memory(self, position: Tensor, velocity: Tensor) -> Any:
+    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Any:
         """Returns the effect's own state at a segment's start; ``None`` if it has none."""
         return None
+
+    def begin_step(
+        self, joint: Joint, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> Any:
+        """Returns the memory with what the step's forces need to know of the joint.
+
+        Called before :meth:`force` and :meth:`dry_friction` if ``needs_joint``. A stiff law can
+        solve for its mean force over the step here, keep it in the memory and return it from
+        :meth:`force`.
+        """
+        return memory
 
     def force(
         self,
@@ -179,7 +242,7 @@ class ActionEffect(Effect):
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("action",)
 
-    def initial_memory(self, command: Tensor) -> Any:
+    def initial_memory(self, command: Tensor, start: Start) -> Any:
         """Returns the effect's own state when ``command`` has been given for long.
 
         ``None`` if it has none.
@@ -198,16 +261,28 @@ class ActionEffect(Effect):
 
 
 class SensorEffect(Effect):
-    """An effect between the true value of a channel and its reading."""
+    """An effect between the true value of a channel and its reading.
+
+    Attributes:
+        needs_rates: Whether its memory starts from :attr:`Start.rates`.
+        spans: The channels that one device may have it on, with the same parameters.
+    """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
+    needs_rates: ClassVar[bool] = False
+    spans: ClassVar[tuple[SensorSpan, ...]] = ("position", "rate", "positions", "rates")
 
-    def initial_memory(self, value: Tensor, reading: Tensor) -> Any:
+    def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
+        """Returns the number of past true values that the memory is to hold."""
+        return 0
+
+    def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> Any:
         """Returns the effect's own state at a segment's start; ``None`` if it has none.
 
         Args:
             value: True value of the channel at the start.
             reading: What the sensor reported there.
+            start: What else is known.
         """
         return None
 
@@ -218,6 +293,18 @@ class SensorEffect(Effect):
         re-synchronised segments would start from the wrong state.
         """
         return reading
+
+    def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor | None:
+        """Returns by how many seconds readings are ahead of the truth; ``None`` for not at all.
+
+        Negative for a delay. A segment whose state was read too late starts from the state
+        extrapolated by as much.
+
+        Args:
+            parameters: The effect's parameters by short name.
+            time: Seconds since the rollout began.
+        """
+        return None
 
     @abstractmethod
     def read(
@@ -234,3 +321,22 @@ class EnvironmentEffect(Effect):
     @abstractmethod
     def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
         """Returns the changed quantity, e.g. the gravity vector (x, y, z) in m/s²."""
+
+
+class ParameterEffect(Effect):
+    """An effect that changes a domain parameter from segment to segment.
+
+    Every domain parameter is a port. Within a segment the parameter is constant.
+    """
+
+    port_kinds: ClassVar[tuple[PortKind, ...]] = ("parameter",)
+
+    @abstractmethod
+    def change(self, value: Tensor, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor:
+        """Returns the domain parameter during a segment.
+
+        Args:
+            value: The domain parameter.
+            parameters: The effect's parameters by short name.
+            time: Seconds from the rollout's beginning to the segment's middle.
+        """

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port, find_port
-from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.effects import Effect, ParameterEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.inverse_dynamics import InverseDynamics
 
@@ -29,7 +29,7 @@ class Simulator(ABC):
         sensors: The channels of a trajectory, what the sensors report.
         parameters: Domain parameters with nominal values; a parameter that a model does not
             sample keeps its nominal value.
-        ports: Where effects attach.
+        ports: Where effects attach; see :attr:`all_ports` for those that need no declaration.
         time_step: Seconds per step.
         is_deterministic: Whether equal parameters and inputs give equal trajectories.
         is_differentiable: Whether gradients flow from trajectories to parameters.
@@ -77,20 +77,38 @@ class Simulator(ABC):
         """
         changed = copy.copy(self)
         for effect in effects:
-            port = find_port(self.ports, effect.port, self.name)
+            port = self.port(effect.port)
             if port.kind not in effect.port_kinds:
                 raise ModelError(
                     f"{effect.id} attaches to a port of kind {' or '.join(effect.port_kinds)}, "
                     f"but {port.name!r} of {self.name} is of kind {port.kind}."
+                )
+            if not effect.suits(port):
+                raise ModelError(
+                    f"{effect.id} makes no sense at the port {port.name!r} of {self.name}, "
+                    f"through which pass {port.unit}."
                 )
             if effect.name in {present.name for present in changed.effects}:
                 raise ModelError(f"{effect.name} is attached to {self.name} already.")
             changed.effects = (*changed.effects, effect)
         return changed
 
+    @property
+    def all_ports(self) -> tuple[Port, ...]:
+        """The declared ports, the clock, and every domain parameter that is no port's namesake."""
+        implied = (
+            Port("clock", "clock", "s", rated=1.0),
+            *(
+                Port(p.name, "parameter", p.unit, rated=abs(p.nominal) or 1.0)
+                for p in self.parameters
+            ),
+        )
+        declared = {port.name for port in self.ports}
+        return (*self.ports, *(port for port in implied if port.name not in declared))
+
     def port(self, name: str) -> Port:
         """Returns the port called ``name``; see :class:`Port` for groups."""
-        return find_port(self.ports, name, self.name)
+        return find_port(self.all_ports, name, self.name)
 
     def check_parameters(self, parameters: Mapping[str, Tensor]) -> None:
         """Raises a ModelError that lists parameters this simulator does not have."""
@@ -173,3 +191,17 @@ class Simulator(ABC):
             name: torch.as_tensor(value, dtype=dtype, device=device)
             for name, value in {**values, **parameters}.items()
         }
+
+    def changed(self, parameters: Mapping[str, Tensor], time: Tensor) -> dict[str, Tensor]:
+        """Returns all parameters, the domain's as parameter effects change them.
+
+        Args:
+            parameters: What :meth:`complete` returned.
+            time: Seconds from the rollout's beginning to each segment's middle.
+        """
+        result = dict(parameters)
+        for effect in self.effects:
+            if isinstance(effect, ParameterEffect):
+                own = effect.own_parameters(parameters)
+                result[effect.port] = effect.change(result[effect.port], own, time)
+        return result

@@ -6,6 +6,7 @@ cannot see, and again in the nominal simulator. Methods that learn from the rig 
 :func:`npdr_ppl.train`; all get the same real rollouts, simulations and iterations of the search.
 """
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any, Literal
 import torch
 
 from npdr_ppl import metrics
+from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.models.effects import CoulombFriction, SensorLowPass
 from npdr_ppl.models.furuta import Furuta, furuta
@@ -40,6 +42,9 @@ __all__ = [
     "study",
     "summarise",
 ]
+
+
+_LOGGER = logging.getLogger(__name__)
 
 
 def furuta_with_effects() -> Callable[..., Any]:
@@ -127,8 +132,13 @@ def run_method(
         if method.embedding is not None:
             binding = replace(binding, embedding=method.embedding)
         chosen = replace(options, backend=method.backend, binding=binding)
-        trained = train(model, target, task, chosen, out=out, seed=seed, progress=progress)
-        policy, domain, records = trained.policy, trained.domain, trained.iterations
+        try:
+            trained = train(model, target, task, chosen, out=out, seed=seed, progress=progress)
+            policy, domain, records = trained.policy, trained.domain, trained.iterations
+        except DataError as error:
+            # A rollout that ended early can be too short for a method: it has no second policy.
+            _LOGGER.warning("%s", error)
+            policy = _trained_once(METHODS["prior"], model, target, task, options, seed)
     elif method.domains != "none":
         policy = _trained_once(method, model, target, task, options, seed)
     real = RealRollouts(target, task, Furuta())

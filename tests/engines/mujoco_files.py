@@ -57,6 +57,22 @@ ARM = """
 </mujoco>
 """
 
+ROLLING = """
+<mujoco>
+  <option timestep="0.002" cone="elliptic"/>
+  <worldbody>
+    <geom type="plane" size="5 5 0.1" condim="6"/>
+    <body name="wheel" pos="0 0 0.049">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <joint name="turn" axis="0 1 0"/>
+      <geom type="sphere" size="0.05" condim="6" friction="0.5 0.005 0.002"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="turn" ctrlrange="-0.1 0.1"/></actuator>
+</mujoco>
+"""
+
 # The hardest dry friction that MuJoCo admits at its time step of 2 ms.
 HARD = 'solreffriction="0.004 1" solimpfriction="0.9999 0.9999 0.001 0.5 2"'
 

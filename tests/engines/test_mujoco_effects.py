@@ -3,20 +3,27 @@
 import sys
 from pathlib import Path
 
+import mujoco
 import pytest
 import torch
 
 from npdr_ppl.engines.mujoco import MujocoSimulator
+from npdr_ppl.language.effects import EnvironmentEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import (
     ActuatorGain,
     ActuatorLag,
     Bias,
+    Contact,
     CoulombFriction,
     InputDelay,
+    JointElasticity,
+    Payload,
+    SensorDelay,
     SensorLowPass,
     Tilt,
     ViscousFriction,
+    candidate_effects,
     effects,
 )
 
@@ -24,6 +31,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from mujoco_files import (  # noqa: E402
     GYMNASIUM,
     HARD,
+    ROLLING,
     arm,
     needs_gymnasium,
     no_strength,
@@ -38,28 +46,33 @@ def elsewhere(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
 
-def cases():
-    for effect in effects().values():
-        for kind, port in (
-            ("action", "motor"),
-            ("action", "elbow_command"),
-            ("force", "shoulder_torque"),
-            ("force", "elbow_torque"),
-            ("sensor", "shoulder"),
-            ("sensor", "shoulder_velocity,elbow_velocity"),
-            ("environment", "gravity"),
-        ):
-            if kind in effect.port_kinds:
-                yield pytest.param(effect(port), id=f"{effect.id}-{port}")
+def loaded_arm(**options):
+    """An arm with a parameter that may drift."""
+    return arm(parameters={"hand": "body hand mass", "friction": "joint elbow damping"}, **options)
 
 
-CASES = tuple(cases())
+def rolling(**options):
+    """A cylinder on the floor."""
+    return MujocoSimulator(mujoco.MjModel.from_xml_string(ROLLING), **options)
+
+
+CASES = tuple(
+    pytest.param(build, effect, id=f"{build.__name__}-{effect.name}")
+    for build in (loaded_arm, rolling)
+    for effect in candidate_effects(build())
+    if build is loaded_arm or isinstance(effect, EnvironmentEffect)
+)
+
+
+def test_every_effect_has_a_case():
+    assert {case.values[1].id for case in CASES} == set(effects())
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])
-@pytest.mark.parametrize("effect", CASES)
-def test_zero_strength_changes_no_bit(effect, integrator):
-    base = arm(integrator=integrator, friction=0.01, parameters={"hand": "body hand mass"})
+@pytest.mark.parametrize(("build", "effect"), CASES)
+def test_zero_strength_changes_no_bit(build, effect, integrator):
+    base = build()
+    base.model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     inputs = random_inputs(base, num_steps=12)
     expected = base.simulate({}, inputs)
     changed = base.with_effects(effect)
@@ -67,7 +80,14 @@ def test_zero_strength_changes_no_bit(effect, integrator):
     assert torch.equal(changed.simulate(no_strength(effect), inputs), expected)
     batch = changed.simulate(no_strength(effect, (2, 1)), inputs)
     assert torch.equal(batch, expected.expand(2, 1, *expected.shape))
+
+
+@pytest.mark.parametrize("effect", [c.values[1] for c in CASES if c.values[0] is loaded_arm])
+def test_zero_strength_changes_no_bit_in_other_domains(effect):
+    base = loaded_arm(friction=0.01)
+    inputs = random_inputs(base, num_steps=6)
     heavy = {"hand": value([0.5, 1.0])}
+    changed = base.with_effects(effect)
     assert torch.equal(
         changed.simulate({**heavy, **no_strength(effect)}, inputs), base.simulate(heavy, inputs)
     )
@@ -87,6 +107,10 @@ def test_zero_strength_changes_no_bit_in_files_of_others(name):
         InputDelay(action),
         ActuatorLag(action),
         SensorLowPass(sensor),
+        SensorDelay(",".join(channel.name for channel in base.sensors)),
+        JointElasticity(joint),
+        *(Payload(p.name) for p in base.ports if p.unit == "kg"),
+        Contact("contact"),
     )
     zero = {}
     for effect in attached:
@@ -95,22 +119,29 @@ def test_zero_strength_changes_no_bit_in_files_of_others(name):
     assert torch.equal(base.with_effects(*attached).simulate(zero, inputs), expected)
 
 
-@pytest.mark.parametrize("effect", CASES)
-def test_prior_draws_matter_and_stay_finite(effect):
-    base = arm()
-    changed = base.with_effects(effect)
+def draws(effect, simulator, num_draws):
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        draws = {
-            f"{effect.name}.{name}": prior.sample((20,)).double()
-            for name, prior in effect.priors(changed.port(effect.port)).items()
+        return {
+            f"{effect.name}.{name}": prior.sample((num_draws,)).double()
+            for name, prior in effect.priors(simulator.port(effect.port)).items()
         }
+
+
+@pytest.mark.parametrize(("build", "effect"), CASES)
+def test_prior_draws_matter_stay_finite_and_do_not_depend_on_the_batch(build, effect):
+    base = build()
+    changed = base.with_effects(effect)
+    given = draws(effect, changed, 10)
     inputs = random_inputs(base, num_steps=100)
-    out = changed.simulate(draws, inputs)
+    out = changed.simulate(given, inputs)
     assert out.isfinite().all()
     assert (
         (out - base.simulate({}, inputs)).abs().flatten(1).amax(1) > 1e-12
     ).float().mean() > 0.9
+    for k in (0, 7):
+        alone = changed.simulate({name: x[k] for name, x in given.items()}, inputs)
+        assert torch.equal(alone, out[k])
 
 
 def test_dry_friction_is_the_engines_own():

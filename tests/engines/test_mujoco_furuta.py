@@ -11,9 +11,14 @@ from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import (
     ActuatorLag,
+    Backlash,
+    ClockSkew,
     CoulombFriction,
     EncoderBias,
     InputDelay,
+    ParameterDrift,
+    Payload,
+    SensorDelay,
     SensorLowPass,
     Tilt,
     ViscousFriction,
@@ -143,7 +148,16 @@ def test_closed_loop_sees_readings_and_ends_at_bounds():
     assert plain.lengths[0] == 60
     assert plain.lengths[1] < 10
     assert (plain.readings[1, int(plain.lengths[1]) + 1 :] == 0.0).all()
-    attached = (EncoderBias("pole_angle"), CoulombFriction("arm"), ActuatorLag("voltage"))
+    attached = (
+        EncoderBias("pole_angle"),
+        CoulombFriction("arm"),
+        ActuatorLag("voltage"),
+        SensorDelay("arm_angle,arm_velocity"),
+        ClockSkew("clock"),
+        Backlash("arm"),
+        ParameterDrift("arm_damping"),
+        Payload("payload"),
+    )
     changed = simulator.with_effects(*attached)
     same = changed.roll_out({}, policy, states, 60, record=True)
     assert torch.equal(same.readings, plain.readings)

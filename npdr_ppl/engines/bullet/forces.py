@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.bullet.scene import Scene
+from npdr_ppl.language.effect_context import Start
 from npdr_ppl.language.effects import ForceEffect
 
 __all__ = ["JointForces", "is_dry"]
@@ -31,6 +32,7 @@ class JointForces:
         effects: Effects with the joint that each acts on.
         parameters: Values of all their parameters.
         time_step: Seconds per substep.
+        start_time: Seconds since the rollout began.
     """
 
     def __init__(
@@ -39,6 +41,7 @@ class JointForces:
         effects: Sequence[tuple[ForceEffect, Joint]],
         parameters: Mapping[str, float],
         time_step: float,
+        start_time: float,
     ) -> None:
         client = scene.client
         self._state = client.getJointState
@@ -51,8 +54,10 @@ class JointForces:
         self._effects = [
             (effect, joint, effect.own_parameters(values)) for effect, joint in effects
         ]
+        time = torch.tensor(start_time, dtype=torch.float64)
         self._memory: list[Any] = [
-            effect.initial_memory(*self._motion(joint)) for effect, joint in effects
+            effect.initial_memory(*self._motion(joint), Start(time, time_step, own))
+            for effect, joint, own in self._effects
         ]
 
     def __call__(self) -> dict[Joint, float]:

@@ -111,7 +111,8 @@ class BulletSimulator(PooledSimulator):
 
         Raises:
             ModelError: Dry friction is attached to a joint whose motor follows a velocity or a
-                position: Bullet has one motor per joint.
+                position: Bullet has one motor per joint. Or an effect has to see its joint before
+                each step.
         """
         changed = super().with_effects(*effects)
         driven = {
@@ -120,6 +121,11 @@ class BulletSimulator(PooledSimulator):
             if command.place.field != "torque"
         }
         for effect in effects:
+            if isinstance(effect, ForceEffect) and effect.needs_joint:
+                raise ModelError(
+                    f"{effect.id} cannot attach to {effect.port!r} of {self.name}: it needs "
+                    "acceleration and inertia before each step, which Bullet does not give."
+                )
             if isinstance(effect, ForceEffect) and is_dry(effect) and effect.port in driven:
                 raise ModelError(
                     f"{effect.id} cannot attach to {effect.port!r} of {self.name}: the joint's "
@@ -208,7 +214,7 @@ class BulletSimulator(PooledSimulator):
             joints = [scene.joints[effect.port] for effect in effects]
             step = segment.time_step / self.settings.substeps
             pairs = list(zip(effects, joints, strict=True))
-            forces = JointForces(scene, pairs, parameters, step)
+            forces = JointForces(scene, pairs, parameters, step, segment.start_time)
 
         def act(step: int, substep: int) -> None:
             commands = segment.actions[step]
@@ -263,11 +269,12 @@ class BulletSimulator(PooledSimulator):
                 of_joint[joint] = name
         for joint, name in of_joint.items():
             info = scene.client.getJointInfo(*joint)
-            unit = "N m" if info[2] == scene.client.JOINT_REVOLUTE else "N"
+            turns = info[2] == scene.client.JOINT_REVOLUTE
+            unit, coordinate = ("N m", "rad") if turns else ("N", "m")
             # A URDF says zero, and Bullet sometimes a thousand, where nothing was said.
             effort = rated.get(name, info[10] if 0.0 < info[10] < 1000.0 else 1.0)
             speed = info[11] if 0.0 < info[11] < 1000.0 else 1.0
-            ports.append(Port(name, "force", unit, effort, speed))
+            ports.append(Port(name, "force", unit, effort, speed, coordinate=coordinate))
         ports += [Port(s.channel.name, "sensor", s.channel.unit, s.rated) for s in self._sensors]
         strength = float(np.linalg.norm(scene.gravity)) or 9.81
         ports.append(Port("gravity", "environment", "m/s²", strength))

@@ -54,7 +54,8 @@ def roll_out(
     constants = flatten(policy.constants(domain), shape)
     states = flatten(initial_states.double().unbind(-1), shape, expand=True)
     with quiet():
-        batch, tables = simulator.make_batch(flat, shape.numel(), step)
+        middle = torch.tensor(0.5 * num_steps * step, dtype=torch.float64)
+        batch, tables = simulator.make_batch(flat, shape.numel(), step, middle)
         stepper = MujocoStepper(simulator, batch, step, simulator.histories(flat, step))
         stepper.place(states)
         stepper.begin()

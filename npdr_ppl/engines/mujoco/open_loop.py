@@ -20,7 +20,7 @@ from npdr_ppl.engines.effect_chain import State, Tables
 from npdr_ppl.engines.mujoco.batches import quiet
 from npdr_ppl.engines.mujoco.native import run_all_steps
 from npdr_ppl.engines.mujoco.stepper import MujocoStepper
-from npdr_ppl.engines.open_loop import recorded_start, true_start, with_past_commands
+from npdr_ppl.engines.segment_start import recorded_start, true_start, with_past_commands
 from npdr_ppl.engines.stepping import flatten
 from npdr_ppl.language.inputs import Inputs
 
@@ -114,35 +114,40 @@ class _Replay:
             return value[first:last] if value.ndim else value
 
         given = {name: part(value) for name, value in self.given.items()}
-        recorded = tuple(part(value) for value in self.start[0])
-        reported = tuple(None if value is None else part(value) for value in self.start[1])
+        recorded = self.start.part(first, last)
         step = self.inputs.time_step
         with quiet():
-            batch, tables = self.simulator.make_batch(given, last - first, step)
+            middle = recorded.time + 0.5 * self.inputs.num_steps * step
+            batch, tables = self.simulator.make_batch(given, last - first, step, middle)
             chain = MujocoStepper(self.simulator, batch, step, self.histories)
-            components = true_start(chain, tables, recorded)
+            records = self._records(chain, first, last)
+            latest = tuple(record.at(-1 if self.past else 0) for record in records)
+            components = true_start(chain, tables, recorded, latest)
             chain.place(components)
             chain.begin()
-            positions = components[: chain.num_positions]
-            velocities = components[chain.num_positions :]
-            records = self._records(chain, first, last)
             state = chain.start(
-                positions,
-                velocities,
+                components[: chain.num_positions],
+                components[chain.num_positions :],
                 tables,
                 tuple(record.at(-1 - self.past) for record in records),
-                reported,
+                recorded.readings,
+                recorded.time,
+                latest=latest,
+                num_past=self.past if chain.action_effects else 0,
             )
             controls = self._controls(chain, state, tables, records, first, last)
             if chain.force_effects:
                 return self._step_by_step(chain, state, tables, controls)
             true = run_all_steps(batch, controls, chain.substeps, self.simulator.readings)
         readings = torch.from_numpy(true)
-        if chain.sensor_effects:
-            for k in range(self.inputs.num_steps):
-                state, values = chain.report(state, readings[:, k].unbind(-1), tables)
-                readings[:, k] = torch.stack(values, dim=-1)
-        return readings
+        if not chain.sensor_effects:
+            return readings
+        # Into a table of its own: effects remember true values.
+        reported = torch.empty_like(readings)
+        for k in range(self.inputs.num_steps):
+            state, values = chain.report(state, readings[:, k].unbind(-1), tables)
+            reported[:, k] = torch.stack(values, dim=-1)
+        return reported
 
     def _commands(self, shape: torch.Size) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Returns limited commands, ``(rows, steps, actions)``, and each simulation's row.
@@ -157,8 +162,8 @@ class _Replay:
         return commands.reshape(num_rows, *commands.shape[-2:]), rows
 
     def _records(self, chain: MujocoStepper, first: int, last: int) -> tuple[CommandRecord, ...]:
-        """Returns the commands of each action channel as action effects see them, if there are."""
-        if not chain.action_effects:
+        """Returns the commands of each action channel, if an effect looks at them."""
+        if not (chain.action_effects or chain.sensor_effects):
             return ()
         return tuple(
             CommandRecord(self.inputs, column, self.shape, limits, torch.float64).part(first, last)

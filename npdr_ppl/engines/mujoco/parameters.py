@@ -113,10 +113,14 @@ class Bindings:
             ShapeError: It returned something of another shape.
         """
         result: Assignments = {}
+        nominal = {parameter.name: parameter.nominal for parameter in self.parameters}
         for name, value in given.items():
             for field in self._set.get(name, ()):
                 for entry in field.entries:
-                    result[entry.array, entry.place] = value * entry.factor
+                    # The file's own number for the nominal value, which rounding might miss.
+                    result[entry.array, entry.place] = torch.where(
+                        value == nominal[name], entry.nominal, value * entry.factor
+                    )
             for field in self._scaled.get(name, ()):
                 for entry in field.entries:
                     result[entry.array, entry.place] = value * entry.nominal

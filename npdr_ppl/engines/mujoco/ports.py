@@ -12,7 +12,7 @@ from npdr_ppl.engines.mujoco.channels import Component, Reading
 from npdr_ppl.engines.mujoco.fields import actuated_joint, element_names, joint_units
 from npdr_ppl.language.channels import Channel, Port
 
-__all__ = ["ForcePort", "derive_ports", "force_ports"]
+__all__ = ["ForcePort", "derive_ports", "driven_dofs", "force_ports"]
 
 Array = NDArray[np.float64]
 
@@ -41,6 +41,7 @@ def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
     has that name. It is rated by the greatest force of the actuators at the joint, or else by the
     weight that the joint carries in the file's pose; the rated speed is what the rated force would
     give the joint over a radian (half the range, or a metre), less where damping ends it sooner.
+    A joint is driven if an actuator moves it in the file's pose, through tendons and sites too.
 
     Args:
         model: A ``mujoco.MjModel``.
@@ -51,7 +52,7 @@ def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
     mujoco.mj_forward(model, data)
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    actuated = _actuator_ratings(model)
+    actuated, driven = _actuator_ratings(model), driven_dofs(model)
     result = []
     for joint, name in enumerate(element_names(model, "joint")):
         is_slide = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -62,14 +63,23 @@ def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
         rated = actuated.get(joint) or _weight(model, data, joint, is_slide) or inertia
         travel = 1.0
         if is_slide and model.jnt_limited[joint]:
-            travel = 0.5 * float(np.ptp(model.jnt_range[joint]))
+            travel = _half_range(model, joint)
         speed = math.sqrt(2.0 * rated * travel / max(inertia, 1e-12))
         if damping > 0.0:
             speed = min(speed, rated / damping)
         if name in taken:
             name = f"{name}_{'force' if is_slide else 'torque'}"
-        unit = joint_units(model, joint)["force"]
-        port = Port(name, "force", unit, rated, speed)
+        units = joint_units(model, joint)
+        port = Port(
+            name,
+            "force",
+            units["force"],
+            rated,
+            speed,
+            travel if is_slide else min(travel, _half_range(model, joint)),
+            units["position"],
+            bool(driven[dof]),
+        )
         result.append(ForcePort(port, joint, int(model.jnt_qposadr[joint]), dof))
     return tuple(result)
 
@@ -80,7 +90,7 @@ def derive_ports(
     actions: Sequence[Channel],
     sensors: Sequence[Component | Reading],
 ) -> tuple[Port, ...]:
-    """Returns all ports: actions, joints, sensors, and gravity where the file has any."""
+    """Returns the ports of actions, joints and sensors."""
     by_position = {joint.position: joint for joint in joints}
     by_velocity = {joint.velocity: joint for joint in joints}
     ports = [Port(a.name, "action", a.unit, _largest(a)) for a in actions]
@@ -95,9 +105,6 @@ def derive_ports(
         elif sensor.channel.unit == "m/s²":
             rated = 9.81
         ports.append(Port(sensor.channel.name, "sensor", sensor.channel.unit, rated))
-    gravity = float(np.linalg.norm(model.opt.gravity))
-    if gravity > 0.0:
-        ports.append(Port("gravity", "environment", "m/s²", gravity))
     return tuple(ports)
 
 
@@ -112,8 +119,32 @@ def _travel(model: Any, joint: ForcePort | None) -> float:
     if joint is None:
         return 1.0
     if model.jnt_limited[joint.joint]:
-        return 0.5 * float(np.ptp(model.jnt_range[joint.joint])) or 1.0
+        return _half_range(model, joint.joint)
     return math.pi if joint.port.unit == "N m" else 1.0
+
+
+def _half_range(model: Any, joint: int) -> float:
+    """Returns half the range of a joint, 1 if it has none."""
+    if not model.jnt_limited[joint]:
+        return 1.0
+    return 0.5 * float(np.ptp(model.jnt_range[joint])) or 1.0
+
+
+def driven_dofs(model: Any) -> NDArray[np.bool_]:
+    """Returns which degrees of freedom actuators move in the file's pose, ``(nv,)``."""
+    mujoco: Any = importlib.import_module("mujoco")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    moment = np.zeros((model.nu, model.nv))
+    if model.nu:
+        mujoco.mju_sparse2dense(
+            moment,
+            data.actuator_moment.reshape(-1),
+            data.moment_rownnz,
+            data.moment_rowadr,
+            data.moment_colind.reshape(-1),
+        )
+    return np.any(moment != 0.0, axis=0)
 
 
 def _actuator_ratings(model: Any) -> dict[int, float]:

@@ -26,15 +26,16 @@ from npdr_ppl.engines.mujoco.channels import (
     state_components,
 )
 from npdr_ppl.engines.mujoco.closed_loop import roll_out
+from npdr_ppl.engines.mujoco.environment import environment_ports, with_environment
 from npdr_ppl.engines.mujoco.fields import did_you_mean, element_names
 from npdr_ppl.engines.mujoco.inverse_dynamics import bound_inverse_dynamics
 from npdr_ppl.engines.mujoco.open_loop import replay
 from npdr_ppl.engines.mujoco.parameters import Binding, Bindings, Derivation
-from npdr_ppl.engines.mujoco.ports import derive_ports, force_ports
+from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
 from npdr_ppl.engines.mujoco_inverse_dynamics import load_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
-from npdr_ppl.language.effects import EnvironmentEffect, ForceEffect
+from npdr_ppl.language.effects import ForceEffect, ParameterEffect
 from npdr_ppl.language.inputs import Inputs
 
 __all__ = ["MujocoSimulator"]
@@ -113,9 +114,14 @@ class MujocoSimulator(ClosedLoopSimulator):
         self._declare_channels(states, sensors, units or {}, bounds or {})
         taken = [channel.name for channel in (*self.states, *self.sensors, *self.actions)]
         self.force_ports = force_ports(self.model, taken)
-        self.ports = derive_ports(self.model, self.force_ports, self.actions, self.readings)
         self.bindings = Bindings(self.model, parameters or {}, derived or {})
         self.parameters = self.bindings.parameters
+        taken += [*self.joints, *(parameter.name for parameter in self.parameters)]
+        self._environment = environment_ports(self.model, driven_dofs(self.model), taken)
+        self.ports = (
+            *derive_ports(self.model, self.force_ports, self.actions, self.readings),
+            *(port.port for port in self._environment),
+        )
         # Derivations that do not fit should say so now.
         self.bindings.assignments({}, self.nominal())
         self.initial_positions = self._initial_positions(keyframe)
@@ -170,7 +176,7 @@ class MujocoSimulator(ClosedLoopSimulator):
         )
 
     def histories(self, given: Mapping[str, Tensor], time_step: float) -> tuple[int, ...]:
-        """Returns the past commands that each action effect may ask for.
+        """Returns how much of the past each action effect and then each sensor effect asks for.
 
         Args:
             given: Given parameters.
@@ -180,7 +186,7 @@ class MujocoSimulator(ClosedLoopSimulator):
         return needed_histories(self.effects, own, time_step)
 
     def make_batch(
-        self, given: Mapping[str, Tensor], num_simulations: int, time_step: float
+        self, given: Mapping[str, Tensor], num_simulations: int, time_step: float, time: Tensor
     ) -> tuple[Any, Tables]:
         """Returns a batch with its parameters set, and the effects' parameters.
 
@@ -188,20 +194,17 @@ class MujocoSimulator(ClosedLoopSimulator):
             given: Given parameters, ``(N,)`` or numbers, in float64.
             num_simulations: N.
             time_step: Seconds per control step.
+            time: Seconds from the rollout's beginning to each segment's middle.
         """
-        domain = self.complete(given, torch.float64, torch.device("cpu"))
+        complete = self.complete(given, torch.float64, torch.device("cpu"))
+        domain = self.changed(complete, time)
+        drifting = {e.port for e in self.effects if isinstance(e, ParameterEffect)}
+        given = {**given, **{name: domain[name] for name in drifting}}
         own = tuple(effect.own_parameters(domain) for effect in self.effects)
         assignments = self.bindings.assignments(given, domain)
-        for effect, values in zip(self.effects, own, strict=True):
-            if isinstance(effect, EnvironmentEffect):
-                gravity = tuple(
-                    assignments.get(
-                        ("opt.gravity", i), torch.tensor(float(g), dtype=torch.float64)
-                    )
-                    for i, g in enumerate(self.model.opt.gravity)
-                )
-                changed = effect.environment(gravity, values)
-                assignments |= {("opt.gravity", i): g for i, g in enumerate(changed)}
+        assignments = with_environment(
+            self.model, self._environment, self.effects, own, assignments
+        )
         model = self._prepared(time_step / self.num_substeps(time_step), set(assignments))
         num_threads = self.num_threads or torch.get_num_threads()
         return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)

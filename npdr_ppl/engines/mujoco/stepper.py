@@ -11,6 +11,7 @@ from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.mujoco.batches import state_view
 from npdr_ppl.engines.mujoco.channels import Component, Reading
+from npdr_ppl.engines.mujoco.joints import JointStates
 
 if TYPE_CHECKING:
     from npdr_ppl.engines.mujoco.simulator import MujocoSimulator
@@ -33,7 +34,8 @@ class MujocoStepper(EffectChain):
         batch: A ``mujoco.batch.Batch`` of N simulations, or ``None`` where only commands and
             readings are to pass through effects.
         time_step: Seconds per control step.
-        histories: Past commands that each action effect may ask for.
+        histories: Past commands that each action effect may ask for, then past values of each
+            sensor effect.
 
     Attributes:
         is_lost: Simulations that the engine warned of, ``(N,)``; they report NaN.
@@ -63,7 +65,13 @@ class MujocoStepper(EffectChain):
         self._applied = state_view(batch, "qfrc_applied") if self.force_effects else None
         # The bounds of dry friction that the engine reads, and what they were without effects.
         self._friction: tuple[np.ndarray, np.ndarray] | None = None
+        self._joints = JointStates(batch, simulator.force_ports) if self.needs_joints else None
         self.is_lost = torch.zeros(batch.nsim, dtype=torch.bool)
+
+    @property
+    def force_step(self) -> float:
+        """Seconds per engine step."""
+        return self._engine_step
 
     @property
     def num_positions(self) -> int:
@@ -79,12 +87,33 @@ class MujocoStepper(EffectChain):
         if self._sensordata is None:
             return
         stages: Any = importlib.import_module("mujoco").mjtStage
-        stage = stages.mjSTAGE_ACC if self._has_accelerations else stages.mjSTAGE_VEL
-        # The solver's first guess belongs to the state; a reading must not change what follows.
+        self._look(stages.mjSTAGE_ACC if self._has_accelerations else stages.mjSTAGE_VEL)
+
+    def accelerations(
+        self, positions: Components, velocities: Components, actions: Components, tables: Tables
+    ) -> Components:
+        """Returns the rate of each velocity among the states, without any effect.
+
+        Leaves the simulations in the state that is asked about.
+        """
+        self.place((*positions, *velocities))
+        self._command(actions)
+        result = self._batch.bind("qacc")
+        self._look(ACCELERATION_STAGE)
+        columns = [c.address for c in self.simulator.components if c.is_velocity]
+        return tuple(_column(result, column) for column in columns)
+
+    def _look(self, stage: int) -> None:
+        """Computes forward stages in the present state, which stays as it is."""
+        # The solver's first guess belongs to the state; a look must not change what follows.
         guess = state_view(self._batch, "warmstart")
         kept = guess.copy()
         self._guarded(self._batch.forward, stage=int(stage))
         guess[:] = kept
+
+    def _command(self, actions: Components) -> None:
+        for i, action in enumerate(actions):
+            self._ctrl[:, i] = action.numpy()
 
     def at_joints(
         self, positions: Components, velocities: Components
@@ -112,8 +141,7 @@ class MujocoStepper(EffectChain):
 
     def move(self, state: State, actions: Components, tables: Tables) -> State:
         """Advances all simulations by one control step under constant actions."""
-        for i, action in enumerate(actions):
-            self._ctrl[:, i] = action.numpy()
+        self._command(actions)
         if self.force_effects:
             for k in range(self.substeps):
                 is_last = k == self.substeps - 1
@@ -125,25 +153,45 @@ class MujocoStepper(EffectChain):
 
     def _move_once(self, state: State, tables: Tables, stage: int) -> State:
         """Advances all simulations by one engine step under the force effects."""
-        assert self._applied is not None
         positions, velocities = self.at_joints((), ())
         state = state._replace(positions=positions, velocities=velocities)
+        if self._joints is not None:
+            self._apply(state, tables, before_step=True)
+            self._look(ACCELERATION_STAGE)
+            state = self.begin_step(state, self._joints.read(positions, velocities), tables)
+        self._apply(state, tables)
+        memory = self.next_force_memory(state, tables)
+        self._guarded(self._batch.step, stage=stage)
+        return state._replace(force_memory=memory)
+
+    def _apply(self, state: State, tables: Tables, *, before_step: bool = False) -> None:
+        """Hands the effects' forces to the engine; see :meth:`applied_forces`.
+
+        Before a step has begun without their dry friction.
+        """
+        assert self._applied is not None
         ports = self.simulator.force_ports
-        for joint in sorted({joint for _, _, joint in self.force_effects}):
-            force = self.applied_force(joint, state, tables)
+        forces = self.applied_forces(
+            state.positions, state.velocities, state, tables, before_step=before_step
+        )
+        if before_step:
+            # What effects that have to see their joint first exerted in the step before.
+            self._applied[:] = 0.0
+        for port, force in zip(ports, forces, strict=True):
             if force is not None:
-                self._applied[:, ports[joint].velocity] = force.numpy()
-        for joint, bound in enumerate(self.dry_friction_bounds(state, tables)):
+                self._applied[:, port.velocity] = force.numpy()
+        if before_step:
+            if self._friction is not None:
+                present, own = self._friction
+                present[:] = own
+            return
+        for port, bound in zip(ports, self.dry_friction_bounds(state, tables), strict=True):
             if bound is not None:
                 if self._friction is None:
                     bounds = self._batch.expand("dof_frictionloss")
                     self._friction = bounds, bounds.copy()
-                bounds, own = self._friction
-                dof = ports[joint].velocity
-                bounds[:, dof] = own[:, dof] + bound.numpy()
-        memory = self.next_force_memory(state, tables, self._engine_step)
-        self._guarded(self._batch.step, stage=stage)
-        return state._replace(force_memory=memory)
+                present, own = self._friction
+                present[:, port.velocity] = own[:, port.velocity] + bound.numpy()
 
     def _guarded(self, run: Any, **options: int) -> None:
         """Runs a method of the batch and notes the simulations that were lost."""

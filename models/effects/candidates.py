@@ -1,0 +1,88 @@
+"""Every effect at every port of a simulator where it makes sense."""
+
+from collections.abc import Iterator
+
+from npdr_ppl.language.channels import Port
+from npdr_ppl.language.effect_context import SensorSpan
+from npdr_ppl.language.effects import Effect, SensorEffect
+from npdr_ppl.language.simulator import Simulator
+from npdr_ppl.models.effects.registry import effects
+
+__all__ = ["candidate_effects", "sensor_groups"]
+
+# Lengths, masses and inertias stay what they are during a rollout.
+_LASTING_UNITS = ("m", "kg", "kg m²")
+
+
+def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
+    """Returns each effect of the catalogue at each port where it makes sense.
+
+    A sensor effect attaches to the channels that one device may have it on; see
+    :class:`~npdr_ppl.language.effects.SensorEffect`. Parameters drift that neither last nor are
+    nominally zero. Effects that the simulator has already are left out.
+
+    Args:
+        simulator: The simulator, whose ports say what passes through them.
+
+    Example:
+        >>> from npdr_ppl.models.pendulum import Pendulum
+        >>> [effect.name for effect in candidate_effects(Pendulum())][:2]
+        ['hinge.viscous_friction', 'hinge.coulomb_friction']
+    """
+    present = {effect.name for effect in simulator.effects}
+    found = []
+    for effect in effects().values():
+        for port in _ports(simulator, effect):
+            attached = effect(port)
+            members = (simulator.port(name) for name in simulator.port(port).channels)
+            if attached.name not in present and all(map(attached.suits, members)):
+                found.append(attached)
+    return tuple(found)
+
+
+def sensor_groups(simulator: Simulator, span: SensorSpan) -> tuple[tuple[str, ...], ...]:
+    """Returns the sensor channels that one device may read, by name.
+
+    Args:
+        simulator: The simulator.
+        span: What a device reads.
+    """
+    ports = {port.name for port in simulator.ports if port.kind == "sensor"}
+    channels = [channel for channel in simulator.sensors if channel.name in ports]
+    rates = tuple(channel.name for channel in channels if channel.rate_of is not None)
+    positions = tuple(channel.name for channel in channels if channel.rate_of is None)
+    if span in ("position", "rate"):
+        return tuple((name,) for name in (positions if span == "position" else rates))
+    if span == "joint":
+        rate_of = {channel.rate_of: channel.name for channel in channels if channel.rate_of}
+        joints = [(name, rate_of[name]) if name in rate_of else (name,) for name in positions]
+        alone = [(rate,) for position, rate in rate_of.items() if position not in positions]
+        return (*joints, *alone)
+    group = {"positions": positions, "rates": rates}.get(span, (*positions, *rates))
+    return (group,) if group else ()
+
+
+def _ports(simulator: Simulator, effect: type[Effect]) -> Iterator[str]:
+    """Returns the names of ports and groups of ports that an effect may attach to."""
+    kinds = set(effect.port_kinds)
+    if issubclass(effect, SensorEffect) and "sensor" in kinds:
+        kinds.remove("sensor")
+        groups = [g for span in effect.spans for g in sensor_groups(simulator, span)]
+        if any("{port}" in parameter.unit for parameter in effect.parameters):
+            groups = [part for group in groups for part in _by_unit(simulator, group)]
+        yield from dict.fromkeys(",".join(group) for group in groups)
+    lasting = {p.name for p in simulator.parameters if not _may_drift(p.unit, p.nominal)}
+    for port in simulator.all_ports:
+        if port.kind in kinds and not (port.kind == "parameter" and port.name in lasting):
+            yield port.name
+
+
+def _by_unit(simulator: Simulator, group: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Returns a group cut into groups of one unit each."""
+    ports: list[Port] = [simulator.port(name) for name in group]
+    units = dict.fromkeys(port.unit for port in ports)
+    return [tuple(port.name for port in ports if port.unit == unit) for unit in units]
+
+
+def _may_drift(unit: str, nominal: float) -> bool:
+    return nominal != 0.0 and unit not in _LASTING_UNITS

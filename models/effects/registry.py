@@ -1,0 +1,91 @@
+"""The registry of effects: the catalogue, and what other packages add to it.
+
+Other packages add theirs by an entry point of group ``npdr_ppl.effects``: its name is the effect's
+id, its value a subclass of :class:`~npdr_ppl.language.effects.Effect`.
+"""
+
+from importlib.metadata import entry_points
+
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.registry import Registry
+
+__all__ = ["effect_class", "effects"]
+
+GROUP = "npdr_ppl.effects"
+
+_HOME = "npdr_ppl.models.effects"
+
+BUILT_IN = {
+    "viscous_friction": f"{_HOME}.friction:ViscousFriction",
+    "coulomb_friction": f"{_HOME}.friction:CoulombFriction",
+    "asymmetric_coulomb_friction": f"{_HOME}.friction:AsymmetricCoulombFriction",
+    "stribeck_friction": f"{_HOME}.friction:StribeckFriction",
+    "presliding_friction": f"{_HOME}.friction_with_state:PreslidingFriction",
+    "quadratic_drag": f"{_HOME}.friction:QuadraticDrag",
+    "load_dependent_friction": f"{_HOME}.friction_with_state:LoadDependentFriction",
+    "friction_drift": f"{_HOME}.friction_with_state:FrictionDrift",
+    "input_delay": f"{_HOME}.actuation:InputDelay",
+    "sensor_delay": f"{_HOME}.timing:SensorDelay",
+    "actuator_lag": f"{_HOME}.actuation:ActuatorLag",
+    "sensor_low_pass": f"{_HOME}.sensing:SensorLowPass",
+    "saturation": f"{_HOME}.actuation:Saturation",
+    "supply_sag": f"{_HOME}.actuation:SupplySag",
+    "dead_zone": f"{_HOME}.actuation:DeadZone",
+    "actuator_gain": f"{_HOME}.actuation:ActuatorGain",
+    "bias": f"{_HOME}.forces:Bias",
+    "cogging": f"{_HOME}.disturbances:Cogging",
+    "spring": f"{_HOME}.forces:Spring",
+    "hardening_spring": f"{_HOME}.forces:HardeningSpring",
+    "joint_elasticity": f"{_HOME}.transmission:JointElasticity",
+    "backlash": f"{_HOME}.transmission:Backlash",
+    "payload": f"{_HOME}.surroundings:Payload",
+    "unbalance": f"{_HOME}.forces:Unbalance",
+    "tilt": f"{_HOME}.surroundings:Tilt",
+    "encoder_bias": f"{_HOME}.sensing:EncoderBias",
+    "encoder_scale": f"{_HOME}.sensing:EncoderScale",
+    "quantisation": f"{_HOME}.sensing:Quantisation",
+    "clock_skew": f"{_HOME}.timing:ClockSkew",
+    "contact": f"{_HOME}.surroundings:Contact",
+    "wind": f"{_HOME}.disturbances:Wind",
+    "periodic_disturbance": f"{_HOME}.disturbances:PeriodicDisturbance",
+    "parameter_drift": f"{_HOME}.disturbances:ParameterDrift",
+}
+"""Effects of this package by id."""
+
+
+def _locations() -> dict[str, str]:
+    """Returns ``module:class`` of every effect by id; built-in ids cannot be taken."""
+    added = {entry.name: entry.value for entry in entry_points(group=GROUP)}
+    return BUILT_IN | {name: value for name, value in added.items() if name not in BUILT_IN}
+
+
+_REGISTRY = Registry("effect", Effect, ModelError, _locations)
+
+
+def effect_class(name: str) -> type[Effect]:
+    """Returns the class of an effect.
+
+    Args:
+        name: Its id, e.g. ``"coulomb_friction"``.
+
+    Raises:
+        ModelError: There is no such effect, it cannot be loaded, or its id is another.
+    """
+    effect = _REGISTRY.find(name)
+    if effect.id != name:
+        raise ModelError(
+            f"The entry point {name!r} of group {GROUP} names an effect whose id is "
+            f"{effect.id!r}; both have to be the same."
+        )
+    return effect
+
+
+def effects() -> dict[str, type[Effect]]:
+    """Returns every effect by its id, the catalogue's first.
+
+    Example:
+        >>> effects()["coulomb_friction"]("arm")
+        CoulombFriction(port='arm')
+    """
+    return {name: effect_class(name) for name in _locations()}

@@ -1,0 +1,131 @@
+"""Readings that are late, or stamped by a clock that is off."""
+
+import math
+from collections.abc import Mapping
+
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.language.channels import Parameter, Port
+from npdr_ppl.language.effect_context import Start
+from npdr_ppl.language.effects import SensorEffect
+from npdr_ppl.models.effects.equivalence import LATENCY
+from npdr_ppl.models.effects.references import LJUNG_1999
+
+__all__ = ["ClockSkew", "SensorDelay"]
+
+
+def _past(value: Tensor, start: Start) -> tuple[Tensor, ...]:
+    """Returns what came before the start, latest first: continued by the rates backwards."""
+    rate, curvature = start.rates
+    steps = (j * start.time_step for j in range(1, start.history + 1))
+    return tuple(value - h * rate + 0.5 * h * h * curvature for h in steps)
+
+
+class SensorDelay(SensorEffect):
+    """y(t) = x(t − d) with a delay d that need not be a whole number of steps.
+
+    Between steps of length h, x is taken as linear: y_k = Σ_j max(0, 1 − |d/h − j|) x_{k−j}.
+    Attach it to the channels that are late together.
+
+    What was read at a segment's start is the state d earlier, so the segment starts from the state
+    extrapolated by d, and what the sensor reports until d has passed is the extrapolation back.
+    Both use the simulator's accelerations without effects under the last command; good while
+    these change little within d.
+    """
+
+    id = "sensor_delay"
+    parameters = (Parameter("delay", "s", 0.0, "delay d"),)
+    is_smooth = False
+    needs_rates = True
+    spans = ("joint", "rates", "all")
+    law = "y(t − d)"
+    equivalence = (LATENCY,)
+    excitation = "chirp"
+    reference = LJUNG_1999
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Uniform up to 30 ms."""
+        return {"delay": dist.Uniform(0.0, 0.03)}
+
+    def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
+        """Returns the steps that the longest delay reaches back."""
+        return math.floor(float(parameters["delay"].detach().max()) / time_step) + 1
+
+    def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor:
+        """Returns −d."""
+        return -parameters["delay"]
+
+    def initial_memory(
+        self, value: Tensor, reading: Tensor, start: Start
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """Returns the weights of x_k, x_{k−1}, …, and the past values, latest first."""
+        steps = start.parameters["delay"] / start.time_step
+        weights = tuple(
+            (1.0 - (steps - j).abs()).clamp_min(0.0).expand(value.shape)
+            for j in range(start.history + 1)
+        )
+        return weights, (value, *_past(value, start)[:-1])
+
+    def read(
+        self,
+        value: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: tuple[tuple[Tensor, ...], tuple[Tensor, ...]],
+        time_step: float,
+    ) -> tuple[Tensor, tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]:
+        """Returns the value d ago."""
+        weights, past = memory
+        reading = weights[0] * value
+        for weight, earlier in zip(weights[1:], past, strict=True):
+            reading = torch.addcmul(reading, weight, earlier)
+        return reading, (weights, (value, *past[:-1]))
+
+
+class ClockSkew(SensorEffect):
+    """y(t) = x(t (1 + κ)): readings stamped by a clock that runs apart from that of the commands.
+
+    κ t is small, so that a parabola through the last three values gives the reading. Both clocks
+    agree when a rollout begins; readings at a segment's start are κ t ahead.
+    """
+
+    id = "clock_skew"
+    port_kinds = ("clock",)
+    parameters = (Parameter("skew", "1", 0.0, "relative skew κ"),)
+    needs_rates = True
+    law = "t (1 + κ)"
+    excitation = "long_run"
+    reference = LJUNG_1999
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Normal; 300 ppm."""
+        return {"skew": dist.Normal(0.0, 3e-4)}
+
+    def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
+        """Returns 2."""
+        return 2
+
+    def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor:
+        """Returns κ t."""
+        return parameters["skew"] * time
+
+    def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> tuple[Tensor, ...]:
+        """Returns the time, the present value and the one before it."""
+        return start.time, value, _past(value, start)[0]
+
+    def read(
+        self,
+        value: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: tuple[Tensor, ...],
+        time_step: float,
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """Returns the value κ t ahead."""
+        before, last, previous = memory
+        time = before + time_step
+        lead = parameters["skew"] * time / time_step
+        rate = 1.5 * value - 2.0 * last + 0.5 * previous
+        curvature = value - 2.0 * last + previous
+        return value + lead * (rate + 0.5 * lead * curvature), (time, value, last)

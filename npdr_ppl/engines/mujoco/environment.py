@@ -1,0 +1,143 @@
+"""What environment ports of a MuJoCo model stand for: gravity, payloads and contact."""
+
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npdr_ppl.engines.mujoco.fields import element_names
+from npdr_ppl.engines.mujoco.parameters import Assignments
+from npdr_ppl.language.channels import Port
+from npdr_ppl.language.effects import Effect, EnvironmentEffect
+
+__all__ = ["EnvironmentPort", "environment_ports", "with_environment"]
+
+# Contact coefficients: what holds each, and the power of the coefficient that it is. A contact's
+# stiffness goes as the inverse square of its time constant. Restitution has no number of its own.
+_CONTACT = {
+    "friction": (("geom_friction", 0, 1.0), ("pair_friction", 0, 1.0), ("pair_friction", 1, 1.0)),
+    "rolling": (("geom_friction", 2, 1.0), ("pair_friction", 3, 1.0), ("pair_friction", 4, 1.0)),
+    "compliance": (("geom_solref", 0, 0.5), ("pair_solref", 0, 0.5)),
+}
+
+
+class EnvironmentPort:
+    """An environment port with the body whose mass it is, if it is a payload.
+
+    Attributes:
+        port: The port.
+        body: Number of the body; ``None`` for gravity and contact.
+    """
+
+    def __init__(self, port: Port, body: int | None = None) -> None:
+        self.port = port
+        self.body = body
+
+
+def environment_ports(
+    model: Any, driven: NDArray[np.bool_], taken: Sequence[str]
+) -> tuple[EnvironmentPort, ...]:
+    """Returns gravity, a payload on every last link and floating base, and contact.
+
+    Each only where the file has it. A payload sits at its body's centre of mass, and its port is
+    called ``payload``, or ``<body>.payload`` where there are several.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        driven: Which degrees of freedom actuators move.
+        taken: Names of channels, joints and parameters.
+    """
+    ports = []
+    gravity = float(np.linalg.norm(model.opt.gravity))
+    if gravity > 0.0:
+        ports.append(EnvironmentPort(Port("gravity", "environment", "m/s²", gravity)))
+    bodies, names = _loaded_bodies(model, driven), element_names(model, "body")
+    for body in bodies:
+        is_alone = len(bodies) == 1 and "payload" not in taken
+        name = "payload" if is_alone else f"{names[body]}.payload"
+        mass = float(model.body_mass[body]) or float(model.body_subtreemass[body]) or 1.0
+        ports.append(EnvironmentPort(Port(name, "environment", "kg", mass), body))
+    if _has_contacts(model):
+        ports.append(EnvironmentPort(Port("contact", "environment", "1")))
+    return tuple(ports)
+
+
+def with_environment(
+    model: Any,
+    ports: Sequence[EnvironmentPort],
+    effects: Sequence[Effect],
+    parameters: Sequence[Mapping[str, Tensor]],
+    assignments: Assignments,
+) -> Assignments:
+    """Returns what to write into the model, as environment effects change it.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        ports: Its environment ports.
+        effects: All effects of a simulator.
+        parameters: Parameters of each by short name, in float64.
+        assignments: What to write without them.
+    """
+    by_name = {port.port.name: port for port in ports}
+    result = dict(assignments)
+
+    def present(array: str, place: int, nominal: float) -> Tensor:
+        return result.get((array, place), torch.tensor(float(nominal), dtype=torch.float64))
+
+    for effect, values in zip(effects, parameters, strict=True):
+        if not isinstance(effect, EnvironmentEffect):
+            continue
+        port = by_name[effect.port]
+        if port.body is not None:
+            mass = present("body_mass", port.body, model.body_mass[port.body])
+            result["body_mass", port.body] = effect.environment(mass, values)
+        elif port.port.name == "gravity":
+            gravity = tuple(present("opt.gravity", i, g) for i, g in enumerate(model.opt.gravity))
+            changed = effect.environment(gravity, values)
+            result |= {("opt.gravity", i): g for i, g in enumerate(changed)}
+        else:
+            one = torch.ones((), dtype=torch.float64)
+            factors = effect.environment({name: one for name in _CONTACT}, values)
+            for name, targets in _CONTACT.items():
+                for array, column, power in targets:
+                    table = np.asarray(getattr(model, array))
+                    for row in range(len(table)):
+                        place = row * table.shape[1] + column
+                        number = float(table[row, column])
+                        # Negative numbers of solref are a stiffness, which goes the other way.
+                        exponent = -1.0 if number < 0.0 and "solref" in array else power
+                        value = present(array, place, number)
+                        result[array, place] = value * factors[name] ** exponent
+    return result
+
+
+def _loaded_bodies(model: Any, driven: NDArray[np.bool_]) -> list[int]:
+    """Returns the bodies that move and carry no other moving body, and all floating bases."""
+    welded = np.asarray(model.body_weldid)
+    moving = [b for b in range(model.nbody) if welded[b] == b and b != 0]
+    carriers = {int(welded[model.body_parentid[body]]) for body in moving}
+    floating = {
+        body
+        for body in moving
+        if welded[model.body_parentid[body]] == 0
+        and not driven[np.asarray(model.dof_bodyid) == body].any()
+    }
+    return [body for body in moving if body not in carriers or body in floating]
+
+
+def _has_contacts(model: Any) -> bool:
+    """Returns whether two geoms may collide of which one moves."""
+    if model.npair:
+        return True
+    mujoco: Any = importlib.import_module("mujoco")
+    off = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    if int(model.opt.disableflags) & off:
+        return False
+    kind, affinity = np.asarray(model.geom_contype), np.asarray(model.geom_conaffinity)
+    body = np.asarray(model.body_weldid)[np.asarray(model.geom_bodyid)]
+    may = (kind[:, None] & affinity) | (affinity[:, None] & kind)
+    return bool(np.any((may != 0) & (body[:, None] != body)))

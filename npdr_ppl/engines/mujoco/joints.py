@@ -1,0 +1,61 @@
+"""Joints of a batch as force effects see them before a step."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.mujoco.ports import ForcePort
+from npdr_ppl.language.effect_context import Joint
+
+__all__ = ["JointStates"]
+
+
+class JointStates:
+    """Accelerations, inertias and drives that the engine has computed last.
+
+    An acceleration includes the forces of contacts, limits and the file's own dry friction. An
+    inverse inertia is that of the free mechanism, a diagonal entry of M⁻¹, and a drive's force all
+    that the actuators exert at the joint, servos' feedback and back-EMF included.
+
+    Args:
+        batch: A ``mujoco.batch.Batch`` of N simulations.
+        ports: The joints.
+    """
+
+    def __init__(self, batch: Any, ports: Sequence[ForcePort]) -> None:
+        model = batch.model
+        self._acceleration = batch.bind("qacc")
+        self._drive = batch.bind("qfrc_actuator")
+        # The lower triangle, row by row without its zeros.
+        self._inertia = batch.bind("M")
+        self._size = int(model.nv)
+        counts = np.asarray(model.M_rownnz)
+        first = np.repeat(np.asarray(model.M_rowadr), counts)
+        within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        self._entries = first + within
+        self._rows = np.repeat(np.arange(self._size), counts)
+        self._columns = np.asarray(model.M_colind)[self._entries]
+        self._velocities = [port.velocity for port in ports]
+
+    def read(self, positions: Components, velocities: Components) -> tuple[Joint, ...]:
+        """Returns the joints.
+
+        Args:
+            positions: Position of each, ``(N,)``.
+            velocities: Velocity of each, ``(N,)``.
+        """
+        inertia = np.zeros((len(self._inertia), self._size, self._size))
+        values = self._inertia[:, self._entries]
+        inertia[:, self._rows, self._columns] = values
+        inertia[:, self._columns, self._rows] = values
+        # A lost simulation may have no inverse, which is no reason to stop the others.
+        inverse = torch.linalg.inv_ex(torch.from_numpy(inertia)).inverse
+        acceleration = torch.from_numpy(self._acceleration.copy())
+        drive = torch.from_numpy(self._drive.copy())
+        return tuple(
+            Joint(q, v, acceleration[:, i], inverse[:, i, i], drive[:, i])
+            for q, v, i in zip(positions, velocities, self._velocities, strict=True)
+        )

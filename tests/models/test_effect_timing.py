@@ -1,0 +1,106 @@
+"""Late sensors and skewed clocks against motions whose readings have closed forms."""
+
+import pytest
+import torch
+
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.effects import ClockSkew, InputDelay, SensorDelay
+from npdr_ppl.models.emps import Emps
+from npdr_ppl.models.furuta import Furuta
+from npdr_ppl.policies.linear import Linear
+from tests.models.effect_replay import FREE, replay
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.0107])
+def test_a_delayed_ramp_is_the_ramp_from_what_was_read(delay):
+    """At constant speed a late reading is a shifted one, and the segment starts from it."""
+    simulator = Emps().with_effects(SensorDelay("position"))
+    out = replay(
+        simulator, FREE | {"position.sensor_delay.delay": delay}, [0.0] * 40, start=[0.1, 0.5]
+    )
+    ramp = 0.1 + 0.5 * Emps.time_step * torch.arange(1, 41, dtype=torch.float64)
+    torch.testing.assert_close(out[:, 0], ramp, rtol=0.0, atol=1e-12)
+
+
+def test_delays_of_all_sensors_and_of_the_input_are_one_class():
+    """From one reading, late commands and late readings give one trajectory.
+
+    What is left is the extrapolation of the state over the delay, 11 ms of a pendulum's swing.
+    """
+    volts = 3.0 * torch.sin(9.0 * 0.002 * torch.arange(-20, 300, dtype=torch.float64))
+    everything = ",".join(sensor.name for sensor in Furuta.sensors)
+    sensors, voltage = SensorDelay(everything), InputDelay("voltage")
+
+    def run(*effects):
+        return replay(
+            Furuta().with_effects(*effects),
+            {f"{effect.name}.delay": 0.0113 for effect in effects},
+            volts[20:],
+            start=[0.1, 0.4, 0.0, 0.5],
+            past_actions=volts[None, :20, None],
+        )
+
+    effect = (run() - run(voltage)).abs().amax(0)
+    difference = (run(sensors) - run(voltage)).abs().amax(0)
+    assert (difference < 0.15 * effect).all()
+
+
+def test_velocities_derived_from_late_positions_are_late_too():
+    """A falling body whose state is estimated from late positions at a segment's start."""
+    delay, fall, begin = 0.0107, 3.0, 400
+    time = Emps.time_step * torch.arange(begin, begin + 41, dtype=torch.float64)
+    position = 0.5 * fall * (time - delay) ** 2
+    late_rate = fall * (time[0] - delay)
+    inputs = Inputs(
+        actions=torch.full((1, 40, 1), fall, dtype=torch.float64),
+        action_names=("voltage",),
+        initial_readings=position[:1, None],
+        initial_values=position[:1, None],
+        initial_rates=late_rate.reshape(1, 1),
+        channel_names=("position",),
+        past_actions=torch.full((1, 8, 1), fall, dtype=torch.float64),
+        time_step=Emps.time_step,
+        mask=torch.ones(1, 40, dtype=torch.bool),
+        rollout=torch.zeros(1, dtype=torch.long),
+        start=torch.tensor([begin]),
+    )
+    simulator = Emps(integrator="constant-acceleration").with_effects(SensorDelay("position"))
+    given = FREE | {"position.sensor_delay.delay": delay}
+    given = {name: torch.tensor(value, dtype=torch.float64) for name, value in given.items()}
+    out = simulator.simulate(given, inputs)[0]
+    # Between steps positions are taken as linear, which is off by a h²/8 at most.
+    torch.testing.assert_close(
+        out[:, 0], position[1:], rtol=0.0, atol=fall * Emps.time_step**2 / 8.0
+    )
+    torch.testing.assert_close(out[:, 1], fall * time[1:])
+
+
+def test_a_closed_loop_reads_late():
+    simulator = Emps().with_effects(SensorDelay("position"))
+    given = {name: torch.tensor(value, dtype=torch.float64) for name, value in FREE.items()}
+    given["position.sensor_delay.delay"] = torch.tensor(0.0107, dtype=torch.float64)
+    policy = Linear(("position", "velocity"), ("voltage",))
+    policy.parameters = torch.zeros_like(policy.parameters).double()
+    start = torch.tensor([[0.1, 0.5]], dtype=torch.float64)
+    episode = simulator.roll_out(given, policy, start, 40, record=True)
+    ramp = 0.1 + 0.5 * (Emps.time_step * torch.arange(1, 41, dtype=torch.float64) - 0.0107)
+    torch.testing.assert_close(episode.readings[0, 1:, 0], ramp, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("skew", [0.0, 1e-3, -2e-3])
+def test_a_skewed_clock_reads_the_parabola_of_a_falling_body_early_or_late(skew):
+    simulator = Emps(integrator="constant-acceleration").with_effects(ClockSkew("clock"))
+    step, acceleration = 2000, 3.0
+    time = Emps.time_step * torch.arange(step, step + 60, dtype=torch.float64)
+    stamped = time * (1.0 + skew)
+    truth = torch.stack(
+        (0.5 * acceleration * (stamped - 2.0) ** 2, acceleration * (stamped - 2.0)), -1
+    )
+    out = replay(
+        simulator,
+        FREE | {"clock.clock_skew.skew": skew},
+        [acceleration] * 59,
+        truth[0].tolist(),
+        step,
+    )
+    torch.testing.assert_close(out, truth[1:], rtol=0.0, atol=1e-10)
