@@ -77,6 +77,20 @@ _ENTRIES = (
         "emps",
         "Emps",
     ),
+    ZooEntry(
+        "mini_golf",
+        "Robot arm strikes a ball past two obstacles; ten parameters of the NPDR paper",
+        "npdr_ppl.models.mini_golf",
+        "mini_golf",
+        "MiniGolf",
+    ),
+    ZooEntry(
+        "mini_golf_two_restitutions",
+        "The same strike, rebounds off the club apart from those off obstacles",
+        "npdr_ppl.models.mini_golf",
+        "mini_golf_two_restitutions",
+        "MiniGolf",
+    ),
 )
 
 
@@ -85,7 +99,8 @@ def zoo() -> dict[str, ZooEntry]:
 
     Example:
         >>> sorted(zoo())
-        ['cart_pole', 'emps', 'furuta', 'furuta_paper', 'pendulum']
+        ['cart_pole', 'emps', 'furuta', 'furuta_paper', 'mini_golf', 'mini_golf_two_restitutions',
+        'pendulum']
     """
     return {entry.name: entry for entry in _ENTRIES}
 
