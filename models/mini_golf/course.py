@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-__all__ = ["MEASURED_ANGLES", "OBSTACLES", "RAILS", "Box", "StrikeParameters"]
+__all__ = ["MEASURED_OBSTACLES", "OBSTACLES", "RAILS", "Box", "StrikeParameters"]
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,15 @@ OBSTACLES = (
 )
 """The left obstacle (1) and the right one (2)."""
 
-MEASURED_ANGLES = (-7.7, 29.3)
-"""Angles of both obstacles on the rig by motion capture, in degrees."""
+MEASURED_OBSTACLES = ((0.852088, 1.48181, -7.7), (0.576446, 1.21897, 29.3))
+"""Both obstacles on the rig by motion capture: x and y of the centre in m, angle in degrees."""
 
-HOLE = (1.18977, 1.37017, 0.0)
-HOLE_HEIGHT = 0.002
+HOLE = (1.18977, 1.37017)
+HOLE_DEPTH = 0.002
+HOLE_RISE = 1e-5
+"""The disc's top in m above the ground: the ball stops once its point of contact is on the disc.
+A disc that stands out by a millimetre would stop it half a centimetre earlier, at the rim."""
+
 HOLE_FRICTION = 10.0
 """Friction and, in m, rolling friction of the disc that stands for the hole."""
 

@@ -26,8 +26,9 @@ from npdr_ppl.models.mini_golf.course import (
     CLUB_MASS,
     DEFAULT_FRICTION,
     HOLE,
+    HOLE_DEPTH,
     HOLE_FRICTION,
-    HOLE_HEIGHT,
+    HOLE_RISE,
     OBSTACLES,
     RAILS,
     Box,
@@ -197,10 +198,11 @@ class Scene:
         hole = p.createCollisionShape(
             p.GEOM_CYLINDER,
             radius=parameters.hole_radius,
-            height=HOLE_HEIGHT,
+            height=HOLE_DEPTH,
             physicsClientId=client,
         )
-        self._body(hole, HOLE, _WORLD, friction=HOLE_FRICTION, rolling=HOLE_FRICTION)
+        place = (*HOLE, HOLE_RISE - 0.5 * HOLE_DEPTH)
+        self._body(hole, place, _WORLD, friction=HOLE_FRICTION, rolling=HOLE_FRICTION)
         sphere = p.createCollisionShape(
             p.GEOM_SPHERE, radius=parameters.ball_radius, physicsClientId=client
         )

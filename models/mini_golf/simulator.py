@@ -65,7 +65,7 @@ class MiniGolf(Simulator):
         Parameter("ball_friction", "1", 0.6, "sliding friction of the ball, a factor"),
         Parameter("ball_inertia_factor", "1", 0.4, "I/(m r²): 2/5 solid, 2/3 hollow"),
         Parameter("ground_friction", "1", 0.4, "sliding friction of the ground, a factor"),
-        Parameter("hole_radius", "m", 0.04, "radius of the sticky disc that is the hole"),
+        Parameter("hole_radius", "m", 0.025, "radius of the sticky disc that is the hole"),
     )
     ports = tuple(Port(action.name, "action", "rad", rated=1.0) for action in _COMMANDS)
     time_step = 0.01
