@@ -44,9 +44,10 @@ MEASURED_OBSTACLES = ((0.852088, 1.48181, -7.7), (0.576446, 1.21897, 29.3))
 
 HOLE = (1.18977, 1.37017)
 HOLE_DEPTH = 0.002
-HOLE_RISE = 1e-5
+HOLE_RISE = 1e-4
 """The disc's top in m above the ground: the ball stops once its point of contact is on the disc.
-A disc that stands out by a millimetre would stop it half a centimetre earlier, at the rim."""
+One that stood out by a millimetre would stop it half a centimetre earlier, at the rim; one of ten
+micrometres lets fast balls pass, because the ground still bears them."""
 
 HOLE_FRICTION = 10.0
 """Friction and, in m, rolling friction of the disc that stands for the hole."""

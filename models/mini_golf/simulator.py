@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Self
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.errors import DataError, ModelError
@@ -14,10 +14,13 @@ from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.models.mini_golf.course import StrikeParameters
-from npdr_ppl.models.mini_golf.kinematics import JOINTS
-from npdr_ppl.models.mini_golf.strikes import Swing, available_workers, run_strikes
+from npdr_ppl.models.mini_golf.kinematics import JOINTS, head_path
+from npdr_ppl.models.mini_golf.scene import SUB_STEPS, HeadPath, Scene
+from npdr_ppl.models.mini_golf.strikes import Segment, simulate_batch
 
-__all__ = ["MiniGolf"]
+__all__ = ["MiniGolf", "Workspace"]
+
+Array = NDArray[np.float64]
 
 _BALL = (Channel("ball_x", "m"), Channel("ball_y", "m"))
 _ANGLES = tuple(
@@ -26,6 +29,34 @@ _ANGLES = tuple(
 _COMMANDS = tuple(
     Channel(f"{angle.name}_command", "rad", angle.lower, angle.upper) for angle in _ANGLES
 )
+
+
+class Workspace:
+    """A scene, and the club head's path for the joint angles last seen.
+
+    Attributes:
+        scene: The connection to Bullet.
+    """
+
+    def __init__(self) -> None:
+        self.scene = Scene()
+        self._key: tuple[bytes, float] | None = None
+        self._path: HeadPath | None = None
+
+    def head(self, angles: Array, time_step: float) -> HeadPath:
+        """Returns the path for joint angles at the bounds of steps, ``(K + 1, 7)`` in rad.
+
+        Between the bounds the angles are linear in time. Thousands of draws share one path, and
+        it takes as long to find as a strike.
+        """
+        key = (angles.tobytes(), time_step)
+        if self._path is None or key != self._key:
+            bounds = np.arange(len(angles))
+            time = np.arange((len(angles) - 1) * SUB_STEPS + 1) / SUB_STEPS
+            fine = np.stack([np.interp(time, bounds, joint) for joint in angles.T], axis=-1)
+            self._path = HeadPath.of(head_path(fine), time_step / SUB_STEPS)
+            self._key = key
+        return self._path
 
 
 class MiniGolf(Simulator):
@@ -41,9 +72,6 @@ class MiniGolf(Simulator):
     exceed 1: a flexible shaft gives back more than the head's own motion.
 
     A strike is simulated from its first sample, at which the ball is at rest.
-
-    Args:
-        num_workers: Processes to simulate in; ``None`` for one per core.
     """
 
     states = (*_BALL, *_ANGLES)
@@ -70,11 +98,6 @@ class MiniGolf(Simulator):
     ports = tuple(Port(action.name, "action", "rad", rated=1.0) for action in _COMMANDS)
     time_step = 0.01
 
-    def __init__(self, num_workers: int | None = None) -> None:
-        self.num_workers = available_workers() if num_workers is None else num_workers
-        if self.num_workers < 1:
-            raise ModelError(f"num_workers is at least 1, got {num_workers}.")
-
     def with_effects(self, *effects: Effect) -> Self:
         """Returns a copy if there is nothing to attach.
 
@@ -98,47 +121,35 @@ class MiniGolf(Simulator):
                 f"{self.name} simulates whole strikes, from the ball at rest; leave out the "
                 "segment length."
             )
-        domain = self.nominal() | dict(parameters)
-        batch_shape = torch.broadcast_shapes(
-            inputs.batch_shape, *(value.shape for value in domain.values())
-        )
-        names = [p.name for p in self.parameters]
-        columns = [domain[name].double().expand(batch_shape).reshape(-1) for name in names]
-        table = torch.stack(columns, dim=-1).cpu()
-        result = torch.zeros(
-            (table.shape[0], inputs.num_segments, inputs.num_steps, len(self.sensors)),
-            dtype=torch.float64,
-        )
-        for rows, element in _by_element(inputs, batch_shape):
-            draws = [_strike_parameters(dict(zip(names, row))) for row in table[rows].tolist()]
-            for segment in range(inputs.num_segments):
-                swing = self._swing(element, segment)
-                num_steps = len(swing.angles) - 1
-                balls = run_strikes(swing, draws, self.num_workers)
-                result[rows, segment, :num_steps, :2] = torch.from_numpy(balls)
-                result[rows, segment, :num_steps, 2:] = torch.from_numpy(swing.angles[1:])
-        shape = (*batch_shape, *result.shape[1:])
-        return result.reshape(shape).to(inputs.actions)
+        return simulate_batch(self, parameters, inputs)
 
-    def _swing(self, inputs: Inputs, segment: int) -> Swing:
-        """Returns the arm's motion in a segment and the ball's place at its start."""
-        columns = [inputs.action_names.index(action.name) for action in self.actions]
-        num_steps = int(inputs.mask[segment].sum())
-        angles = inputs.actions[segment, :num_steps][:, columns].double().cpu().numpy()
+    def set_up(self) -> Workspace:
+        """Returns what strikes of one process share."""
+        return Workspace()
+
+    def simulate_one(
+        self, workspace: Workspace, parameters: Mapping[str, float], segment: Segment, seed: int
+    ) -> Array:
+        """Simulates one strike; nothing in it is random.
+
+        Args:
+            workspace: What :meth:`set_up` returned.
+            parameters: All parameters, in the declared units.
+            segment: The commands, and where the ball lies.
+            seed: Has no effect.
+
+        Returns:
+            Ball and joints after each step, ``(steps, 9)`` in m and rad.
+        """
         # What the joints were told after the last step is not on record: they hold still.
-        angles = np.concatenate([angles, angles[-1:]])
-        ball = torch.stack([state[..., segment] for state in self.initial_states(inputs)[:2]])
-        return Swing(angles, ball.double().cpu().numpy(), inputs.time_step)
-
-
-def _by_element(inputs: Inputs, batch_shape: torch.Size) -> list[tuple[Tensor, Inputs]]:
-    """Returns the rows of the flat batch that share inputs, and these inputs."""
-    rows = torch.arange(batch_shape.numel())
-    if not inputs.batch_shape:
-        return [(rows, inputs)]
-    count = inputs.batch_shape.numel()
-    index = torch.arange(count).reshape(inputs.batch_shape).expand(batch_shape).reshape(-1)
-    return [(rows[index == i], inputs.element(i)) for i in range(count)]
+        angles = np.concatenate([segment.actions, segment.actions[-1:]])
+        ball = workspace.scene.strike(
+            _strike_parameters(parameters),
+            segment.initial_state[: len(_BALL)],
+            workspace.head(angles, segment.time_step),
+            segment.time_step,
+        )
+        return np.concatenate([ball, angles[1:]], axis=-1)
 
 
 def _strike_parameters(values: Mapping[str, float]) -> StrikeParameters:
