@@ -77,12 +77,14 @@ class RoundInfo:
         num_failed: Of these, how many were dropped because they were not finite.
         seconds: Training time.
         losses: Figures by name, e.g. ``validation_log_prob`` per member.
+        faults: Counts of what went wrong at workers, by kind; empty where none were used.
     """
 
     num_simulations: int
     num_failed: int
     seconds: float
     losses: Mapping[str, Any] = field(default_factory=dict)
+    faults: Mapping[str, int] = field(default_factory=dict)
 
 
 class Backend(ABC):

@@ -34,9 +34,11 @@ __all__ = [
     "train",
     "with_likelihood",
     "with_noise",
+    "workers",
 ]
 
 if TYPE_CHECKING:
+    from npdr_ppl.engines.workers import workers
     from npdr_ppl.errors import NpdrError
     from npdr_ppl.language.channels import Channel, Parameter, Port
     from npdr_ppl.language.effects import Effect
@@ -79,6 +81,7 @@ _HOMES = {
     "train": "workflows.npdr_loop",
     "with_likelihood": "workflows.learned_likelihood",
     "with_noise": "language.handlers",
+    "workers": "engines.workers",
 }
 
 

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-import torch
 
 __all__ = ["derived_seed", "seeded"]
 
@@ -31,6 +30,8 @@ def seeded(seed: int, *purpose: str | int) -> Iterator[None]:
 
     Pyro and zuko draw from torch's global stream and take no generator.
     """
+    import torch  # takes seconds, and processes that only derive seeds start often
+
     devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(derived_seed(seed, *purpose))

@@ -6,6 +6,13 @@ from typing import Annotated
 import typer
 
 from npdr_ppl.cli.fit import InitialState, Noise, Precision
+from npdr_ppl.cli.worker_options import (
+    Address,
+    ExecutorOption,
+    TimeLimit,
+    WorkersOption,
+    chosen_workers,
+)
 
 __all__ = ["compare"]
 
@@ -43,6 +50,10 @@ def compare(
         Noise, typer.Option(help="Noise of readings: auto estimates it, model takes the model's.")
     ] = Noise.AUTO,
     device: Annotated[str, typer.Option(help="Where to train: cpu or cuda.")] = "cpu",
+    executor: ExecutorOption = None,
+    workers: WorkersOption = None,
+    address: Address = None,
+    time_limit: TimeLimit = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
 ) -> None:
     """Compare inference backends with the same budget of simulations and the same seed.
@@ -64,23 +75,24 @@ def compare(
     chosen = resolve_effects(resolve_model(model), effect or [])
     named = candidates(split_candidates(backends))
     train, test = resolve_rollouts(data, holdout)
-    comparison = run_compare(
-        chosen,
-        train,
-        test,
-        backends=named,
-        rounds=rounds,
-        num_simulations=simulations,
-        seed=seed,
-        options=BindingOptions(
-            embedding, segment_length or None, initial_state.value, precision.value
-        ),
-        noise=noise.value,
-        device=device,
-        out=out,
-        progress=False if quiet else None,
-    )
-    shown = train if test is None else test
-    write_comparison_figures(comparison, chosen, shown, out, seed=seed)
+    with chosen_workers(executor, workers, address, time_limit):
+        comparison = run_compare(
+            chosen,
+            train,
+            test,
+            backends=named,
+            rounds=rounds,
+            num_simulations=simulations,
+            seed=seed,
+            options=BindingOptions(
+                embedding, segment_length or None, initial_state.value, precision.value
+            ),
+            noise=noise.value,
+            device=device,
+            out=out,
+            progress=False if quiet else None,
+        )
+        shown = train if test is None else test
+        write_comparison_figures(comparison, chosen, shown, out, seed=seed)
     if not quiet:
         show_comparison(comparison.to_dict(), out)

@@ -6,6 +6,14 @@ from typing import Annotated
 
 import typer
 
+from npdr_ppl.cli.worker_options import (
+    Address,
+    ExecutorOption,
+    TimeLimit,
+    WorkersOption,
+    chosen_workers,
+)
+
 __all__ = ["InitialState", "fit"]
 
 
@@ -58,6 +66,10 @@ def fit(
         Noise, typer.Option(help="Noise of readings: auto estimates it, model takes the model's.")
     ] = Noise.AUTO,
     device: Annotated[str, typer.Option(help="Where to train: cpu or cuda.")] = "cpu",
+    executor: ExecutorOption = None,
+    workers: WorkersOption = None,
+    address: Address = None,
+    time_limit: TimeLimit = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
 ) -> None:
     """Infer the posterior over a model's parameters from measured rollouts.
@@ -74,22 +86,23 @@ def fit(
 
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_rollouts(data, holdout)
-    posterior, result = run_fit(
-        chosen,
-        train,
-        test,
-        out=out,
-        backend=backend,
-        rounds=rounds,
-        num_simulations=simulations,
-        seed=seed,
-        options=BindingOptions(
-            embedding, segment_length or None, initial_state.value, precision.value
-        ),
-        noise=noise.value,
-        device=device,
-        progress=False if quiet else None,
-    )
-    write_fit_figures(posterior, chosen, train if test is None else test, out, seed=seed)
+    with chosen_workers(executor, workers, address, time_limit):
+        posterior, result = run_fit(
+            chosen,
+            train,
+            test,
+            out=out,
+            backend=backend,
+            rounds=rounds,
+            num_simulations=simulations,
+            seed=seed,
+            options=BindingOptions(
+                embedding, segment_length or None, initial_state.value, precision.value
+            ),
+            noise=noise.value,
+            device=device,
+            progress=False if quiet else None,
+        )
+        write_fit_figures(posterior, chosen, train if test is None else test, out, seed=seed)
     if not quiet:
         show_fit(result, out)

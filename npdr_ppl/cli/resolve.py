@@ -7,6 +7,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import cloudpickle
+
 from npdr_ppl.errors import DataError, ModelError, NpdrError
 
 if TYPE_CHECKING:
@@ -65,6 +67,8 @@ def _load_function(path: Path, function: str) -> Callable[..., Any]:
         raise ModelError(f"{path} is not a Python file.")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
+    # Workers cannot import a module of this name, so what it defines travels as code.
+    cloudpickle.register_pickle_by_value(module)
     try:
         spec.loader.exec_module(module)
     except Exception as error:

@@ -6,6 +6,14 @@ from typing import Annotated
 
 import typer
 
+from npdr_ppl.cli.worker_options import (
+    Address,
+    ExecutorOption,
+    TimeLimit,
+    WorkersOption,
+    chosen_workers,
+)
+
 __all__ = ["train"]
 
 INTERRUPTED = 130
@@ -89,6 +97,10 @@ def train(
     animate: Annotated[
         bool, typer.Option("--animate", help="Draw the last rollout as rollout.gif (Furuta only).")
     ] = False,
+    executor: ExecutorOption = None,
+    workers: WorkersOption = None,
+    address: Address = None,
+    time_limit: TimeLimit = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print JSON instead of a table.")
@@ -147,15 +159,16 @@ def train(
         stop_return=stop_return,
     )
     try:
-        training = run_train(
-            chosen,
-            device,
-            chosen_task,
-            options,
-            out=out,
-            seed=seed,
-            progress=False if quiet else None,
-        )
+        with chosen_workers(executor, workers, address, time_limit):
+            training = run_train(
+                chosen,
+                device,
+                chosen_task,
+                options,
+                out=out,
+                seed=seed,
+                progress=False if quiet else None,
+            )
     except KeyboardInterrupt:
         typer.echo(
             f"npdr: interrupted; the same command with --resume continues the run in {out}.",

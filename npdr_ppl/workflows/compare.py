@@ -253,6 +253,7 @@ class _Run:
             rounds=len(infos),
             num_simulations=sum(info.num_simulations for info in infos),
             num_failed=sum(info.num_failed for info in infos),
+            faults=posterior.provenance.faults,
             seconds={**posterior.provenance.seconds, "sample": sampled},
             peak_memory=peak,
         )

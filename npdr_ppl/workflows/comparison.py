@@ -76,6 +76,7 @@ class Row:
         rounds: Rounds it took.
         num_simulations: Simulations in all.
         num_failed: Of these, how many failed.
+        faults: Counts of what went wrong at workers, by kind; empty where none were used.
         seconds: To ``simulate``, ``train`` and ``sample`` (ten thousand draws with densities).
         peak_memory: Sampled increase of resident memory while it ran, MiB; ``None`` if unknown.
     """
@@ -88,6 +89,7 @@ class Row:
     rounds: int = 0
     num_simulations: int = 0
     num_failed: int = 0
+    faults: Mapping[str, int] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     peak_memory: float | None = None
 
@@ -192,6 +194,7 @@ class Comparison:
             "rounds": row.rounds,
             "num_simulations": row.num_simulations,
             "num_failed": row.num_failed,
+            **({"faults": dict(row.faults)} if row.faults else {}),
             "seconds": dict(row.seconds),
             "peak_memory_mib": row.peak_memory,
         }

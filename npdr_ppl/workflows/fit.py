@@ -1,12 +1,14 @@
 """`npdr fit` as a function: infer, evaluate, diagnose, draw, and write it all down."""
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from npdr_ppl.engines.workers import collect_faults
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.rollouts import Rollouts
@@ -62,8 +64,9 @@ def fit(
     """
     options = options or BindingOptions()
     used_noise = None
-    if noise == "auto" and not declares_noise(model, train, options):
-        used_noise = residual_noise(model, train, options, seed=seed)
+    with collect_faults() as before:
+        if noise == "auto" and not declares_noise(model, train, options):
+            used_noise = residual_noise(model, train, options, seed=seed)
     noisy = model if used_noise is None else with_noise(model, used_noise)
     posterior = infer(
         noisy,
@@ -81,11 +84,16 @@ def fit(
         progress=progress,
     )
     started = time.perf_counter()
-    most_likely = posterior.most_likely(seed=seed)
-    data = posterior.to_arviz(seed=seed)
-    sampled = time.perf_counter() - started
-    evaluated = train if test is None else test
-    metrics = score(model, evaluated, most_likely, options)
+    with collect_faults() as after:
+        most_likely = posterior.most_likely(seed=seed)
+        data = posterior.to_arviz(seed=seed)
+        sampled = time.perf_counter() - started
+        evaluated = train if test is None else test
+        metrics = score(model, evaluated, most_likely, options)
+    # A resumed run knows the faults of its finished rounds from disk.
+    faults = Counter(posterior.provenance.faults)
+    for part in (before, after):
+        faults.update(part.counts())
     result = {
         "backend": posterior.backend.name,
         **describe(data),
@@ -102,6 +110,8 @@ def fit(
         "diagnosis": diagnose(data).to_dict(),
         "units": parameter_units(posterior),
     }
+    if faults:
+        result["faults"] = dict(faults)
     if out is not None:
         from npdr_ppl.workflows.arviz_module import to_netcdf
 

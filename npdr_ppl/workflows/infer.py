@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.embeddings import Embedding
+from npdr_ppl.engines.workers import collect_faults, report_progress
 from npdr_ppl.errors import BackendError, NpdrError
 from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
 from npdr_ppl.inference.mixture import Mixture
@@ -162,13 +164,15 @@ def run_round(
             z = method.ask_near(problem, Mixture(start.densities), num_simulations)
         z = (method.ask(problem, state, num_simulations) if z is None else z).cpu()
     x = None if store is None else store.simulations(index, z)
-    if x is None:
-        x = simulate_features(bound, z, seed, f"round {index}", report, label)
+    with collect_faults() as collected:
+        if x is None:
+            x = simulate_features(bound, z, seed, f"round {index}", report, label)
         if store is not None:
             store.save_simulations(index, z, x)
     simulated = time.perf_counter()
     with seeded(seed, "train", index):
         state, info = method.tell(problem, state, z, x, report.stage(f"{label}: train"))
+    info = replace(info, faults=collected.counts())
     spent = {"simulate": simulated - started, "train": time.perf_counter() - simulated}
     return state, info, spent
 
@@ -206,7 +210,12 @@ def simulate_features(
     for start in range(0, len(z), chunk):
         part = z[start : start + chunk]
         # A stream for each chunk, so that a resumed run simulates the same.
-        with seeded(seed, "simulate", purpose, start):
+        share = len(part) / len(z)
+
+        def within(fraction: float, status: str, start: int = start, share: float = share) -> None:
+            step(min(1.0, start / len(z) + fraction * share), status)
+
+        with seeded(seed, "simulate", purpose, start), report_progress(within):
             features.append(bound.features(bound.prior.execute(part)).float().cpu())
         step(min(1.0, (start + chunk) / len(z)), f"{start + len(part)} simulations")
     result = torch.cat(features)

@@ -243,6 +243,8 @@ class _Loop:
             "internal_model": self.domain,
             "parameters": describe(settled.data)["parameters"],
         }
+        if faults := settled.posterior.provenance.faults:
+            record["faults"] = faults
         if not is_last:
             domains = self._posterior_domains(index, settled)
             record |= self._optimise(index + 1, domains, report)

@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -51,6 +52,14 @@ class Provenance:
     num_simulations: int
     rounds: Sequence[RoundInfo] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def faults(self) -> dict[str, int]:
+        """Counts of what went wrong at workers, by kind; empty where none were used."""
+        counts: Counter[str] = Counter()
+        for info in self.rounds:
+            counts.update(info.faults)
+        return dict(counts)
 
 
 class PosteriorBase(ABC):

@@ -1,0 +1,80 @@
+"""Options of `npdr` that say where simulations run, shared by the commands that simulate."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+__all__ = [
+    "Address",
+    "ExecutorName",
+    "ExecutorOption",
+    "TimeLimit",
+    "WorkersOption",
+    "chosen_workers",
+]
+
+PANEL = "Workers, for engines that run one simulation at a time"
+
+
+class ExecutorName(StrEnum):
+    """What runs simulations."""
+
+    LOKY = "loky"
+    DASK = "dask"
+    RAY = "ray"
+    THREADS = "threads"
+    SERIAL = "serial"
+
+
+ExecutorOption = Annotated[
+    ExecutorName | None,
+    typer.Option(
+        "--executor", help="What runs simulations; loky by default.", rich_help_panel=PANEL
+    ),
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", min=1, help="Workers; one per core by default.", rich_help_panel=PANEL
+    ),
+]
+Address = Annotated[
+    str | None,
+    typer.Option("--address", help="Address of a Dask or Ray cluster.", rich_help_panel=PANEL),
+]
+TimeLimit = Annotated[
+    float | None,
+    typer.Option(
+        "--time-limit", help="Seconds per simulation; 60 by default.", rich_help_panel=PANEL
+    ),
+]
+
+
+@contextmanager
+def chosen_workers(
+    executor: ExecutorName | None,
+    num_workers: int | None,
+    address: str | None,
+    time_limit: float | None,
+) -> Iterator[None]:
+    """Has simulations inside the block run where the options say.
+
+    A model whose engine is batched has no use for workers; if any were asked for, standard error
+    says so in the end.
+    """
+    from npdr_ppl.engines.workers import workers
+
+    is_asked = any(value is not None for value in (executor, num_workers, address, time_limit))
+    chosen = "loky" if executor is None else executor.value
+    limit = 60.0 if time_limit is None else time_limit
+    with workers(chosen, num_workers, address=address, time_limit=limit) as used:
+        yield
+    if is_asked and not used.is_used:
+        typer.echo(
+            "npdr: note: --executor, --workers, --address and --time-limit had no effect, because "
+            "the model's engine simulates batches by itself.",
+            err=True,
+        )

@@ -1,0 +1,223 @@
+"""What a builder made: bodies, joints and links by name."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from npdr_ppl.engines.bullet.channels import (
+    JOINT_FIELDS,
+    POSE_FIELDS,
+    RATE_FIELDS,
+    Place,
+    Sensor,
+)
+from npdr_ppl.engines.bullet.settings import BulletSettings
+from npdr_ppl.errors import ModelError
+
+__all__ = ["Builder", "Scene", "Urdf"]
+
+Builder = Callable[[Any, Mapping[str, float]], Mapping[str, int]]
+"""Builds a scene in an empty world: takes PyBullet's client and the parameters by name, returns
+body ids by name."""
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """Builds a scene of one robot from a URDF file.
+
+    Inertias are those of the file; PyBullet's own default computes them from collision shapes.
+
+    Attributes:
+        path: The file; workers have to find it there, too.
+        name: What the body is called.
+        is_fixed: Whether the base is fixed to the world.
+        position: Where the base goes, in metres.
+    """
+
+    path: str | PathLike[str]
+    name: str = "robot"
+    is_fixed: bool = True
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __call__(self, client: Any, parameters: Mapping[str, float]) -> dict[str, int]:
+        """Loads the file."""
+        path = Path(self.path)
+        if not path.is_file():
+            raise ModelError(f"{path} does not exist.")
+        try:
+            body = client.loadURDF(
+                str(path),
+                basePosition=self.position,
+                useFixedBase=self.is_fixed,
+                flags=client.URDF_USE_INERTIA_FROM_FILE,
+            )
+        except Exception as error:  # PyBullet's own error has no class that could be named
+            raise ModelError(f"{path} is not a URDF file that Bullet can load.") from error
+        return {self.name: body}
+
+
+class Scene:
+    """A world with everything in it.
+
+    Motors that Bullet gives to every joint are switched off, and damping of bodies is what the
+    settings say, so that nothing acts that was not asked for.
+
+    Args:
+        client: PyBullet's client.
+        build: Fills the world.
+        parameters: The parameters by name, for the builder.
+        settings: Settings of the engine.
+        time_step: Seconds per step, substeps included.
+
+    Attributes:
+        client: PyBullet's client.
+        bodies: Ids by name.
+        joints: Body and index of each joint that moves, by name.
+        links: Body and index of each link, by name; a body's base has the index -1.
+        gravity: Acceleration of gravity, in m/s².
+        damping: Damping of bodies, in 1/s.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        build: Builder,
+        parameters: Mapping[str, float],
+        settings: BulletSettings,
+        time_step: float,
+    ) -> None:
+        self.client = client
+        self.gravity = settings.gravity
+        self.damping = settings.damping
+        client.resetSimulation()
+        client.setPhysicsEngineParameter(**settings.engine_parameters())
+        client.setTimeStep(time_step / settings.substeps)
+        client.setGravity(*settings.gravity)
+        self.bodies = dict(build(client, parameters))
+        self.joints: dict[str, tuple[int, int]] = {}
+        self.links: dict[str, tuple[int, int]] = {}
+        self._ambiguous: set[str] = set()
+        for name, body in self.bodies.items():
+            self._index(name, body)
+
+    def find(self, place: Place) -> tuple[int, int]:
+        """Returns body and index of a joint, link or body.
+
+        Raises:
+            ModelError: There is none of that name, or several.
+        """
+        if place.kind == "body":
+            known = {name: (body, -1) for name, body in self.bodies.items()}
+        else:
+            known = self.joints if place.kind == "joint" else self.links
+        if place.name in known:
+            return known[place.name]
+        if place.name in self._ambiguous:
+            raise ModelError(
+                f"Several bodies have a {place.kind} {place.name!r}; put the body's name in "
+                f"front, as in {next(iter(self.bodies))}/{place.name}."
+            )
+        raise ModelError(
+            f"The scene has no {place.kind} {place.name!r}; it has "
+            f"{', '.join(sorted(known)) or 'none'}."
+        )
+
+    def reader(self, sensors: Sequence[Sensor]) -> Callable[[], list[float]]:
+        """Returns a function that reads sensors in the present state of the world."""
+        read = [self._reading(sensor.place) for sensor in sensors]
+        return lambda: [function() for function in read]
+
+    def place_joint(self, joint: tuple[int, int], position: float, velocity: float) -> None:
+        """Puts a joint into a state."""
+        self.client.resetJointState(*joint, position, velocity)
+
+    def place_body(self, body: int, values: Mapping[str, float]) -> None:
+        """Gives a body's base a pose and a velocity; fields that are not given stay.
+
+        Args:
+            body: Its id.
+            values: Values by field: ``x`` … ``yaw``, ``vx`` … ``wz``.
+        """
+        client = self.client
+        position, orientation = client.getBasePositionAndOrientation(body)
+        pose = dict(
+            zip(
+                POSE_FIELDS,
+                (*position, *client.getEulerFromQuaternion(orientation)),
+                strict=True,
+            )
+        )
+        rates = dict(zip(RATE_FIELDS, sum(client.getBaseVelocity(body), ()), strict=True))
+        if any(field in values for field in POSE_FIELDS):
+            pose |= {field: values[field] for field in POSE_FIELDS if field in values}
+            if any(field in values for field in POSE_FIELDS[3:]):
+                orientation = client.getQuaternionFromEuler([pose[f] for f in POSE_FIELDS[3:]])
+            client.resetBasePositionAndOrientation(
+                body, [pose[f] for f in POSE_FIELDS[:3]], orientation
+            )
+        rates |= {field: values[field] for field in RATE_FIELDS if field in values}
+        # Moving a body sets its velocity to zero, so the velocity comes last.
+        client.resetBaseVelocity(
+            body, [rates[f] for f in RATE_FIELDS[:3]], [rates[f] for f in RATE_FIELDS[3:]]
+        )
+
+    def _index(self, name: str, body: int) -> None:
+        """Notes a body's joints and links, and makes them passive."""
+        client = self.client
+        client.changeDynamics(body, -1, linearDamping=self.damping, angularDamping=self.damping)
+        base = client.getBodyInfo(body)[0].decode()
+        self._note(self.links, name, base, (body, -1))
+        for index in range(client.getNumJoints(body)):
+            info = client.getJointInfo(body, index)
+            client.changeDynamics(
+                body, index, linearDamping=self.damping, angularDamping=self.damping
+            )
+            self._note(self.links, name, info[12].decode(), (body, index))
+            if info[2] in (client.JOINT_REVOLUTE, client.JOINT_PRISMATIC):
+                self._note(self.joints, name, info[1].decode(), (body, index))
+                client.setJointMotorControl2(body, index, client.VELOCITY_CONTROL, force=0.0)
+
+    def _note(
+        self, table: dict[str, tuple[int, int]], body: str, name: str, value: tuple[int, int]
+    ) -> None:
+        table[f"{body}/{name}"] = value
+        if name in table:
+            del table[name]
+            self._ambiguous.add(name)
+        elif name not in self._ambiguous:
+            table[name] = value
+
+    def _reading(self, place: Place) -> Callable[[], float]:
+        """Returns a function that reads one place."""
+        client = self.client
+        body, index = self.find(place)
+        if place.kind == "joint":
+            column = JOINT_FIELDS.index(place.field)
+            joint_state = client.getJointState
+            return lambda: joint_state(body, index)[column]
+        pose, rate = self._motion(body, index)
+        if place.field in RATE_FIELDS:
+            part, column = divmod(RATE_FIELDS.index(place.field), 3)
+            return lambda: rate()[part][column]
+        part, column = divmod(POSE_FIELDS.index(place.field), 3)
+        if part == 0:
+            return lambda: pose()[0][column]
+        to_angles = client.getEulerFromQuaternion
+        return lambda: to_angles(pose()[1])[column]
+
+    def _motion(self, body: int, index: int) -> tuple[Callable[[], Any], Callable[[], Any]]:
+        """Returns functions that read a link's pose and its velocities."""
+        client = self.client
+        if index == -1:
+            return (
+                partial(client.getBasePositionAndOrientation, body),
+                partial(client.getBaseVelocity, body),
+            )
+        link_state = client.getLinkState
+        return (
+            lambda: link_state(body, index, computeForwardKinematics=1)[:2],
+            lambda: link_state(body, index, computeLinkVelocity=1)[6:8],
+        )

@@ -1,0 +1,310 @@
+"""A PyBullet scene as a simulator."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from os import PathLike
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from npdr_ppl.engines.bullet.channels import Command, Sensor
+from npdr_ppl.engines.bullet.client import connect, connected
+from npdr_ppl.engines.bullet.forces import JointForces, is_dry
+from npdr_ppl.engines.bullet.parameters import BoundParameter
+from npdr_ppl.engines.bullet.scene import Builder, Scene, Urdf
+from npdr_ppl.engines.bullet.settings import BulletSettings
+from npdr_ppl.engines.pooled import PooledSimulator, Segment
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.channels import Channel, Parameter, Port
+from npdr_ppl.language.effects import Effect, EnvironmentEffect, ForceEffect
+
+__all__ = ["BulletSimulator"]
+
+# What Bullet's motors take for no limit.
+_NO_LIMIT = 1e9
+
+
+class BulletSimulator(PooledSimulator):
+    """A scene of PyBullet, simulated on workers in DIRECT mode.
+
+    The scene is built anew for each simulation, because contacts and solver caches would carry
+    something of the last one over. Every joint that moves is a force port, commands and sensors
+    are ports, and ``gravity`` is one of the environment.
+
+    A subclass can override :meth:`start` and :meth:`drive` for what channels cannot express, e.g.
+    a body that is moved along a path.
+
+    Args:
+        scene: A builder, or a URDF file of one robot with a fixed base.
+        parameters: Domain parameters by name: a place in the scene such as ``"link lower mass"``,
+            ``"joint elbow damping"``, ``"body ball restitution"``, ``"body wall x_offset"`` or
+            ``"world gravity"``, whose value in the scene is the nominal one; or the declaration
+            of a parameter that the builder takes care of.
+        actions: Commands of joints; bare channels are left to :meth:`drive`.
+        sensors: What is read after each step.
+        states: Sensors whose value at a segment's start is put into the scene; ``None`` for all
+            those of joints and bodies. What is not put in starts as the builder left it.
+        settings: Settings of the engine.
+
+    Raises:
+        ModelError: The scene cannot be built, or something in it cannot be found.
+
+    Attributes:
+        settings: Settings of the engine.
+    """
+
+    is_deterministic = True
+
+    def __init__(
+        self,
+        scene: Builder | str | PathLike[str],
+        *,
+        parameters: Mapping[str, str | Parameter] | None = None,
+        actions: Sequence[Command | Channel] = (),
+        sensors: Sequence[Sensor],
+        states: Sequence[str] | None = None,
+        settings: BulletSettings | None = None,
+    ) -> None:
+        self.settings = settings or BulletSettings()
+        self.time_step = self.settings.time_step
+        self._build: Builder = scene if callable(scene) else Urdf(scene)
+        self._commands = tuple(
+            (column, action)
+            for column, action in enumerate(actions)
+            if isinstance(action, Command)
+        )
+        self._sensors = tuple(sensors)
+        self.actions = tuple(a.channel if isinstance(a, Command) else a for a in actions)
+        self.sensors = tuple(sensor.channel for sensor in sensors)
+        self._states = self._chosen_states(states)
+        self.states = tuple(sensor.channel for sensor in self._states)
+        declared = dict(parameters or {})
+        self._bound = tuple(
+            BoundParameter(name, text) for name, text in declared.items() if isinstance(text, str)
+        )
+        given = [value for value in declared.values() if isinstance(value, Parameter)]
+        for name, value in declared.items():
+            if isinstance(value, Parameter) and value.name != name:
+                raise ModelError(f"The parameter {value.name!r} is given as {name!r}.")
+        nominal = {parameter.name: parameter.nominal for parameter in given}
+        with connected() as client:
+            built = Scene(client, self._build, nominal, self.settings, self.time_step)
+            found = {bound.name: bound.declaration(built) for bound in self._bound}
+            by_name = {p.name: p for p in given} | found
+            self.parameters = tuple(by_name[name] for name in declared)
+            self.ports = self._find_ports(built)
+            built.reader(self._sensors)  # says so now if something is not there
+
+    @property
+    def name(self) -> str:
+        """Name for messages: that of the class, and of the URDF file where there is one."""
+        file = f"({str(self._build.path)!r})" if isinstance(self._build, Urdf) else ""
+        return f"{type(self).__name__}{file}"
+
+    def recorded_settings(self) -> dict[str, Any]:
+        """Returns the settings of the engine, for JSON."""
+        return {"engine": "bullet", **asdict(self.settings)}
+
+    def with_effects(self, *effects: Effect) -> Self:
+        """Returns a copy with effects attached; see :meth:`Simulator.with_effects`.
+
+        Raises:
+            ModelError: Dry friction is attached to a joint whose motor follows a velocity or a
+                position: Bullet has one motor per joint.
+        """
+        changed = super().with_effects(*effects)
+        driven = {
+            command.place.name: command.place.field
+            for _, command in self._commands
+            if command.place.field != "torque"
+        }
+        for effect in effects:
+            if isinstance(effect, ForceEffect) and is_dry(effect) and effect.port in driven:
+                raise ModelError(
+                    f"{effect.id} cannot attach to {effect.port!r} of {self.name}: the joint's "
+                    f"motor follows a {driven[effect.port]}, and it would have to be the friction."
+                )
+        return changed
+
+    def set_up(self) -> Any:
+        """Connects to a physics server in the worker's process."""
+        torch.set_num_threads(1)
+        return connect()
+
+    def simulate_one(
+        self, workspace: Any, parameters: Mapping[str, float], segment: Segment, seed: int
+    ) -> np.ndarray:
+        """Simulates one segment; see :meth:`PooledSimulator.simulate_one`."""
+        client = workspace
+        scene = Scene(client, self._build, parameters, self.settings, segment.time_step)
+        for bound in self._bound:
+            bound.apply(scene, parameters[bound.name])
+        self._change_environment(scene, parameters)
+        self.start(scene, parameters, segment)
+        read = scene.reader(self._sensors)
+        act = self._actuation(scene, parameters, segment)
+        drive = None if type(self).drive is BulletSimulator.drive else self.drive
+        readings = np.empty((len(segment.actions), len(self._sensors)))
+        step_simulation = client.stepSimulation
+        for step in range(len(readings)):
+            for substep in range(self.settings.substeps):
+                act(step, substep)
+                if drive is not None:
+                    drive(scene, segment, step, substep)
+                step_simulation()
+            readings[step] = read()
+        return readings
+
+    def start(self, scene: Scene, parameters: Mapping[str, float], segment: Segment) -> None:
+        """Puts the scene into a segment's initial state.
+
+        Args:
+            scene: The scene, with its parameters.
+            parameters: All parameters.
+            segment: The segment; its initial state is in the order of ``states``.
+        """
+        joints: dict[tuple[int, int], dict[str, float]] = {}
+        bodies: dict[int, dict[str, float]] = {}
+        for sensor, value in zip(self._states, segment.initial_state.tolist(), strict=True):
+            body, index = scene.find(sensor.place)
+            if sensor.place.kind == "joint":
+                joints.setdefault((body, index), {})[sensor.place.field] = value
+            else:
+                bodies.setdefault(body, {})[sensor.place.field] = value
+        for joint, values in joints.items():
+            position, velocity = scene.client.getJointState(*joint)[:2]
+            scene.place_joint(
+                joint, values.get("position", position), values.get("velocity", velocity)
+            )
+        for body, values in bodies.items():
+            scene.place_body(body, values)
+
+    def drive(self, scene: Scene, segment: Segment, step: int, substep: int) -> None:
+        """Moves things in a way that no joint command can, before a substep.
+
+        By default there are none.
+
+        Args:
+            scene: The scene.
+            segment: What is simulated; ``segment.actions[step]`` is the present command.
+            step: Number of the step, from 0.
+            substep: Number of the substep within it, from 0.
+        """
+
+    def _actuation(self, scene: Scene, parameters: Mapping[str, float], segment: Segment) -> Any:
+        """Returns a function that applies commands and force effects before a substep."""
+        client = scene.client
+        control, torque_control = client.setJointMotorControl2, client.TORQUE_CONTROL
+        torques, motors = [], []
+        for column, command in self._commands:
+            joint = scene.find(command.place)
+            if command.place.field == "torque":
+                torques.append((column, joint))
+            else:
+                motors.append((column, _motor(client, command, joint)))
+        effects = [e for e in self.effects if isinstance(e, ForceEffect)]
+        forces = None
+        if effects:
+            joints = [scene.joints[effect.port] for effect in effects]
+            step = segment.time_step / self.settings.substeps
+            pairs = list(zip(effects, joints, strict=True))
+            forces = JointForces(scene, pairs, parameters, step)
+
+        def act(step: int, substep: int) -> None:
+            commands = segment.actions[step]
+            if substep == 0:
+                for column, follow in motors:
+                    follow(commands[column])
+            total = {} if forces is None else forces()
+            for column, joint in torques:
+                total[joint] = commands[column] + total.get(joint, 0.0)
+            for joint, torque in total.items():
+                # Bullet forgets torques after each substep.
+                control(*joint, torque_control, force=torque)
+
+        return act
+
+    def _change_environment(self, scene: Scene, parameters: Mapping[str, float]) -> None:
+        """Lets effects turn gravity."""
+        gravity: Any = scene.gravity
+        effects = [e for e in self.effects if isinstance(e, EnvironmentEffect)]
+        for effect in effects:
+            values = {n: torch.tensor(parameters[n]).double() for n in effect.parameter_names}
+            gravity = effect.environment(gravity, effect.own_parameters(values))
+        if effects:
+            scene.gravity = tuple(float(component) for component in gravity)
+            scene.client.setGravity(*scene.gravity)
+
+    def _chosen_states(self, names: Sequence[str] | None) -> tuple[Sensor, ...]:
+        """Returns the sensors that are states."""
+        possible = {s.channel.name: s for s in self._sensors if s.place.kind != "link"}
+        if names is None:
+            return tuple(possible.values())
+        unknown = [name for name in names if name not in possible]
+        if unknown:
+            raise ModelError(
+                f"{', '.join(unknown)} cannot be a state: sensors of joints and bodies can, "
+                f"here {', '.join(possible) or 'none'}."
+            )
+        return tuple(possible[name] for name in names)
+
+    def _find_ports(self, scene: Scene) -> tuple[Port, ...]:
+        """Returns the ports of a scene."""
+        rated = {c.place.name: c.rated for _, c in self._commands if c.place.field == "torque"}
+        commands = {command.channel.name: command for _, command in self._commands}
+        ports = [
+            Port(a.name, "action", a.unit, commands[a.name].rated if a.name in commands else 1.0)
+            for a in self.actions
+        ]
+        of_joint: dict[tuple[int, int], str] = {}
+        for name, joint in scene.joints.items():
+            if joint not in of_joint or "/" not in name:
+                of_joint[joint] = name
+        for joint, name in of_joint.items():
+            info = scene.client.getJointInfo(*joint)
+            unit = "N m" if info[2] == scene.client.JOINT_REVOLUTE else "N"
+            # A URDF says zero, and Bullet sometimes a thousand, where nothing was said.
+            effort = rated.get(name, info[10] if 0.0 < info[10] < 1000.0 else 1.0)
+            speed = info[11] if 0.0 < info[11] < 1000.0 else 1.0
+            ports.append(Port(name, "force", unit, effort, speed))
+        ports += [Port(s.channel.name, "sensor", s.channel.unit, s.rated) for s in self._sensors]
+        strength = float(np.linalg.norm(scene.gravity)) or 9.81
+        ports.append(Port("gravity", "environment", "m/s²", strength))
+        names = [port.name for port in ports]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ModelError(
+                f"{', '.join(twice)} names two ports of {self.name}; call the channel otherwise."
+            )
+        return tuple(ports)
+
+
+def _motor(client: Any, command: Command, joint: tuple[int, int]) -> Any:
+    """Returns a function that has a joint's motor follow a velocity or a position."""
+    control = client.setJointMotorControl2
+    force = _NO_LIMIT if command.max_force is None else command.max_force
+    if command.place.field == "velocity":
+
+        def follow(value: float) -> None:
+            control(
+                *joint,
+                client.VELOCITY_CONTROL,
+                targetVelocity=value,
+                velocityGain=command.velocity_gain,
+                force=force,
+            )
+
+    else:
+
+        def follow(value: float) -> None:
+            control(
+                *joint,
+                client.POSITION_CONTROL,
+                targetPosition=value,
+                positionGain=command.position_gain,
+                velocityGain=command.velocity_gain,
+                force=force,
+            )
+
+    return follow

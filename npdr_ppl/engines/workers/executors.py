@@ -1,0 +1,187 @@
+"""Executors: what hands chunks to workers, all of them joblib's but the serial one."""
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+from npdr_ppl.engines.workers.crew import Crew, run_chunk
+from npdr_ppl.engines.workers.options import WorkerOptions
+from npdr_ppl.engines.workers.supervisor import Chunk, ChunkResult
+from npdr_ppl.errors import DependencyError, SimulationError
+
+__all__ = ["ChunkExecutor", "open_executor"]
+
+
+class ChunkExecutor(ABC):
+    """Runs chunks on workers.
+
+    Attributes:
+        num_workers: How many chunks run at once.
+    """
+
+    num_workers: int
+
+    @abstractmethod
+    def run(self, chunks: Iterable[Chunk]) -> Iterator[ChunkResult]:
+        """Yields results in the order in which they come."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Ends what was started here, and nothing else."""
+
+
+class _Serial(ChunkExecutor):
+    """One process, looked after by the caller's thread."""
+
+    num_workers = 1
+
+    def __init__(self) -> None:
+        self._crew = Crew()
+
+    def run(self, chunks: Iterable[Chunk]) -> Iterator[ChunkResult]:
+        return map(self._crew.run, chunks)
+
+    def close(self) -> None:
+        self._crew.close()
+
+
+class _Joblib(ChunkExecutor):
+    """One of joblib's backends.
+
+    Args:
+        num_workers: Workers; ``None`` for all there are.
+        backend: joblib's name of the backend.
+        settings: What else joblib's backend takes.
+        stack: Holds what has to be closed after joblib's backend.
+        crew: Supervisors where workers are threads of this process.
+        is_streaming: Whether the backend can hand over results while others are under way.
+    """
+
+    def __init__(
+        self,
+        num_workers: int | None,
+        backend: str,
+        settings: dict[str, Any],
+        stack: ExitStack,
+        *,
+        crew: Crew | None = None,
+        is_streaming: bool = True,
+    ) -> None:
+        from joblib import Parallel, parallel_config
+
+        # Names of clusters are known to the configuration only, which counts for what is made
+        # inside the block.
+        with parallel_config(backend=backend, n_jobs=num_workers or -1, **settings):
+            parallel = Parallel(
+                return_as="generator_unordered" if is_streaming else "list",
+                batch_size=1,  # chunks are batches already
+                pre_dispatch="2*n_jobs",
+                max_nbytes=None,
+            )
+        self._crew = crew
+        self._parallel = stack.enter_context(parallel)
+        self._stack = ExitStack()
+        self.num_workers = max(1, self._parallel._effective_n_jobs())
+
+    def run(self, chunks: Iterable[Chunk]) -> Iterator[ChunkResult]:
+        from joblib import delayed
+
+        function = run_chunk if self._crew is None else self._crew.run
+        results = self._parallel(delayed(function)(chunk) for chunk in chunks)
+        yield from results
+
+    def keep(self, stack: ExitStack) -> None:
+        """Takes over what has to be closed in the end."""
+        self._stack = stack
+
+    def close(self) -> None:
+        # Also the processes that threads are still waiting for.
+        if self._crew is not None:
+            self._crew.close()
+        self._stack.close()
+
+
+def open_executor(options: WorkerOptions) -> ChunkExecutor:
+    """Returns the executor that the options name; the caller closes it.
+
+    Raises:
+        DependencyError: Dask or Ray is not installed.
+        SimulationError: There is no cluster at the address.
+    """
+    if options.executor == "serial":
+        return _Serial()
+    number = options.num_workers
+    with ExitStack() as stack:
+        if options.executor == "threads":
+            executor = _Joblib(number, "threading", {}, stack, crew=Crew())
+        elif options.executor == "dask":
+            client = _dask_client(options, stack)
+            executor = _Joblib(number, "dask", {"client": client}, stack)
+        elif options.executor == "ray":
+            _connect_to_ray(options, stack)
+            # Its pool cannot stream: results come wave by wave.
+            executor = _Joblib(number, "ray", {}, stack, is_streaming=False)
+        else:
+            executor = _Joblib(number, "loky", {"inner_max_num_threads": 1}, stack)
+        executor.keep(stack.pop_all())
+        return executor
+
+
+def _dask_client(options: WorkerOptions, stack: ExitStack) -> Any:
+    """Connects to a Dask cluster, or starts one on this machine."""
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise _missing("dask") from error
+    cluster: Any = options.address
+    if cluster is None:
+        cluster = stack.enter_context(
+            LocalCluster(
+                n_workers=options.num_workers,
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.WARNING,
+            )
+        )
+    try:
+        return stack.enter_context(Client(cluster, set_as_default=False))
+    except (OSError, ValueError, TimeoutError) as error:
+        raise _unreachable(options, error) from error
+
+
+def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
+    """Connects this process to a Ray cluster, or starts one on this machine."""
+    try:
+        import ray
+        from ray.util.joblib import register_ray
+    except ImportError as error:
+        raise _missing("ray") from error
+    register_ray()
+    if ray.is_initialized():  # the caller's own connection
+        return
+    is_local = options.address is None
+    try:
+        ray.init(
+            address="local" if is_local else options.address,
+            num_cpus=options.num_workers if is_local else None,
+            include_dashboard=False if is_local else None,
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+        )
+    except (OSError, ValueError, RuntimeError) as error:
+        raise _unreachable(options, error) from error
+    stack.callback(ray.shutdown)
+
+
+def _missing(executor: str) -> DependencyError:
+    return DependencyError(
+        f"The executor {executor!r} needs a package that is not installed: "
+        f"pip install 'npdr-ppl[{executor}]'."
+    )
+
+
+def _unreachable(options: WorkerOptions, error: Exception) -> SimulationError:
+    where = f" at {options.address}" if options.address else ""
+    return SimulationError(f"There is no {options.executor} cluster{where}: {error}")

@@ -1,0 +1,122 @@
+"""`workers`: which workers the simulations inside a block use, and what went wrong there."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from npdr_ppl.engines.workers.faults import Faults
+from npdr_ppl.engines.workers.options import Executor, WorkerOptions
+from npdr_ppl.engines.workers.pool import Outcome, Pool, Progress
+from npdr_ppl.engines.workers.task import Task
+
+__all__ = ["Workers", "collect_faults", "report_progress", "run_on_workers", "workers"]
+
+
+class Workers:
+    """The workers of a block.
+
+    Attributes:
+        pool: The pool.
+        faults: What went wrong so far.
+        is_used: Whether any simulation has used them.
+    """
+
+    def __init__(self, options: WorkerOptions) -> None:
+        self.pool = Pool(options)
+        self.faults = Faults()
+        self.is_used = False
+
+
+class FaultCollector:
+    """Sums up faults.
+
+    Attributes:
+        faults: What went wrong so far.
+    """
+
+    def __init__(self) -> None:
+        self.faults = Faults()
+
+    def counts(self) -> dict[str, int]:
+        """Returns counts by kind; empty where no worker was used."""
+        return self.faults.counts() if self.faults.num_draws else {}
+
+
+_WORKERS: ContextVar[Workers | None] = ContextVar("workers", default=None)
+_COLLECTORS: ContextVar[tuple[FaultCollector, ...]] = ContextVar("collectors", default=())
+_PROGRESS: ContextVar[Progress | None] = ContextVar("progress", default=None)
+
+
+@contextmanager
+def workers(
+    executor: Executor = "loky",
+    num_workers: int | None = None,
+    *,
+    address: str | None = None,
+    chunk_size: int | None = None,
+    time_limit: float = 60.0,
+    retries: int = 1,
+) -> Iterator[Workers]:
+    """Chooses the workers of simulations inside the block, and ends them with it.
+
+    Only engines that run one simulation at a time use workers; batched ones need none. See
+    :class:`~npdr_ppl.engines.workers.options.WorkerOptions` for the arguments.
+
+    Raises:
+        ModelError: An option is out of its range.
+
+    Example:
+        >>> import npdr_ppl as npdr
+        >>> with npdr.workers("serial", time_limit=5.0) as used:
+        ...     pass  # npdr.infer(model, rollouts), for example
+        >>> used.faults.counts()["lost"]
+        0
+    """
+    options = WorkerOptions(executor, num_workers, address, chunk_size, time_limit, retries)
+    chosen = Workers(options)
+    token = _WORKERS.set(chosen)
+    try:
+        yield chosen
+    finally:
+        _WORKERS.reset(token)
+        chosen.pool.close()
+
+
+@contextmanager
+def collect_faults() -> Iterator[FaultCollector]:
+    """Sums up what goes wrong inside the block."""
+    collector = FaultCollector()
+    token = _COLLECTORS.set((*_COLLECTORS.get(), collector))
+    try:
+        yield collector
+    finally:
+        _COLLECTORS.reset(token)
+
+
+@contextmanager
+def report_progress(progress: Progress) -> Iterator[None]:
+    """Has simulations inside the block report how far they are.
+
+    Args:
+        progress: Called with the fraction of the present call to a simulator that is done.
+    """
+    token = _PROGRESS.set(progress)
+    try:
+        yield
+    finally:
+        _PROGRESS.reset(token)
+
+
+def run_on_workers(task: Task, payloads: list, seed: int) -> Outcome:
+    """Runs draws on the workers of the block, or on one worker per core outside of any."""
+    chosen = _WORKERS.get()
+    if chosen is None:
+        with Pool() as pool:
+            outcome = pool.run(task, payloads, seed=seed, progress=_PROGRESS.get())
+    else:
+        chosen.is_used = True
+        outcome = chosen.pool.run(task, payloads, seed=seed, progress=_PROGRESS.get())
+        chosen.faults += outcome.faults
+    for collector in _COLLECTORS.get():
+        collector.faults += outcome.faults
+    return outcome
