@@ -13,7 +13,6 @@ How contacts are solved is part of the model, so it is fixed here:
 * no damping in the air, and the bodies never sleep.
 """
 
-import importlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from npdr_ppl.engines.bullet.client import connect
+from npdr_ppl.engines.bullet.settings import BulletSettings
 from npdr_ppl.models.mini_golf.course import (
     CLUB_HEAD_SIZE,
     CLUB_MASS,
@@ -40,14 +41,16 @@ __all__ = ["GRAVITY", "HeadPath", "Scene", "SUB_STEPS"]
 
 Array = NDArray[np.float64]
 
-SUB_STEPS = 4
-"""Sub-steps per sample of 10 ms."""
-
-SOLVER_ITERATIONS = 20
-GRAVITY = 9.81
-
-CONTACT_THRESHOLD = 1e-5
-"""Distance in m from which on two bodies touch."""
+SETTINGS = BulletSettings(
+    time_step=0.01,
+    substeps=4,
+    solver_iterations=20,
+    contact_breaking_threshold=1e-5,
+    contact_erp=0.0,
+    restitution_velocity_threshold=0.0,
+)
+SUB_STEPS = SETTINGS.substeps
+GRAVITY = -SETTINGS.gravity[2]
 
 REACH = 0.15
 """Distance in m of ball and club head beyond which the head is not moved: the ball has a radius
@@ -56,6 +59,11 @@ of 2.6 cm at most, the head a half-diagonal of 3.7 cm."""
 REST_SPEED = 1e-4
 """Speed in m/s, and speed of the surface, below which a ball that nothing will push lies still:
 rolling friction stops it within a micrometre."""
+
+STEPS_PER_REST_CHECK = 10
+
+ASIDE = (0.0, 0.0, 100.0), (0.0, 0.0, 0.0, 1.0)
+"""Where the head is when it is out of reach: it falls there, which is no one's business."""
 
 _BALL, _WORLD, _HEAD = 1, 2, 4
 """Collision groups; the ball meets both others, which do not meet each other."""
@@ -105,14 +113,11 @@ class Scene:
     """
 
     def __init__(self) -> None:
-        self._bullet: Any = importlib.import_module("pybullet")
-        self._client: int = self._bullet.connect(self._bullet.DIRECT)
+        self._client: Any = connect()
 
     def close(self) -> None:
         """Ends the connection."""
-        if self._client >= 0:
-            self._bullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        self._client.disconnect()
 
     def strike(
         self, parameters: StrikeParameters, ball: Array, head: HeadPath, time_step: float
@@ -132,80 +137,60 @@ class Scene:
         return self._run(body, head_body, head, parameters.ball_radius)
 
     def _run(self, ball: int, head_body: int, head: HeadPath, radius: float) -> Array:
-        p, client = self._bullet, self._client
-        num_steps = len(head.positions) // SUB_STEPS
-        result = np.empty((num_steps, 2))
-        positions, quaternions = head.positions, head.quaternions
-        velocities, rates = head.velocities, head.rates
-        (x, y, _), _ = p.getBasePositionAndOrientation(ball, physicsClientId=client)
+        client = self._client
+        place, push = client.resetBasePositionAndOrientation, client.resetBaseVelocity
+        locate, step_simulation = client.getBasePositionAndOrientation, client.stepSimulation
+        track = head.ground_track
+        result = np.empty((len(track), 2))
+        (x, y, _), _ = locate(ball)
         is_near = True
-        for step in range(num_steps):
+        for step, (head_x, head_y) in enumerate(track.tolist()):
             was_near = is_near
-            hx, hy = positions[step * SUB_STEPS][:2]
-            is_near = (hx - x) ** 2 + (hy - y) ** 2 < REACH**2
+            is_near = (head_x - x) ** 2 + (head_y - y) ** 2 < REACH**2
             if was_near and not is_near:
-                p.resetBasePositionAndOrientation(
-                    head_body, (0.0, 0.0, 100.0), (0.0, 0.0, 0.0, 1.0), physicsClientId=client
-                )
+                place(head_body, *ASIDE)
             for k in range(step * SUB_STEPS, (step + 1) * SUB_STEPS):
                 if is_near:
-                    p.resetBasePositionAndOrientation(
-                        head_body, positions[k], quaternions[k], physicsClientId=client
-                    )
-                    p.resetBaseVelocity(
-                        head_body, velocities[k], rates[k], physicsClientId=client
-                    )
-                p.stepSimulation(physicsClientId=client)
-            (x, y, _), _ = p.getBasePositionAndOrientation(ball, physicsClientId=client)
+                    place(head_body, head.positions[k], head.quaternions[k])
+                    push(head_body, head.velocities[k], head.rates[k])
+                step_simulation()
+            (x, y, _), _ = locate(ball)
             result[step] = x, y
-            if not is_near and step % 10 == 0:
-                linear, angular = p.getBaseVelocity(ball, physicsClientId=client)
-                surface = radius * max(map(abs, angular))
-                if max(*map(abs, linear), surface) < REST_SPEED:
-                    distance = np.linalg.norm(head.ground_track[step:] - (x, y), axis=-1)
-                    if distance.min() > REACH:
-                        result[step:] = x, y
-                        break
+            if is_near or step % STEPS_PER_REST_CHECK or not self._is_at_rest(ball, radius):
+                continue
+            if np.linalg.norm(track[step:] - (x, y), axis=-1).min() > REACH:
+                result[step:] = x, y
+                break
         return result
+
+    def _is_at_rest(self, ball: int, radius: float) -> bool:
+        linear, angular = self._client.getBaseVelocity(ball)
+        return max(*map(abs, linear), radius * max(map(abs, angular))) < REST_SPEED
 
     def _build(
         self, parameters: StrikeParameters, ball: Array, time_step: float
     ) -> tuple[int, int]:
-        p, client = self._bullet, self._client
+        client = self._client
         self._sub_step = time_step / SUB_STEPS
-        p.resetSimulation(physicsClientId=client)
-        p.setPhysicsEngineParameter(
-            fixedTimeStep=self._sub_step,
-            numSubSteps=1,
-            numSolverIterations=SOLVER_ITERATIONS,
-            contactBreakingThreshold=CONTACT_THRESHOLD,
-            contactERP=0.0,
-            restitutionVelocityThreshold=0.0,
-            deterministicOverlappingPairs=1,
-            enableFileCaching=0,
-            physicsClientId=client,
-        )
-        p.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
+        client.resetSimulation()
+        client.setPhysicsEngineParameter(enableFileCaching=0, **SETTINGS.engine_parameters())
+        client.setTimeStep(self._sub_step)
+        client.setGravity(*SETTINGS.gravity)
         obstacle = parameters.obstacle_restitution
-        ground = p.createCollisionShape(
-            p.GEOM_BOX, halfExtents=(4.0, 4.0, 0.5), physicsClientId=client
-        )
+        ground = client.createCollisionShape(client.GEOM_BOX, halfExtents=(4.0, 4.0, 0.5))
         self._body(ground, (0.0, 0.0, -0.5), _WORLD, friction=parameters.ground_friction)
         for box in RAILS:
             self._box(box, obstacle)
         for box, shift in zip(OBSTACLES, parameters.obstacle_shifts, strict=True):
             self._box(box.moved(*shift), obstacle)
-        hole = p.createCollisionShape(
-            p.GEOM_CYLINDER,
+        hole = client.createCollisionShape(
+            client.GEOM_CYLINDER,
             radius=parameters.hole_radius,
             height=HOLE_DEPTH,
-            physicsClientId=client,
         )
         place = (*HOLE, HOLE_RISE - 0.5 * HOLE_DEPTH)
         self._body(hole, place, _WORLD, friction=HOLE_FRICTION, rolling=HOLE_FRICTION)
-        sphere = p.createCollisionShape(
-            p.GEOM_SPHERE, radius=parameters.ball_radius, physicsClientId=client
-        )
+        sphere = client.createCollisionShape(client.GEOM_SPHERE, radius=parameters.ball_radius)
         ball_body = self._body(
             sphere,
             (float(ball[0]), float(ball[1]), parameters.ball_radius),
@@ -215,20 +200,15 @@ class Scene:
             rolling=parameters.ball_rolling_friction,
             restitution=1.0,
         )
-        inertia = (
-            parameters.ball_inertia_factor * parameters.ball_mass * parameters.ball_radius**2
-        )
-        p.changeDynamics(
-            ball_body, -1, localInertiaDiagonal=(inertia,) * 3, physicsClientId=client
-        )
-        head_shape = p.createCollisionShape(
-            p.GEOM_BOX,
+        inertia = parameters.ball_inertia_factor * parameters.ball_mass * parameters.ball_radius**2
+        client.changeDynamics(ball_body, -1, localInertiaDiagonal=(inertia,) * 3)
+        head_shape = client.createCollisionShape(
+            client.GEOM_BOX,
             halfExtents=tuple(0.5 * size for size in CLUB_HEAD_SIZE),
-            physicsClientId=client,
         )
         head_body = self._body(
             head_shape,
-            (0.0, 0.0, 100.0),
+            ASIDE[0],
             _HEAD,
             mass=CLUB_MASS,
             restitution=parameters.club_restitution,
@@ -236,9 +216,9 @@ class Scene:
         return ball_body, head_body
 
     def _box(self, box: Box, restitution: float) -> None:
-        p, client = self._bullet, self._client
-        shape = p.createCollisionShape(
-            p.GEOM_BOX, halfExtents=tuple(0.5 * s for s in box.size), physicsClientId=client
+        client = self._client
+        shape = client.createCollisionShape(
+            client.GEOM_BOX, halfExtents=tuple(0.5 * s for s in box.size)
         )
         half = 0.5 * box.angle
         self._body(
@@ -261,15 +241,14 @@ class Scene:
         rolling: float = 0.0,
         restitution: float = 0.0,
     ) -> int:
-        p, client = self._bullet, self._client
-        body = p.createMultiBody(
+        client = self._client
+        body = client.createMultiBody(
             baseMass=mass,
             baseCollisionShapeIndex=shape,
             basePosition=position,
             baseOrientation=orientation,
-            physicsClientId=client,
         )
-        p.changeDynamics(
+        client.changeDynamics(
             body,
             -1,
             lateralFriction=friction,
@@ -278,8 +257,7 @@ class Scene:
             restitution=restitution,
             linearDamping=0.0,
             angularDamping=0.0,
-            physicsClientId=client,
         )
         mask = _BALL if group != _BALL else _WORLD | _HEAD
-        p.setCollisionFilterGroupMask(body, -1, group, mask, physicsClientId=client)
+        client.setCollisionFilterGroupMask(body, -1, group, mask)
         return body

@@ -1,22 +1,20 @@
 """The simulator of one strike: joint angles replayed, the ball's course out."""
 
-import copy
 from collections.abc import Mapping
-from typing import Self
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.errors import DataError, ModelError
+from npdr_ppl.engines.pooled import PooledSimulator, Segment
+from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel, Parameter, Port
-from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.models.mini_golf.course import StrikeParameters
 from npdr_ppl.models.mini_golf.kinematics import JOINTS, head_path
-from npdr_ppl.models.mini_golf.scene import SUB_STEPS, HeadPath, Scene
-from npdr_ppl.models.mini_golf.strikes import Segment, simulate_batch
+from npdr_ppl.models.mini_golf.scene import SETTINGS, SUB_STEPS, HeadPath, Scene
 
 __all__ = ["MiniGolf", "Workspace"]
 
@@ -59,7 +57,7 @@ class Workspace:
         return self._path
 
 
-class MiniGolf(Simulator):
+class MiniGolf(PooledSimulator):
     """A robot arm strikes a golf ball, which rolls past two obstacles towards a hole.
 
     The arm is where it is told to be: a command is the joints' position at its own time, between
@@ -95,18 +93,15 @@ class MiniGolf(Simulator):
         Parameter("ground_friction", "1", 0.4, "sliding friction of the ground, a factor"),
         Parameter("hole_radius", "m", 0.025, "radius of the sticky disc that is the hole"),
     )
-    ports = tuple(Port(action.name, "action", "rad", rated=1.0) for action in _COMMANDS)
-    time_step = 0.01
+    ports = (
+        *(Port(action.name, "action", "rad", rated=1.0) for action in _COMMANDS),
+        *(Port(channel.name, "sensor", channel.unit, rated=1.0) for channel in states),
+    )
+    time_step = SETTINGS.time_step
 
-    def with_effects(self, *effects: Effect) -> Self:
-        """Returns a copy if there is nothing to attach.
-
-        Raises:
-            ModelError: There is; Bullet's contacts have no place for effects yet.
-        """
-        if effects:
-            raise ModelError(f"{self.name} takes no effects, but got {effects[0].name}.")
-        return copy.copy(self)
+    def recorded_settings(self) -> dict[str, Any]:
+        """Returns the settings of the engine, for JSON."""
+        return {"engine": "bullet", **asdict(SETTINGS)}
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
         """Simulates all strikes; see :meth:`Simulator.simulate`.
@@ -114,14 +109,12 @@ class MiniGolf(Simulator):
         Raises:
             DataError: A segment does not begin where its rollout does.
         """
-        self.check_parameters(parameters)
-        self.check_inputs(inputs)
         if bool(inputs.start.any()):
             raise DataError(
                 f"{self.name} simulates whole strikes, from the ball at rest; leave out the "
                 "segment length."
             )
-        return simulate_batch(self, parameters, inputs)
+        return super().simulate(parameters, inputs)
 
     def set_up(self) -> Workspace:
         """Returns what strikes of one process share."""

@@ -29,7 +29,9 @@ def figure4_facts(posterior: PosteriorBase, *, seed: int = 0) -> dict[str, Any]:
         ``<side>_turned_round``: share of the draws in which an obstacle is turned by more than a
         right angle – a box that is turned by half a turn is the same box, so there are two modes.
     """
-    draws = {name: v.double().numpy() for name, v in posterior.sample(NUM_DRAWS, seed=seed).items()}
+    draws = {
+        name: v.double().numpy() for name, v in posterior.sample(NUM_DRAWS, seed=seed).items()
+    }
     everywhere = posterior.prior.to_parameters(posterior.prior.sample(NUM_DRAWS))
     facts: dict[str, Any] = {
         "mass_spread": float(draws["ball_mass"].std() / everywhere["ball_mass"].std()),

@@ -1,4 +1,4 @@
-"""Mini golf: the arm's kinematics, contacts against textbook physics, and the simulator's duties."""
+"""Mini golf: kinematics, contacts against textbook physics, and the simulator's duties."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import npdr_ppl as npdr
-from npdr_ppl.errors import DataError, ModelError
+from npdr_ppl.errors import DataError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.models.effects import InputDelay
@@ -102,7 +102,9 @@ def test_velocities_of_a_path_are_those_of_its_positions():
     turn = np.stack([Pose.of(0, 0, 0, 0, 0, 90 * t).rotation for t in time])
     poses = Pose(np.stack([time, 0 * time, 2 * time], -1), turn)
     path = HeadPath.of(poses, 0.0025)
-    np.testing.assert_allclose(np.array(path.velocities) - (0, 0, GRAVITY * 0.0025), [[1, 0, 2]] * 40)
+    np.testing.assert_allclose(
+        np.array(path.velocities) - (0, 0, GRAVITY * 0.0025), [[1, 0, 2]] * 40
+    )
     np.testing.assert_allclose(path.rates, [[0, 0, np.pi / 2]] * 40, atol=1e-9)
 
 
@@ -216,6 +218,10 @@ def test_segments_that_begin_under_way_are_refused():
         MiniGolf().simulate({}, inputs)
 
 
-def test_effects_are_refused():
-    with pytest.raises(ModelError, match="takes no effects"):
-        MiniGolf().with_effects(InputDelay(port="joint_1_command"))
+def test_effects_of_commands_and_readings_apply():
+    inputs = swing(30)
+    lagging = MiniGolf().with_effects(InputDelay(port="joint_1_command"))
+    delay = {"joint_1_command.input_delay.delay": torch.tensor(0.05)}
+    moved = lagging.simulate(delay, inputs)[0, :, 2]
+    plain = MiniGolf().simulate({}, inputs)[0, :, 2]
+    torch.testing.assert_close(moved[5:-1], plain[:-6])
