@@ -13,18 +13,15 @@ How contacts are solved is part of the model, so it is fixed here:
 * no damping in the air, and the bodies never sleep.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from npdr_ppl.engines.bullet.client import connect
 from npdr_ppl.engines.bullet.settings import BulletSettings
+from npdr_ppl.models.mini_golf.clubs import Club
 from npdr_ppl.models.mini_golf.course import (
-    CLUB_HEAD_SIZE,
-    CLUB_MASS,
     DEFAULT_FRICTION,
     HOLE,
     HOLE_DEPTH,
@@ -35,9 +32,8 @@ from npdr_ppl.models.mini_golf.course import (
     Box,
     StrikeParameters,
 )
-from npdr_ppl.models.mini_golf.kinematics import Pose
 
-__all__ = ["GRAVITY", "HeadPath", "Scene", "SUB_STEPS"]
+__all__ = ["GRAVITY", "SETTINGS", "SUB_STEPS", "Scene"]
 
 Array = NDArray[np.float64]
 
@@ -62,48 +58,8 @@ rolling friction stops it within a micrometre."""
 
 STEPS_PER_REST_CHECK = 10
 
-ASIDE = (0.0, 0.0, 100.0), (0.0, 0.0, 0.0, 1.0)
-"""Where the head is when it is out of reach: it falls there, which is no one's business."""
-
 _BALL, _WORLD, _HEAD = 1, 2, 4
 """Collision groups; the ball meets both others, which do not meet each other."""
-
-
-@dataclass(frozen=True)
-class HeadPath:
-    """Where the club head is at the start of each of M sub-steps, and how it moves in it.
-
-    Plain lists, because one path serves thousands of strikes and Bullet's functions take numbers.
-
-    Attributes:
-        positions: Positions of its centre in m, M of (x, y, z).
-        quaternions: Rotations, M of (x, y, z, w).
-        velocities: Mean velocities in m/s, plus what gravity takes in a sub-step: the head is
-            held up.
-        rates: Mean angular velocities in rad/s.
-        ground_track: x and y at the start of every step in m, ``(M / SUB_STEPS, 2)``.
-    """
-
-    positions: list[list[float]]
-    quaternions: list[list[float]]
-    velocities: list[list[float]]
-    rates: list[list[float]]
-    ground_track: Array
-
-    @classmethod
-    def of(cls, poses: Pose, sub_step: float) -> "HeadPath":
-        """Derives velocities from poses at the M + 1 bounds of sub-steps of ``sub_step`` s."""
-        velocities = np.diff(poses.position, axis=0) / sub_step
-        velocities[:, 2] += GRAVITY * sub_step
-        turned = poses.rotation[1:] @ poses.rotation[:-1].swapaxes(-1, -2)
-        rates = Rotation.from_matrix(turned).as_rotvec() / sub_step
-        return cls(
-            poses.position[:-1].tolist(),
-            poses.quaternion()[:-1].tolist(),
-            velocities.tolist(),
-            rates.tolist(),
-            poses.position[:-1:SUB_STEPS, :2],
-        )
 
 
 class Scene:
@@ -120,43 +76,43 @@ class Scene:
         self._client.disconnect()
 
     def strike(
-        self, parameters: StrikeParameters, ball: Array, head: HeadPath, time_step: float
+        self, parameters: StrikeParameters, ball: Array, club: Club, time_step: float
     ) -> Array:
         """Simulates one strike.
 
         Args:
             parameters: The course and the ball.
             ball: Where the ball lies at the start in m, ``(2,)``.
-            head: The club head's path over K steps, K · ``SUB_STEPS`` samples.
+            club: What strikes it, on its way through K steps.
             time_step: Seconds per step.
 
         Returns:
             The ball's x and y after each step in m, ``(K, 2)``.
         """
-        body, head_body = self._build(parameters, ball, time_step)
-        return self._run(body, head_body, head, parameters.ball_radius)
-
-    def _run(self, ball: int, head_body: int, head: HeadPath, radius: float) -> Array:
         client = self._client
-        place, push = client.resetBasePositionAndOrientation, client.resetBaseVelocity
+        self._build_course(parameters, time_step / SUB_STEPS)
+        ball_body = self._add_ball(parameters, ball)
+        club_body, head = club.build(client, parameters.club_restitution)
+        client.setCollisionFilterGroupMask(club_body, head, _HEAD, _BALL)
         locate, step_simulation = client.getBasePositionAndOrientation, client.stepSimulation
-        track = head.ground_track
+        track = club.ground_track
         result = np.empty((len(track), 2))
-        (x, y, _), _ = locate(ball)
+        (x, y, _), _ = locate(ball_body)
         is_near = True
         for step, (head_x, head_y) in enumerate(track.tolist()):
             was_near = is_near
             is_near = (head_x - x) ** 2 + (head_y - y) ** 2 < REACH**2
             if was_near and not is_near:
-                place(head_body, *ASIDE)
+                club.put_aside(client, club_body)
             for k in range(step * SUB_STEPS, (step + 1) * SUB_STEPS):
                 if is_near:
-                    place(head_body, head.positions[k], head.quaternions[k])
-                    push(head_body, head.velocities[k], head.rates[k])
+                    club.follow(client, club_body, k)
                 step_simulation()
-            (x, y, _), _ = locate(ball)
+            (x, y, _), _ = locate(ball_body)
             result[step] = x, y
-            if is_near or step % STEPS_PER_REST_CHECK or not self._is_at_rest(ball, radius):
+            if is_near or step % STEPS_PER_REST_CHECK:
+                continue
+            if not self._is_at_rest(ball_body, parameters.ball_radius):
                 continue
             if np.linalg.norm(track[step:] - (x, y), axis=-1).min() > REACH:
                 result[step:] = x, y
@@ -167,14 +123,11 @@ class Scene:
         linear, angular = self._client.getBaseVelocity(ball)
         return max(*map(abs, linear), radius * max(map(abs, angular))) < REST_SPEED
 
-    def _build(
-        self, parameters: StrikeParameters, ball: Array, time_step: float
-    ) -> tuple[int, int]:
+    def _build_course(self, parameters: StrikeParameters, sub_step: float) -> None:
         client = self._client
-        self._sub_step = time_step / SUB_STEPS
         client.resetSimulation()
         client.setPhysicsEngineParameter(enableFileCaching=0, **SETTINGS.engine_parameters())
-        client.setTimeStep(self._sub_step)
+        client.setTimeStep(sub_step)
         client.setGravity(*SETTINGS.gravity)
         obstacle = parameters.obstacle_restitution
         ground = client.createCollisionShape(client.GEOM_BOX, halfExtents=(4.0, 4.0, 0.5))
@@ -190,30 +143,22 @@ class Scene:
         )
         place = (*HOLE, HOLE_RISE - 0.5 * HOLE_DEPTH)
         self._body(hole, place, _WORLD, friction=HOLE_FRICTION, rolling=HOLE_FRICTION)
-        sphere = client.createCollisionShape(client.GEOM_SPHERE, radius=parameters.ball_radius)
-        ball_body = self._body(
-            sphere,
-            (float(ball[0]), float(ball[1]), parameters.ball_radius),
+
+    def _add_ball(self, parameters: StrikeParameters, place: Array) -> int:
+        client = self._client
+        radius, mass = parameters.ball_radius, parameters.ball_mass
+        body = self._body(
+            client.createCollisionShape(client.GEOM_SPHERE, radius=radius),
+            (float(place[0]), float(place[1]), radius),
             _BALL,
-            mass=parameters.ball_mass,
+            mass=mass,
             friction=parameters.ball_friction,
             rolling=parameters.ball_rolling_friction,
             restitution=1.0,
         )
-        inertia = parameters.ball_inertia_factor * parameters.ball_mass * parameters.ball_radius**2
-        client.changeDynamics(ball_body, -1, localInertiaDiagonal=(inertia,) * 3)
-        head_shape = client.createCollisionShape(
-            client.GEOM_BOX,
-            halfExtents=tuple(0.5 * size for size in CLUB_HEAD_SIZE),
-        )
-        head_body = self._body(
-            head_shape,
-            ASIDE[0],
-            _HEAD,
-            mass=CLUB_MASS,
-            restitution=parameters.club_restitution,
-        )
-        return ball_body, head_body
+        inertia = parameters.ball_inertia_factor * mass * radius**2
+        client.changeDynamics(body, -1, localInertiaDiagonal=(inertia,) * 3)
+        return body
 
     def _box(self, box: Box, restitution: float) -> None:
         client = self._client

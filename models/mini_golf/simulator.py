@@ -2,19 +2,20 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.engines.pooled import PooledSimulator, Segment
-from npdr_ppl.errors import DataError
+from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.mini_golf.clubs import Club, ClubKind, club_of
 from npdr_ppl.models.mini_golf.course import StrikeParameters
-from npdr_ppl.models.mini_golf.kinematics import JOINTS, head_path
-from npdr_ppl.models.mini_golf.scene import SETTINGS, SUB_STEPS, HeadPath, Scene
+from npdr_ppl.models.mini_golf.kinematics import JOINTS
+from npdr_ppl.models.mini_golf.scene import GRAVITY, SETTINGS, SUB_STEPS, Scene
 
 __all__ = ["MiniGolf", "Workspace"]
 
@@ -30,7 +31,7 @@ _COMMANDS = tuple(
 
 
 class Workspace:
-    """A scene, and the club head's path for the joint angles last seen.
+    """A scene, and the club on its way along the joint angles last seen.
 
     Attributes:
         scene: The connection to Bullet.
@@ -39,22 +40,22 @@ class Workspace:
     def __init__(self) -> None:
         self.scene = Scene()
         self._key: tuple[bytes, float] | None = None
-        self._path: HeadPath | None = None
+        self._club: Club | None = None
 
-    def head(self, angles: Array, time_step: float) -> HeadPath:
-        """Returns the path for joint angles at the bounds of steps, ``(K + 1, 7)`` in rad.
+    def club(self, kind: ClubKind, angles: Array, time_step: float) -> Club:
+        """Returns the club for joint angles at the bounds of steps, ``(K + 1, 7)`` in rad.
 
-        Between the bounds the angles are linear in time. Thousands of draws share one path, and
-        it takes as long to find as a strike.
+        Between the bounds the angles are linear in time. Thousands of draws share one swing,
+        whose kinematics take as long as a strike.
         """
         key = (angles.tobytes(), time_step)
-        if self._path is None or key != self._key:
+        if self._club is None or key != self._key:
             bounds = np.arange(len(angles))
             time = np.arange((len(angles) - 1) * SUB_STEPS + 1) / SUB_STEPS
             fine = np.stack([np.interp(time, bounds, joint) for joint in angles.T], axis=-1)
-            self._path = HeadPath.of(head_path(fine), time_step / SUB_STEPS)
+            self._club = club_of(kind, fine, time_step / SUB_STEPS, SUB_STEPS, GRAVITY)
             self._key = key
-        return self._path
+        return self._club
 
 
 class MiniGolf(PooledSimulator):
@@ -70,6 +71,10 @@ class MiniGolf(PooledSimulator):
     exceed 1: a flexible shaft gives back more than the head's own motion.
 
     A strike is simulated from its first sample, at which the ball is at rest.
+
+    Args:
+        club: What strikes: ``"head"``, the club head alone, or ``"arm"``, the whole arm as one
+            multi-body, which launches the ball the same and takes several times as long.
     """
 
     states = (*_BALL, *_ANGLES)
@@ -99,9 +104,14 @@ class MiniGolf(PooledSimulator):
     )
     time_step = SETTINGS.time_step
 
+    def __init__(self, club: ClubKind = "head") -> None:
+        if club not in get_args(ClubKind):
+            raise ModelError(f"the club is 'head' or 'arm', not {club!r}.")
+        self.club: ClubKind = club
+
     def recorded_settings(self) -> dict[str, Any]:
         """Returns the settings of the engine, for JSON."""
-        return {"engine": "bullet", **asdict(SETTINGS)}
+        return {"engine": "bullet", "club": self.club, **asdict(SETTINGS)}
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
         """Simulates all strikes; see :meth:`Simulator.simulate`.
@@ -139,7 +149,7 @@ class MiniGolf(PooledSimulator):
         ball = workspace.scene.strike(
             _strike_parameters(parameters),
             segment.initial_state[: len(_BALL)],
-            workspace.head(angles, segment.time_step),
+            workspace.club(self.club, angles, segment.time_step),
             segment.time_step,
         )
         return np.concatenate([ball, angles[1:]], axis=-1)

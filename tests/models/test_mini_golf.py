@@ -8,14 +8,15 @@ import pytest
 import torch
 
 import npdr_ppl as npdr
-from npdr_ppl.errors import DataError
+from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.models.effects import InputDelay
 from npdr_ppl.models.mini_golf import MiniGolf, mini_golf, mini_golf_two_restitutions
+from npdr_ppl.models.mini_golf.clubs import ClubHead
 from npdr_ppl.models.mini_golf.course import CLUB_MASS, HOLE, StrikeParameters
 from npdr_ppl.models.mini_golf.kinematics import JOINTS, Pose, head_path
-from npdr_ppl.models.mini_golf.scene import GRAVITY, SUB_STEPS, HeadPath, Scene
+from npdr_ppl.models.mini_golf.scene import GRAVITY, SUB_STEPS, Scene
 
 RECORDING = Path(__file__).parents[2].parent / "shared/data/mini_golf/strike_100hz_8s.csv"
 needs_recording = pytest.mark.skipif(
@@ -48,6 +49,14 @@ def scene():
     scene.close()
 
 
+class Straight(ClubHead):
+    """A head that follows given poses instead of joint angles."""
+
+    def __init__(self, poses):
+        super().__init__(np.empty((0, 7)), TIME_STEP / SUB_STEPS, SUB_STEPS, GRAVITY)
+        self.poses = poses
+
+
 def strike(scene, parameters, *, y=0.0, x=0.1, num_steps=100, speed=HEAD_SPEED):
     """A head that moves 6 cm along x and then stands; the ball lies 5 cm ahead of it."""
     time = np.arange(num_steps * SUB_STEPS + 1) * TIME_STEP / SUB_STEPS
@@ -55,8 +64,9 @@ def strike(scene, parameters, *, y=0.0, x=0.1, num_steps=100, speed=HEAD_SPEED):
     position[:] = x - 0.05, y, parameters.ball_radius
     position[:, 0] += np.minimum(speed * time, 0.06)
     rotation = np.broadcast_to(Pose.of(0, 0, 0, 0, 90, 0).rotation, (len(time), 3, 3))
-    head = HeadPath.of(Pose(position, rotation), TIME_STEP / SUB_STEPS)
-    return scene.strike(parameters, np.array((x, y)), head, TIME_STEP)
+    return scene.strike(
+        parameters, np.array((x, y)), Straight(Pose(position, rotation)), TIME_STEP
+    )
 
 
 def speeds(positions):
@@ -101,11 +111,10 @@ def test_velocities_of_a_path_are_those_of_its_positions():
     time = np.arange(41) * 0.0025
     turn = np.stack([Pose.of(0, 0, 0, 0, 0, 90 * t).rotation for t in time])
     poses = Pose(np.stack([time, 0 * time, 2 * time], -1), turn)
-    path = HeadPath.of(poses, 0.0025)
-    np.testing.assert_allclose(
-        np.array(path.velocities) - (0, 0, GRAVITY * 0.0025), [[1, 0, 2]] * 40
-    )
-    np.testing.assert_allclose(path.rates, [[0, 0, np.pi / 2]] * 40, atol=1e-9)
+    club = Straight(poses)
+    held_up = (0.0, 0.0, GRAVITY * 0.0025)
+    np.testing.assert_allclose(np.array(club.velocities) - held_up, [[1, 0, 2]] * 40)
+    np.testing.assert_allclose(club.rates, [[0, 0, np.pi / 2]] * 40, atol=1e-9)
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0, 1.5])
@@ -225,3 +234,17 @@ def test_effects_of_commands_and_readings_apply():
     moved = lagging.simulate(delay, inputs)[0, :, 2]
     plain = MiniGolf().simulate({}, inputs)[0, :, 2]
     torch.testing.assert_close(moved[5:-1], plain[:-6])
+
+
+def test_the_whole_arm_strikes_as_the_head_alone():
+    inputs = swing(80)
+    draws = {"ball_restitution": torch.tensor([0.0, 0.5, 1.0])}
+    head, arm = (MiniGolf(club).simulate(draws, inputs)[:, 0, :, :2] for club in ("head", "arm"))
+    away = (head[:, -1] - head[:, 0]).norm(dim=-1)
+    assert bool((away > 0.1).all())
+    assert bool(((arm - head).norm(dim=-1).amax(-1) < 0.03 * away).all())
+
+
+def test_an_unknown_club_is_refused():
+    with pytest.raises(ModelError, match="'head' or 'arm'"):
+        MiniGolf("putter")
