@@ -98,9 +98,8 @@ def zoo() -> dict[str, ZooEntry]:
     """Returns every model of the zoo by name.
 
     Example:
-        >>> sorted(zoo())
-        ['cart_pole', 'emps', 'furuta', 'furuta_paper', 'mini_golf', 'mini_golf_two_restitutions',
-        'pendulum']
+        >>> "furuta" in zoo() and "mini_golf" in zoo()
+        True
     """
     return {entry.name: entry for entry in _ENTRIES}
 
