@@ -46,8 +46,8 @@ OPTIONS = BindingOptions(EMBEDDING, None, "recorded")
 """Whole strikes, from the recorded place of the ball."""
 
 
-NUM_DRAWS = 200
-"""Posterior draws among which the most likely is sought, as many as the paper plots."""
+NUM_DRAWS = 1_000
+"""Posterior draws among which the most likely is sought, less than one round's simulations."""
 
 
 @dataclass(frozen=True)
