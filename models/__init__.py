@@ -77,6 +77,20 @@ _ENTRIES = (
         "emps",
         "Emps",
     ),
+    ZooEntry(
+        "mini_golf",
+        "Robot arm strikes a ball past two obstacles; ten parameters of the NPDR paper",
+        "npdr_ppl.models.mini_golf",
+        "mini_golf",
+        "MiniGolf",
+    ),
+    ZooEntry(
+        "mini_golf_two_restitutions",
+        "The same strike, rebounds off the club apart from those off obstacles",
+        "npdr_ppl.models.mini_golf",
+        "mini_golf_two_restitutions",
+        "MiniGolf",
+    ),
 )
 
 
@@ -84,8 +98,8 @@ def zoo() -> dict[str, ZooEntry]:
     """Returns every model of the zoo by name.
 
     Example:
-        >>> sorted(zoo())
-        ['cart_pole', 'emps', 'furuta', 'furuta_paper', 'pendulum']
+        >>> "furuta" in zoo() and "mini_golf" in zoo()
+        True
     """
     return {entry.name: entry for entry in _ENTRIES}
 

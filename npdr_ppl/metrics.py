@@ -13,7 +13,7 @@ from contextlib import redirect_stdout
 from functools import cache
 from io import StringIO
 from types import ModuleType
-from typing import TypedDict
+from typing import Literal, TypedDict
 
 import numpy as np
 import torch
@@ -75,7 +75,12 @@ def rmse(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> Tensor:
     return torch.stack(result, dim=-1)
 
 
-def dtw(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> Tensor:
+def dtw(
+    simulated: Sequence[Tensor],
+    measured: Sequence[Tensor],
+    *,
+    open_end: Literal["simulated", "measured"] = "simulated",
+) -> Tensor:
     """Distance of dynamic time warping per rollout, channels in units of their range.
 
     With ``d_ij`` the Euclidean distance between step i of the measured and step j of the
@@ -91,6 +96,9 @@ def dtw(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> Tensor:
     Args:
         simulated: One ``(..., T, C)`` per rollout.
         measured: One ``(T, C)`` per rollout, in the same units.
+        open_end: Which series may leave out its end. With ``"measured"`` the two change places:
+            the simulated one is spent and the measured one need not be, so that a simulation
+            that does too little is forgiven.
 
     Returns:
         ``(..., R)`` float64, dimensionless; NaN where a simulation is not finite.
@@ -109,7 +117,10 @@ def dtw(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> Tensor:
         scale = _scale(y).double().cpu()
         query = (y.double().cpu() / scale).numpy()
         batch = (x.detach().double().cpu() / scale).reshape(-1, *x.shape[-2:]).numpy()
-        values = [_open_end_dtw(query, reference) for reference in batch]
+        if open_end == "simulated":
+            values = [_open_end_dtw(query, reference) for reference in batch]
+        else:
+            values = [_open_end_dtw(reference, query) for reference in batch]
         result.append(torch.tensor(values, dtype=torch.float64).reshape(x.shape[:-2]))
     return torch.stack(result, dim=-1)
 

@@ -16,12 +16,13 @@ class Experiment(StrEnum):
 
     TABLE2 = "table2"
     PENDULUM = "pendulum"
+    MINI_GOLF = "mini-golf"
 
 
 def reproduce(
     experiment: Annotated[Experiment, typer.Argument(help="Which table or figure.")],
     data: Annotated[
-        Path | None, typer.Option(help="The paper's recordings; needed for table2.")
+        Path | None, typer.Option(help="The paper's recordings; needed for table2 and mini-golf.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("reproduction"),
     backends: Annotated[
@@ -63,6 +64,17 @@ def reproduce(
 
         ridges, result = reproduce_pendulum(out, backends=chosen, seed=seed, progress=progress)
         write_pendulum_figures(ridges, out)
+    elif experiment is Experiment.MINI_GOLF:
+        from npdr_ppl.plots.mini_golf import write_mini_golf_figures
+        from npdr_ppl.rollouts import Rollouts
+        from npdr_ppl.workflows.mini_golf_table import reproduce_mini_golf
+
+        if data is None:
+            raise DataError("mini-golf needs the paper's recordings: pass --data FILE.")
+        posteriors, result = reproduce_mini_golf(
+            Rollouts.load(data), out, backends=chosen, seed=seed, progress=progress
+        )
+        write_mini_golf_figures({label: p[-1] for label, p in posteriors.items()}, out, seed=seed)
     else:
         from npdr_ppl.models.furuta import furuta
         from npdr_ppl.plots.comparison_figures import write_comparison_figures

@@ -1,7 +1,7 @@
 """Embeddings: from trajectories to the features that a backend conditions on."""
 
 from npdr_ppl.embeddings.base import Embedding
-from npdr_ppl.embeddings.networks import Convolutional, Recurrent
+from npdr_ppl.embeddings.networks import Convolutional, Linear, Recurrent
 from npdr_ppl.embeddings.registry import embedding_by_name, embedding_names
 from npdr_ppl.embeddings.score import Score
 from npdr_ppl.embeddings.statistics import AllSteps, BayesSimStatistic, Differences, LastStep
@@ -12,6 +12,7 @@ __all__ = [
     "Averaged",
     "BayesSimStatistic",
     "Convolutional",
+    "Linear",
     "Differences",
     "Embedding",
     "LastStep",

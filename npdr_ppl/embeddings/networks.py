@@ -1,4 +1,4 @@
-"""Embeddings that are trained: recurrent and convolutional networks over raw trajectories."""
+"""Embeddings that are trained: linear, recurrent and convolutional networks of trajectories."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from npdr_ppl.embeddings.base import Embedding, check_trajectory
 from npdr_ppl.errors import ShapeError
 from npdr_ppl.language.inputs import Inputs
 
-__all__ = ["Convolutional", "Recurrent"]
+__all__ = ["Convolutional", "Linear", "Recurrent"]
 
 
 class _Trained(Embedding):
@@ -22,6 +22,26 @@ class _Trained(Embedding):
         check_trajectory(trajectory, inputs)
         mask = inputs.mask.to(trajectory.device)
         return torch.where(mask[..., None], trajectory, 0.0)
+
+
+@dataclass(frozen=True)
+class Linear(_Trained):
+    """One trained linear layer over all readings of all segments.
+
+    Where every reading of a trajectory means something of its own, as on the way of a ball, this
+    learns the combinations that matter. Of a stride of 2, ``linear/2``, it is the embedding of
+    Muratore et al. (2021) for mini golf.
+
+    Attributes:
+        output: Features F handed to the density estimator.
+    """
+
+    output: int = 100
+
+    def network(self, feature_shape: torch.Size) -> nn.Module:
+        """Returns the network ``(n, S, K, C) → (n, F)``."""
+        _checked(feature_shape)
+        return nn.Sequential(nn.Flatten(), nn.Linear(feature_shape.numel(), self.output))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable
 
 from npdr_ppl.embeddings.base import Embedding
-from npdr_ppl.embeddings.networks import Convolutional, Recurrent
+from npdr_ppl.embeddings.networks import Convolutional, Linear, Recurrent
 from npdr_ppl.embeddings.statistics import AllSteps, BayesSimStatistic, Differences, LastStep
 from npdr_ppl.embeddings.wrappers import Averaged, Masked, Strided
 from npdr_ppl.errors import ModelError
@@ -18,6 +18,7 @@ _EMBEDDINGS: dict[str, Callable[[], Embedding]] = {
     "differences": Differences,
     "gru": Recurrent,
     "conv": Convolutional,
+    "linear": Linear,
 }
 
 _WORD = re.compile(

@@ -175,6 +175,7 @@ def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path
         (["compare", "pendulum", "--data", "DATA", "--out", "OUT", "--backends", "snpe-c,snpe-c"],
          "cannot be told apart"),
         (["reproduce", "table2"], "pass --data"),
+        (["reproduce", "mini-golf"], "pass --data"),
         (["reproduce", "pendulum", "--backends", "mcmc"], "mcmc"),
     ],
 )  # fmt: skip

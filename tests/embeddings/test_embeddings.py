@@ -137,7 +137,7 @@ def test_block_means_by_hand(trajectory, inputs):
 
 
 WORDS = (
-    "bayessim", "last", "all", "differences", "gru", "conv",
+    "bayessim", "last", "all", "differences", "gru", "conv", "linear",
     "all/2", "all~2", "gru[x]/2", "gru~2", "conv/4",
 )  # fmt: skip
 
@@ -173,7 +173,7 @@ def test_a_failed_simulation_does_not_spoil_the_others(word, trajectory, inputs)
     assert torch.isfinite(features[[0, 2]]).all() and not torch.isfinite(features[1]).all()
 
 
-@pytest.mark.parametrize("word", ["gru", "conv"])
+@pytest.mark.parametrize("word", ["gru", "conv", "linear"])
 def test_networks_tell_segments_apart(word):
     """Averaging must not mix segments up: swapping two of them changes the output."""
     torch.manual_seed(0)
@@ -183,7 +183,7 @@ def test_networks_tell_segments_apart(word):
     assert not torch.allclose(network(x), network(x[:, [1, 0, 2]]), atol=1e-4)
 
 
-@pytest.mark.parametrize("word", ["gru", "conv"])
+@pytest.mark.parametrize("word", ["gru", "conv", "linear"])
 def test_networks_learn(word):
     """A frequency is read off noisy sines: far below the error of guessing the mean."""
     torch.manual_seed(0)
@@ -204,7 +204,8 @@ def test_networks_learn(word):
 
 
 def test_words():
-    assert set(embedding_names()) == {"bayessim", "last", "all", "differences", "gru", "conv"}
+    known = {"bayessim", "last", "all", "differences", "gru", "conv", "linear"}
+    assert set(embedding_names()) == known
     assert embedding_by_name("all/10") == Strided(AllSteps(), 10)
     assert embedding_by_name("gru[x, y]/3") == Strided(Masked(Recurrent(), ("x", "y")), 3)
     for word in ("", "al", "all/", "all/0", "all/-1", "all[]", "all/2[x]", "all/2/3", "ALL"):

@@ -1,0 +1,214 @@
+"""What strikes the ball: the club head alone, or the whole arm that holds it.
+
+Both follow the joints' recorded angles and have, at every contact, the velocity that goes with
+them; a body that was merely put from place to place would have none and pass on no momentum. The
+head alone launches the ball as the whole arm does, at a fraction of the cost.
+"""
+
+from abc import ABC, abstractmethod
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from npdr_ppl.models.mini_golf.course import CLUB_HEAD_SIZE, CLUB_MASS, DEFAULT_FRICTION
+from npdr_ppl.models.mini_golf.kinematics import BASE, CLUB, HEAD, JOINTS, Pose, head_path
+
+__all__ = ["Club", "ClubHead", "ClubKind", "WholeArm", "club_of"]
+
+Array = NDArray[np.float64]
+
+ClubKind = Literal["head", "arm"]
+
+ASIDE = (0.0, 0.0, 100.0), (0.0, 0.0, 0.0, 1.0)
+"""Where the head is when it is out of reach: it falls there, which is no one's business."""
+
+MOTOR_FORCE = 1e5
+"""Greatest torque of a joint's motor in N m; no more than a way to say that the joint obeys."""
+
+LINK_RADIUS = 0.05
+"""Radius of the ball of matter that stands for a link in m; its inertia matters as little as its
+mass where joints obey."""
+
+
+class Club(ABC):
+    """A striker that is moved along a recorded swing.
+
+    Args:
+        angles: Joint angles in rad at the M + 1 bounds of sub-steps, ``(M + 1, 7)``.
+        sub_step: Seconds per sub-step.
+        sub_steps: Sub-steps per step.
+        gravity: Acceleration of gravity in m/s².
+    """
+
+    def __init__(self, angles: Array, sub_step: float, sub_steps: int, gravity: float) -> None:
+        self.angles, self.sub_step = angles, sub_step
+        self.sub_steps, self.gravity = sub_steps, gravity
+
+    @abstractmethod
+    def build(self, client: Any, restitution: float) -> tuple[int, int]:
+        """Adds the club to a scene.
+
+        Returns:
+            Body and link of the head.
+        """
+
+    @abstractmethod
+    def follow(self, client: Any, body: int, k: int) -> None:
+        """Gives the club its pose and velocity of sub-step k, just before that sub-step."""
+
+    @abstractmethod
+    def put_aside(self, client: Any, body: int) -> None:
+        """Takes care of a club that is out of the ball's reach."""
+
+    @cached_property
+    def poses(self) -> Pose:
+        """Poses of the head's centre at the bounds of sub-steps."""
+        return head_path(self.angles)
+
+    @cached_property
+    def ground_track(self) -> Array:
+        """X and y of the head at the start of every step in m, ``(steps, 2)``."""
+        return self.poses.position[: -1 : self.sub_steps, :2]
+
+
+class ClubHead(Club):
+    """The head alone, along the arm's forward kinematics; see :class:`Club`."""
+
+    def build(self, client: Any, restitution: float) -> tuple[int, int]:
+        """Adds the head; see :meth:`Club.build`."""
+        body = client.createMultiBody(
+            baseMass=CLUB_MASS,
+            baseCollisionShapeIndex=_head_shape(client),
+            basePosition=ASIDE[0],
+        )
+        _set_surface(client, body, -1, restitution)
+        return body, -1
+
+    def follow(self, client: Any, body: int, k: int) -> None:
+        """Moves the head; see :meth:`Club.follow`."""
+        client.resetBasePositionAndOrientation(body, self._positions[k], self._quaternions[k])
+        client.resetBaseVelocity(body, self.velocities[k], self.rates[k])
+
+    def put_aside(self, client: Any, body: int) -> None:
+        """Puts the head where nothing is."""
+        client.resetBasePositionAndOrientation(body, *ASIDE)
+
+    # Plain lists, because one swing serves thousands of strikes and Bullet takes numbers.
+
+    @cached_property
+    def _positions(self) -> list[list[float]]:
+        return self.poses.position.tolist()
+
+    @cached_property
+    def _quaternions(self) -> list[list[float]]:
+        return self.poses.quaternion().tolist()
+
+    @cached_property
+    def velocities(self) -> list[list[float]]:
+        """Mean velocities in sub-steps in m/s, plus what gravity takes: the head is held up."""
+        velocities = np.diff(self.poses.position, axis=0) / self.sub_step
+        velocities[:, 2] += self.gravity * self.sub_step
+        return velocities.tolist()
+
+    @cached_property
+    def rates(self) -> list[list[float]]:
+        """Mean angular velocities in sub-steps in rad/s."""
+        rotation = self.poses.rotation
+        turned = rotation[1:] @ rotation[:-1].swapaxes(-1, -2)
+        return (Rotation.from_matrix(turned).as_rotvec() / self.sub_step).tolist()
+
+
+class WholeArm(Club):
+    """Seven links, the club and its head as one multi-body; see :class:`Club`.
+
+    Every joint is put to its angle and given its velocity, which its motor holds against gravity
+    and the blow.
+    """
+
+    def build(self, client: Any, restitution: float) -> tuple[int, int]:
+        """Adds the arm; see :meth:`Club.build`."""
+        matter = client.createCollisionShape(client.GEOM_SPHERE, radius=LINK_RADIUS)
+        frames = [joint.frame for joint in JOINTS] + [CLUB @ HEAD]
+        masses = [joint.mass for joint in JOINTS] + [CLUB_MASS]
+        count = len(frames)
+        body = client.createMultiBody(
+            baseMass=0.0,
+            basePosition=BASE.position.tolist(),
+            baseOrientation=BASE.quaternion().tolist(),
+            linkMasses=masses,
+            linkCollisionShapeIndices=[matter] * len(JOINTS) + [_head_shape(client)],
+            linkVisualShapeIndices=[-1] * count,
+            linkPositions=[frame.position.tolist() for frame in frames],
+            linkOrientations=[frame.quaternion().tolist() for frame in frames],
+            linkInertialFramePositions=[(0.0, 0.0, 0.0)] * count,
+            linkInertialFrameOrientations=[(0.0, 0.0, 0.0, 1.0)] * count,
+            linkParentIndices=list(range(count)),
+            linkJointTypes=[client.JOINT_REVOLUTE] * len(JOINTS) + [client.JOINT_FIXED],
+            linkJointAxis=[(0.0, 0.0, 1.0)] * count,
+        )
+        for link in range(len(JOINTS)):
+            client.changeDynamics(body, link, jointDamping=0.0)
+            client.setCollisionFilterGroupMask(body, link, 0, 0)
+        _set_surface(client, body, len(JOINTS), restitution)
+        return body, len(JOINTS)
+
+    def follow(self, client: Any, body: int, k: int) -> None:
+        """Moves the joints; see :meth:`Club.follow`."""
+        angles, rates = self._angles[k], self._rates[k]
+        for joint, (angle, rate) in enumerate(zip(angles, rates, strict=True)):
+            client.resetJointState(body, joint, angle, rate)
+        client.setJointMotorControlArray(
+            body,
+            range(len(rates)),
+            client.VELOCITY_CONTROL,
+            targetVelocities=rates,
+            forces=[MOTOR_FORCE] * len(rates),
+        )
+
+    def put_aside(self, client: Any, body: int) -> None:
+        """Stops the joints: the arm stays where it left the ball."""
+        client.setJointMotorControlArray(
+            body,
+            range(len(JOINTS)),
+            client.VELOCITY_CONTROL,
+            targetVelocities=[0.0] * len(JOINTS),
+            forces=[MOTOR_FORCE] * len(JOINTS),
+        )
+
+    @cached_property
+    def _angles(self) -> list[list[float]]:
+        return self.angles.tolist()
+
+    @cached_property
+    def _rates(self) -> list[list[float]]:
+        return (np.diff(self.angles, axis=0) / self.sub_step).tolist()
+
+
+def club_of(
+    kind: ClubKind, angles: Array, sub_step: float, sub_steps: int, gravity: float
+) -> Club:
+    """Returns the club of a kind; see :class:`Club` for the other arguments."""
+    kinds: dict[str, type[Club]] = {"head": ClubHead, "arm": WholeArm}
+    return kinds[kind](angles, sub_step, sub_steps, gravity)
+
+
+def _head_shape(client: Any) -> int:
+    return client.createCollisionShape(
+        client.GEOM_BOX, halfExtents=[0.5 * size for size in CLUB_HEAD_SIZE]
+    )
+
+
+def _set_surface(client: Any, body: int, link: int, restitution: float) -> None:
+    client.changeDynamics(
+        body,
+        link,
+        lateralFriction=DEFAULT_FRICTION,
+        spinningFriction=0.0,
+        rollingFriction=0.0,
+        restitution=restitution,
+        linearDamping=0.0,
+        angularDamping=0.0,
+    )
