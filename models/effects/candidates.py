@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Port
 from npdr_ppl.language.effect_context import SensorSpan
 from npdr_ppl.language.effects import Effect, SensorEffect
@@ -19,7 +20,8 @@ def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
 
     A sensor effect attaches to the channels that one device may have it on; see
     :class:`~npdr_ppl.language.effects.SensorEffect`. Parameters drift that neither last nor are
-    nominally zero. Effects that the simulator has already are left out.
+    nominally zero. Effects that the simulator has already, or
+    that its engine cannot apply, are left out.
 
     Args:
         simulator: The simulator, whose ports say what passes through them.
@@ -35,7 +37,11 @@ def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
         for port in _ports(simulator, effect):
             attached = effect(port)
             members = (simulator.port(name) for name in simulator.port(port).channels)
-            if attached.name not in present and all(map(attached.suits, members)):
+            if (
+                attached.name not in present
+                and all(map(attached.suits, members))
+                and _is_accepted(simulator, attached)
+            ):
                 found.append(attached)
     return tuple(found)
 
@@ -75,6 +81,15 @@ def _ports(simulator: Simulator, effect: type[Effect]) -> Iterator[str]:
     for port in simulator.all_ports:
         if port.kind in kinds and not (port.kind == "parameter" and port.name in lasting):
             yield port.name
+
+
+def _is_accepted(simulator: Simulator, effect: Effect) -> bool:
+    """Returns whether a simulator takes an effect; not every engine can apply each."""
+    try:
+        simulator.with_effects(effect)
+    except ModelError:
+        return False
+    return True
 
 
 def _by_unit(simulator: Simulator, group: tuple[str, ...]) -> list[tuple[str, ...]]:

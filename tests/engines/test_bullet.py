@@ -14,7 +14,7 @@ from npdr_ppl.engines.bullet import BulletSettings, BulletSimulator, Command, Se
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Parameter
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import effects
+from npdr_ppl.models.effects import candidate_effects, effects
 from npdr_ppl.models.effects.friction import CoulombFriction, ViscousFriction
 from npdr_ppl.models.pendulum import Pendulum
 
@@ -134,6 +134,12 @@ def test_effects_that_need_more_than_bullet_gives_are_refused_in_one_sentence(ur
     effect = effects()[effect_id]
     with pytest.raises(ModelError, match=effect_id):
         bullet_pendulum(urdf).with_effects(effect(PORTS[effect.port_kinds[0]]))
+
+
+def test_candidates_are_what_bullet_takes(urdf):
+    simulator = bullet_pendulum(urdf)
+    assert simulator.port("hinge").is_driven
+    assert {effect.id for effect in candidate_effects(simulator)} == effects().keys() - REFUSED
 
 
 @pytest.mark.parametrize("effect_id", sorted(effects().keys() - REFUSED))

@@ -263,6 +263,7 @@ class BulletSimulator(PooledSimulator):
             Port(a.name, "action", a.unit, commands[a.name].rated if a.name in commands else 1.0)
             for a in self.actions
         ]
+        driven = {scene.find(command.place) for _, command in self._commands}
         of_joint: dict[tuple[int, int], str] = {}
         for name, joint in scene.joints.items():
             if joint not in of_joint or "/" not in name:
@@ -274,7 +275,8 @@ class BulletSimulator(PooledSimulator):
             # A URDF says zero, and Bullet sometimes a thousand, where nothing was said.
             effort = rated.get(name, info[10] if 0.0 < info[10] < 1000.0 else 1.0)
             speed = info[11] if 0.0 < info[11] < 1000.0 else 1.0
-            ports.append(Port(name, "force", unit, effort, speed, coordinate=coordinate))
+            port = Port(name, "force", unit, effort, speed, 1.0, coordinate, joint in driven)
+            ports.append(port)
         ports += [Port(s.channel.name, "sensor", s.channel.unit, s.rated) for s in self._sensors]
         strength = float(np.linalg.norm(scene.gravity)) or 9.81
         ports.append(Port("gravity", "environment", "m/s²", strength))
