@@ -163,7 +163,9 @@ def test_an_executor_that_breaks_is_replaced():
 def test_an_interrupt_ends_all_processes(tmp_path, executor):
     here = Path(__file__).parent
     script = (
-        f"import sys; sys.path[:0] = {[str(here.parents[1]), str(here)]}\n"
+        f"import signal, sys; sys.path[:0] = {[str(here.parents[1]), str(here)]}\n"
+        # Where the tests run in the background, a shell has told them to ignore interrupts.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "import npdr_ppl as npdr\n"
         "from tasks import Sleep\n"
         "if __name__ == '__main__':\n"
