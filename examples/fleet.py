@@ -160,11 +160,30 @@ def coverage(draws: Mapping[str, Tensor], truth: Fleet, mass: float = 0.9) -> li
     return covered
 
 
+def c2st_per_rig(draws: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> list[float]:
+    """Returns how well a classifier tells two chains apart, rig by rig; 0.5 is not at all."""
+    ours, theirs = draws["coordinates"], others["coordinates"]
+    return [c2st(ours[:, k], theirs[:, k]) for k in range(NUM_RIGS)]
+
+
+def print_floor(inputs: npdr.Inputs, num_samples: int, seed: int) -> None:
+    """Compares two chains on the exact likelihood: no learnt one can do better."""
+    measured = {"readings": draw_fleet(inputs, seed).readings}
+    first, second = (
+        run_nuts(pyro.condition(fleet, measured), inputs, num_samples, chain) for chain in (0, 1)
+    )
+    shown = ", ".join(f"{score:.3f}" for score in c2st_per_rig(first, second))
+    print(f"two chains on the exact likelihood: C2ST per rig {shown}")
+
+
 def main() -> None:
     """Runs the fleets that the arguments choose."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--fleets", type=int, default=1)
     parser.add_argument("--references", type=int, default=1, help="fleets compared with NUTS")
+    parser.add_argument(
+        "--floor", action="store_true", help="compare two chains on the exact likelihood instead"
+    )
     parser.add_argument("--simulations", type=int, default=120_000)
     parser.add_argument("--samples", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
@@ -172,6 +191,9 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     inputs = chirp()
+    if arguments.floor:
+        print_floor(inputs, arguments.samples, arguments.seed)
+        return
     start = time.perf_counter()
     learnt = learn(inputs, arguments.simulations, arguments.seed)
     print(f"learnt the likelihood of one rollout in {time.perf_counter() - start:.0f} s")
@@ -195,10 +217,7 @@ def main() -> None:
             exact = pyro.condition(fleet, measured)
             reference = run_nuts(exact, inputs, arguments.samples, number)
             seconds = time.perf_counter() - start
-            scores = [
-                c2st(draws["coordinates"][:, k], reference["coordinates"][:, k])
-                for k in range(NUM_RIGS)
-            ]
+            scores = c2st_per_rig(draws, reference)
             result["c2st"].append(scores)
             shown = ", ".join(f"{score:.3f}" for score in scores)
             print(f"  on the exact one {seconds:.0f} s; C2ST per rig {shown}", flush=True)
