@@ -40,17 +40,33 @@ _STEPS_PER_LEAST_TIME_CONSTANT = 1000.0
 _GREATEST_DAMPING_RATIO = 0.999
 
 
-def _unknown(position: Tensor) -> _Memory:
-    zero = torch.zeros_like(position)
-    return torch.full_like(position, torch.nan), zero, zero
-
-
 def _pull(joint: Joint, share: Tensor) -> Tensor:
     """Returns δ̈ of a motor that nothing joins to its link."""
     return (joint.drive * joint.inverse_inertia / share - joint.acceleration) / (1.0 - share)
 
 
-class JointElasticity(ForceEffect):
+class _Transmission(ForceEffect):
+    """What joins a motor to its link; how far the motor is ahead is found in the first step."""
+
+    needs_joint = True
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether a motor drives the joint."""
+        return port.is_driven
+
+    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> _Memory:
+        """Returns an advance that is not known yet."""
+        zero = torch.zeros_like(position)
+        return torch.full_like(position, torch.nan), zero, zero
+
+    def force(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: _Memory
+    ) -> Tensor:
+        """Returns the mean force during the step."""
+        return memory[2]
+
+
+class JointElasticity(_Transmission):
     """s = k δ + d δ̇: a spring and a damper between motor and link.
 
     In terms of the free resonance ω = 1/T: δ̈ = p − ω² δ − 2 ζ ω δ̇ with the pull p of the drive,
@@ -64,7 +80,6 @@ class JointElasticity(ForceEffect):
         _SHARE,
     )
     strength = ("time_constant",)
-    needs_joint = True
     law = "motor and link joined by k δ + d δ̇"
     excitation = "chirp"
     reference = SPONG_1987
@@ -76,14 +91,6 @@ class JointElasticity(ForceEffect):
             "damping_ratio": dist.Uniform(0.005, 0.3),
             "motor_share": dist.Uniform(0.05, 0.9),
         }
-
-    def suits(self, port: Port) -> bool:
-        """Returns whether a motor drives the joint."""
-        return port.is_driven
-
-    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> _Memory:
-        """Returns a deflection to be found in the first step."""
-        return _unknown(position)
 
     def begin_step(
         self,
@@ -113,14 +120,8 @@ class JointElasticity(ForceEffect):
         change = (next_rate - rate) / time_step
         return settled + moved, next_rate, -share / joint.inverse_inertia * change
 
-    def force(
-        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: _Memory
-    ) -> Tensor:
-        """Returns the mean force during the step."""
-        return memory[2]
 
-
-class Backlash(ForceEffect):
+class Backlash(_Transmission):
     """|δ| ≤ g: play of half width g between motor and link, which meet without a bounce.
 
     While the gap is open no drive reaches the link, and the link moves without the motor's
@@ -131,7 +132,6 @@ class Backlash(ForceEffect):
     parameters = (Parameter("play", "{coordinate}", 0.0, "half width g of the gap"), _SHARE)
     strength = ("play",)
     is_smooth = False
-    needs_joint = True
     law = "motor ahead of the link by up to ±g"
     excitation = "reversals"
     reference = TAO_1996
@@ -142,14 +142,6 @@ class Backlash(ForceEffect):
             "play": dist.HalfNormal(0.002 * port.rated_position),
             "motor_share": dist.Uniform(0.05, 0.9),
         }
-
-    def suits(self, port: Port) -> bool:
-        """Returns whether a motor drives the joint."""
-        return port.is_driven
-
-    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> _Memory:
-        """Returns a gap to be closed in the first step."""
-        return _unknown(position)
 
     def begin_step(
         self,
@@ -169,9 +161,3 @@ class Backlash(ForceEffect):
         next_rate = (reached - advance) / time_step
         change = (next_rate - rate) / time_step
         return reached, next_rate, -share / joint.inverse_inertia * change
-
-    def force(
-        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: _Memory
-    ) -> Tensor:
-        """Returns the mean force during the step."""
-        return memory[2]
