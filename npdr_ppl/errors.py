@@ -10,6 +10,7 @@ __all__ = [
     "NpdrError",
     "ShapeError",
     "SimulationError",
+    "TooShortError",
 ]
 
 
@@ -19,6 +20,10 @@ class NpdrError(Exception):
 
 class DataError(NpdrError, ValueError):
     """Measured data are malformed or do not fit the model."""
+
+
+class TooShortError(DataError):
+    """Measured rollouts are sound and fit, and are too short for what is asked of them."""
 
 
 class ModelError(NpdrError, ValueError):

@@ -18,7 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import signal
 
-from npdr_ppl.errors import DataError
+from npdr_ppl.errors import DataError, TooShortError
 
 __all__ = ["Derivatives", "Smoothing", "cutoffs", "differentiate", "held_actions", "thin"]
 
@@ -98,7 +98,7 @@ def cutoffs(
         DataError: A rollout is too short, or a cut-off is not below half the sampling rate.
     """
     if min(len(values) for values in positions) < LEAST_ROWS:
-        raise DataError(
+        raise TooShortError(
             f"Accelerations are estimated from rollouts of at least {LEAST_ROWS} readings, got "
             f"one of {min(len(values) for values in positions)}."
         )

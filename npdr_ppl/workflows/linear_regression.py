@@ -8,7 +8,7 @@ import torch
 from scipy import linalg
 from torch import Tensor
 
-from npdr_ppl.errors import BackendError, DataError, ModelError
+from npdr_ppl.errors import BackendError, DataError, ModelError, TooShortError
 from npdr_ppl.inference.conjugate import row_noise
 from npdr_ppl.inference.regression import LinearRegression
 from npdr_ppl.language.effects import LinearForceEffect
@@ -292,7 +292,7 @@ def _recorded_rows(
         parts.append(torch.as_tensor(thin(both, step, parallel_cutoff)))
     both = torch.cat(parts)
     if both[..., 0].numel() <= len(form.names):
-        raise DataError(
+        raise TooShortError(
             f"{len(both)} rows are left of the rollouts by a filter of {parallel_cutoff:.3g} Hz, "
             f"too few for {len(form.names)} base parameters; record longer rollouts."
         )

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import torch
 
 from npdr_ppl import metrics
-from npdr_ppl.errors import DataError
+from npdr_ppl.errors import TooShortError
 from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.models.effects import CoulombFriction, SensorLowPass
 from npdr_ppl.models.furuta import Furuta, furuta
@@ -135,7 +135,7 @@ def run_method(
         try:
             trained = train(model, target, task, chosen, out=out, seed=seed, progress=progress)
             policy, domain, records = trained.policy, trained.domain, trained.iterations
-        except DataError as error:
+        except TooShortError as error:
             # A rollout that ended early can be too short for a method: it has no second policy.
             _LOGGER.warning("%s", error)
             policy = _trained_once(METHODS["prior"], model, target, task, options, seed)
