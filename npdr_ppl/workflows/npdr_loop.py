@@ -24,8 +24,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from npdr_ppl.errors import DataError
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.policies.base import Policy
@@ -45,15 +43,16 @@ from npdr_ppl.workflows.domains import (
 )
 from npdr_ppl.workflows.fit import describe
 from npdr_ppl.workflows.infer import infer
+from npdr_ppl.workflows.loop_domains import training_domains
 from npdr_ppl.workflows.loop_folder import LoopFolder
 from npdr_ppl.workflows.loop_options import (
     NEW_ATTEMPTS,
-    SPREAD_WIDER,
     Action,
     LoopOptions,
     Model,
     Revise,
 )
+from npdr_ppl.workflows.loop_result import Training, Tried, best_measured
 from npdr_ppl.workflows.policy_optimisation import optimise_policy
 from npdr_ppl.workflows.posterior import Posterior
 from npdr_ppl.workflows.progress import Reporter, reporter
@@ -69,40 +68,6 @@ _LOGGER = logging.getLogger(__name__)
 
 PREDICTIVE_DRAWS = 500
 """Draws per ensemble member that a diagnosis reads."""
-
-
-@dataclass(frozen=True)
-class Training:
-    """What a training run came to.
-
-    Attributes:
-        policy: The policy to deploy.
-        domain: Parameters of its internal model.
-        deployed: Number of the iteration whose rollouts measured it; ``None`` for the last
-            policy, which none has.
-        iterations: The records of the iterations, as in ``train.json``.
-        rollouts: All real rollouts.
-        posterior: The last posterior; ``None`` if no iteration was computed in this process.
-        model: The model, with what was added to it.
-    """
-
-    policy: Policy
-    domain: dict[str, float]
-    deployed: int | None
-    iterations: list[dict[str, Any]]
-    rollouts: Rollouts
-    posterior: Posterior | None
-    model: Model
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the content of ``train.json``."""
-        values = self.policy.parameters.tolist()
-        return {
-            "iterations": self.iterations,
-            "policy": dict(zip(self.policy.names, values, strict=True)),
-            "deployed": self.deployed,
-            "internal_model": self.domain,
-        }
 
 
 def train(
@@ -176,7 +141,7 @@ class _Loop:
         self.policy = task.policy
         self.posterior: Posterior | None = None
         self.records: list[dict[str, Any]] = []
-        self.tried: list[_Tried] = []
+        self.tried: list[Tried] = []
 
     def run(self) -> Training:
         """Runs all iterations, or those that are left."""
@@ -202,7 +167,7 @@ class _Loop:
         return self._result()
 
     def _result(self) -> Training:
-        best = self._best_measured()
+        best = best_measured(self.tried, self.options.deploys, self.task.success)
         return Training(
             self.policy if best is None else self.tried[best].policy,
             self.domain if best is None else self.tried[best].domain,
@@ -212,16 +177,6 @@ class _Loop:
             self.posterior,
             self.model,
         )
-
-    def _best_measured(self) -> int | None:
-        """Returns the iteration of the policy to deploy, ``None`` for the last policy."""
-        if self.options.deploys == "last" or not self.tried:
-            return None
-        best = max(range(len(self.tried)), key=lambda index: self.tried[index].real_return)
-        threshold = self.task.success
-        if threshold is not None and self.tried[best].real_return < threshold:
-            return None
-        return best
 
     def _can_collect(self, number: int) -> bool:
         """Returns whether the target has so many episodes left."""
@@ -240,7 +195,7 @@ class _Loop:
         new = [self._collect(self.policy) for _ in range(self.options.rollouts)]
         returns = [float(rollout.rewards[0].sum()) for rollout in new if rollout.rewards]
         real_return = sum(returns) / len(returns)
-        self.tried.append(_Tried(self.policy, self.domain, real_return))
+        self.tried.append(Tried(self.policy, self.domain, real_return))
         saved = self.folder.iteration(index)
         if saved is not None:
             self._take_over(index, saved, report)
@@ -370,7 +325,7 @@ class _Loop:
             data,
             options.binding,
             noise=options.noise,
-            wants_neighbourhood=options.start == "closest fit",
+            wants_neighbourhood=options.start == "closest fit" and self.backend.continues,
             seed=seed,
         )
         binding = prepared.options
@@ -405,26 +360,14 @@ class _Loop:
 
     def _posterior_domains(self, index: int, settled: "_Settled") -> Domains:
         """Returns what the policy is trained in next."""
-        options = self.options
-        number = options.num_domains
-        from_prior = 0
-        if settled.action is Action.MIXED:
-            from_prior = round(options.prior_share * number)
-        seed = derived_seed(self.seed, "posterior domains", index)
-        posterior = settled.posterior
-        if options.domains == "posterior":
-            z = posterior.sample_mixture(number - from_prior, seed=seed)
-        else:
-            most_likely = posterior.most_likely(seed=self.seed)
-            z = posterior.prior.to_reference({k: v[None] for k, v in most_likely.items()})
-            z = z.expand(number - from_prior, -1)
-        generator = torch.Generator().manual_seed(seed)
-        # Where the model is wrong its posterior is too narrow, by how much nobody knows.
-        spread = options.spread * (2.0 if settled.action in SPREAD_WIDER else 1.0)
-        domains = domains_at(posterior.prior, z).spread(spread, generator)
-        if from_prior:
-            domains = domains.followed_by(self._prior_domains(from_prior))
-        return domains
+        return training_domains(
+            settled.posterior,
+            self.options,
+            settled.action,
+            from_prior=self._prior_domains,
+            seed=derived_seed(self.seed, "posterior domains", index),
+            most_likely_seed=self.seed,
+        )
 
     def _optimise(self, number: int, domains: Domains | None, report: Reporter) -> dict[str, Any]:
         """Trains policy ``number``, unless it is on disk, and returns the figures."""
@@ -450,15 +393,6 @@ class _Loop:
             self.folder.save_policy(number, parameters, figures)
         self.policy = self.task.policy.with_parameters(parameters.to(self.task.policy.parameters))
         return figures
-
-
-@dataclass(frozen=True)
-class _Tried:
-    """A policy that ran on the target, its internal model, and what it reached there."""
-
-    policy: Policy
-    domain: dict[str, float]
-    real_return: float
 
 
 @dataclass(frozen=True)

@@ -255,6 +255,7 @@ def test_inference_may_start_from_the_last_posterior_or_the_closest_fit(tmp_path
     ]
     assert spreads[0] == pytest.approx(1.0, abs=0.15)  # the prior is N(0, I)
     assert spreads[1] < 0.8 * spreads[0]
+    # The recording tells mass and length far more sharply; the margin is a tenth of the prior.
     assert spreads[2] < 0.5 * spreads[0]
     assert anew.iterations[0] == onward.iterations[0]
     # Nothing was simulated again, and the posterior is there, where a finished run is resumed.
