@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 __all__ = [
     "Calibration",
     "Channel",
+    "Discovery",
+    "DiscoveryOptions",
     "Effect",
     "Inputs",
     "LoopOptions",
@@ -29,6 +31,7 @@ __all__ = [
     "calibrate",
     "compare",
     "diagnose",
+    "discover",
     "infer",
     "remove_effect",
     "simulate",
@@ -53,6 +56,7 @@ if TYPE_CHECKING:
     from npdr_ppl.workflows.calibration_result import Calibration
     from npdr_ppl.workflows.compare import compare
     from npdr_ppl.workflows.diagnostics import diagnose
+    from npdr_ppl.workflows.discovery import Discovery, DiscoveryOptions, discover
     from npdr_ppl.workflows.infer import infer
     from npdr_ppl.workflows.learned_likelihood import with_likelihood
     from npdr_ppl.workflows.loop_options import LoopOptions
@@ -63,6 +67,8 @@ if TYPE_CHECKING:
 _HOMES = {
     "Calibration": "workflows.calibration_result",
     "Channel": "language.channels",
+    "Discovery": "workflows.discovery",
+    "DiscoveryOptions": "workflows.discovery",
     "Effect": "language.effects",
     "Inputs": "language.inputs",
     "LoopOptions": "workflows.loop_options",
@@ -78,6 +84,7 @@ _HOMES = {
     "calibrate": "workflows.calibration",
     "compare": "workflows.compare",
     "diagnose": "workflows.diagnostics",
+    "discover": "workflows.discovery",
     "infer": "workflows.infer",
     "remove_effect": "language.handlers",
     "simulate": "language.sites",

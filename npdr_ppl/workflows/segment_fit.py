@@ -14,7 +14,7 @@ for all parameters, all segments and all components of their initial states: the
 black box.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,6 +25,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
@@ -142,11 +143,35 @@ class SegmentModel:
             z: Parameters, ``(n, d)``.
             offsets: Offsets of the initial states, ``(n, S, m)``.
         """
+        box = self.black_box(z)
+        return self.run(box.simulator, box.parameters, offsets)
+
+    @property
+    def simulator(self) -> Simulator:
+        """The model's simulator, effects included."""
+        box = self.prior.black_boxes[self._site]
+        assert isinstance(box, SimulatorBlackBox)
+        return box.simulator
+
+    def black_box(self, z: Tensor) -> SimulatorBlackBox:
+        """Returns the black-box site as the model makes it at n points, ``(n, d)``."""
         box = self.prior.black_boxes_at(z)[self._site]
         assert isinstance(box, SimulatorBlackBox)
-        inputs = self._shifted(offsets)
-        simulated = box.simulator.simulate(box.parameters, inputs)[..., self._columns]
-        return simulated.expand(len(z), *self.observed.shape)
+        return box
+
+    def run(
+        self, simulator: Simulator, parameters: Mapping[str, Tensor], offsets: Tensor
+    ) -> Tensor:
+        """Returns readings of a simulator along the recording, ``(n, S, K, C)``.
+
+        Args:
+            simulator: The model's own, or one with further effects.
+            parameters: Parameters by name, ``(n,)`` each, or fewer that broadcast to n.
+            offsets: Offsets of the initial states, ``(n, S, m)``.
+        """
+        simulated = simulator.simulate(parameters, self._shifted(offsets))[..., self._columns]
+        num = torch.broadcast_shapes(simulated.shape[:-3], offsets.shape[:1])
+        return simulated.expand(*num, *self.observed.shape)
 
     def residuals(self, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
         """Returns whitened residuals, ``(n, S, K · C)`` float64, zero where nothing was measured.
@@ -199,7 +224,12 @@ class SegmentModel:
 
 
 def fit_segments(
-    segments: SegmentModel, z: Tensor, *, max_steps: int = 12, max_rescalings: int = 4
+    segments: SegmentModel,
+    z: Tensor,
+    *,
+    offsets: Tensor | None = None,
+    max_steps: int = 12,
+    max_rescalings: int = 4,
 ) -> SegmentFit:
     """Fits parameters and initial states, and finds the scale of what is left.
 
@@ -210,6 +240,7 @@ def fit_segments(
     Args:
         segments: The model and the recording.
         z: Where to begin, ``(d,)``.
+        offsets: Offsets of the initial states to begin with, ``(S, m)``; zero by default.
         max_steps: Greatest number of steps for one scale.
         max_rescalings: Greatest number of scales.
 
@@ -217,7 +248,9 @@ def fit_segments(
         DataError: The simulation fails where the search begins.
     """
     z = z.double()
-    offsets = torch.zeros(segments.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
+    if offsets is None:
+        shape = segments.inputs.num_segments, segments.num_offsets
+        offsets = torch.zeros(shape, dtype=torch.float64)
     scale = segments.scale_of(z, offsets)
     if not bool(scale.isfinite().all()):
         raise DataError("The simulation fails at the parameters that the fit begins with.")

@@ -1,0 +1,202 @@
+"""Discovery: is something wrong, where, what is it, and does adding it help?"""
+
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+from typing import Any
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.discovery.credible import Estimate, estimates
+from npdr_ppl.workflows.discovery.data_checks import data_problems
+from npdr_ppl.workflows.discovery.equivalents import equivalents
+from npdr_ppl.workflows.discovery.evidence import closest
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
+from npdr_ppl.workflows.discovery.next_experiment import NextExperiment, next_experiment
+from npdr_ppl.workflows.discovery.options import DiscoveryOptions
+from npdr_ppl.workflows.discovery.projection import Projection
+from npdr_ppl.workflows.discovery.proof import prove
+from npdr_ppl.workflows.discovery.residual_map import worst_windows
+from npdr_ppl.workflows.discovery.result import Discovery, Finding, Verdict
+from npdr_ppl.workflows.discovery.search import Added, Search, Searcher
+from npdr_ppl.workflows.discovery.separation import separation_matrix
+
+__all__ = ["discover"]
+
+MOST_UNEXPLAINED = 0.1
+"""Share of the misfit that may stay unexplained where what was found is to be called the cause."""
+
+SURVIVES = 0.05
+"""Probability from which an alternative has to be reckoned with."""
+
+LEADING = 10
+"""Candidates in the separation matrix."""
+
+
+def discover(
+    model: Callable[..., Any],
+    rollouts: Rollouts,
+    *,
+    holdout: Rollouts | None = None,
+    options: DiscoveryOptions | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> Discovery:
+    """Finds what a model misses in a recording, names it, adds it and proves that it helps.
+
+    Args:
+        model: A Pyro model with one black-box site; a simulator with ports is all it needs.
+        rollouts: The recording that effects are found and fitted on.
+        holdout: Rollouts to prove it on, of another excitation where there are some; never used
+            to choose or fit anything.
+        options: How to search.
+        report: Called with a sentence at each step.
+
+    Raises:
+        DataError: The recording is too short, or does not fit the model.
+        ModelError: The model cannot be inferred.
+    """
+    options = options or DiscoveryOptions()
+    if holdout is not None and holdout.channel_names != rollouts.channel_names:
+        raise DataError("The held-out rollouts have other channels than those to fit.")
+    seconds: dict[str, float] = {}
+    binding = options.binding(rollouts)
+    searcher = Searcher(model, rollouts, options, report)
+    with _timed(seconds, "fit"):
+        start = searcher.fit_base()
+    with _timed(seconds, "check data"):
+        problems = tuple(data_problems(start, rollouts, binding))
+    with _timed(seconds, "screen"):
+        first = searcher.look(start)
+    with _timed(seconds, "search"):
+        search = searcher.run(first, max_effects=0 if problems else options.max_effects)
+    final, last = search.final, search.rounds[-1]
+    unexplained = _unexplained(search)
+    units = _units(final)
+    every = estimates(final, units, seed=options.seed)
+    effects = [_finding(added, search, every) for added in search.added]
+    verdict, reason = _judge(search, effects, problems, unexplained, options)
+    with _timed(seconds, "prove"):
+        gap = {}
+        if holdout is not None:
+            gap = prove(
+                start, final, holdout, _like(binding, rollouts, holdout), seed=options.seed
+            )
+    with _timed(seconds, "next experiment"):
+        advice = _advice(search, rollouts, binding) if verdict == "ambiguous" else None
+    leading = first.ranking[:LEADING]
+    return Discovery(
+        verdict=verdict,
+        reason=reason,
+        problems=problems,
+        alarm=first.alarm,
+        remainder=last.alarm,
+        unexplained=unexplained,
+        where=worst_windows(start, rollouts),
+        effects=effects,
+        ranking=first.ranking,
+        separation=separation_matrix(Projection(start), leading),
+        separation_names=tuple(candidate.name for candidate in leading),
+        gap=gap,
+        next_experiment=advice,
+        model=model,
+        revised=final.model,
+        parameters=every,
+        search=search,
+        options=options,
+        seconds=seconds,
+    )
+
+
+def _judge(
+    search: Search,
+    effects: list[Finding],
+    problems: tuple[str, ...],
+    unexplained: float,
+    options: DiscoveryOptions,
+) -> tuple[Verdict, str]:
+    """Returns the verdict and what it rests on."""
+    if problems:
+        return "unknown", f"The data come first: {problems[0]}"
+    if not effects:
+        if not search.rounds[-1].alarm.fired:
+            return "none", "Nothing is missing that this recording could show."
+        return "unknown", "Simulation and recording disagree, and no effect explains it."
+    if search.rounds[-1].alarm.fired and unexplained > MOST_UNEXPLAINED:
+        return "unknown", (
+            f"What was found leaves {unexplained:.0%} of the disagreement unexplained, most of it "
+            f"in {search.rounds[-1].alarm.loudest}."
+        )
+    unsure = [f for f in effects if f.probability < options.confidence]
+    sure = [f for f in effects if f.probability >= options.confidence]
+    if sure and sum(f.share for f in unsure) <= MOST_UNEXPLAINED * sum(f.share for f in effects):
+        return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
+    names = " or ".join(n for n, p in unsure[0].alternatives.items() if p >= SURVIVES)
+    return "ambiguous", f"The recording cannot tell which it is: {names}."
+
+
+def _finding(added: Added, search: Search, every: dict[str, Estimate]) -> Finding:
+    effect = added.effect
+    survivors = [
+        name
+        for name, probability in added.alternatives.items()
+        if probability >= SURVIVES and name != effect.name
+    ]
+    known = equivalents(effect, search.final.names)
+    ids = dict.fromkeys([name.rsplit(".", 1)[1] for name in survivors] + list(known))
+    return Finding(
+        effect,
+        added.probability,
+        added.alternatives,
+        tuple(name for name in ids if name != effect.id),
+        added.share,
+        {
+            site.removeprefix(f"{effect.name}."): every[site]
+            for site in effect.parameter_names
+            if site in every
+        },
+    )
+
+
+def _unexplained(search: Search) -> float:
+    """Returns the share of the misfit that the last model leaves and one law could explain."""
+    first, final = search.rounds[0].hypothesis, search.final
+    scale = closest([first, final]).fit.scale
+    explained = 2.0 * float((first.losses(scale) - final.losses(scale)).sum())
+    left = search.rounds[-1].alarm.gain
+    return left / max(left + max(explained, 0.0), 1e-12)
+
+
+def _units(hypothesis: Hypothesis) -> dict[str, str]:
+    simulator = hypothesis.simulator
+    units = {parameter.name: parameter.unit for parameter in simulator.parameters}
+    for effect in simulator.effects:
+        own = effect.units(simulator.port(effect.port))
+        units |= {f"{effect.name}.{name}": unit for name, unit in own.items()}
+    return units
+
+
+def _advice(search: Search, rollouts: Rollouts, binding: BindingOptions) -> NextExperiment | None:
+    """Returns the experiment that would tell the survivors of the least certain effect apart."""
+    added = min(search.added, key=lambda a: a.probability)
+    names = [n for n, p in added.alternatives.items() if p >= SURVIVES]
+    survivors = [search.trials[added.place, n] for n in names if (added.place, n) in search.trials]
+    if len(survivors) < 2:
+        return None
+    ids = {name.rsplit(".", 1)[1] for name in names}
+    classes = [group for group in added.effect.equivalence if len(ids & set(group.members)) > 1]
+    return next_experiment(survivors, rollouts, binding, classes)
+
+
+def _like(binding: BindingOptions, rollouts: Rollouts, holdout: Rollouts) -> BindingOptions:
+    """Returns segments of the same duration at the held-out recording's rate."""
+    assert binding.segment_length is not None
+    steps = round(binding.segment_length * rollouts.time_step / holdout.time_step)
+    return BindingOptions(None, max(2, steps), binding.initial_state, binding.precision)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str):
+    begin = time.monotonic()
+    yield
+    seconds[stage] = time.monotonic() - begin

@@ -1,0 +1,141 @@
+"""A hypothesis: the model with some effects, fitted to the recording."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.handlers import add_effect
+from npdr_ppl.language.simulator import Simulator
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.arviz_export import effective_share
+from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.segment_fit import (
+    Linearisation,
+    SegmentFit,
+    SegmentModel,
+    fit_segments,
+)
+
+__all__ = ["Hypothesis", "fit_hypothesis"]
+
+START_LIMIT = 2.0
+"""How far from the prior's centre a fit may begin, in standard deviations: at the ends of a range
+a parameter hardly moves in reference coordinates."""
+
+Model = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A model with effects, at its best along the recording.
+
+    Attributes:
+        model: The model, effects included.
+        effects: The effects that were added to the model in question, in the order of adding.
+        segments: The model along the recording.
+        fit: Parameters and initial states that leave least.
+    """
+
+    model: Model
+    effects: tuple[Effect, ...]
+    segments: SegmentModel
+    fit: SegmentFit
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The effects' names."""
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def simulator(self) -> Simulator:
+        """The simulator with all effects."""
+        return self.segments.simulator
+
+    @cached_property
+    def linearisation(self) -> Linearisation:
+        """Residuals and derivatives at the fit, whitened by its own scale."""
+        return self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
+
+    @cached_property
+    def parameters(self) -> dict[str, Tensor]:
+        """The parameters, ``site.shape`` by latent site."""
+        values = self.segments.prior.to_parameters(self.fit.z[None])
+        return {name: value[0] for name, value in values.items()}
+
+    @cached_property
+    def share(self) -> float:
+        """Share of the readings that are worth an independent one."""
+        residual = self.linearisation.residual
+        mask = self.segments.inputs.mask
+        return float(
+            effective_share(residual.unflatten(-1, (-1, len(self.fit.scale))), mask).mean()
+        )
+
+    def losses(self, scale: Tensor) -> Tensor:
+        """Returns minus the log density of each segment, up to a constant, ``(S,)``.
+
+        Args:
+            scale: Standard deviation of the readings per channel, ``(C,)``.
+        """
+        residual = self.segments.residuals(self.fit.z[None], self.fit.offsets[None], scale)[0]
+        return 0.5 * (residual.square().sum(-1) + self.fit.offsets.square().sum(-1))
+
+    def complexity(self, scale: Tensor, share: float) -> float:
+        """Returns the loss that the prior and the posterior's narrowness add to the evidence.
+
+        ½|z|² + ½ log |1 + H|, by Laplace's approximation.
+
+        Args:
+            scale: Standard deviation of the readings per channel, ``(C,)``.
+            share: Share of independent readings.
+        """
+        ratio = float((self.fit.scale / scale).square().mean())
+        information = self.linearisation.information() * ratio * share
+        eye = torch.eye(len(information), dtype=torch.float64)
+        return 0.5 * float(self.fit.z.square().sum() + torch.logdet(eye + information))
+
+
+def fit_hypothesis(
+    model: Model,
+    rollouts: Rollouts,
+    options: BindingOptions,
+    *,
+    effects: tuple[Effect, ...] = (),
+    start: Mapping[str, Tensor] | None = None,
+    offsets: Tensor | None = None,
+    max_steps: int = 12,
+    max_rescalings: int = 4,
+) -> Hypothesis:
+    """Fits a model with effects to a recording.
+
+    Args:
+        model: The model in question.
+        rollouts: The recording.
+        options: Its segments.
+        effects: Effects to add.
+        start: Parameters to begin with by site; the others begin in the middle of their priors.
+        offsets: Offsets of the initial states to begin with, ``(S, m)``.
+        max_steps: Greatest number of steps for one scale.
+        max_rescalings: Greatest number of scales.
+
+    Raises:
+        DataError: The simulation fails at the start, or the data do not fit the model.
+    """
+    for effect in effects:
+        model = add_effect(model, effect)
+    segments = SegmentModel(model, rollouts, options)
+    z = torch.zeros(segments.prior.num_parameters, dtype=torch.float64)
+    if start:
+        middle = segments.prior.to_parameters(z[None])
+        known = {name: torch.as_tensor(value)[None] for name, value in start.items()}
+        z = segments.prior.to_reference({name: known.get(name, v) for name, v in middle.items()})
+        z = z[0].nan_to_num(0.0).clamp(-START_LIMIT, START_LIMIT)
+    fit = fit_segments(
+        segments, z, offsets=offsets, max_steps=max_steps, max_rescalings=max_rescalings
+    )
+    return Hypothesis(model, effects, segments, fit)

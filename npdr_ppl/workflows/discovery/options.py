@@ -1,0 +1,76 @@
+"""What discovery may be told."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.binding import BindingOptions
+
+__all__ = ["DiscoveryOptions"]
+
+SEGMENT_SECONDS = 0.2
+"""Length of a segment: long against delays and lags, short against the time in which an unstable
+motion forgets where it started."""
+
+FEWEST_STEPS, MOST_STEPS = 20, 200
+
+FEWEST_SEGMENTS = 8
+"""With fewer there is nothing to tell an effect from chance by."""
+
+
+@dataclass(frozen=True)
+class DiscoveryOptions:
+    """How discovery searches.
+
+    Attributes:
+        segment_length: Steps between re-synchronisations; ``None`` for ``SEGMENT_SECONDS``.
+        effects: The effects to search; ``None`` for every effect of the catalogue at every port
+            where it makes sense.
+        max_effects: Greatest number of effects to add.
+        false_alarm_rate: Probability that an alarm fires although nothing is missing.
+        confidence: Probability above which one cause is named.
+        precision: Of the simulation.
+        seed: Seed of everything random.
+    """
+
+    segment_length: int | None = None
+    effects: tuple[Effect, ...] | None = None
+    max_effects: int = 4
+    false_alarm_rate: float = 0.01
+    confidence: float = 0.9
+    precision: Literal["float64", "float32"] = "float64"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            DataError: One makes no sense.
+        """
+        if self.segment_length is not None and self.segment_length < 2:
+            raise DataError(f"a segment has at least two steps, got {self.segment_length}.")
+        if self.max_effects < 0:
+            raise DataError(f"the number of effects cannot be negative, got {self.max_effects}.")
+        for name in ("false_alarm_rate", "confidence"):
+            value = getattr(self, name)
+            if not 0.0 < value < 1.0:
+                raise DataError(f"{name} lies between 0 and 1, got {value}.")
+
+    def binding(self, rollouts: Rollouts) -> BindingOptions:
+        """Returns how a recording is cut into segments.
+
+        Raises:
+            DataError: The recording is too short.
+        """
+        length = self.segment_length
+        if length is None:
+            length = round(SEGMENT_SECONDS / rollouts.time_step)
+            length = max(FEWEST_STEPS, min(MOST_STEPS, length))
+        if sum(rollouts.lengths) < FEWEST_SEGMENTS * length:
+            raise DataError(
+                f"{sum(rollouts.lengths)} steps are too few for {FEWEST_SEGMENTS} segments of "
+                f"{length} steps; record more, or choose a shorter segment_length."
+            )
+        return BindingOptions(None, length, "uncertain", self.precision)

@@ -1,0 +1,103 @@
+"""What is left of a change once everything that must not speak has been taken out.
+
+The state at each segment's start is known within the smoother's error, and the parameters are
+refitted together with whatever is added: both can imitate an effect. With residuals r, starts'
+derivatives G and parameters' derivatives J, whitened, starts are integrated out by
+
+    C = 1 + G Gᵀ,     C⁻¹ = 1 − G (1 + Gᵀ G)⁻¹ Gᵀ
+
+segment by segment, and parameters by projecting on what J cannot explain: a column x has the score
+
+    g = xᵀ C⁻¹ r − B Jᵀ C⁻¹ r,     B = xᵀ C⁻¹ J (Jᵀ C⁻¹ J + 1)⁻¹
+
+and, with a second column y, the information xᵀ C⁻¹ y − B Jᵀ C⁻¹ y. Sums of a segment's terms are
+independent from segment to segment; what is inside one is not, so the variance of a score is
+taken from how the segments' terms scatter (Liang & Zeger 1986), never from their number.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
+
+__all__ = ["Projection", "Scores"]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores and information of P columns.
+
+    Attributes:
+        by_segment: Projected scores, ``(S, P)``.
+        information: Projected information, ``(P, P)``.
+        total: Information before the parameters were refitted, ``(P,)``.
+    """
+
+    by_segment: Tensor
+    information: Tensor
+    total: Tensor
+
+    @property
+    def score(self) -> Tensor:
+        """Scores of all segments, ``(P,)``."""
+        return self.by_segment.sum(0)
+
+    @property
+    def absorbed(self) -> Tensor:
+        """Share of each column that refitted parameters explain, ``(P,)``."""
+        return 1.0 - self.information.diagonal() / self.total.clamp_min(1e-30)
+
+
+class Projection:
+    """A fitted hypothesis, ready to be asked about columns.
+
+    Args:
+        hypothesis: The hypothesis.
+    """
+
+    def __init__(self, hypothesis: Hypothesis) -> None:
+        now = hypothesis.linearisation
+        self._starts = now.by_starts
+        eye = torch.eye(now.by_starts.shape[-1], dtype=torch.float64)
+        self._inner = eye + now.by_starts.mT @ now.by_starts
+        #: Residuals as they were with the initial states at the smoother's estimate, (S, N).
+        self.residual = now.residual + (now.by_starts @ hypothesis.fit.offsets[..., None])[..., 0]
+        self._by_z = now.by_parameters
+        self._weights = self.solve(now.by_parameters)
+        self._weighted = self.solve(self.residual[..., None])[..., 0]
+        d = now.by_parameters.shape[-1]
+        self._information = (now.by_parameters.mT @ self._weights).sum(0)
+        self._information = self._information + torch.eye(d, dtype=torch.float64)
+        self._score = (now.by_parameters.mT @ self._weighted[..., None])[..., 0]  # (S, d)
+
+    @property
+    def parameter_scores(self) -> Tensor:
+        """Scores of the parameters by segment, ``(S, d)``."""
+        return self._score
+
+    @property
+    def parameter_information(self) -> Tensor:
+        """Information of the parameters with their prior, ``(d, d)``."""
+        return self._information
+
+    def solve(self, columns: Tensor) -> Tensor:
+        """Returns C⁻¹ x, ``(S, N, P)``."""
+        inner = torch.linalg.solve(self._inner, self._starts.mT @ columns)
+        return columns - self._starts @ inner
+
+    @cached_property
+    def misfit(self) -> float:
+        """rᵀ C⁻¹ r."""
+        return float((self.residual * self._weighted).sum())
+
+    def scores(self, columns: Tensor) -> Scores:
+        """Returns the scores of columns, ``(S, N, P)``."""
+        weighted = self.solve(columns)
+        cross = (self._weights.mT @ columns).sum(0)  # (d, P)
+        refit = torch.linalg.solve(self._information, cross)
+        own = (columns.mT @ weighted).sum(0)
+        by_segment = (columns.mT @ self._weighted[..., None])[..., 0] - self._score @ refit
+        return Scores(by_segment, own - cross.mT @ refit, own.diagonal())

@@ -1,0 +1,175 @@
+"""What discovery found."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.workflows.discovery.alarm import Alarm
+from npdr_ppl.workflows.discovery.credible import Estimate
+from npdr_ppl.workflows.discovery.next_experiment import NextExperiment
+from npdr_ppl.workflows.discovery.options import DiscoveryOptions
+from npdr_ppl.workflows.discovery.proof import Gap
+from npdr_ppl.workflows.discovery.residual_map import Spot
+from npdr_ppl.workflows.discovery.revised_model import revised_source
+from npdr_ppl.workflows.discovery.screening import Screened
+from npdr_ppl.workflows.discovery.search import Search
+
+__all__ = ["Discovery", "Finding", "Verdict"]
+
+Verdict = Literal["none", "named", "ambiguous", "unknown"]
+"""Nothing is missing; what is missing has a name; it has several names that the recording cannot
+tell apart; it is none of the catalogue."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that was missing.
+
+    Attributes:
+        effect: The effect.
+        probability: That it is this one, given all others found.
+        alternatives: Probabilities of what could stand in its place, itself included, by name.
+        equivalent_to: Ids of causes that the recording may not tell from it.
+        share: Share of the misfit that it explains.
+        parameters: Its parameters' estimates by short name.
+    """
+
+    effect: Effect
+    probability: float
+    alternatives: dict[str, float]
+    equivalent_to: tuple[str, ...]
+    share: float
+    parameters: dict[str, Estimate]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns JSON-serialisable values."""
+        return {
+            "effect": self.effect.id,
+            "port": self.effect.port,
+            "probability": self.probability,
+            "equivalent_to": list(self.equivalent_to),
+            "alternatives": self.alternatives,
+            "share": self.share,
+            "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """What discovery found.
+
+    Attributes:
+        verdict: What the recording says of the model.
+        reason: The verdict in a sentence.
+        problems: What is wrong with the recording itself; nothing is named then.
+        alarm: Whether the model as it was and the recording disagree.
+        remainder: The same for the revised model.
+        unexplained: Share of the misfit that the revised model leaves and something could explain.
+        where: The windows that the model as it was misses most, the worst first.
+        effects: What was missing, in the order of finding.
+        ranking: All candidates at the model as it was, by linear gain.
+        separation: Distance between the leading candidates once parameters are refitted, in
+            standard deviations, ``(n, n)``; the diagonal is the distance from none.
+        separation_names: Their names.
+        gap: Metrics on the held-out recording; empty without one.
+        next_experiment: What to record next, where candidates could not be told apart.
+        model: The model as it was.
+        revised: The model with the effects.
+        parameters: All parameters' estimates in the revised model, by site.
+        search: How it was found.
+        options: How it was searched.
+        seconds: Time spent, by stage.
+    """
+
+    verdict: Verdict
+    reason: str
+    problems: tuple[str, ...]
+    alarm: Alarm
+    remainder: Alarm
+    unexplained: float
+    where: list[Spot]
+    effects: list[Finding]
+    ranking: list[Screened]
+    separation: Tensor
+    separation_names: tuple[str, ...]
+    gap: dict[str, Gap]
+    next_experiment: NextExperiment | None
+    model: Callable[..., Any]
+    revised: Callable[..., Any]
+    parameters: dict[str, Estimate]
+    search: Search
+    options: DiscoveryOptions
+    seconds: dict[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns JSON-serialisable values; architecture's names, and more."""
+        return {
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "data_problems": list(self.problems),
+            "alarm": {"p_value": self.alarm.p_value, "fired": self.alarm.fired},
+            "remainder": {
+                "p_value": self.remainder.p_value,
+                "fired": self.remainder.fired,
+                "unexplained": self.unexplained,
+            },
+            "where": [spot.to_dict() for spot in self.where],
+            "effects": [finding.to_dict() for finding in self.effects],
+            "ranking": [_ranked(s) for s in self.ranking],
+            "separation": {
+                "names": list(self.separation_names),
+                "distance": self.separation.tolist(),
+            },
+            "gap": {name: gap.to_dict() for name, gap in self.gap.items()},
+            "next_experiment": self.next_experiment and self.next_experiment.to_dict(),
+            "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
+            "seconds": self.seconds,
+        }
+
+    def source(self) -> str:
+        """Returns the revised model as Python source."""
+        effects = tuple(finding.effect for finding in self.effects)
+        fitted = {
+            name: float(value)
+            for name, value in self.search.final.parameters.items()
+            if torch.as_tensor(value).numel() == 1
+        }
+        return revised_source(self.model, effects, fitted)
+
+    def save(self, folder: Path) -> None:
+        """Writes ``discovery.json`` and ``revised_model.py``.
+
+        Args:
+            folder: Where to; made if it is not there.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(self.to_dict(), indent=2, allow_nan=False)
+        (folder / "discovery.json").write_text(text + "\n", encoding="utf-8")
+        (folder / "revised_model.py").write_text(self.source(), encoding="utf-8")
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{f.effect.name} ({f.probability:.0%})" for f in self.effects)
+        return f"Discovery({self.verdict}{': ' + found if found else ''})"
+
+
+def _ranked(candidate: Screened) -> dict[str, Any]:
+    effect = candidate.variant.effect
+    return {
+        "effect": effect.id,
+        "port": effect.port,
+        "gain": candidate.gain,
+        "separation": candidate.separation,
+        "absorbed": candidate.absorbed,
+        "p_value": candidate.p_value,
+        "estimate": {
+            name.removeprefix(f"{effect.name}."): float(value)
+            for name, value in candidate.variant.parameters(candidate.sizes).items()
+        },
+        "minimum_detectable": candidate.minimum_detectable,
+    }

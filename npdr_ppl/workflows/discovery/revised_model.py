@@ -1,0 +1,64 @@
+"""The revised model as a Python file."""
+
+import importlib.util
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.handlers import ModelWithEffects
+
+__all__ = ["revised_source"]
+
+FUNCTION = "revised_model"
+
+
+def revised_source(
+    model: Callable[..., Any], effects: tuple[Effect, ...], fitted: Mapping[str, float]
+) -> str:
+    """Returns Python source that defines ``revised_model``.
+
+    A model of an installed module is imported; one of a file is copied, so that the result stands
+    alone.
+
+    Args:
+        model: The model in question.
+        effects: The effects to add.
+        fitted: Parameters of the closest fit by site, for readers.
+    """
+    base: Callable[..., Any] = model.base if isinstance(model, ModelWithEffects) else model
+    present = [e for e, _ in model.effects] if isinstance(model, ModelWithEffects) else []
+    every = [*present, *effects]
+    head, name = _base(base)
+    imports = sorted({f"from {type(e).__module__} import {type(e).__name__}" for e in every})
+    if every:
+        imports = ["from npdr_ppl import add_effect", *imports]
+    lines = [head.rstrip(), "", "", *imports, "", f"{FUNCTION} = {name}"]
+    lines += [f"{FUNCTION} = add_effect({FUNCTION}, {effect!r})" for effect in every]
+    lines += ["", "# Where the model came closest to the recording."]
+    lines += ["CLOSEST_FIT = {"]
+    lines += [f'    "{site}": {value:.6g},' for site, value in fitted.items()]
+    return "\n".join([*lines, "}", ""])
+
+
+def _base(model: Callable[..., Any]) -> tuple[str, str]:
+    """Returns what defines a model, and its name."""
+    module = inspect.getmodule(model)
+    name = getattr(model, "__name__", type(model).__name__)
+    if module is not None and _is_installed(module.__name__):
+        doc = f'"""{name} with the effects that it was missing."""'
+        return f"{doc}\n\nfrom {module.__name__} import {name}", name
+    path = inspect.getsourcefile(model)
+    if path is None:
+        return f"# {name} was defined where no source is: import it here.", name
+    return Path(path).read_text(encoding="utf-8"), name
+
+
+def _is_installed(module: str) -> bool:
+    if module == "__main__":
+        return False
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False

@@ -1,0 +1,268 @@
+"""The search: add the effect that explains most, look again, take back what became needless."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from npdr_ppl.errors import NpdrError
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.models.effects import candidate_effects
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.discovery.alarm import Alarm, sound_alarm
+from npdr_ppl.workflows.discovery.equivalents import irreducible
+from npdr_ppl.workflows.discovery.evidence import closest, weigh
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
+from npdr_ppl.workflows.discovery.latent_force import Responses, generic_laws, responses
+from npdr_ppl.workflows.discovery.options import DiscoveryOptions
+from npdr_ppl.workflows.discovery.projection import Projection
+from npdr_ppl.workflows.discovery.screening import Screened, screen
+from npdr_ppl.workflows.discovery.sensitivities import sensitivities
+
+__all__ = ["Added", "Round", "Search", "Searcher"]
+
+SHORTLIST = 6
+"""Candidates fitted in full in each round."""
+
+TRIAL = {"max_steps": 6, "max_rescalings": 2}
+"""Steps of a fit that is only to be compared with others."""
+
+PRIOR_OF_ANY = 0.5
+"""Prior probability that anything of the catalogue is missing."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """What was seen at one state of the model.
+
+    Attributes:
+        hypothesis: The model as it was, fitted.
+        alarm: Whether something was missing then.
+        ranking: The candidates by linear gain.
+        responses: What pulses of force at the joints would change.
+        weights: Probability of each candidate fitted in full, by name; ``""`` for none.
+    """
+
+    hypothesis: Hypothesis
+    alarm: Alarm
+    ranking: list[Screened]
+    responses: Responses
+    weights: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Added:
+    """An effect that the search ended with.
+
+    Attributes:
+        effect: The effect.
+        place: Name of the effect in whose place it stands, by which its trials are found.
+        share: Share of all that was explained which is lost without it.
+        alternatives: Probability of the effects that could stand in its place, itself included,
+            given all others, by name.
+    """
+
+    effect: Effect
+    place: str
+    share: float
+    alternatives: dict[str, float]
+
+    @property
+    def probability(self) -> float:
+        """Probability of the effect, given all others."""
+        return self.alternatives[self.effect.name]
+
+
+@dataclass(frozen=True)
+class Search:
+    """What the search came to.
+
+    Attributes:
+        rounds: What was seen before each addition, and at last.
+        final: The model at last.
+        added: Its effects.
+        removed: Names of effects that were added and taken back.
+        trials: Hypotheses of the last look at each effect, by the name of what stood in for what.
+    """
+
+    rounds: list[Round]
+    final: Hypothesis
+    added: list[Added]
+    removed: list[str]
+    trials: dict[tuple[str, str], Hypothesis]
+
+
+class Searcher:
+    """Searches a recording for missing effects.
+
+    Args:
+        model: The model in question.
+        rollouts: The recording.
+        options: How to search.
+        report: Called with a sentence at each step.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        rollouts: Rollouts,
+        options: DiscoveryOptions,
+        report: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.model = model
+        self.rollouts = rollouts
+        self.options = options
+        self.binding: BindingOptions = options.binding(rollouts)
+        self._report = report
+
+    def fit_base(self) -> Hypothesis:
+        """Fits the model as it is."""
+        self._report("fitting the model as it is")
+        return fit_hypothesis(self.model, self.rollouts, self.binding)
+
+    def run(self, first: Round, *, max_effects: int) -> Search:
+        """Adds effects until no alarm fires, nothing helps, or there are enough.
+
+        Args:
+            first: What was seen at the model as it is.
+            max_effects: How many are enough.
+        """
+        current, now = first.hypothesis, first
+        rounds = [first]
+        removed: list[str] = []
+        while now.alarm.fired and len(current.effects) < max_effects:
+            better, weights = self._extended(current, now.ranking)
+            rounds[-1] = replace(now, weights=weights)
+            if better is None:
+                break
+            current, needless = self._pruned(better)
+            removed += needless
+            if any(set(current.names) == set(r.hypothesis.names) for r in rounds):
+                break
+            now = self.look(current)
+            rounds.append(now)
+        added, trials = [], {}
+        for effect in current.effects:
+            current, alternatives, tried = self._alternatives(current, effect, first.hypothesis)
+            trials |= tried
+            added.append(alternatives)
+        return Search(rounds, current, added, removed, trials)
+
+    def look(self, hypothesis: Hypothesis) -> Round:
+        """Screens all candidates at a fitted hypothesis."""
+        projection = Projection(hypothesis)
+        ranking = screen(projection, sensitivities(hypothesis, self._candidates(hypothesis)))
+        found = responses(hypothesis)
+        alarm = sound_alarm(
+            projection, ranking, generic_laws(found, _angles(hypothesis)), self.options
+        )
+        best = ", ".join(s.name for s in ranking[:3]) or "none"
+        self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
+        return Round(hypothesis, alarm, ranking, found)
+
+    def _candidates(self, hypothesis: Hypothesis) -> tuple[Effect, ...]:
+        """Returns the effects that may be added."""
+        if self.options.effects is not None:
+            return tuple(e for e in self.options.effects if e.name not in hypothesis.names)
+        return irreducible(candidate_effects(hypothesis.simulator), hypothesis.names)
+
+    def _extended(
+        self, current: Hypothesis, ranking: list[Screened]
+    ) -> tuple[Hypothesis | None, dict[str, float]]:
+        """Returns the model with the candidate that explains most, unless none does."""
+        trials: dict[str, Hypothesis] = {}
+        for candidate in ranking[:SHORTLIST]:
+            found = self._fitted(current, candidate)
+            if found is not None:
+                trials[candidate.name] = found
+                self._report(f"tried {candidate.name}: {_shown(found)}")
+        if not trials:
+            return None, {}
+        each = math.log(PRIOR_OF_ANY / max(1, len(ranking)))
+        hypotheses = [current, *trials.values()]
+        log_prior = [math.log(1 - PRIOR_OF_ANY), *(each for _ in trials)]
+        weights = dict(zip(("", *trials), weigh(hypotheses, log_prior, seed=0), strict=True))
+        best = max(trials, key=lambda name: weights[name])
+        if weights[""] > 1.0 - self.options.confidence:
+            return None, weights
+        self._report(f"adding {best}")
+        return trials[best], weights
+
+    def _fitted(self, current: Hypothesis, candidate: Screened) -> Hypothesis | None:
+        """Returns the model with a candidate, fitted from where the linear gain puts it."""
+        start = current.parameters | candidate.variant.parameters(candidate.sizes)
+        return self._fit((*current.effects, candidate.variant.effect), start, current)
+
+    def _fit(
+        self, effects: tuple[Effect, ...], start: dict, current: Hypothesis
+    ) -> Hypothesis | None:
+        try:
+            return fit_hypothesis(
+                self.model,
+                self.rollouts,
+                self.binding,
+                effects=effects,
+                start=start,
+                offsets=current.fit.offsets,
+                **TRIAL,
+            )
+        except NpdrError:
+            return None
+
+    def _without(self, current: Hypothesis, effect: Effect) -> Hypothesis | None:
+        rest = tuple(e for e in current.effects if e.name != effect.name)
+        start = {k: v for k, v in current.parameters.items() if k not in effect.parameter_names}
+        return self._fit(rest, start, current)
+
+    def _pruned(self, current: Hypothesis) -> tuple[Hypothesis, list[str]]:
+        """Takes back effects that the last addition made needless."""
+        removed: list[str] = []
+        for effect in current.effects[:-1]:
+            without = self._without(current, effect)
+            if without is None:
+                continue
+            if weigh([without, current], [0.0, 0.0], seed=0)[0] > self.options.confidence:
+                self._report(f"removing {effect.name}")
+                current, removed = without, [*removed, effect.name]
+        return current, removed
+
+    def _alternatives(
+        self, current: Hypothesis, effect: Effect, base: Hypothesis
+    ) -> tuple[Hypothesis, Added, dict[tuple[str, str], Hypothesis]]:
+        """Asks what else could stand in an effect's place, all others being there."""
+        without = self._without(current, effect)
+        if without is None:
+            return current, Added(effect, effect.name, 1.0, {effect.name: 1.0}), {}
+        candidates = tuple(e for e in self._candidates(without) if e.name != effect.name)
+        ranking = screen(Projection(without), sensitivities(without, candidates))
+        trials = {effect.name: current}
+        for candidate in ranking[:SHORTLIST]:
+            found = self._fitted(without, candidate)
+            if found is not None:
+                trials[candidate.name] = found
+        weights = weigh(list(trials.values()), [0.0] * len(trials), seed=0)
+        alternatives = dict(zip(trials, weights, strict=True))
+        best = max(alternatives, key=lambda name: alternatives[name])
+        swapped = trials[best]
+        chosen = next(e for e in swapped.effects if e.name == best)
+        self._report(f"{effect.name}: probability {alternatives[effect.name]:.2f}")
+        tried = {(effect.name, name): trial for name, trial in trials.items()}
+        scale = closest([base, swapped]).fit.scale
+        whole, lost = (
+            float((h.losses(scale) - swapped.losses(scale)).sum()) for h in (base, without)
+        )
+        share = max(0.0, lost) / max(whole, 1e-12)
+        return swapped, Added(chosen, effect.name, share, alternatives), tried
+
+
+def _shown(hypothesis: Hypothesis) -> str:
+    return ", ".join(
+        f"{name} {scale:.3g}"
+        for name, scale in zip(
+            hypothesis.segments.channel_names, hypothesis.fit.scale.tolist(), strict=True
+        )
+    )
+
+
+def _angles(hypothesis: Hypothesis) -> frozenset[str]:
+    return frozenset(c.name for c in hypothesis.simulator.sensors if c.unit == "rad")

@@ -1,0 +1,181 @@
+"""What each candidate effect would change along the recording.
+
+At zero strength an effect changes nothing, and close to it the change is linear in the strengths.
+The slope is a finite difference of the black box: one simulation with the effect switched on at a
+small size, less the one without. Parameters that give an effect its shape are tried at several
+values, and effects that are not smooth in their strength at several sizes.
+"""
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
+
+__all__ = ["Variant", "sensitivities"]
+
+SIZES = (1.0, 0.25)
+"""Sizes of an effect that is not smooth, in those its probe gives."""
+
+SMALL = 0.05
+"""Size of one that is smooth: small enough for the linear term to rule."""
+
+SHAPE_QUANTILES = (0.5, 0.15, 0.85)
+"""Where in their priors shapes are tried; the first stands for all that is not varied."""
+
+MOST_SHAPES = 7
+"""Shapes tried of one effect."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """An effect of one shape, switched on at one size.
+
+    Attributes:
+        effect: The effect.
+        values: Its parameters at size one, by short name.
+        strengths: Names of those that scale it.
+        nominal: Their values at zero strength.
+        lower: Least number of sizes that the priors admit, by strength.
+        upper: Greatest number of sizes, by strength.
+        deviation: Standard deviation of the priors in sizes, by strength.
+        change: What one size changes in the whitened readings, ``(S, N, k)``.
+    """
+
+    effect: Effect
+    values: Mapping[str, float]
+    strengths: tuple[str, ...]
+    nominal: Tensor
+    lower: Tensor
+    upper: Tensor
+    deviation: Tensor
+    change: Tensor
+
+    def parameters(self, sizes: Tensor) -> dict[str, Tensor]:
+        """Returns the parameters by site name for numbers of sizes, ``(k,)``."""
+        values = {name: torch.tensor(v, dtype=torch.float64) for name, v in self.values.items()}
+        for k, name in enumerate(self.strengths):
+            values[name] = self.nominal[k] + sizes[k] * (values[name] - self.nominal[k])
+        return {f"{self.effect.name}.{name}": value for name, value in values.items()}
+
+
+def sensitivities(hypothesis: Hypothesis, effects: tuple[Effect, ...]) -> list[Variant]:
+    """Returns what each effect would change, in each shape and size.
+
+    Effects whose simulation fails are left out.
+
+    Args:
+        hypothesis: Where the effects are to be added.
+        effects: The candidates.
+    """
+    segments, fit = hypothesis.segments, hypothesis.fit
+    box = segments.black_box(fit.z[None])
+    base = segments.run(box.simulator, box.parameters, fit.offsets[None])[0]
+    mask = segments.inputs.mask[..., None]
+    result = []
+    for effect in effects:
+        port = box.simulator.port(effect.port)
+        priors = effect.priors(port)
+        probe = effect.probe(port)
+        strengths = effect.strength or tuple(p.name for p in effect.parameters)
+        resting = {p.name: p.nominal for p in effect.parameters}
+        try:
+            changed = box.simulator.with_effects(effect)
+        except ModelError:
+            continue
+        shapes = _shapes(effect, priors, strengths)
+        sizes = (SMALL,) if effect.is_smooth else SIZES
+        for shape, size in itertools.product(shapes, sizes):
+            values = {**probe, **shape}
+            nominal = torch.tensor([_resting(resting[n], probe[n]) for n in strengths]).double()
+            full = torch.tensor([values[n] for n in strengths], dtype=torch.float64)
+            switched = {
+                n: size * (values[n] - z) + z
+                for n, z in zip(strengths, nominal.tolist(), strict=True)
+            }
+            # One simulation per strength, the others resting.
+            batch = {
+                f"{effect.name}.{name}": torch.tensor(
+                    [
+                        (switched[name] if on == name else resting[name])
+                        if name in strengths
+                        else values[name]
+                        for on in strengths
+                    ],
+                    dtype=torch.float64,
+                )
+                for name in values
+            }
+            moved = segments.run(
+                changed,
+                {**box.parameters, **batch},
+                fit.offsets[None].expand(len(strengths), -1, -1),
+            )
+            difference = ((moved - base).double() * mask / fit.scale).flatten(-2) / size
+            if not bool(difference.isfinite().all()) or float(difference.abs().max()) == 0.0:
+                continue
+            lower, upper, deviation = _limits(priors, strengths, nominal, full)
+            result.append(
+                Variant(
+                    effect,
+                    values,
+                    strengths,
+                    nominal,
+                    lower,
+                    upper,
+                    deviation,
+                    difference.permute(1, 2, 0),
+                )
+            )
+    return result
+
+
+def _shapes(
+    effect: Effect, priors: Mapping[str, Distribution], strengths: tuple[str, ...]
+) -> list[dict[str, float]]:
+    """Returns values of the parameters that give an effect its shape, nominal ones first."""
+    varied = [p for p in effect.parameters if p.name not in strengths]
+    shapes: list[dict[str, float]] = [{p.name: p.nominal for p in varied}]
+    for parameter in varied:
+        for quantile in SHAPE_QUANTILES[1:]:
+            value = float(priors[parameter.name].icdf(torch.tensor(quantile)))
+            shapes.append({**shapes[0], parameter.name: value})
+    return shapes[:MOST_SHAPES]
+
+
+def _resting(nominal: float, probe: float) -> float:
+    """Returns zero strength as a number to interpolate from; a limit at infinity rests far off."""
+    return nominal if math.isfinite(nominal) else 2.0 * probe
+
+
+def _limits(
+    priors: Mapping[str, Distribution],
+    strengths: tuple[str, ...],
+    nominal: Tensor,
+    full: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns least, greatest and typical numbers of sizes that the priors admit."""
+    lower, upper, deviation = [], [], []
+    for k, name in enumerate(strengths):
+        prior = priors[name]
+        unit = float(full[k] - nominal[k])
+        support: object = prior.support
+        low = float(getattr(support, "lower_bound", -math.inf))
+        high = float(getattr(support, "upper_bound", math.inf))
+        ends = sorted(((low - float(nominal[k])) / unit, (high - float(nominal[k])) / unit))
+        lower.append(ends[0])
+        upper.append(ends[1])
+        spread = (float(prior.variance) + (float(prior.mean) - float(nominal[k])) ** 2) ** 0.5
+        deviation.append(max(spread / abs(unit), 1e-6))
+    return (
+        torch.tensor(lower, dtype=torch.float64),
+        torch.tensor(upper, dtype=torch.float64),
+        torch.tensor(deviation, dtype=torch.float64),
+    )
