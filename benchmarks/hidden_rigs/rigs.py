@@ -117,10 +117,10 @@ FURUTA = Rig(
     time_step=0.002,
     substeps=4,
     duration=4.0,
-    amplitudes=(4.0,),
+    amplitudes=(3.8,),
     limits=(4.0,),
     band=Band(0.8, 3.0),
-    centring=(Centring((2.5, 0.0), (0.15, 0.0)),),
+    centring=(Centring((4.0, 0.0), (0.2, 0.0)),),
     start_spread=(0.2, 2.0),
     measurement=Measurement((2.0 * math.pi / 2048,) * 2, (0.05, 0.1)),
     effects=(
@@ -171,8 +171,8 @@ CART_POLE = Rig(
     amplitudes=(16.0,),
     limits=(20.0,),
     band=Band(0.6, 2.5),
-    centring=(Centring((12.0, 0.0), (4.0, -0.4)),),
-    start_spread=(0.3, 1.5),
+    centring=(Centring((12.0, 0.0), (4.0, -0.6)),),
+    start_spread=(0.3, 1.2),
     measurement=Measurement((2e-4, 2.0 * math.pi / 4096), (0.01, 0.03)),
     effects=(
         *_at("rail", _FRICTION, _FORCE, _GEAR),
@@ -260,7 +260,8 @@ TWO_LINK_ARM = Rig(
         "elbow_damping": (0.02, 0.06),
     },
     time_step=0.005,
-    substeps=5,
+    # Not the five of the engine under test.
+    substeps=8,
     duration=5.0,
     amplitudes=(8.0, 2.2),
     limits=(10.0, 3.0),
