@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from hidden_rigs.faults import FAULTS, spoilt
+from hidden_rigs.furuta_engine import record_in_mujoco
 from hidden_rigs.hidden import Hidden
 from hidden_rigs.recording import record
 from hidden_rigs.rig import Place, Rig
@@ -55,8 +56,8 @@ class Case:
         fit: Rollouts to find, name and fit the effect with.
         holdout: Rollouts of another excitation.
         truth: What is hidden; for bad data, what was done to them.
-        equivalent: For inseparable cases, the names of what these recordings cannot tell from the
-            truth; any of them, or all as a class, is right.
+        alternatives: What these recordings cannot tell from the truth, each the names of effects
+            that together take the truth's place; any of them, or all as a class, is right.
         condition: The condition.
         strength: Multiple of a typical size.
         seed: The seed.
@@ -68,7 +69,7 @@ class Case:
     fit: Rollouts
     holdout: Rollouts
     truth: tuple[Hidden, ...]
-    equivalent: tuple[str, ...]
+    alternatives: tuple[tuple[str, ...], ...]
     condition: Condition
     strength: float
     seed: int
@@ -130,7 +131,9 @@ def places(rig: str, condition: Condition, seed: int = 0) -> tuple[tuple[Place, 
         "absorbed": chosen.absorbed,
     }
     if condition not in groups:
-        raise ModelError(f"There is no condition {condition!r}; there are {', '.join(CONDITIONS)}.")
+        raise ModelError(
+            f"There is no condition {condition!r}; there are {', '.join(CONDITIONS)}."
+        )
     return tuple((place,) for place in groups[condition])
 
 
@@ -179,7 +182,8 @@ def make_case(
         is_coloured=condition == "null_coloured",
         has_outliers=condition == "null_outliers",
     )
-    recording = record(
+    recorder = record_in_mujoco if chosen.engine == "mujoco" else record
+    recording = recorder(
         chosen,
         (*FIT_EXCITATIONS, *HOLDOUT_EXCITATIONS),
         parameters=parameters,
@@ -193,14 +197,13 @@ def make_case(
     for _, kind in hidden if condition == "bad_data" else ():
         rollouts, fault = spoilt(kind, rollouts, chosen.layout, derived_seed(seed, rig, kind))
         truth = (*truth, fault)
-    others = chosen.inseparable.get(hidden[0], ()) if condition == "inseparable" else ()
     return Case(
         rig=rig,
         model=chosen.model,
         fit=rollouts[:number],
         holdout=rollouts[number:],
         truth=truth,
-        equivalent=tuple(f"{port}.{effect_id}" for port, effect_id in others),
+        alternatives=_alternatives(chosen, condition, hidden),
         condition=condition,
         strength=strength,
         seed=seed,
@@ -221,7 +224,21 @@ def _pair(rig: Rig, seed: int) -> tuple[Place, ...]:
         for first, second in itertools.combinations(rig.effects, 2)
         if first[0] != second[0]
         and first[1] != second[1]
-        and second not in rig.inseparable.get(first, ())
+        and (second,) not in rig.inseparable.get(first, ())
+        and (second,) not in rig.same.get(first, ())
     ]
     generator = np.random.default_rng(derived_seed(seed, rig.name, "pair"))
     return pairs[int(generator.integers(len(pairs)))]
+
+
+def _alternatives(
+    rig: Rig, condition: Condition, hidden: Sequence[Place]
+) -> tuple[tuple[str, ...], ...]:
+    """Returns what comes to the same as what is hidden."""
+    table = rig.inseparable if condition == "inseparable" else rig.same
+    choices = [((place,), *table.get(place, ())) for place in hidden]
+    found = [
+        tuple(f"{port}.{effect_id}" for place in chosen for port, effect_id in place)
+        for chosen in itertools.product(*choices)
+    ]
+    return tuple(found[1:])  # the first is the truth

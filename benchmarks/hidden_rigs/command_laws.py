@@ -68,8 +68,8 @@ def _dead_zone(p: Values, substep: float) -> CommandLaw:
 
 def _position_dependent_gain(p: Values, substep: float) -> CommandLaw:
     """A motor that is stronger in some positions than in others; in no catalogue."""
-    return lambda command, position: command * (
-        1.0 + p["depth"] * np.sin(p["wave_number"] * position)
+    return lambda command, position: (
+        command * (1.0 + p["depth"] * np.sin(p["wave_number"] * position))
     )
 
 

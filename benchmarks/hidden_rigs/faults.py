@@ -35,7 +35,9 @@ def _degrees(rollouts: Rollouts, layout: Layout, generator: Generator) -> tuple[
     turning = [name for name in layout.sensors if units[name].startswith("rad")]
     chosen = turning or list(layout.sensors)
     factor = 180.0 / np.pi if turning else 1000.0
-    return _times(rollouts, chosen, factor), Hidden(",".join(chosen), "wrong_unit", {"factor": factor})
+    return _times(rollouts, chosen, factor), Hidden(
+        ",".join(chosen), "wrong_unit", {"factor": factor}
+    )
 
 
 def _one_in_degrees(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hidden_rigs.excitation import EXCITATIONS
+from hidden_rigs.driving import commanded, references, starts
 from hidden_rigs.hidden import Hidden
 from hidden_rigs.measurement import Measurement, noisy
 from hidden_rigs.mechanics import Array
@@ -70,7 +70,7 @@ def record(
     lead = math.ceil(_LEAD / rig.time_step)
     skew = sum(h.parameters["skew"] for h in hidden if h.effect_id == "clock_skew")
     tail = math.ceil(num_steps * max(skew, 0.0)) + 1
-    references = _references(rig, excitations, num_steps, tail, seed)
+    wanted = references(rig, excitations, num_steps, tail, seed)
     num_rollouts = len(excitations)
     plant = Plant(
         rig.mechanics,
@@ -82,7 +82,7 @@ def record(
         duration=num_steps * rig.time_step,
         generator=np.random.default_rng(derived_seed(seed, "bursts")),
     )
-    q, v = plant.start(*_start(rig, num_rollouts, is_from_rest, seed))
+    q, v = plant.start(*starts(rig, num_rollouts, is_from_rest, seed))
     num_joints = len(rig.layout.joints)
     motion = np.empty(((lead + num_steps + tail) * num_substeps + 1, 2 * num_joints, num_rollouts))
     motion[0] = np.concatenate((q[:num_joints], v[:num_joints]))
@@ -91,7 +91,7 @@ def record(
     for step in range(-lead, num_steps + tail):
         plant.begin_step(step * rig.time_step)
         if step >= 0:
-            commands[step] = _commands(rig, references[step], q, v)
+            commands[step] = commanded(rig, wanted[step], q, v)
         present = list(commands[step]) if step >= 0 else [np.zeros(num_rollouts)] * len(rig.limits)
         for k in range(num_substeps):
             q, v = plant.advance(q, v, present, step * rig.time_step + k * substep)
@@ -115,47 +115,3 @@ def record(
         action_units=units[1],
     )
     return Recording(rollouts, true.transpose(2, 0, 1))
-
-
-def _references(
-    rig: Rig, excitations: Sequence[str], num_steps: int, tail: int, seed: int
-) -> Array:
-    """Returns the excitations before feedback, ``(steps, actions, R)``."""
-    time = rig.time_step * np.arange(num_steps, dtype=np.float64)
-    result = np.zeros((num_steps + tail, len(rig.amplitudes), len(excitations)))
-    for r, name in enumerate(excitations):
-        for a, amplitude in enumerate(rig.amplitudes):
-            generator = np.random.default_rng(derived_seed(seed, "excitation", r, a))
-            signal = amplitude * EXCITATIONS[name](time, rig.band, generator)
-            result[:num_steps, a, r] = signal
-    # What comes after the recording decides nothing but the last reading of a fast clock.
-    result[num_steps:] = result[num_steps - 1]
-    return result
-
-
-def _start(
-    rig: Rig, num_rollouts: int, is_from_rest: bool, seed: int
-) -> tuple[Array, Array]:
-    """Returns positions and velocities when the simulation begins, ``(joints, R)`` each."""
-    generator = np.random.default_rng(derived_seed(seed, "start"))
-    spread = np.array(rig.start_spread)[:, None]
-    positions = spread * generator.uniform(-1.0, 1.0, (len(spread), num_rollouts))
-    positions[:, ::2] = 0.0
-    if is_from_rest:
-        positions[:] = 0.0
-    return positions, np.zeros_like(positions)
-
-
-def _commands(rig: Rig, reference: Array, q: Array, v: Array) -> Array:
-    """Returns excitation plus centring within the limits, ``(actions, R)``.
-
-    The centring has sensors of its own, without effects and noise: it belongs to the rig and not
-    to what is measured.
-    """
-    result = []
-    for a, (centring, limit) in enumerate(zip(rig.centring, rig.limits, strict=True)):
-        feedback = np.zeros_like(reference[a])
-        for i, gain in enumerate(centring.position_gains):
-            feedback = feedback + gain * q[i] + centring.velocity_gains[i] * v[i]
-        result.append(np.clip(reference[a] - feedback, -limit, limit))
-    return np.array(result)

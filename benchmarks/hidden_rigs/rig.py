@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 from torch import Tensor
 
@@ -54,8 +55,11 @@ class Rig:
         measurement: Noise of the readings.
         effects: Effects of the catalogue that a finder can see here.
         absorbed: Effects that leave no trace: the model's own parameters take their place.
+        same: Effects that no recording of the rig can tell from others, with these: alternatives,
+            each one effect or several together.
         inseparable: Effects that recordings from rest cannot tell from others, with these.
         outside: Effects that are in no catalogue.
+        engine: What makes the truth: the equations, or MuJoCo with features of its own.
     """
 
     name: str
@@ -76,8 +80,10 @@ class Rig:
     measurement: Measurement
     effects: tuple[Place, ...]
     absorbed: tuple[Place, ...] = ()
-    inseparable: Mapping[Place, tuple[Place, ...]] = field(default_factory=dict)
+    same: Mapping[Place, tuple[tuple[Place, ...], ...]] = field(default_factory=dict)
+    inseparable: Mapping[Place, tuple[tuple[Place, ...], ...]] = field(default_factory=dict)
     outside: tuple[Place, ...] = ()
+    engine: Literal["equations", "mujoco"] = "equations"
 
     def port(self, name: str) -> Port:
         """Returns a port of the model under test, whose rated values scale effects."""

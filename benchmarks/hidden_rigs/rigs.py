@@ -1,6 +1,7 @@
-"""The five rigs."""
+"""The five rigs, one of them in two engines."""
 
 import math
+from dataclasses import replace
 
 from hidden_rigs import under_test
 from hidden_rigs.equations import (
@@ -46,9 +47,24 @@ def _at(port: str, *groups: tuple[str, ...]) -> tuple[Place, ...]:
     return tuple((port, effect_id) for group in groups for effect_id in group)
 
 
-def _one_of(*members: Place) -> dict[Place, tuple[Place, ...]]:
+_Alternatives = dict[Place, tuple[tuple[Place, ...], ...]]
+
+
+def _one_of(*members: Place) -> _Alternatives:
     """Returns each member with the others."""
-    return {m: tuple(other for other in members if other != m) for m in members}
+    return {m: tuple((other,) for other in members if other != m) for m in members}
+
+
+def _asymmetric(*joints: str) -> _Alternatives:
+    """Returns asymmetric friction with what comes to the same: friction and a bias."""
+    return {
+        (joint, "asymmetric_coulomb_friction"): (((joint, "coulomb_friction"), (joint, "bias")),)
+        for joint in joints
+    }
+
+
+_PENDULUM_OFFSET = _one_of(("gravity", "tilt"), ("angle", "encoder_bias"), ("hinge", "unbalance"))
+_ARM_OFFSET = _one_of(("gravity", "tilt"), ("shoulder_angle", "encoder_bias"))
 
 
 PENDULUM = Rig(
@@ -83,8 +99,9 @@ PENDULUM = Rig(
     absorbed=(("torque", "actuator_gain"), ("payload", "payload")),
     inseparable={
         **_one_of(("torque", "input_delay"), ("angle,velocity", "sensor_delay")),
-        **_one_of(("gravity", "tilt"), ("angle", "encoder_bias"), ("hinge", "unbalance")),
+        **_PENDULUM_OFFSET,
     },
+    same={**_PENDULUM_OFFSET, **_asymmetric("hinge")},
     outside=(
         *_at("hinge", _OUTSIDE_FORCE),
         *_at("torque", _OUTSIDE_COMMAND),
@@ -139,11 +156,30 @@ FURUTA = Rig(
         ("arm", "viscous_friction"),
         ("pole", "viscous_friction"),
     ),
+    same=_asymmetric("arm", "pole"),
     inseparable=_one_of(
         ("voltage", "input_delay"),
         ("arm_angle,pole_angle,arm_velocity,pole_velocity", "sensor_delay"),
     ),
     outside=(*_at("arm", _OUTSIDE_FORCE), *_at("voltage", _OUTSIDE_COMMAND)),
+)
+
+FURUTA_MUJOCO = replace(
+    FURUTA,
+    name="furuta_mujoco",
+    effects=(
+        ("arm", "coulomb_friction"),
+        ("pole", "coulomb_friction"),
+        ("voltage", "input_delay"),
+        ("voltage", "actuator_lag"),
+        ("arm_velocity,pole_velocity", "sensor_low_pass"),
+        ("gravity", "tilt"),
+    ),
+    absorbed=(("arm", "viscous_friction"), ("pole", "viscous_friction")),
+    inseparable={},
+    same={},
+    outside=(),
+    engine="mujoco",
 )
 
 CART_POLE = Rig(
@@ -193,6 +229,7 @@ CART_POLE = Rig(
         ("hinge", "viscous_friction"),
         ("cart_position", "encoder_bias"),
     ),
+    same=_asymmetric("rail", "hinge"),
     inseparable=_one_of(
         ("force", "input_delay"),
         ("cart_position,pole_angle,cart_velocity,pole_velocity", "sensor_delay"),
@@ -239,6 +276,7 @@ EMPS = Rig(
         **_one_of(("voltage", "input_delay"), ("position,velocity", "sensor_delay")),
         **_one_of(("voltage", "actuator_lag"), ("position,velocity", "sensor_low_pass")),
     },
+    same=_asymmetric("carriage"),
     outside=(*_at("carriage", _OUTSIDE_FORCE), *_at("voltage", _OUTSIDE_COMMAND)),
 )
 
@@ -253,7 +291,12 @@ TWO_LINK_ARM = Rig(
         ("shoulder_angle", "elbow_angle"),
         ("shoulder_velocity", "elbow_velocity"),
     ),
-    known={"gravity": 9.81, "lower_mass": 0.8, "upper_length": UPPER_LENGTH, "lower_length": LOWER_LENGTH},
+    known={
+        "gravity": 9.81,
+        "lower_mass": 0.8,
+        "upper_length": UPPER_LENGTH,
+        "lower_length": LOWER_LENGTH,
+    },
     unknown={
         "upper_mass": (1.0, 1.4),
         "shoulder_damping": (0.06, 0.2),
@@ -284,7 +327,8 @@ TWO_LINK_ARM = Rig(
         ("clock", "clock_skew"),
     ),
     absorbed=(("shoulder", "viscous_friction"), ("elbow", "viscous_friction")),
-    inseparable=_one_of(("gravity", "tilt"), ("shoulder_angle", "encoder_bias")),
+    same={**_ARM_OFFSET, **_asymmetric("shoulder", "elbow")},
+    inseparable=_ARM_OFFSET,
     outside=(
         *_at("shoulder", _OUTSIDE_FORCE),
         *_at("elbow", _OUTSIDE_FORCE),
@@ -294,6 +338,6 @@ TWO_LINK_ARM = Rig(
 )
 
 RIGS: dict[str, Rig] = {
-    rig.name: rig for rig in (PENDULUM, FURUTA, CART_POLE, EMPS, TWO_LINK_ARM)
+    rig.name: rig for rig in (PENDULUM, FURUTA, FURUTA_MUJOCO, CART_POLE, EMPS, TWO_LINK_ARM)
 }
 """The rigs by name."""

@@ -136,7 +136,10 @@ def _bouc_wen(port: Port, s: float, g: Generator) -> Values:
 
 
 def _uneven_friction(port: Port, s: float, g: Generator) -> Values:
-    return {"magnitude": s * 0.05 * port.rated, "wave_number": 8.0 * _around(g) / port.rated_position}
+    return {
+        "magnitude": s * 0.05 * port.rated,
+        "wave_number": 8.0 * _around(g) / port.rated_position,
+    }
 
 
 def _uneven_gain(port: Port, s: float, g: Generator) -> Values:
@@ -166,7 +169,9 @@ def _stop(port: Port, s: float, g: Generator) -> Values:
 
 
 def _detents(port: Port, s: float, g: Generator) -> Values:
-    count = 12.0 if port.coordinate == "rad" else round(2.0 * math.pi / (0.25 * port.rated_position))
+    count = (
+        12.0 if port.coordinate == "rad" else round(2.0 * math.pi / (0.25 * port.rated_position))
+    )
     return {"force": s * 0.08 * port.rated, "count": count, "width": 0.6 / count}
 
 
@@ -213,6 +218,7 @@ _SIZES: dict[str, Size] = {
     "position_dependent_gain": _uneven_gain,
     "asymmetric_gain": _signed("difference", 0.1, is_rated=False),
     "eccentric_encoder": lambda port, s, g: {
-        "amplitude": s * 0.02 * port.rated, "phase": g.uniform(0.0, 2.0 * math.pi)
+        "amplitude": s * 0.02 * port.rated,
+        "phase": g.uniform(0.0, 2.0 * math.pi),
     },  # fmt: skip
 }

@@ -19,8 +19,18 @@ from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.models.two_link_arm import TwoLinkArm
 
-__all__ = ["cart_pole", "emps", "furuta", "pendulum", "pendulum_simulator", "cart_pole_simulator",
-           "emps_simulator", "furuta_simulator", "two_link_arm", "two_link_arm_simulator"]  # fmt: skip
+__all__ = [
+    "cart_pole",
+    "cart_pole_simulator",
+    "emps",
+    "emps_simulator",
+    "furuta",
+    "furuta_simulator",
+    "pendulum",
+    "pendulum_simulator",
+    "two_link_arm",
+    "two_link_arm_simulator",
+]
 
 
 @cache
