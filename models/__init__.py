@@ -78,6 +78,13 @@ _ENTRIES = (
         "Emps",
     ),
     ZooEntry(
+        "two_link_arm",
+        "Planar arm of two driven links in MuJoCo, with unknown masses and dampings",
+        "npdr_ppl.models.two_link_arm",
+        "two_link_arm",
+        "TwoLinkArm",
+    ),
+    ZooEntry(
         "mini_golf",
         "Robot arm strikes a ball past two obstacles; ten parameters of the NPDR paper",
         "npdr_ppl.models.mini_golf",

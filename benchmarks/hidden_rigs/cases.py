@@ -1,0 +1,244 @@
+"""Cases of the blind benchmark: recordings to explain, and the truth to judge by."""
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from torch import Tensor
+
+from hidden_rigs.faults import FAULTS, spoilt
+from hidden_rigs.furuta_engine import record_in_mujoco
+from hidden_rigs.hidden import Hidden
+from hidden_rigs.recording import record
+from hidden_rigs.rig import Place, Rig
+from hidden_rigs.rigs import RIGS
+from hidden_rigs.sizes import drawn
+from npdr_ppl.errors import ModelError
+from npdr_ppl.randomness import derived_seed
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["CONDITIONS", "Case", "Condition", "cases", "make_case", "places"]
+
+Condition = Literal[
+    "null",
+    "null_noise3",
+    "null_coloured",
+    "null_outliers",
+    "one",
+    "two",
+    "inseparable",
+    "outside",
+    "absorbed",
+    "bad_data",
+]
+"""What is hidden: nothing, under four kinds of noise; one effect; two; one of a class that the
+excitation cannot split; one that no catalogue has; one that the model's parameters swallow; or
+nothing, in data that were spoilt."""
+
+CONDITIONS: tuple[Condition, ...] = get_args(Condition)
+"""All conditions."""
+
+_NULL_NOISE: tuple[Condition, ...] = ("null", "null_noise3", "null_coloured", "null_outliers")
+
+FIT_EXCITATIONS = ("multisine", "steps", "multisine", "steps")
+HOLDOUT_EXCITATIONS = ("chirp", "chirp")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One recording session of one rig.
+
+    Attributes:
+        rig: Name of the rig.
+        model: The Pyro model under test.
+        fit: Rollouts to find, name and fit the effect with.
+        holdout: Rollouts of another excitation.
+        truth: What is hidden; for bad data, what was done to them.
+        alternatives: What these recordings cannot tell from the truth, each the names of effects
+            that together take the truth's place; any of them, or all as a class, is right.
+        condition: The condition.
+        strength: Multiple of a typical size.
+        seed: The seed.
+        parameters: True domain parameters.
+    """
+
+    rig: str
+    model: Callable[..., Tensor]
+    fit: Rollouts
+    holdout: Rollouts
+    truth: tuple[Hidden, ...]
+    alternatives: tuple[tuple[str, ...], ...]
+    condition: Condition
+    strength: float
+    seed: int
+    parameters: Mapping[str, float]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what is hidden, ``"<port>.<effect>"``."""
+        return tuple(hidden.name for hidden in self.truth)
+
+
+def cases(
+    condition: Condition,
+    seeds: Sequence[int],
+    rigs: Sequence[str] = tuple(RIGS),
+    strengths: Sequence[float] = (1.0,),
+) -> Iterator[Case]:
+    """Records the cases of a condition one after the other.
+
+    Every place of a rig gets every seed and every strength; ``two`` draws one pair per seed.
+
+    Args:
+        condition: What is hidden.
+        seeds: Seeds; each stands for true parameters, excitations, starts and noise.
+        rigs: Names of rigs.
+        strengths: Multiples of a typical size; conditions that hide no effect ignore them.
+
+    Raises:
+        ModelError: There is no such condition or rig.
+    """
+    for name, seed in itertools.product(rigs, seeds):
+        for chosen in places(name, condition, seed):
+            for strength in strengths if chosen and condition != "bad_data" else (1.0,):
+                yield make_case(name, condition, chosen, strength=strength, seed=seed)
+
+
+def places(rig: str, condition: Condition, seed: int = 0) -> tuple[tuple[Place, ...], ...]:
+    """Returns what the cases of a condition hide in a rig: places for each case.
+
+    Args:
+        rig: Name of the rig.
+        condition: What is hidden.
+        seed: Draws the pair of condition ``two``.
+
+    Raises:
+        ModelError: There is no such condition or rig.
+    """
+    chosen = _rig(rig)
+    if condition in _NULL_NOISE:
+        return ((),)
+    if condition == "bad_data":
+        return tuple((("data", kind),) for kind in FAULTS)
+    if condition == "two":
+        return (_pair(chosen, seed),)
+    groups: dict[str, Sequence[Place]] = {
+        "one": chosen.effects,
+        "inseparable": tuple(chosen.inseparable),
+        "outside": chosen.outside,
+        "absorbed": chosen.absorbed,
+    }
+    if condition not in groups:
+        raise ModelError(
+            f"There is no condition {condition!r}; there are {', '.join(CONDITIONS)}."
+        )
+    return tuple((place,) for place in groups[condition])
+
+
+def make_case(
+    rig: str,
+    condition: Condition,
+    hidden: Sequence[Place] = (),
+    *,
+    strength: float = 1.0,
+    seed: int,
+) -> Case:
+    """Records one case.
+
+    The seed alone decides the true parameters, excitations, starts and noise, and what is drawn
+    of an effect besides its strength: cases that differ in strength differ in nothing else.
+
+    Args:
+        rig: Name of the rig.
+        condition: The condition.
+        hidden: What to hide; for bad data, ``("data", <kind>)``.
+        strength: Multiple of a typical size.
+        seed: The seed.
+
+    Raises:
+        ModelError: There is no such rig or effect.
+    """
+    chosen = _rig(rig)
+    generator = np.random.default_rng(derived_seed(seed, rig, "parameters"))
+    parameters = dict(chosen.known)
+    parameters |= {name: generator.uniform(*ends) for name, ends in chosen.unknown.items()}
+    truth = tuple(
+        drawn(
+            chosen.port(port),
+            effect_id,
+            strength,
+            np.random.default_rng(derived_seed(seed, rig, "effect", port, effect_id)),
+        )
+        for port, effect_id in hidden
+        if condition != "bad_data"
+    )
+    measurement = chosen.measurement
+    if condition == "null_noise3":
+        measurement = measurement.scaled(3.0)
+    measurement = replace(
+        measurement,
+        is_coloured=condition == "null_coloured",
+        has_outliers=condition == "null_outliers",
+    )
+    recorder = record_in_mujoco if chosen.engine == "mujoco" else record
+    recording = recorder(
+        chosen,
+        (*FIT_EXCITATIONS, *HOLDOUT_EXCITATIONS),
+        parameters=parameters,
+        hidden=truth,
+        measurement=measurement,
+        is_from_rest=condition == "inseparable",
+        seed=derived_seed(seed, rig, "recording"),
+    )
+    number = len(FIT_EXCITATIONS)
+    rollouts = recording.rollouts
+    for _, kind in hidden if condition == "bad_data" else ():
+        rollouts, fault = spoilt(kind, rollouts, chosen.layout, derived_seed(seed, rig, kind))
+        truth = (*truth, fault)
+    return Case(
+        rig=rig,
+        model=chosen.model,
+        fit=rollouts[:number],
+        holdout=rollouts[number:],
+        truth=truth,
+        alternatives=_alternatives(chosen, condition, hidden),
+        condition=condition,
+        strength=strength,
+        seed=seed,
+        parameters=parameters,
+    )
+
+
+def _rig(name: str) -> Rig:
+    if name not in RIGS:
+        raise ModelError(f"There is no rig {name!r}; there are {', '.join(RIGS)}.")
+    return RIGS[name]
+
+
+def _pair(rig: Rig, seed: int) -> tuple[Place, ...]:
+    """Draws two effects that no class holds both of, and that act at different ports."""
+    pairs = [
+        (first, second)
+        for first, second in itertools.combinations(rig.effects, 2)
+        if first[0] != second[0]
+        and first[1] != second[1]
+        and (second,) not in rig.inseparable.get(first, ())
+        and (second,) not in rig.same.get(first, ())
+    ]
+    generator = np.random.default_rng(derived_seed(seed, rig.name, "pair"))
+    return pairs[int(generator.integers(len(pairs)))]
+
+
+def _alternatives(
+    rig: Rig, condition: Condition, hidden: Sequence[Place]
+) -> tuple[tuple[str, ...], ...]:
+    """Returns what comes to the same as what is hidden."""
+    table = rig.inseparable if condition == "inseparable" else rig.same
+    choices = [((place,), *table.get(place, ())) for place in hidden]
+    found = [
+        tuple(f"{port}.{effect_id}" for place in chosen for port, effect_id in place)
+        for chosen in itertools.product(*choices)
+    ]
+    return tuple(found[1:])  # the first is the truth

@@ -1,0 +1,117 @@
+"""Recordings of a rig: excitation, true motion, readings."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hidden_rigs.driving import commanded, references, starts
+from hidden_rigs.hidden import Hidden
+from hidden_rigs.measurement import Measurement, noisy
+from hidden_rigs.mechanics import Array
+from hidden_rigs.plant import Plant
+from hidden_rigs.rig import Rig
+from hidden_rigs.sensors import sensed
+from npdr_ppl.randomness import derived_seed
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["Recording", "record"]
+
+# Seconds that a rig has been simulated when its recording begins, without commands: what a late
+# sensor reports first has happened by then.
+_LEAD = 0.2
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Rollouts with what nobody but the benchmark may see.
+
+    Attributes:
+        rollouts: Readings and commands.
+        true_states: True positions, then velocities, at the samples, ``(R, K + 1, channels)``.
+    """
+
+    rollouts: Rollouts
+    true_states: Array
+
+
+def record(
+    rig: Rig,
+    excitations: Sequence[str],
+    *,
+    parameters: Mapping[str, float],
+    hidden: Sequence[Hidden] = (),
+    measurement: Measurement | None = None,
+    is_from_rest: bool = False,
+    seed: int,
+    duration: float | None = None,
+    substeps: int | None = None,
+) -> Recording:
+    """Records one rollout per excitation.
+
+    The noise, the excitations and the starts depend on the seed alone.
+
+    Args:
+        rig: The rig.
+        excitations: Names of excitations, see :mod:`hidden_rigs.excitation`.
+        parameters: True domain parameters.
+        hidden: What is hidden.
+        measurement: Noise; ``None`` for none at all.
+        is_from_rest: Whether all rollouts start at rest in the pose zero; otherwise every second
+            is let go from somewhere else.
+        seed: The seed.
+        duration: Seconds per rollout; ``None`` for the rig's.
+        substeps: Integration steps per sample; ``None`` for the rig's.
+    """
+    num_substeps = substeps or rig.substeps
+    substep = rig.time_step / num_substeps
+    num_steps = round((duration or rig.duration) / rig.time_step)
+    lead = math.ceil(_LEAD / rig.time_step)
+    skew = sum(h.parameters["skew"] for h in hidden if h.effect_id == "clock_skew")
+    tail = math.ceil(num_steps * max(skew, 0.0)) + 1
+    wanted = references(rig, excitations, num_steps, tail, seed)
+    num_rollouts = len(excitations)
+    plant = Plant(
+        rig.mechanics,
+        rig.layout,
+        parameters,
+        hidden,
+        num_rollouts=num_rollouts,
+        substep=substep,
+        duration=num_steps * rig.time_step,
+        generator=np.random.default_rng(derived_seed(seed, "bursts")),
+    )
+    q, v = plant.start(*starts(rig, num_rollouts, is_from_rest, seed))
+    num_joints = len(rig.layout.joints)
+    motion = np.empty(((lead + num_steps + tail) * num_substeps + 1, 2 * num_joints, num_rollouts))
+    motion[0] = np.concatenate((q[:num_joints], v[:num_joints]))
+    commands = np.zeros((num_steps + tail, len(rig.limits), num_rollouts))
+    row = 0
+    for step in range(-lead, num_steps + tail):
+        plant.begin_step(step * rig.time_step)
+        if step >= 0:
+            commands[step] = commanded(rig, wanted[step], q, v)
+        present = list(commands[step]) if step >= 0 else [np.zeros(num_rollouts)] * len(rig.limits)
+        for k in range(num_substeps):
+            q, v = plant.advance(q, v, present, step * rig.time_step + k * substep)
+            row += 1
+            motion[row, :num_joints] = q[:num_joints]
+            motion[row, num_joints:] = v[:num_joints]
+    begin = lead * num_substeps
+    values = sensed(motion, substep, begin, num_substeps, num_steps, hidden, rig.layout)
+    if measurement is not None:
+        noise = np.random.default_rng(derived_seed(seed, "noise"))
+        values = noisy(values, measurement, noise)
+    true = motion[begin : begin + num_steps * num_substeps + 1 : num_substeps]
+    units = rig.units
+    rollouts = Rollouts.from_arrays(
+        values,
+        commands[:num_steps].transpose(2, 0, 1),
+        channel_names=rig.layout.sensors,
+        action_names=rig.layout.actions,
+        time_step=rig.time_step,
+        channel_units=units[0],
+        action_units=units[1],
+    )
+    return Recording(rollouts, true.transpose(2, 0, 1))
