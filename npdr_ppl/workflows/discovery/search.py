@@ -1,8 +1,10 @@
 """The search: add the effect that explains most, look again, take back what became needless."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+
+from torch import Tensor
 
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
@@ -25,7 +27,18 @@ SHORTLIST = 6
 """Candidates fitted in full in each round."""
 
 TRIAL = {"max_steps": 6, "max_rescalings": 2}
-"""Steps of a fit that is only to be compared with others."""
+"""Steps of a fit that shows whether a candidate is worth a longer one."""
+
+FULL = {"max_steps": 12, "max_rescalings": 4}
+
+CONTENDERS = 3
+"""Candidates that are fitted to the end."""
+
+CONTENDS = 0.3
+"""A candidate contends whose loss is at most this much above the least, relatively …"""
+
+CONTENDS_ANYWAY = 20.0
+"""… or this much, absolutely."""
 
 PRIOR_OF_ANY = 0.5
 """Prior probability that anything of the catalogue is missing."""
@@ -178,6 +191,7 @@ class Searcher:
                 self._report(f"tried {candidate.name}: {_shown(found)}")
         if not trials:
             return None, {}
+        trials = self._converged(trials)
         each = math.log(PRIOR_OF_ANY / max(1, len(ranking)))
         hypotheses = [current, *trials.values()]
         log_prior = [math.log(1 - PRIOR_OF_ANY), *(each for _ in trials)]
@@ -193,9 +207,29 @@ class Searcher:
         start = current.parameters | candidate.variant.parameters(candidate.sizes)
         return self._fit((*current.effects, candidate.variant.effect), start, current)
 
+    def _converged(self, trials: dict[str, Hypothesis]) -> dict[str, Hypothesis]:
+        """Fits the contenders to the end; the others are too far behind for that to matter."""
+        scale = closest(list(trials.values())).fit.scale
+        losses = {name: float(trial.losses(scale).sum()) for name, trial in trials.items()}
+        least = min(losses.values())
+        result = dict(trials)
+        for name in sorted(losses, key=lambda name: losses[name])[:CONTENDERS]:
+            if losses[name] <= least + max(CONTENDS_ANYWAY, CONTENDS * abs(least)):
+                trial = trials[name]
+                longer = self._fit(trial.effects, trial.parameters, trial, **FULL)
+                result[name] = longer or trial
+        return result
+
     def _fit(
-        self, effects: tuple[Effect, ...], start: dict, current: Hypothesis
+        self,
+        effects: tuple[Effect, ...],
+        start: Mapping[str, Tensor],
+        current: Hypothesis,
+        *,
+        max_steps: int = TRIAL["max_steps"],
+        max_rescalings: int = TRIAL["max_rescalings"],
     ) -> Hypothesis | None:
+        """Returns the model with effects, fitted; ``None`` if it cannot be simulated."""
         try:
             return fit_hypothesis(
                 self.model,
@@ -204,7 +238,8 @@ class Searcher:
                 effects=effects,
                 start=start,
                 offsets=current.fit.offsets,
-                **TRIAL,
+                max_steps=max_steps,
+                max_rescalings=max_rescalings,
             )
         except NpdrError:
             return None
@@ -240,6 +275,7 @@ class Searcher:
             found = self._fitted(without, candidate)
             if found is not None:
                 trials[candidate.name] = found
+        trials = self._converged(trials)
         weights = weigh(list(trials.values()), [0.0] * len(trials), seed=0)
         alternatives = dict(zip(trials, weights, strict=True))
         best = max(alternatives, key=lambda name: alternatives[name])
