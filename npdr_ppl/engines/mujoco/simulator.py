@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward
 from npdr_ppl.engines.closed_loop_simulator import ClosedLoopSimulator
-from npdr_ppl.engines.compilation import CompileMode
 from npdr_ppl.engines.effect_chain import Tables, needed_histories
+from npdr_ppl.engines.episodes import EpisodeRequest, Episodes
 from npdr_ppl.engines.mujoco.batches import make_batch, prepared_copy, quiet
 from npdr_ppl.engines.mujoco.channels import (
     Component,
@@ -147,33 +146,12 @@ class MujocoSimulator(ClosedLoopSimulator):
         """Replays the inputs' actions in float64; see :meth:`Simulator.simulate`."""
         return replay(self, parameters, inputs)
 
-    def roll_out(
-        self,
-        parameters: Mapping[str, Tensor],
-        policy: FeedbackPolicy,
-        initial_states: Tensor,
-        num_steps: int,
-        *,
-        reward: Reward | None = None,
-        time_step: float | None = None,
-        record: bool = False,
-        compile: CompileMode | None = None,
-        expected_calls: int = 1,
-    ) -> Episodes:
+    def run_episodes(self, request: EpisodeRequest) -> Episodes:
         """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`.
 
         The arguments for compilation change nothing: the engine is compiled.
         """
-        return roll_out(
-            self,
-            parameters,
-            policy,
-            initial_states,
-            num_steps,
-            reward=reward,
-            time_step=time_step,
-            record=record,
-        )
+        return roll_out(self, request)
 
     def histories(self, given: Mapping[str, Tensor], time_step: float) -> tuple[int, ...]:
         """Returns how much of the past each action effect and then each sensor effect asks for.
