@@ -1,6 +1,6 @@
 """A PyBullet scene as a simulator."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from os import PathLike
 from typing import Any, Self
@@ -14,7 +14,8 @@ from npdr_ppl.engines.bullet.forces import JointForces, is_dry
 from npdr_ppl.engines.bullet.parameters import BoundParameter
 from npdr_ppl.engines.bullet.scene import Builder, Scene, Urdf
 from npdr_ppl.engines.bullet.settings import BulletSettings
-from npdr_ppl.engines.pooled import PooledSimulator, Segment
+from npdr_ppl.engines.pooled import Segment
+from npdr_ppl.engines.stepped import SteppedSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.effects import Effect, EnvironmentEffect, ForceEffect
@@ -25,7 +26,7 @@ __all__ = ["BulletSimulator"]
 _NO_LIMIT = 1e9
 
 
-class BulletSimulator(PooledSimulator):
+class BulletSimulator(SteppedSimulator):
     """A scene of PyBullet, simulated on workers in DIRECT mode.
 
     The scene is built anew for each simulation, because contacts and solver caches would carry
@@ -138,10 +139,10 @@ class BulletSimulator(PooledSimulator):
         torch.set_num_threads(1)
         return connect()
 
-    def simulate_one(
+    def begin(
         self, workspace: Any, parameters: Mapping[str, float], segment: Segment, seed: int
-    ) -> np.ndarray:
-        """Simulates one segment; see :meth:`PooledSimulator.simulate_one`."""
+    ) -> "_Simulation":
+        """Begins a simulation; see :meth:`SteppedSimulator.begin`."""
         client = workspace
         scene = Scene(client, self._build, parameters, self.settings, segment.time_step)
         for bound in self._bound:
@@ -151,16 +152,7 @@ class BulletSimulator(PooledSimulator):
         read = scene.reader(self._sensors)
         act = self._actuation(scene, parameters, segment)
         drive = None if type(self).drive is BulletSimulator.drive else self.drive
-        readings = np.empty((len(segment.actions), len(self._sensors)))
-        step_simulation = client.stepSimulation
-        for step in range(len(readings)):
-            for substep in range(self.settings.substeps):
-                act(step, substep)
-                if drive is not None:
-                    drive(scene, segment, step, substep)
-                step_simulation()
-            readings[step] = read()
-        return readings
+        return _Simulation(scene, segment, act, drive, read, self.settings.substeps)
 
     def start(self, scene: Scene, parameters: Mapping[str, float], segment: Segment) -> None:
         """Puts the scene into a segment's initial state.
@@ -287,6 +279,34 @@ class BulletSimulator(PooledSimulator):
                 f"{', '.join(twice)} names two ports of {self.name}; call the channel otherwise."
             )
         return tuple(ports)
+
+
+class _Simulation:
+    """A simulation under way; see :class:`~npdr_ppl.engines.stepped.Simulation`."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        segment: Segment,
+        act: Callable[[int, int], None],
+        drive: Callable[[Scene, Segment, int, int], None] | None,
+        read: Callable[[], list[float]],
+        substeps: int,
+    ) -> None:
+        self.read = read
+        self._scene, self._segment = scene, segment
+        self._act, self._drive = act, drive
+        self._substeps = substeps
+        self._step_simulation = scene.client.stepSimulation
+
+    def advance(self, step: int) -> None:
+        """Makes all substeps of a step."""
+        drive, step_simulation = self._drive, self._step_simulation
+        for substep in range(self._substeps):
+            self._act(step, substep)
+            if drive is not None:
+                drive(self._scene, self._segment, step, substep)
+            step_simulation()
 
 
 def _motor(client: Any, command: Command, joint: tuple[int, int]) -> Any:

@@ -136,6 +136,11 @@ class MujocoSimulator(ClosedLoopSimulator):
         """Names of the force ports."""
         return tuple(port.port.name for port in self.force_ports)
 
+    @property
+    def is_rate(self) -> tuple[bool, ...]:
+        """Whether each state is a velocity, those of balls and free bodies included."""
+        return tuple(component.is_velocity for component in self.components)
+
     def num_substeps(self, time_step: float) -> int:
         """Returns the engine steps per control step of so many seconds."""
         if self.substeps is not None:
