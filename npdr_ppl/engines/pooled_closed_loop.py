@@ -203,9 +203,12 @@ def roll_out(simulator: "SteppedSimulator", request: EpisodeRequest) -> Episodes
 
     def rows(values: Tensor) -> np.ndarray:
         values = values.detach().to(device="cpu", dtype=torch.float64)
-        return values.expand(*shape, values.shape[-1]).reshape(-1, values.shape[-1]).numpy()
+        width = values.shape[-1]
+        return values.expand(*shape, width).reshape(shape.numel(), width).numpy()
 
-    table = torch.stack([value.detach().expand(shape) for value in domain.values()], dim=-1)
+    table = torch.zeros(*shape, len(domain), dtype=torch.float64)
+    for column, value in enumerate(domain.values()):
+        table[..., column] = value.detach()
     payloads = [
         _OneEpisode(*one)
         for one in zip(
