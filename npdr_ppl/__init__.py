@@ -15,6 +15,7 @@ __all__ = [
     "Calibration",
     "Channel",
     "Effect",
+    "GymnasiumSimulator",
     "Inputs",
     "LoopOptions",
     "MujocoSimulator",
@@ -39,6 +40,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from npdr_ppl.engines.gymnasium import GymnasiumSimulator
     from npdr_ppl.engines.mujoco import MujocoSimulator
     from npdr_ppl.engines.workers import workers
     from npdr_ppl.errors import NpdrError
@@ -64,6 +66,7 @@ _HOMES = {
     "Calibration": "workflows.calibration_result",
     "Channel": "language.channels",
     "Effect": "language.effects",
+    "GymnasiumSimulator": "engines.gymnasium",
     "Inputs": "language.inputs",
     "LoopOptions": "workflows.loop_options",
     "MujocoSimulator": "engines.mujoco",

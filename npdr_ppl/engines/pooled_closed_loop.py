@@ -149,7 +149,11 @@ class _OneStepper(EffectChain):
         self._columns = [sensors.index(state.name) for state in part.states]
         self._simulation, self._segment = simulation, segment
         self._step = 0
-        self._values = self._read()
+        values = list(self._read())
+        # What an engine shows of a state that it was just given may be rounded, or of before.
+        for column, value in zip(self._columns, segment.initial_state[order], strict=True):
+            values[column] = torch.full(_ONE, float(value), dtype=torch.float64)
+        self._values: Components = tuple(values)
 
     @property
     def num_positions(self) -> int:

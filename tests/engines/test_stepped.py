@@ -12,7 +12,7 @@ from npdr_ppl.engines.stepped import SteppedSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import InputDelay, EncoderBias, ViscousFriction
+from npdr_ppl.models.effects import EncoderBias, InputDelay, ViscousFriction
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.linear import Linear
 from npdr_ppl.policies.mppi import MPPI
