@@ -15,6 +15,7 @@ from npdr_ppl.engines.bullet.parameters import BoundParameter
 from npdr_ppl.engines.bullet.scene import Builder, Scene, Urdf
 from npdr_ppl.engines.bullet.settings import BulletSettings
 from npdr_ppl.engines.pooled import Segment
+from npdr_ppl.engines.source_files import recorded_files
 from npdr_ppl.engines.stepped import SteppedSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port
@@ -104,8 +105,11 @@ class BulletSimulator(SteppedSimulator):
         return f"{type(self).__name__}{file}"
 
     def recorded_settings(self) -> dict[str, Any]:
-        """Returns the settings of the engine."""
-        return {"engine": "bullet", **asdict(self.settings)}
+        """Returns the settings of the engine and the text of the URDF file, where there is one."""
+        settings = {"engine": "bullet", **asdict(self.settings)}
+        if isinstance(self._build, Urdf):
+            settings["urdf"] = recorded_files(self._build.path)
+        return settings
 
     def with_effects(self, *effects: Effect) -> Self:
         """Returns a copy with effects attached; see :meth:`Simulator.with_effects`.

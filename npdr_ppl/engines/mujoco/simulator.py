@@ -1,5 +1,6 @@
 """Simulation of any MJCF file in MuJoCo, many parameter sets and segments at a time."""
 
+import importlib
 import logging
 import math
 from collections.abc import Mapping
@@ -32,6 +33,7 @@ from npdr_ppl.engines.mujoco.open_loop import replay
 from npdr_ppl.engines.mujoco.parameters import Binding, Bindings, Derivation
 from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
 from npdr_ppl.engines.mujoco_inverse_dynamics import load_mjcf
+from npdr_ppl.engines.source_files import recorded_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.effects import ForceEffect, ParameterEffect
@@ -105,6 +107,7 @@ class MujocoSimulator(ClosedLoopSimulator):
             raise ModelError(f"MujocoSimulator needs at least one substep, got {substeps=}.")
         with quiet(logger.warning):
             self.model: Any = load_mjcf(source)
+        self._source = recorded_mjcf(source)
         self._models: dict[tuple[float, tuple[int, ...]], Any] = {}
         is_path = isinstance(source, str | PathLike)
         self._label = Path(source).name if is_path else "a model"
@@ -135,6 +138,17 @@ class MujocoSimulator(ClosedLoopSimulator):
     def joints(self) -> tuple[str, ...]:
         """Names of the force ports."""
         return tuple(port.port.name for port in self.force_ports)
+
+    def recorded_settings(self) -> dict[str, Any]:
+        """Returns the text of the MJCF and what the parameters set in it, and the version."""
+        return {
+            "engine": "mujoco",
+            "version": importlib.import_module("mujoco").__version__,
+            "mjcf": self._source,
+            "parameters": {p.name: p.description for p in self.parameters},
+            "time_step": self.time_step,
+            "substeps": self.num_substeps(self.time_step),
+        }
 
     @property
     def is_rate(self) -> tuple[bool, ...]:
