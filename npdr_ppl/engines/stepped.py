@@ -21,7 +21,7 @@ class Simulation(Protocol):
         """Returns the present true values of the sensors' channels, ``(sensors,)``."""
         ...
 
-    def advance(self, step: int) -> None:
+    def advance(self, step: int, /) -> None:
         """Makes a step under ``segment.actions[step]``; steps come in order, from 0."""
         ...
 
@@ -50,11 +50,12 @@ class SteppedSimulator(PooledSimulator, ClosedLoopSimulator):
         """Simulates one segment; see :meth:`PooledSimulator.simulate_one`."""
         simulation = self.begin(workspace, parameters, segment, seed)
         advance, read = simulation.advance, simulation.read
-        readings = np.empty((len(segment.actions), len(self.sensors)))
-        for step in range(len(readings)):
+        num_steps = len(segment.actions)
+        readings = []
+        for step in range(num_steps):
             advance(step)
-            readings[step] = read()
-        return readings
+            readings.append(read())
+        return np.array(readings, dtype=np.float64).reshape(num_steps, len(self.sensors))
 
     def run_episodes(self, request: EpisodeRequest) -> Episodes:
         """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`.

@@ -1,6 +1,6 @@
 """A PyBullet scene as a simulator."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from os import PathLike
 from typing import Any, Self
@@ -14,6 +14,7 @@ from npdr_ppl.engines.bullet.forces import JointForces, is_dry
 from npdr_ppl.engines.bullet.parameters import BoundParameter
 from npdr_ppl.engines.bullet.scene import Builder, Scene, Urdf
 from npdr_ppl.engines.bullet.settings import BulletSettings
+from npdr_ppl.engines.bullet.stepping import BulletSimulation, stepping
 from npdr_ppl.engines.pooled import Segment
 from npdr_ppl.engines.source_files import recorded_files
 from npdr_ppl.engines.stepped import SteppedSimulator
@@ -22,9 +23,6 @@ from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.effects import Effect, EnvironmentEffect, ForceEffect
 
 __all__ = ["BulletSimulator"]
-
-# What Bullet's motors take for no limit.
-_NO_LIMIT = 1e9
 
 
 class BulletSimulator(SteppedSimulator):
@@ -145,7 +143,7 @@ class BulletSimulator(SteppedSimulator):
 
     def begin(
         self, workspace: Any, parameters: Mapping[str, float], segment: Segment, seed: int
-    ) -> "_Simulation":
+    ) -> BulletSimulation:
         """Begins a simulation; see :meth:`SteppedSimulator.begin`."""
         client = workspace
         scene = Scene(client, self._build, parameters, self.settings, segment.time_step)
@@ -153,10 +151,12 @@ class BulletSimulator(SteppedSimulator):
             bound.apply(scene, parameters[bound.name])
         self._change_environment(scene, parameters)
         self.start(scene, parameters, segment)
-        read = scene.reader(self._sensors)
-        act = self._actuation(scene, parameters, segment)
+        forces = self._forces(scene, parameters, segment)
         drive = None if type(self).drive is BulletSimulator.drive else self.drive
-        return _Simulation(scene, segment, act, drive, read, self.settings.substeps)
+        return BulletSimulation(
+            stepping(scene, segment, self._commands, self.settings.substeps, forces, drive),
+            scene.reader(self._sensors),
+        )
 
     def start(self, scene: Scene, parameters: Mapping[str, float], segment: Segment) -> None:
         """Puts the scene into a segment's initial state.
@@ -193,38 +193,16 @@ class BulletSimulator(SteppedSimulator):
             substep: Number of the substep within it, from 0.
         """
 
-    def _actuation(self, scene: Scene, parameters: Mapping[str, float], segment: Segment) -> Any:
-        """Returns a function that applies commands and force effects before a substep."""
-        client = scene.client
-        control, torque_control = client.setJointMotorControl2, client.TORQUE_CONTROL
-        torques, motors = [], []
-        for column, command in self._commands:
-            joint = scene.find(command.place)
-            if command.place.field == "torque":
-                torques.append((column, joint))
-            else:
-                motors.append((column, _motor(client, command, joint)))
+    def _forces(
+        self, scene: Scene, parameters: Mapping[str, float], segment: Segment
+    ) -> JointForces | None:
+        """Returns the forces of effects at joints, where there are any."""
         effects = [e for e in self.effects if isinstance(e, ForceEffect)]
-        forces = None
-        if effects:
-            joints = [scene.joints[effect.port] for effect in effects]
-            step = segment.time_step / self.settings.substeps
-            pairs = list(zip(effects, joints, strict=True))
-            forces = JointForces(scene, pairs, parameters, step, segment.start_time)
-
-        def act(step: int, substep: int) -> None:
-            commands = segment.actions[step]
-            if substep == 0:
-                for column, follow in motors:
-                    follow(commands[column])
-            total = {} if forces is None else forces()
-            for column, joint in torques:
-                total[joint] = commands[column] + total.get(joint, 0.0)
-            for joint, torque in total.items():
-                # Bullet forgets torques after each substep.
-                control(*joint, torque_control, force=torque)
-
-        return act
+        if not effects:
+            return None
+        pairs = [(effect, scene.joints[effect.port]) for effect in effects]
+        step = segment.time_step / self.settings.substeps
+        return JointForces(scene, pairs, parameters, step, segment.start_time)
 
     def _change_environment(self, scene: Scene, parameters: Mapping[str, float]) -> None:
         """Lets effects turn gravity."""
@@ -283,61 +261,3 @@ class BulletSimulator(SteppedSimulator):
                 f"{', '.join(twice)} names two ports of {self.name}; call the channel otherwise."
             )
         return tuple(ports)
-
-
-class _Simulation:
-    """A simulation under way; see :class:`~npdr_ppl.engines.stepped.Simulation`."""
-
-    def __init__(
-        self,
-        scene: Scene,
-        segment: Segment,
-        act: Callable[[int, int], None],
-        drive: Callable[[Scene, Segment, int, int], None] | None,
-        read: Callable[[], list[float]],
-        substeps: int,
-    ) -> None:
-        self.read = read
-        self._scene, self._segment = scene, segment
-        self._act, self._drive = act, drive
-        self._substeps = substeps
-        self._step_simulation = scene.client.stepSimulation
-
-    def advance(self, step: int) -> None:
-        """Makes all substeps of a step."""
-        drive, step_simulation = self._drive, self._step_simulation
-        for substep in range(self._substeps):
-            self._act(step, substep)
-            if drive is not None:
-                drive(self._scene, self._segment, step, substep)
-            step_simulation()
-
-
-def _motor(client: Any, command: Command, joint: tuple[int, int]) -> Any:
-    """Returns a function that has a joint's motor follow a velocity or a position."""
-    control = client.setJointMotorControl2
-    force = _NO_LIMIT if command.max_force is None else command.max_force
-    if command.place.field == "velocity":
-
-        def follow(value: float) -> None:
-            control(
-                *joint,
-                client.VELOCITY_CONTROL,
-                targetVelocity=value,
-                velocityGain=command.velocity_gain,
-                force=force,
-            )
-
-    else:
-
-        def follow(value: float) -> None:
-            control(
-                *joint,
-                client.POSITION_CONTROL,
-                targetPosition=value,
-                positionGain=command.position_gain,
-                velocityGain=command.velocity_gain,
-                force=force,
-            )
-
-    return follow

@@ -279,8 +279,8 @@ class _Simulation:
         self._act = self._boxed if act is None else act
         self._reading: Callable[[Any, Any], Any]
         if isinstance(read, str):
-            path = Path(read)
-            self._reading = lambda inner, _: path.get(inner)
+            get = Path(read).getter()
+            self._reading = lambda inner, _: get(inner)
         else:
             self._reading = _observed if read is None else read
 
@@ -294,7 +294,8 @@ class _Simulation:
         self._observation = self._step(action)[0]
 
     def _boxed(self, inner: Any, commands: Array) -> Array:
-        return commands.astype(self._space.dtype).reshape(self._space.shape)
+        action = commands.astype(self._space.dtype)
+        return action if len(self._space.shape) == 1 else action.reshape(self._space.shape)
 
 
 def _observed(inner: Any, observation: Any) -> Any:
