@@ -116,4 +116,5 @@ class Attribute:
 
 def vector(value: Any) -> NDArray[np.float64]:
     """Returns numbers as a flat copy: environments may reuse their arrays."""
-    return np.array(value, dtype=np.float64).reshape(-1)
+    copied = np.array(value, dtype=np.float64)
+    return copied if copied.ndim == 1 else copied.reshape(-1)
