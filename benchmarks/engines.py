@@ -13,6 +13,7 @@ import argparse
 import importlib.util
 import json
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,15 +21,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import workers
 
 import npdr_ppl as npdr
+from npdr_ppl.engines.bullet.client import connect
+from npdr_ppl.engines.gymnasium import Attribute
+from npdr_ppl.engines.pooled import Segment
 from npdr_ppl.models.effects import CoulombFriction
+from npdr_ppl.models.pendulum import Pendulum
 
 TARGET = 0.15
 """Greatest cost of an adapter that is acceptable, relative to the engine's own time."""
 
 LEAST_SECONDS = 1.0
 """Rows that take milliseconds are repeated for so long."""
+
+BULLET_BATCH = 32
+"""Simulations of the engines that run one at a time."""
+
+ODE_BATCH = 1 << 15
+"""A batch in which arithmetic outweighs the calls to torch."""
 
 FURUTA_XML = Path(__file__).parents[1] / "models" / "furuta.xml"
 
@@ -172,13 +184,113 @@ def hard_friction(case: MujocoCase) -> Any:
 
 
 def bullet_rows(batch_sizes: tuple[int, ...], num_steps: int) -> Iterator[Row]:
-    """The Bullet adapter against a loop over pybullet's stepSimulation in one process."""
-    return iter(())
+    """BulletSimulator against a loop by hand over PyBullet's functions, both in this process.
+
+    What workers add is measured by ``benchmarks/workers.py``.
+    """
+    batch_size = min(BULLET_BATCH, batch_sizes[-1])
+    yield bullet_row(batch_size, num_steps, 1)
+    yield bullet_row(batch_size, num_steps, 4)
+
+
+def bullet_row(batch_size: int, num_steps: int, substeps: int) -> Row:
+    """A pendulum on a motor, its mass varied."""
+    file = Path(tempfile.mkdtemp()) / "pendulum.urdf"
+    file.write_text(workers.URDF)
+    client, told = connect(), workers.segment(num_steps)
+    simulator = workers.pendulum(file, substeps)
+    masses = np.linspace(0.8, 1.2, batch_size).tolist()
+
+    def own() -> np.ndarray:
+        return np.stack(
+            [workers.bare_loop(client, str(file), told, substeps, mass) for mass in masses]
+        )
+
+    def adapter() -> np.ndarray:
+        parameters = [{**workers.PARAMETERS, "mass": mass} for mass in masses]
+        return np.stack([simulator.simulate_one(client, p, told, 0) for p in parameters])
+
+    case = f"pendulum, {substeps} substep{'s' * (substeps > 1)}"
+    return Row("bullet", case, batch_size, num_steps, adapter, own)
+
+
+def gymnasium_rows(batch_sizes: tuple[int, ...], num_steps: int) -> Iterator[Row]:
+    """GymnasiumSimulator against a loop by hand over an environment, both in this process."""
+    if importlib.util.find_spec("gymnasium") is None:
+        return
+    import gymnasium
+
+    simulator = npdr.GymnasiumSimulator(
+        "Pendulum-v1",
+        parameters={"mass": Attribute("m", "kg")},
+        states=(npdr.Channel("angle", "rad"), npdr.Channel("velocity", "rad/s", rate_of="angle")),
+        set_state="state",
+    )
+    commands = np.sin(0.1 * np.arange(num_steps))[:, None].astype(np.float32)
+    told = Segment(np.array([2.0, 0.0]), commands.astype(float), simulator.time_step, 0.0)
+    masses = np.linspace(0.8, 1.2, min(BULLET_BATCH, batch_sizes[-1])).tolist()
+    workspace = simulator.set_up()
+    environment = gymnasium.make("Pendulum-v1", disable_env_checker=True)
+    inner = environment.unwrapped
+
+    def own() -> np.ndarray:
+        result = np.empty((len(masses), num_steps, 2))
+        for rows, mass in zip(result, masses, strict=True):
+            inner.m = mass
+            environment.reset(seed=0)
+            inner.state = np.array([2.0, 0.0])
+            for row, command in zip(rows, commands, strict=True):
+                environment.step(command)
+                row[:] = inner.state
+        return result
+
+    def adapter() -> np.ndarray:
+        return np.stack([simulator.simulate_one(workspace, {"mass": m}, told, 0) for m in masses])
+
+    yield Row("gymnasium", "pendulum", len(masses), num_steps, adapter, own)
 
 
 def ode_rows(batch_sizes: tuple[int, ...], num_steps: int) -> Iterator[Row]:
-    """ODE simulators have no engine below them; ``benchmarks/simulation.py`` compares theirs."""
-    return iter(())
+    """ODESimulator, not compiled, against the same equations in a loop of torch by hand.
+
+    ``benchmarks/simulation.py`` compares what compiling it brings.
+    """
+    for batch_size in (*batch_sizes, ODE_BATCH):
+        yield ode_row(batch_size, num_steps)
+
+
+def ode_row(batch_size: int, num_steps: int) -> Row:
+    """The zoo's pendulum, mass and damping varied, semi-implicit Euler."""
+    simulator = Pendulum(compile="never")
+    step = simulator.time_step
+    torque = 3.0 * torch.sin(0.1 * torch.arange(num_steps).double())
+    inputs = npdr.Inputs.single(
+        torque[:, None],
+        torch.tensor([0.5, 0.0], dtype=torch.float64),
+        action_names=("torque",),
+        state_names=("angle", "velocity"),
+        time_step=step,
+    )
+    factors = torch.linspace(0.8, 1.2, batch_size, dtype=torch.float64)
+    parameters = {"mass": factors, "damping": 0.1 * factors}
+
+    def own() -> np.ndarray:
+        mass, damping = parameters["mass"], parameters["damping"]
+        inverse, lever = 3.0 / mass, 1.5 * 9.81
+        drag = damping * inverse
+        angle, velocity = torch.full_like(mass, 0.5), torch.zeros_like(mass)
+        rows = []
+        for command in torque:
+            rate = command * inverse - drag * velocity - lever * torch.sin(angle)
+            velocity = velocity + step * rate
+            angle = angle + step * velocity
+            rows += [angle, velocity]
+        return torch.stack(rows, dim=-1).reshape(batch_size, num_steps, 2).numpy()
+
+    def adapter() -> np.ndarray:
+        return simulator.simulate(parameters, inputs)[:, 0].numpy()
+
+    return Row("ode", "pendulum", batch_size, num_steps, adapter, own)
 
 
 def measure(row: Row, num_repeats: int) -> dict[str, Any]:
@@ -220,22 +332,31 @@ def main() -> None:
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[1, 32, 256])
     parser.add_argument("--steps", type=int, default=200, help="steps per simulation")
     parser.add_argument("--repeats", type=int, default=9, help="repeats per row")
+    parser.add_argument("--engines", default="mujoco,bullet,gymnasium,ode", help="Which rows.")
     parser.add_argument("--json", help="file to write the figures to")
     options = parser.parse_args()
     torch.set_num_threads(1)
     num_repeats = 3 if options.quick else options.repeats
     sizes = tuple(options.batch_sizes)
+    tables = {
+        "mujoco": mujoco_rows,
+        "bullet": bullet_rows,
+        "gymnasium": gymnasium_rows,
+        "ode": ode_rows,
+    }
+    chosen = [tables[name] for name in options.engines.split(",")]
     results = []
     print(
-        f"{'engine':8}{'case':28}{'batch':>6}{'own steps/s':>14}{'adapter steps/s':>17}{'cost':>8}"
+        f"{'engine':11}{'case':28}{'batch':>6}{'own steps/s':>14}{'adapter steps/s':>17}"
+        f"{'cost':>8}"
     )
-    for rows in (mujoco_rows, bullet_rows, ode_rows):
+    for rows in chosen:
         for row in rows(sizes, options.steps):
             found = measure(row, num_repeats)
             results.append({"engine": row.engine, "case": row.case, "batch": row.batch_size})
             results[-1] |= found
             print(
-                f"{row.engine:8}{row.case:28}{row.batch_size:6}{found['own']:14,.0f}"
+                f"{row.engine:11}{row.case:28}{row.batch_size:6}{found['own']:14,.0f}"
                 f"{found['adapter']:17,.0f}{100.0 * found['cost']:7.1f}%",
                 flush=True,
             )

@@ -3,6 +3,7 @@
     python benchmarks/faults.py                          # a pendulum in Bullet, some minutes
     python benchmarks/faults.py --times 2                # faults that a retry does not cure
     python benchmarks/faults.py --model file.py:model --data measured.csv
+    python benchmarks/faults.py --strike strike_100hz_8s.csv     # mini golf, about ten minutes
 
 Faults are real: processes exit or segfault, sleep, sit in native code, and trajectories are NaN.
 Three fits are made: clean, clean with another seed (the yardstick of Monte-Carlo error), and
@@ -18,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,9 @@ import npdr_ppl as npdr
 from npdr_ppl.cli.resolve import resolve_model
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.mini_golf import mini_golf
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows import mini_golf_fit
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "engines"))
 
@@ -68,6 +72,11 @@ def bullet_pendulum(folder: Path) -> tuple[Callable[..., Any], Rollouts]:
     return npdr.with_noise(model, {"angle": 0.02, "velocity": 0.1}), rollouts
 
 
+def mini_golf_strike(file: Path) -> tuple[Callable[..., Any], Rollouts]:
+    """Returns the mini-golf model and its first recorded strike, as Table 1 is fitted to it."""
+    return partial(mini_golf, noise=mini_golf_fit.NOISE), Rollouts.load(file)[[0]]
+
+
 def moments(posterior: npdr.Posterior) -> dict[str, tuple[float, float]]:
     """Returns mean and standard deviation of every parameter."""
     draws = posterior.sample(4_000, seed=0)
@@ -90,10 +99,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", help="Zoo name, or path/to/file.py:function.")
     parser.add_argument("--data", type=Path, help="Rollouts of the model.")
+    parser.add_argument("--strike", type=Path, help="Recorded strikes of mini golf.")
     parser.add_argument("--simulations", type=int, default=5_000)
     parser.add_argument("--backend", default="snpe-c")
-    parser.add_argument("--embedding", default="all/10")
+    parser.add_argument("--embedding", help="all/10; for --strike that of Table 1.")
     parser.add_argument("--segment-length", type=int)
+    parser.add_argument("--initial-state", help="estimated; for --strike recorded.")
     parser.add_argument("--crash", type=float, default=0.01)
     parser.add_argument("--hang", type=float, default=0.01)
     parser.add_argument("--nan", type=float, default=0.03)
@@ -110,10 +121,16 @@ def main() -> None:
         tempfile.TemporaryDirectory() as folder,
         npdr.workers(options.executor, options.workers, time_limit=options.time_limit),
     ):
-        if options.model is None:
+        if options.strike is not None:
+            model, rollouts = mini_golf_strike(options.strike)
+        elif options.model is None:
             model, rollouts = bullet_pendulum(Path(folder))
         else:
             model, rollouts = resolve_model(options.model), Rollouts.load(options.data)
+        embedding, start = (
+            (mini_golf_fit.EMBEDDING, "recorded") if options.strike else ("all/10", "estimated")
+        )
+        embedding, start = options.embedding or embedding, options.initial_state or start
         log = Path(folder) / "faults"
         log.mkdir()
 
@@ -124,8 +141,9 @@ def main() -> None:
                 rollouts,
                 backend=backend(options.backend),
                 num_simulations=options.simulations,
-                embedding=options.embedding,
+                embedding=embedding,
                 segment_length=options.segment_length,
+                initial_state=start,
                 seed=seed,
                 progress=False,
             )

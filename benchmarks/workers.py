@@ -80,10 +80,12 @@ def pendulum(file: Path, substeps: int) -> BulletSimulator:
 def segment(num_steps: int) -> Segment:
     """A sine of torque from rest."""
     torque = 4.5 * np.sin(2 * math.pi * 0.02 * np.arange(num_steps))
-    return Segment(np.zeros(2), torque[:, None], 0.02)
+    return Segment(np.zeros(2), torque[:, None], 0.02, 0.0)
 
 
-def bare_loop(client: Any, file: str, told: Segment, substeps: int) -> np.ndarray:
+def bare_loop(
+    client: Any, file: str, told: Segment, substeps: int, mass: float = PARAMETERS["mass"]
+) -> np.ndarray:
     """The same simulation as one would write it by hand."""
     client.resetSimulation()
     client.setTimeStep(told.time_step / substeps)
@@ -92,8 +94,9 @@ def bare_loop(client: Any, file: str, told: Segment, substeps: int) -> np.ndarra
     client.setJointMotorControl2(body, 0, client.VELOCITY_CONTROL, force=0.0)
     for link in (-1, 0):
         client.changeDynamics(body, link, linearDamping=0.0, angularDamping=0.0)
-    client.changeDynamics(body, 0, mass=1.2, jointDamping=0.1)
-    client.changeDynamics(body, 0, localInertiaDiagonal=[0.0833 * 1.2, 0.0833 * 1.2, 1.2e-6])
+    moments = [0.0833 * mass, 0.0833 * mass, 1e-6 * mass]
+    client.changeDynamics(body, 0, mass=mass, jointDamping=PARAMETERS["damping"])
+    client.changeDynamics(body, 0, localInertiaDiagonal=moments)
     client.resetJointState(body, 0, 0.0, 0.0)
     control, step, state = (
         client.setJointMotorControl2,

@@ -17,6 +17,7 @@ __all__ = [
     "Discovery",
     "DiscoveryOptions",
     "Effect",
+    "GymnasiumSimulator",
     "Inputs",
     "LoopOptions",
     "MujocoSimulator",
@@ -42,6 +43,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from npdr_ppl.engines.gymnasium import GymnasiumSimulator
     from npdr_ppl.engines.mujoco import MujocoSimulator
     from npdr_ppl.engines.workers import workers
     from npdr_ppl.errors import NpdrError
@@ -70,6 +72,7 @@ _HOMES = {
     "Discovery": "workflows.discovery",
     "DiscoveryOptions": "workflows.discovery",
     "Effect": "language.effects",
+    "GymnasiumSimulator": "engines.gymnasium",
     "Inputs": "language.inputs",
     "LoopOptions": "workflows.loop_options",
     "MujocoSimulator": "engines.mujoco",

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.closed_loop import Reward
-from npdr_ppl.engines.ode import ODESimulator
+from npdr_ppl.engines.episodes import Reward
 from npdr_ppl.errors import ModelError, ShapeError
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.policies.base import Policy
 from npdr_ppl.randomness import derived_seed
 
@@ -58,7 +58,9 @@ class MPPI(Policy):
     plan on devices.
 
     Args:
-        simulator: The internal model; its effects act, with the past commands known.
+        simulator: The internal model; its effects act, with the past commands known. Any
+            simulator will do that reports its full state and starts from a given one; a batched
+            engine plans in milliseconds, one on workers takes K M H steps of its own per plan.
         reward: Reward of a step, from the readings at its end and the limited command.
         horizon: Steps of the plan H.
         num_samples: Candidate sequences K.
@@ -79,7 +81,7 @@ class MPPI(Policy):
 
     def __init__(
         self,
-        simulator: ODESimulator,
+        simulator: Simulator,
         reward: Reward,
         *,
         horizon: int,
@@ -99,6 +101,12 @@ class MPPI(Policy):
         simulator.check_parameters(self.domains)
         self.observations = tuple(state.name for state in simulator.states)
         self.actions = tuple(action.name for action in simulator.actions)
+        if not self.observations or not self.actions:
+            raise ModelError(
+                f"MPPI needs a simulator that starts from a state and takes actions, but "
+                f"{simulator.name} has {len(self.observations)} states and "
+                f"{len(self.actions)} actions."
+            )
         sensors = [sensor.name for sensor in simulator.sensors]
         if missing := [name for name in self.observations if name not in sensors]:
             raise ModelError(
@@ -222,10 +230,12 @@ class MPPI(Policy):
         # Draws are on an axis in front of the episodes'.
         domains = {name: x.to(**like)[..., None] for name, x in self.domains.items()}
         domains |= {name: x.to(**like) for name, x in constants.items()}
-        trajectories = self.simulator.simulate(domains, inputs)
+        trajectories = self.simulator.simulate(domains, inputs).to(**like)
         values = trajectories[..., self._columns].unbind(-1)
-        num_joints = len(self.simulator.joints)
-        rewards = self.reward(values[:num_joints], values[num_joints:], candidates.unbind(-1))
+        kinds = list(zip(values, self.simulator.is_rate, strict=True))
+        positions = tuple(value for value, is_rate in kinds if not is_rate)
+        velocities = tuple(value for value, is_rate in kinds if is_rate)
+        rewards = self.reward(positions, velocities, candidates.unbind(-1))
         outside = torch.zeros_like(rewards, dtype=torch.bool)
         for value, state in zip(values, self.simulator.states, strict=True):
             # Written so that a NaN counts as outside.

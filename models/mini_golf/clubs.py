@@ -6,6 +6,7 @@ head alone launches the ball as the whole arm does, at a fraction of the cost.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Literal
 
@@ -56,8 +57,8 @@ class Club(ABC):
         """
 
     @abstractmethod
-    def follow(self, client: Any, body: int, k: int) -> None:
-        """Gives the club its pose and velocity of sub-step k, just before that sub-step."""
+    def follower(self, client: Any, body: int) -> Callable[[int], None]:
+        """Returns what gives the club its pose and velocity of a sub-step, just before that."""
 
     @abstractmethod
     def put_aside(self, client: Any, body: int) -> None:
@@ -87,10 +88,18 @@ class ClubHead(Club):
         _set_surface(client, body, -1, restitution)
         return body, -1
 
-    def follow(self, client: Any, body: int, k: int) -> None:
-        """Moves the head; see :meth:`Club.follow`."""
-        client.resetBasePositionAndOrientation(body, self._positions[k], self._quaternions[k])
-        client.resetBaseVelocity(body, self.velocities[k], self.rates[k])
+    def follower(self, client: Any, body: int) -> Callable[[int], None]:
+        """Returns what moves the head; see :meth:`Club.follower`."""
+        # Looked up once: the client wraps a function anew each time it is asked for it.
+        place, push = client.resetBasePositionAndOrientation, client.resetBaseVelocity
+        positions, quaternions = self._positions, self._quaternions
+        velocities, rates = self.velocities, self.rates
+
+        def follow(k: int) -> None:
+            place(body, positions[k], quaternions[k])
+            push(body, velocities[k], rates[k])
+
+        return follow
 
     def put_aside(self, client: Any, body: int) -> None:
         """Puts the head where nothing is."""
@@ -155,18 +164,23 @@ class WholeArm(Club):
         _set_surface(client, body, len(JOINTS), restitution)
         return body, len(JOINTS)
 
-    def follow(self, client: Any, body: int, k: int) -> None:
-        """Moves the joints; see :meth:`Club.follow`."""
-        angles, rates = self._angles[k], self._rates[k]
-        for joint, (angle, rate) in enumerate(zip(angles, rates, strict=True)):
-            client.resetJointState(body, joint, angle, rate)
-        client.setJointMotorControlArray(
-            body,
-            range(len(rates)),
-            client.VELOCITY_CONTROL,
-            targetVelocities=rates,
-            forces=[MOTOR_FORCE] * len(rates),
-        )
+    def follower(self, client: Any, body: int) -> Callable[[int], None]:
+        """Returns what moves the joints; see :meth:`Club.follower`."""
+        place, control = client.resetJointState, client.setJointMotorControlArray
+
+        def follow(k: int) -> None:
+            angles, rates = self._angles[k], self._rates[k]
+            for joint, (angle, rate) in enumerate(zip(angles, rates, strict=True)):
+                place(body, joint, angle, rate)
+            control(
+                body,
+                range(len(rates)),
+                client.VELOCITY_CONTROL,
+                targetVelocities=rates,
+                forces=[MOTOR_FORCE] * len(rates),
+            )
+
+        return follow
 
     def put_aside(self, client: Any, body: int) -> None:
         """Stops the joints: the arm stays where it left the ball."""

@@ -1,16 +1,13 @@
 """Closed loop: batches of policies in batches of domains, reward and termination fused."""
 
 import copy
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.compilation import (
-    CompileMode,
     compiled,
     is_worthwhile,
     mark_sizes_dynamic,
@@ -18,28 +15,14 @@ from npdr_ppl.engines.compilation import (
     with_fallback,
 )
 from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
+from npdr_ppl.engines.episodes import EpisodeRequest, Episodes, FeedbackPolicy, Reward
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.stepping import Stepper, flatten
-from npdr_ppl.errors import ModelError
-from npdr_ppl.language.simulator import Simulator
 
 if TYPE_CHECKING:
     from npdr_ppl.engines.ode import ODESimulator
 
-__all__ = [
-    "Episodes",
-    "FeedbackPolicy",
-    "LoopBody",
-    "Reward",
-    "begin",
-    "check_channels",
-    "roll_out",
-    "run_eagerly",
-]
-
-Reward = Callable[[Components, Components, Components], Tensor]
-"""Maps positions and velocities at a step's start and its commands, before any limit, to the
-reward of the step."""
+__all__ = ["LoopBody", "begin", "roll_out", "run_eagerly"]
 
 # Steps per call of a compiled kernel: the call's overhead is spread over them, while compilation
 # time grows with them.
@@ -48,48 +31,6 @@ _STEPS_PER_CALL = 10
 # Simulations that a compiled kernel advances through the whole episode before the next block, so
 # that memory stays bounded. Measured: larger is faster up to here, because calls cost 50 µs each.
 _BLOCK = 1 << 16
-
-
-class FeedbackPolicy(Protocol):
-    """What the loop asks of a policy; see :class:`npdr_ppl.policies.base.Policy`."""
-
-    observations: tuple[str, ...]
-    actions: tuple[str, ...]
-    parameters: Tensor
-
-    def constants(self, domain: Mapping[str, Tensor]) -> Any:
-        """Returns what ``act`` needs, computed once per episode."""
-        ...
-
-    def initial_memory(self, observation: tuple[Tensor, ...]) -> Any:
-        """Returns the policy's own state at the start."""
-        ...
-
-    def act(
-        self, observation: tuple[Tensor, ...], time: Tensor | float, memory: Any, constants: Any
-    ) -> tuple[tuple[Tensor, ...], Any]:
-        """Returns commands and the next memory."""
-        ...
-
-
-@dataclass(frozen=True)
-class Episodes:
-    """Simulated episodes of a batch of shape B, broadcast over policies, domains and states.
-
-    An episode ends after the step at which a state leaves its bounds; records are zero after it.
-
-    Attributes:
-        returns: Sum of rewards, ``B``; ``None`` without a reward.
-        lengths: Steps until the episode ended, ``B``.
-        readings: What the sensors reported, the start included, ``B + (steps + 1, sensors)``;
-            ``None`` unless recorded.
-        commands: Commands before any limit, ``B + (steps, actions)``; ``None`` unless recorded.
-    """
-
-    returns: Tensor | None
-    lengths: Tensor
-    readings: Tensor | None = None
-    commands: Tensor | None = None
 
 
 class _Loop(NamedTuple):
@@ -181,41 +122,21 @@ class LoopBody:
         return loop._replace(readings=tuple(reading.clone() for reading in loop.readings))
 
 
-def roll_out(
-    simulator: "ODESimulator",
-    parameters: Mapping[str, Tensor],
-    policy: FeedbackPolicy,
-    initial_states: Tensor,
-    num_steps: int,
-    *,
-    reward: Reward | None = None,
-    time_step: float | None = None,
-    record: bool = False,
-    compile: CompileMode | None = None,
-    expected_calls: int = 1,
-) -> Episodes:
-    """Simulates episodes of policies in domains; see :meth:`ODESimulator.roll_out`."""
-    simulator.check_parameters(parameters)
-    check_channels(simulator, policy)
-    step = time_step or simulator.time_step
-    dtype = simulator.common_dtype(parameters, initial_states)
-    dtype = torch.promote_types(dtype, policy.parameters.dtype)
+def roll_out(simulator: "ODESimulator", request: EpisodeRequest) -> Episodes:
+    """Simulates episodes of policies in domains; see :class:`EpisodeRequest`."""
+    reward, num_steps, step = request.reward, request.num_steps, request.time_step
+    initial_states = request.initial_states
+    dtype = simulator.common_dtype(request.parameters, initial_states)
+    dtype = torch.promote_types(dtype, request.policy.parameters.dtype)
     device = initial_states.device
-    policy = copy.copy(policy)
-    policy.parameters = policy.parameters.to(dtype=dtype, device=device)
-    domain = simulator.complete(parameters, dtype, device)
-    shape = torch.broadcast_shapes(
-        *(value.shape for value in domain.values()),
-        policy.parameters.shape[:-1],
-        initial_states.shape[:-1],
-    )
-    mode = compile or simulator.compile
-    is_compiled = not record and is_worthwhile(
+    policy, domain, shape = request.batch(simulator, dtype, device)
+    mode = request.compile or simulator.compile
+    is_compiled = not request.record and is_worthwhile(
         mode,
         device,
         num_steps=num_steps,
         batch_size=shape.numel(),
-        expected_calls=expected_calls,
+        expected_calls=request.expected_calls,
     )
 
     def run(is_compiled: bool) -> Episodes:
@@ -227,24 +148,12 @@ def roll_out(
         states = flatten(initial_states.to(dtype).unbind(-1), shape, expand=True)
         loop = begin(body, states, tables)
         if not is_compiled:
-            return run_eagerly(body, loop, tables, constants, num_steps, shape, record)
+            return run_eagerly(body, loop, tables, constants, num_steps, shape, request.record)
         loop = body.without_repetition(flatten(loop, loop.total.shape, expand=True))
         loop = _run_compiled(body, loop, tables, constants, num_steps)
         return _episodes(loop, shape, reward)
 
     return with_fallback(mode, is_compiled, run)
-
-
-def check_channels(simulator: Simulator, policy: FeedbackPolicy) -> None:
-    """Raises a ModelError where the policy's channels are not the simulator's."""
-    sensors = [sensor.name for sensor in simulator.sensors]
-    missing = [name for name in policy.observations if name not in sensors]
-    missing += [action.name for action in simulator.actions if action.name not in policy.actions]
-    if missing:
-        raise ModelError(
-            f"{type(policy).__name__} and {simulator.name} do not fit together: "
-            f"{', '.join(missing)} is on one side only."
-        )
 
 
 def begin(body: LoopBody, states: Components, tables: Tables) -> _Loop:

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward
 from npdr_ppl.engines.compilation import CompileMode
+from npdr_ppl.engines.episodes import EpisodeRequest, Episodes, FeedbackPolicy, Reward
 from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["ClosedLoopSimulator"]
@@ -15,7 +15,6 @@ __all__ = ["ClosedLoopSimulator"]
 class ClosedLoopSimulator(Simulator):
     """A simulator in which policies can be trained."""
 
-    @abstractmethod
     def roll_out(
         self,
         parameters: Mapping[str, Tensor],
@@ -47,4 +46,24 @@ class ClosedLoopSimulator(Simulator):
             compile: Replaces the simulator's choice; an engine that is compiled ignores it.
             expected_calls: How many calls of this size are to come, so that ``auto`` can tell
                 whether compilation pays back.
+
+        Raises:
+            ModelError: A parameter is unknown, or the policy's channels are not the simulator's.
         """
+        request = EpisodeRequest(
+            parameters,
+            policy,
+            initial_states,
+            num_steps,
+            reward,
+            time_step or self.time_step,
+            record,
+            compile,
+            expected_calls,
+        )
+        request.check(self)
+        return self.run_episodes(request)
+
+    @abstractmethod
+    def run_episodes(self, request: EpisodeRequest) -> Episodes:
+        """Simulates the episodes of a request that has been checked; see :meth:`roll_out`."""

@@ -7,10 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward, roll_out
+from npdr_ppl.engines.closed_loop import roll_out
 from npdr_ppl.engines.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.engines.compilation import CompileMode
 from npdr_ppl.engines.effect_chain import Tables, needed_histories
+from npdr_ppl.engines.episodes import EpisodeRequest, Episodes
 from npdr_ppl.engines.integrators import Components, Integrator, integrator
 from npdr_ppl.engines.open_loop import replay
 from npdr_ppl.engines.stepping import flatten
@@ -113,32 +114,9 @@ class ODESimulator(ClosedLoopSimulator):
         """Replays the inputs' actions; see :meth:`Simulator.simulate`."""
         return replay(self, parameters, inputs)
 
-    def roll_out(
-        self,
-        parameters: Mapping[str, Tensor],
-        policy: FeedbackPolicy,
-        initial_states: Tensor,
-        num_steps: int,
-        *,
-        reward: Reward | None = None,
-        time_step: float | None = None,
-        record: bool = False,
-        compile: CompileMode | None = None,
-        expected_calls: int = 1,
-    ) -> Episodes:
+    def run_episodes(self, request: EpisodeRequest) -> Episodes:
         """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`."""
-        return roll_out(
-            self,
-            parameters,
-            policy,
-            initial_states,
-            num_steps,
-            reward=reward,
-            time_step=time_step,
-            record=record,
-            compile=compile,
-            expected_calls=expected_calls,
-        )
+        return roll_out(self, request)
 
     def common_dtype(self, parameters: Mapping[str, Tensor], other: Tensor) -> torch.dtype:
         """Returns the widest floating type among the tensors."""

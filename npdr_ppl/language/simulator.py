@@ -94,6 +94,11 @@ class Simulator(ABC):
         return changed
 
     @property
+    def is_rate(self) -> tuple[bool, ...]:
+        """Whether each state is the rate of another; the others are positions."""
+        return tuple(state.rate_of is not None for state in self.states)
+
+    @property
     def all_ports(self) -> tuple[Port, ...]:
         """The declared ports, the clock, and every domain parameter that is no port's namesake."""
         implied = (

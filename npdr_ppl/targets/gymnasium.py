@@ -1,13 +1,18 @@
 """Any Gymnasium environment with a box of actions as a target domain."""
 
-import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from npdr_ppl.errors import DependencyError, ModelError
+from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.environments import (
+    box_channels,
+    limited_channels,
+    load_gymnasium,
+    make_environment,
+)
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.targets.base import Array, Controller, TargetDomain
@@ -57,9 +62,9 @@ class GymnasiumTarget(TargetDomain):
         time_step: float | None = None,
         name: str | None = None,
     ) -> None:
-        gymnasium = _gymnasium()
+        gymnasium = load_gymnasium()
         if isinstance(environment, str):
-            environment = _made(gymnasium, environment)
+            environment = make_environment(environment)
         self._environment = environment
         self._read = read or _flat
         spec = environment.spec
@@ -78,11 +83,11 @@ class GymnasiumTarget(TargetDomain):
                 "command real numbers, of a Box."
             )
         self.sensors = (
-            _channels(environment.observation_space, "observation")
+            box_channels(environment.observation_space, "observation")
             if sensors is None
             else tuple(sensors)
         )
-        self.actions = _limited(environment.action_space, actions, self.name)
+        self.actions = limited_channels(environment.action_space, actions, self.name)
         if time_step is None:
             time_step = getattr(environment.unwrapped, "dt", None)
         if time_step is None:
@@ -128,44 +133,5 @@ class GymnasiumTarget(TargetDomain):
         return reading
 
 
-def _gymnasium() -> Any:
-    try:
-        return importlib.import_module("gymnasium")
-    except ImportError as error:
-        raise DependencyError(
-            "Targets made of environments need Gymnasium: pip install npdr-ppl[gymnasium]."
-        ) from error
-
-
-def _made(gymnasium: Any, name: str) -> Any:
-    """Returns a new environment."""
-    try:
-        return gymnasium.make(name)
-    except gymnasium.error.Error as error:
-        raise ModelError(f"Gymnasium cannot make {name!r}: {error}") from error
-
-
 def _flat(values: Any) -> Array:
     return np.array(values, dtype=np.float64).reshape(-1)
-
-
-def _channels(space: Any, prefix: str) -> tuple[Channel, ...]:
-    """Returns a channel without a unit for each entry of a box."""
-    bounds = zip(_flat(space.low), _flat(space.high), strict=True)
-    return tuple(
-        Channel(f"{prefix}_{index}", "", float(lower), float(upper))
-        for index, (lower, upper) in enumerate(bounds)
-    )
-
-
-def _limited(space: Any, actions: Sequence[Channel] | None, name: str) -> tuple[Channel, ...]:
-    """Returns action channels with the limits of the environment's box."""
-    own = _channels(space, "action")
-    if actions is None:
-        return own
-    if len(actions) != len(own):
-        raise ModelError(f"{name} has {len(own)} actions, but {len(actions)} were named.")
-    return tuple(
-        Channel(named.name, named.unit, limit.lower, limit.upper, named.rate_of)
-        for named, limit in zip(actions, own, strict=True)
-    )

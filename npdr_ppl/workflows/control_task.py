@@ -7,7 +7,7 @@ from difflib import get_close_matches
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.closed_loop import Reward
+from npdr_ppl.engines.episodes import Reward
 from npdr_ppl.errors import ModelError
 from npdr_ppl.policies.base import Policy
 

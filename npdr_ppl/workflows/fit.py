@@ -10,7 +10,6 @@ import numpy as np
 
 from npdr_ppl.engines.workers import collect_faults
 from npdr_ppl.inference.base import Backend
-from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.closest_fit import prepare
@@ -18,7 +17,7 @@ from npdr_ppl.workflows.diagnostics import diagnose
 from npdr_ppl.workflows.evaluation import score
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.posterior import Posterior
-from npdr_ppl.workflows.run_folder import write_json
+from npdr_ppl.workflows.run_folder import engine_settings, write_json
 from npdr_ppl.workflows.units import parameter_units
 
 if TYPE_CHECKING:
@@ -110,7 +109,7 @@ def fit(
     }
     if faults:
         result["faults"] = dict(faults)
-    if settings := _engine_settings(posterior):
+    if settings := engine_settings(posterior.prior):
         result["engine"] = settings
     if out is not None:
         from npdr_ppl.workflows.arviz_module import to_netcdf
@@ -135,16 +134,6 @@ def describe(data: "Data") -> dict[str, Any]:
             "hdi_94": _plain(intervals[name]),
         }
     return {"parameters": parameters}
-
-
-def _engine_settings(posterior: Posterior) -> dict[str, Any]:
-    """Returns the settings of the simulators' engines by site, where there are any."""
-    settings = {
-        name: box.simulator.recorded_settings()
-        for name, box in posterior.prior.black_boxes.items()
-        if isinstance(box, SimulatorBlackBox)
-    }
-    return {name: values for name, values in settings.items() if values}
 
 
 def _plain(value: Any) -> Any:

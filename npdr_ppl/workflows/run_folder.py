@@ -1,6 +1,7 @@
 """An inference run as a folder: JSON, safetensors and NetCDF; no pickle is written or read.
 
-    run.json                      backend, options, seeds, versions, the model's source
+    run.json                      backend, options, seeds, versions, the model's source,
+                                  engines with their settings and the text of MJCF and URDF files
     data_<site>.nc                measured rollouts (or data.safetensors for plain observations)
     round_<r>_simulations.safetensors   parameters z and features x of a round
     round_<r>.safetensors, round_<r>.json   the backend's state after that round
@@ -28,12 +29,15 @@ from torch import Tensor
 from npdr_ppl.errors import BackendError, DataError
 from npdr_ppl.inference.base import Backend, RoundInfo
 from npdr_ppl.language.handlers import ModelWithEffects
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.atomic import replacing
 from npdr_ppl.workflows.binding import BoundModel
 
 __all__ = [
     "RunFolder",
+    "engine_settings",
     "load_tensors",
     "plain",
     "read_json",
@@ -108,6 +112,7 @@ class RunFolder:
                 "rounds": rounds,
                 "versions": versions(),
                 "model": {"name": repr(bound.model), "source": source_text(bound.model)},
+                "engines": engine_settings(bound.prior),
             },
         )
 
@@ -221,6 +226,16 @@ def source_text(model: Any) -> str:
         return inspect.getsource(model)
     except (OSError, TypeError):
         return repr(model)
+
+
+def engine_settings(prior: Prior) -> dict[str, Any]:
+    """Returns the settings of the simulators' engines by site, where there are any."""
+    settings = {
+        name: box.simulator.recorded_settings()
+        for name, box in prior.black_boxes.items()
+        if isinstance(box, SimulatorBlackBox)
+    }
+    return {name: values for name, values in settings.items() if values}
 
 
 def _binding(bound: BoundModel) -> dict[str, Any]:

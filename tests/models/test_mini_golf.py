@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import npdr_ppl as npdr
+from npdr_ppl.engines.pooled import Segment
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
@@ -248,3 +249,20 @@ def test_the_whole_arm_strikes_as_the_head_alone():
 def test_an_unknown_club_is_refused():
     with pytest.raises(ModelError, match="'head' or 'arm'"):
         MiniGolf("putter")
+
+
+@pytest.mark.parametrize("club", ["head", "arm"])
+def test_shortcuts_out_of_the_clubs_reach_change_nothing(monkeypatch, club):
+    """Only near the club are sub-steps made one by one, and only there is it moved."""
+    simulator = MiniGolf(club)
+    workspace = simulator.set_up()
+    given = swing(150)
+    start = torch.stack(simulator.initial_states(given), dim=-1)[0].numpy()
+    segment = Segment(start, given.actions[0].numpy(), TIME_STEP, 0.0)
+    parameters = {parameter.name: parameter.nominal for parameter in simulator.parameters}
+    quick = simulator.simulate_one(workspace, parameters, segment, 0)
+    monkeypatch.setattr("npdr_ppl.models.mini_golf.scene.REACH", 100.0)
+    thorough = simulator.simulate_one(workspace, parameters, segment, 0)
+    assert np.linalg.norm(quick[-1, :2] - quick[0, :2]) > 0.3
+    np.testing.assert_allclose(quick, thorough, rtol=0, atol=1e-9 if club == "head" else 1e-6)
+    workspace.scene.close()

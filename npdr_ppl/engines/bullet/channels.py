@@ -8,6 +8,7 @@ one of the same name, the body's goes in front: ``"joint left/elbow position"``.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 from npdr_ppl.errors import ModelError
@@ -69,7 +70,7 @@ class Command:
         """
         parse_place(self.target, {"joint": get_args(CommandMode)})
 
-    @property
+    @cached_property
     def place(self) -> Place:
         """The target, parsed."""
         return parse_place(self.target, {"joint": get_args(CommandMode)})
@@ -99,7 +100,7 @@ class Sensor:
         """
         parse_place(self.source, _SENSOR_FIELDS)
 
-    @property
+    @cached_property
     def place(self) -> Place:
         """The source, parsed."""
         return parse_place(self.source, _SENSOR_FIELDS)

@@ -16,7 +16,15 @@ def connect() -> Any:
         import pybullet
         from pybullet_utils.bullet_client import BulletClient
 
-        return BulletClient(connection_mode=pybullet.DIRECT)
+        class QuickClient(BulletClient):
+            """Keeps each function once it was asked for; the base wraps it anew every time."""
+
+            def __getattr__(self, name: str) -> Any:
+                function = super().__getattr__(name)
+                self.__dict__[name] = function
+                return function
+
+        return QuickClient(connection_mode=pybullet.DIRECT)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -125,10 +126,28 @@ class Scene:
             f"{', '.join(sorted(known)) or 'none'}."
         )
 
-    def reader(self, sensors: Sequence[Sensor]) -> Callable[[], list[float]]:
-        """Returns a function that reads sensors in the present state of the world."""
-        read = [self._reading(sensor.place) for sensor in sensors]
-        return lambda: [function() for function in read]
+    def reader(self, sensors: Sequence[Sensor]) -> Callable[[], Sequence[float]]:
+        """Returns a function that reads sensors in the present state of the world.
+
+        What is read by one of Bullet's functions is asked for once, however many sensors show it.
+        """
+        sources: dict[Any, Callable[[], Any]] = {}
+        columns = []
+        for sensor in sensors:
+            key, column, function = self._source(sensor.place)
+            sources.setdefault(key, function)
+            columns.append((list(sources).index(key), column))
+        functions = list(sources.values())
+        if len(functions) == 1 and len(columns) > 1:  # a joint's position and velocity, say
+            (function,) = functions
+            chosen = itemgetter(*(column for _, column in columns))
+            return lambda: chosen(function())
+
+        def read() -> list[float]:
+            seen = [function() for function in functions]
+            return [seen[source][column] for source, column in columns]
+
+        return read
 
     def place_joint(self, joint: tuple[int, int], position: float, velocity: float) -> None:
         """Puts a joint into a state."""
@@ -190,23 +209,23 @@ class Scene:
         elif name not in self._ambiguous:
             table[name] = value
 
-    def _reading(self, place: Place) -> Callable[[], float]:
-        """Returns a function that reads one place."""
+    def _source(self, place: Place) -> tuple[Any, int, Callable[[], Any]]:
+        """Returns a key of what shows a place, the place's column in it, and how to read it."""
         client = self.client
         body, index = self.find(place)
         if place.kind == "joint":
             column = JOINT_FIELDS.index(place.field)
-            joint_state = client.getJointState
-            return lambda: joint_state(body, index)[column]
+            return ("joint", body, index), column, partial(client.getJointState, body, index)
         pose, rate = self._motion(body, index)
-        if place.field in RATE_FIELDS:
-            part, column = divmod(RATE_FIELDS.index(place.field), 3)
-            return lambda: rate()[part][column]
-        part, column = divmod(POSE_FIELDS.index(place.field), 3)
+        is_rate = place.field in RATE_FIELDS
+        part, column = divmod((RATE_FIELDS if is_rate else POSE_FIELDS).index(place.field), 3)
+        key = "rate" if is_rate else "pose", body, index, part
+        if is_rate:
+            return key, column, lambda: rate()[part]
         if part == 0:
-            return lambda: pose()[0][column]
+            return key, column, lambda: pose()[0]
         to_angles = client.getEulerFromQuaternion
-        return lambda: to_angles(pose()[1])[column]
+        return key, column, lambda: to_angles(pose()[1])
 
     def _motion(self, body: int, index: int) -> tuple[Callable[[], Any], Callable[[], Any]]:
         """Returns functions that read a link's pose and its velocities."""

@@ -14,18 +14,18 @@ from npdr_ppl.engines.bullet.forces import JointForces, is_dry
 from npdr_ppl.engines.bullet.parameters import BoundParameter
 from npdr_ppl.engines.bullet.scene import Builder, Scene, Urdf
 from npdr_ppl.engines.bullet.settings import BulletSettings
-from npdr_ppl.engines.pooled import PooledSimulator, Segment
+from npdr_ppl.engines.bullet.stepping import BulletSimulation, stepping
+from npdr_ppl.engines.pooled import Segment
+from npdr_ppl.engines.source_files import recorded_files
+from npdr_ppl.engines.stepped import SteppedSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.effects import Effect, EnvironmentEffect, ForceEffect
 
 __all__ = ["BulletSimulator"]
 
-# What Bullet's motors take for no limit.
-_NO_LIMIT = 1e9
 
-
-class BulletSimulator(PooledSimulator):
+class BulletSimulator(SteppedSimulator):
     """A scene of PyBullet, simulated on workers in DIRECT mode.
 
     The scene is built anew for each simulation, because contacts and solver caches would carry
@@ -103,8 +103,11 @@ class BulletSimulator(PooledSimulator):
         return f"{type(self).__name__}{file}"
 
     def recorded_settings(self) -> dict[str, Any]:
-        """Returns the settings of the engine."""
-        return {"engine": "bullet", **asdict(self.settings)}
+        """Returns the settings of the engine and the text of the URDF file, where there is one."""
+        settings = {"engine": "bullet", **asdict(self.settings)}
+        if isinstance(self._build, Urdf):
+            settings["urdf"] = recorded_files(self._build.path)
+        return settings
 
     def with_effects(self, *effects: Effect) -> Self:
         """Returns a copy with effects attached; see :meth:`Simulator.with_effects`.
@@ -138,29 +141,22 @@ class BulletSimulator(PooledSimulator):
         torch.set_num_threads(1)
         return connect()
 
-    def simulate_one(
+    def begin(
         self, workspace: Any, parameters: Mapping[str, float], segment: Segment, seed: int
-    ) -> np.ndarray:
-        """Simulates one segment; see :meth:`PooledSimulator.simulate_one`."""
+    ) -> BulletSimulation:
+        """Begins a simulation; see :meth:`SteppedSimulator.begin`."""
         client = workspace
         scene = Scene(client, self._build, parameters, self.settings, segment.time_step)
         for bound in self._bound:
             bound.apply(scene, parameters[bound.name])
         self._change_environment(scene, parameters)
         self.start(scene, parameters, segment)
-        read = scene.reader(self._sensors)
-        act = self._actuation(scene, parameters, segment)
+        forces = self._forces(scene, parameters, segment)
         drive = None if type(self).drive is BulletSimulator.drive else self.drive
-        readings = np.empty((len(segment.actions), len(self._sensors)))
-        step_simulation = client.stepSimulation
-        for step in range(len(readings)):
-            for substep in range(self.settings.substeps):
-                act(step, substep)
-                if drive is not None:
-                    drive(scene, segment, step, substep)
-                step_simulation()
-            readings[step] = read()
-        return readings
+        return BulletSimulation(
+            stepping(scene, segment, self._commands, self.settings.substeps, forces, drive),
+            scene.reader(self._sensors),
+        )
 
     def start(self, scene: Scene, parameters: Mapping[str, float], segment: Segment) -> None:
         """Puts the scene into a segment's initial state.
@@ -197,38 +193,16 @@ class BulletSimulator(PooledSimulator):
             substep: Number of the substep within it, from 0.
         """
 
-    def _actuation(self, scene: Scene, parameters: Mapping[str, float], segment: Segment) -> Any:
-        """Returns a function that applies commands and force effects before a substep."""
-        client = scene.client
-        control, torque_control = client.setJointMotorControl2, client.TORQUE_CONTROL
-        torques, motors = [], []
-        for column, command in self._commands:
-            joint = scene.find(command.place)
-            if command.place.field == "torque":
-                torques.append((column, joint))
-            else:
-                motors.append((column, _motor(client, command, joint)))
+    def _forces(
+        self, scene: Scene, parameters: Mapping[str, float], segment: Segment
+    ) -> JointForces | None:
+        """Returns the forces of effects at joints, where there are any."""
         effects = [e for e in self.effects if isinstance(e, ForceEffect)]
-        forces = None
-        if effects:
-            joints = [scene.joints[effect.port] for effect in effects]
-            step = segment.time_step / self.settings.substeps
-            pairs = list(zip(effects, joints, strict=True))
-            forces = JointForces(scene, pairs, parameters, step, segment.start_time)
-
-        def act(step: int, substep: int) -> None:
-            commands = segment.actions[step]
-            if substep == 0:
-                for column, follow in motors:
-                    follow(commands[column])
-            total = {} if forces is None else forces()
-            for column, joint in torques:
-                total[joint] = commands[column] + total.get(joint, 0.0)
-            for joint, torque in total.items():
-                # Bullet forgets torques after each substep.
-                control(*joint, torque_control, force=torque)
-
-        return act
+        if not effects:
+            return None
+        pairs = [(effect, scene.joints[effect.port]) for effect in effects]
+        step = segment.time_step / self.settings.substeps
+        return JointForces(scene, pairs, parameters, step, segment.start_time)
 
     def _change_environment(self, scene: Scene, parameters: Mapping[str, float]) -> None:
         """Lets effects turn gravity."""
@@ -287,33 +261,3 @@ class BulletSimulator(PooledSimulator):
                 f"{', '.join(twice)} names two ports of {self.name}; call the channel otherwise."
             )
         return tuple(ports)
-
-
-def _motor(client: Any, command: Command, joint: tuple[int, int]) -> Any:
-    """Returns a function that has a joint's motor follow a velocity or a position."""
-    control = client.setJointMotorControl2
-    force = _NO_LIMIT if command.max_force is None else command.max_force
-    if command.place.field == "velocity":
-
-        def follow(value: float) -> None:
-            control(
-                *joint,
-                client.VELOCITY_CONTROL,
-                targetVelocity=value,
-                velocityGain=command.velocity_gain,
-                force=force,
-            )
-
-    else:
-
-        def follow(value: float) -> None:
-            control(
-                *joint,
-                client.POSITION_CONTROL,
-                targetPosition=value,
-                positionGain=command.position_gain,
-                velocityGain=command.velocity_gain,
-                force=force,
-            )
-
-    return follow

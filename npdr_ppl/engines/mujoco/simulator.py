@@ -1,5 +1,6 @@
 """Simulation of any MJCF file in MuJoCo, many parameter sets and segments at a time."""
 
+import importlib
 import logging
 import math
 from collections.abc import Mapping
@@ -11,10 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.closed_loop import Episodes, FeedbackPolicy, Reward
 from npdr_ppl.engines.closed_loop_simulator import ClosedLoopSimulator
-from npdr_ppl.engines.compilation import CompileMode
 from npdr_ppl.engines.effect_chain import Tables, needed_histories
+from npdr_ppl.engines.episodes import EpisodeRequest, Episodes
 from npdr_ppl.engines.mujoco.batches import make_batch, prepared_copy, quiet
 from npdr_ppl.engines.mujoco.channels import (
     Component,
@@ -33,6 +33,7 @@ from npdr_ppl.engines.mujoco.open_loop import replay
 from npdr_ppl.engines.mujoco.parameters import Binding, Bindings, Derivation
 from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
 from npdr_ppl.engines.mujoco_inverse_dynamics import load_mjcf
+from npdr_ppl.engines.source_files import recorded_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.effects import ForceEffect, ParameterEffect
@@ -106,6 +107,7 @@ class MujocoSimulator(ClosedLoopSimulator):
             raise ModelError(f"MujocoSimulator needs at least one substep, got {substeps=}.")
         with quiet(logger.warning):
             self.model: Any = load_mjcf(source)
+        self._source = recorded_mjcf(source)
         self._models: dict[tuple[float, tuple[int, ...]], Any] = {}
         is_path = isinstance(source, str | PathLike)
         self._label = Path(source).name if is_path else "a model"
@@ -137,6 +139,22 @@ class MujocoSimulator(ClosedLoopSimulator):
         """Names of the force ports."""
         return tuple(port.port.name for port in self.force_ports)
 
+    def recorded_settings(self) -> dict[str, Any]:
+        """Returns the text of the MJCF and what the parameters set in it, and the version."""
+        return {
+            "engine": "mujoco",
+            "version": importlib.import_module("mujoco").__version__,
+            "mjcf": self._source,
+            "parameters": {p.name: p.description for p in self.parameters},
+            "time_step": self.time_step,
+            "substeps": self.num_substeps(self.time_step),
+        }
+
+    @property
+    def is_rate(self) -> tuple[bool, ...]:
+        """Whether each state is a velocity, those of balls and free bodies included."""
+        return tuple(component.is_velocity for component in self.components)
+
     def num_substeps(self, time_step: float) -> int:
         """Returns the engine steps per control step of so many seconds."""
         if self.substeps is not None:
@@ -147,33 +165,12 @@ class MujocoSimulator(ClosedLoopSimulator):
         """Replays the inputs' actions in float64; see :meth:`Simulator.simulate`."""
         return replay(self, parameters, inputs)
 
-    def roll_out(
-        self,
-        parameters: Mapping[str, Tensor],
-        policy: FeedbackPolicy,
-        initial_states: Tensor,
-        num_steps: int,
-        *,
-        reward: Reward | None = None,
-        time_step: float | None = None,
-        record: bool = False,
-        compile: CompileMode | None = None,
-        expected_calls: int = 1,
-    ) -> Episodes:
+    def run_episodes(self, request: EpisodeRequest) -> Episodes:
         """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`.
 
         The arguments for compilation change nothing: the engine is compiled.
         """
-        return roll_out(
-            self,
-            parameters,
-            policy,
-            initial_states,
-            num_steps,
-            reward=reward,
-            time_step=time_step,
-            record=record,
-        )
+        return roll_out(self, request)
 
     def histories(self, given: Mapping[str, Tensor], time_step: float) -> tuple[int, ...]:
         """Returns how much of the past each action effect and then each sensor effect asks for.

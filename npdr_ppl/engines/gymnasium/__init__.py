@@ -1,0 +1,6 @@
+"""Gymnasium environments as simulators, one simulation at a time on workers."""
+
+from npdr_ppl.engines.gymnasium.attributes import Attribute
+from npdr_ppl.engines.gymnasium.simulator import GymnasiumSimulator
+
+__all__ = ["Attribute", "GymnasiumSimulator"]
