@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import torch
 
+from npdr_ppl.workflows.discovery.chance import LargestStatistic
 from npdr_ppl.workflows.discovery.latent_force import GenericLaw
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.projection import Projection
-from npdr_ppl.workflows.discovery.screening import Screened, largest_statistic_p_value
+from npdr_ppl.workflows.discovery.screening import Screened
 
 __all__ = ["Alarm", "sound_alarm"]
 
@@ -22,12 +23,14 @@ class Alarm:
         fired: Whether it is below the rate of false alarms that was asked for.
         loudest: What disagrees most: an effect's name, or that of a law outside the catalogue.
         gain: Greatest reduction of the misfit by one candidate or law.
+        p_values: The same probability for each candidate and law, by name.
     """
 
     p_value: float
     fired: bool
     loudest: str
     gain: float
+    p_values: dict[str, float]
 
 
 def sound_alarm(
@@ -46,7 +49,7 @@ def sound_alarm(
     """
     groups, names, gains = [], [], []
     for candidate in ranking:
-        groups.append(projection.scores(candidate.variant.change).by_segment)
+        groups.append(candidate.variant.change)
         names.append(candidate.name)
         gains.append(candidate.gain)
     if laws:
@@ -55,11 +58,18 @@ def sound_alarm(
         # What the refitted parameters explain leaves nothing but rounding errors.
         known = scores.absorbed < 1.0 - 1e-6
         for k in torch.nonzero(known)[:, 0].tolist():
-            groups.append(scores.by_segment[:, k : k + 1])
+            groups.append(laws[k].change)
             names.append(laws[k].name)
             gains.append(float(scores.score[k] ** 2 / information[k]))
     if not groups:
-        return Alarm(1.0, False, "", 0.0)
-    p_value, values = largest_statistic_p_value(groups, seed=options.seed)
-    loudest = min(range(len(names)), key=lambda k: values[k])
-    return Alarm(p_value, p_value <= options.false_alarm_rate, names[loudest], max(gains))
+        return Alarm(1.0, False, "", 0.0, {})
+    values = LargestStatistic(projection, seed=options.seed).p_values(groups)
+    p_value = min(values)
+    loudest = max((k for k in range(len(names)) if values[k] == p_value), key=lambda k: gains[k])
+    return Alarm(
+        p_value,
+        p_value <= options.false_alarm_rate,
+        names[loudest],
+        max(gains),
+        dict(zip(names, values, strict=True)),
+    )

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from npdr_ppl.inference.gaussian_mixture import GaussianMixture
 from npdr_ppl.randomness import seeded
+from npdr_ppl.workflows.discovery.chance import block_sums
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
-from npdr_ppl.workflows.discovery.screening import block_scores
 
 __all__ = ["Estimate", "estimates", "parameter_density"]
 
@@ -51,7 +51,7 @@ def parameter_density(hypothesis: Hypothesis) -> GaussianMixture:
     in few segments: V is at least the information's share of independent readings.
     """
     projection = Projection(hypothesis)
-    blocks = block_scores(projection.parameter_scores)
+    blocks = block_sums(projection.parameter_scores)
     num, d = blocks.shape
     correction = num / max(1, num - min(d, num - 1))
     scatter = correction * blocks.mT @ blocks

@@ -1,7 +1,7 @@
 """Discovery: is something wrong, where, what is it, and does adding it help?"""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -196,7 +196,7 @@ def _like(binding: BindingOptions, rollouts: Rollouts, holdout: Rollouts) -> Bin
 
 
 @contextmanager
-def _timed(seconds: dict[str, float], stage: str):
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     begin = time.monotonic()
     yield
     seconds[stage] = time.monotonic() - begin

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from npdr_ppl.workflows.discovery.chance import block_sums
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
-from npdr_ppl.workflows.discovery.screening import block_scores
 
 __all__ = ["closest", "evidence", "weigh"]
 
@@ -40,7 +40,7 @@ def evidence(
     scale, share = reference.fit.scale, reference.share
     rows = []
     for hypothesis, prior in zip(hypotheses, log_prior, strict=True):
-        blocks = -share * block_scores(hypothesis.losses(scale)[:, None])[:, 0]
+        blocks = -share * block_sums(hypothesis.losses(scale)[:, None])[:, 0]
         rows.append(blocks + (prior - hypothesis.complexity(scale, share)) / len(blocks))
     return torch.stack(rows)
 

@@ -74,6 +74,20 @@ class Projection:
         self._score = (now.by_parameters.mT @ self._weighted[..., None])[..., 0]  # (S, d)
 
     @property
+    def weighted_residual(self) -> Tensor:
+        """C⁻¹ r: the residuals with every initial state at its best, ``(S, N)``."""
+        return self._weighted
+
+    def weights_of(self, columns: Tensor) -> Tensor:
+        """Returns what residuals are multiplied by for the scores of columns, ``(S, N, P)``.
+
+        C⁻¹ x with the parameters' span taken out.
+        """
+        cross = (self._weights.mT @ columns).sum(0)
+        refit = torch.linalg.solve(self._information, cross)
+        return self.solve(columns) - self._weights @ refit
+
+    @property
     def parameter_scores(self) -> Tensor:
         """Scores of the parameters by segment, ``(S, d)``."""
         return self._score

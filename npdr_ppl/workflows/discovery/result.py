@@ -121,7 +121,7 @@ class Discovery:
             },
             "where": [spot.to_dict() for spot in self.where],
             "effects": [finding.to_dict() for finding in self.effects],
-            "ranking": [_ranked(s) for s in self.ranking],
+            "ranking": [_ranked(s, self.alarm.p_values[s.name]) for s in self.ranking],
             "separation": {
                 "names": list(self.separation_names),
                 "distance": self.separation.tolist(),
@@ -158,7 +158,7 @@ class Discovery:
         return f"Discovery({self.verdict}{': ' + found if found else ''})"
 
 
-def _ranked(candidate: Screened) -> dict[str, Any]:
+def _ranked(candidate: Screened, p_value: float) -> dict[str, Any]:
     effect = candidate.variant.effect
     return {
         "effect": effect.id,
@@ -166,7 +166,7 @@ def _ranked(candidate: Screened) -> dict[str, Any]:
         "gain": candidate.gain,
         "separation": candidate.separation,
         "absorbed": candidate.absorbed,
-        "p_value": candidate.p_value,
+        "p_value": p_value,
         "estimate": {
             name.removeprefix(f"{effect.name}."): float(value)
             for name, value in candidate.variant.parameters(candidate.sizes).items()
