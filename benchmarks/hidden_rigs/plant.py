@@ -159,11 +159,47 @@ class Plant:
         next_q = q + h / 6.0 * (v + 2.0 * (v2 + v3) + v4)
         next_v = v + h / 6.0 * (a1 + 2.0 * (a2 + a3) + a4)
         for i in self._dry_joints:
-            # What has turned round under friction has stopped on the way.
-            next_v[i] = np.where(next_v[i] * directions[i] < 0.0, 0.0, next_v[i])
+            turned = next_v[i] * directions[i] < 0.0
+            if turned.any():
+                next_v = self._after_reversal(i, turned, v, next_q, next_v, a4, time + h)
         for i, bristles in self._bristles:
             bristles.advance(0.5 * (v[i] + next_v[i]), h)
         return next_q, next_v
+
+    def _after_reversal(
+        self,
+        joint: int,
+        turned: Flags,
+        v: Array,
+        next_q: Array,
+        next_v: Array,
+        last: Array,
+        time: float,
+    ) -> Array:
+        """Returns the velocities where a joint has turned round, and its friction with it.
+
+        It stops on the way. If friction holds it, it is at rest; otherwise it has gone on from
+        rest for the remaining share of the substep, and so have the other coordinates under what
+        has changed.
+
+        Args:
+            joint: The joint.
+            turned: Where it has turned round, ``(R,)``.
+            v: Velocities before the substep.
+            next_q: Positions after it.
+            next_v: Velocities after it, friction as it was before.
+            last: Accelerations after it, friction as it was before.
+            time: Seconds since the recording began.
+        """
+        change = np.where(turned, v[joint] - next_v[joint], 1.0)
+        remaining = np.where(turned, -next_v[joint] / change, 0.0) * self.substep
+        stopped = next_v.copy()
+        stopped[joint] = np.where(turned, 0.0, next_v[joint])
+        directions, held = self._friction_modes(next_q, stopped, time)
+        after = self._rates(next_q, stopped, time, directions, held)
+        result = next_v + np.where(turned, (after - last) * remaining, 0.0)
+        result[joint] = np.where(turned, after[joint] * remaining, next_v[joint])
+        return result
 
     def _rates(
         self,

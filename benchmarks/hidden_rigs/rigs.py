@@ -29,7 +29,9 @@ _FRICTION = (
 _COMMAND = ("input_delay", "actuator_lag", "saturation", "supply_sag", "dead_zone")
 _FORCE = ("bias", "spring", "hardening_spring", "periodic_disturbance")
 _TURNING = ("cogging", "wind")
-_GEAR = ("load_dependent_friction", "joint_elasticity", "backlash")
+_LOAD = ("load_dependent_friction",)
+# Where the inertia that a drive sees hardly varies: elsewhere a motor's share of it is no number.
+_GEAR = ("joint_elasticity", "backlash")
 _OUTSIDE_FORCE = (
     "bouc_wen_hysteresis",
     "position_dependent_friction",
@@ -86,7 +88,7 @@ PENDULUM = Rig(
     start_spread=(1.5,),
     measurement=Measurement((2.0 * math.pi / 4096,), (0.02,)),
     effects=(
-        *_at("hinge", ("viscous_friction",), _FRICTION, _FORCE, _TURNING, _GEAR),
+        *_at("hinge", ("viscous_friction",), _FRICTION, _FORCE, _TURNING, _LOAD, _GEAR),
         *_at("torque", _COMMAND),
         ("angle,velocity", "sensor_delay"),
         ("velocity", "sensor_low_pass"),
@@ -141,7 +143,7 @@ FURUTA = Rig(
     start_spread=(0.2, 2.0),
     measurement=Measurement((2.0 * math.pi / 2048,) * 2, (0.05, 0.1)),
     effects=(
-        *_at("arm", _FRICTION, _FORCE, _TURNING, _GEAR),
+        *_at("arm", _FRICTION, _FORCE, _TURNING, _LOAD),
         *_at("pole", _FRICTION, ("bias", "spring", "cogging")),
         *_at("voltage", _COMMAND),
         ("arm_angle,pole_angle,arm_velocity,pole_velocity", "sensor_delay"),
@@ -211,7 +213,7 @@ CART_POLE = Rig(
     start_spread=(0.3, 1.2),
     measurement=Measurement((2e-4, 2.0 * math.pi / 4096), (0.01, 0.03)),
     effects=(
-        *_at("rail", _FRICTION, _FORCE, _GEAR),
+        *_at("rail", _FRICTION, _FORCE, _LOAD, _GEAR),
         *_at("hinge", _FRICTION, ("bias", "spring"), _TURNING),
         *_at("force", _COMMAND),
         ("cart_position,pole_angle,cart_velocity,pole_velocity", "sensor_delay"),
@@ -259,7 +261,7 @@ EMPS = Rig(
     start_spread=(0.1,),
     measurement=Measurement((1e-5,), (5e-4,)),
     effects=(
-        *_at("carriage", _FRICTION, _FORCE, _GEAR),
+        *_at("carriage", _FRICTION, _FORCE, _LOAD, _GEAR),
         *_at("voltage", _COMMAND),
         ("position,velocity", "sensor_delay"),
         ("velocity", "sensor_low_pass"),
@@ -313,8 +315,8 @@ TWO_LINK_ARM = Rig(
     start_spread=(0.8, 1.0),
     measurement=Measurement((2.0 * math.pi / 4096,) * 2, (0.03, 0.05)),
     effects=(
-        *_at("shoulder", _FRICTION, _FORCE, _TURNING, _GEAR),
-        *_at("elbow", _FRICTION, _FORCE, _TURNING, _GEAR),
+        *_at("shoulder", _FRICTION, _FORCE, _TURNING, _LOAD),
+        *_at("elbow", _FRICTION, _FORCE, _TURNING, _LOAD),
         *_at("shoulder_torque", _COMMAND, ("actuator_gain",)),
         *_at("elbow_torque", _COMMAND, ("actuator_gain",)),
         ("shoulder_angle,elbow_angle,shoulder_velocity,elbow_velocity", "sensor_delay"),
