@@ -3,10 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from npdr_ppl.displays.columns import scalar_columns
 from npdr_ppl.plots.bands import plot_bands
 from npdr_ppl.plots.marginals import plot_marginals
 from npdr_ppl.plots.pair import plot_pair
@@ -77,18 +76,6 @@ def write_fit_figures(
     )
     paths.append(save_figure(figure, out / "bands.png"))
     return paths
-
-
-def scalar_columns(parameters: dict[str, Tensor]) -> dict[str, NDArray[np.float64]]:
-    """Returns one column per scalar parameter."""
-    columns: dict[str, NDArray[np.float64]] = {}
-    for name, value in parameters.items():
-        flat = value.reshape(len(value), -1).double().numpy()
-        if flat.shape[1] == 1:
-            columns[name] = flat[:, 0]
-        else:
-            columns |= {f"{name}[{i}]": flat[:, i] for i in range(flat.shape[1])}
-    return columns
 
 
 def _values(parameters: dict[str, Tensor]) -> dict[str, float]:

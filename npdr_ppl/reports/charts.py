@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from npdr_ppl.plots.marginals import density
-from npdr_ppl.plots.theme import COLORS, SERIES
+from npdr_ppl.displays.marginal import density
+from npdr_ppl.displays.theme import COLORS, SERIES
 from npdr_ppl.reports.content import ChartPart
 
 __all__ = [

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from npdr_ppl.displays.columns import scalar_columns
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.reports.charts import bands_chart, marginals_chart, matrix_chart, pit_chart
 from npdr_ppl.reports.content import ChartPart
@@ -78,16 +79,12 @@ def predictive_charts(data: "Data", run: Path) -> list[ChartPart]:
 
 def parameter_samples(dataset: "xr.Dataset") -> dict[str, Array]:
     """Returns the draws ``(n,)`` of every scalar parameter, vectors element by element."""
-    columns: dict[str, Array] = {}
+    draws = {}
     for name in dataset.data_vars:
         values = np.asarray(dataset[name], dtype=float)
-        flat = values.reshape(values.shape[0] * values.shape[1], -1)
-        flat = flat[:: max(1, len(flat) // MAX_DRAWS)]
-        if flat.shape[1] == 1:
-            columns[str(name)] = flat[:, 0]
-        else:
-            columns |= {f"{name}[{i}]": flat[:, i] for i in range(flat.shape[1])}
-    return columns
+        flat = values.reshape(-1, *values.shape[2:])
+        draws[str(name)] = flat[:: max(1, len(flat) // MAX_DRAWS)]
+    return scalar_columns(draws)
 
 
 def _bands(
