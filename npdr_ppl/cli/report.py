@@ -1,9 +1,12 @@
 """`npdr report`: a finished run as one HTML file."""
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from npdr_ppl.cli.manners import AsJson, Quiet, Verbose
 
 __all__ = ["report"]
 
@@ -13,7 +16,9 @@ def report(
     out: Annotated[
         Path | None, typer.Option(help="The file; report.html in the run's folder by default.")
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Write a finished run as one HTML file that opens anywhere, without a network.
 
@@ -25,5 +30,7 @@ def report(
     from npdr_ppl.reports import write_report
 
     path = write_report(run, out)
-    if not quiet:
+    if as_json:
+        typer.echo(json.dumps({"report": str(path)}))
+    elif not quiet:
         typer.echo(f"The report is in {path}")
