@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from npdr_ppl.displays.theme import SERIES
 from npdr_ppl.reports.charts import ChartPart, bars_chart, rounded
 from npdr_ppl.reports.content import (
     CodePart,
@@ -67,21 +68,39 @@ def _verdict(result: Mapping[str, Any], effects: list[Any]) -> Verdict:
     word = str(result["verdict"])
     best = _named(effects[0]) if effects else "an effect"
     others = ", ".join(_named(effect) for effect in effects[1:])
+    p_value = number((result.get("alarm") or {}).get("p_value"))
+    gained = _gained(result.get("gap") or {})
     verdicts = {
         "none": Verdict(
-            "no effect is missing", "The model explains the recording as it is.", "good"
+            "no effect is missing",
+            f"The model explains the recording as it is (alarm: p = {p_value}).",
+            "good",
         ),
-        "named": Verdict(f"missing: {best}", "Adding it to the model closes the gap.", "good"),
+        "named": Verdict(f"missing: {best}", gained, "good"),
         "ambiguous": Verdict(
             f"missing: {best}, or another",
-            f"These data do not tell it from {others or 'its equivalents'}.",
+            f"These data do not tell it from {others or 'its equivalents'}. {gained}",
             "warn",
         ),
         "unknown": Verdict(
-            "something unknown is missing", "No effect of the catalogue closes the gap.", "bad"
+            "something unknown is missing",
+            "The model misses the recording, and no effect of the catalogue explains how.",
+            "bad",
         ),
     }
     return verdicts.get(word, Verdict(word, str(result.get("reason", ""))))
+
+
+def _gained(gap: Mapping[str, Any]) -> str:
+    """Returns in a sentence what the revised model gains on held-out rollouts."""
+    closed = [
+        f"{values['closed']:.0%} in {metric}"
+        for metric, values in gap.items()
+        if values.get("closed") is not None
+    ]
+    if not closed:
+        return "What it gains on held-out rollouts was not measured."
+    return f"Of the gap on held-out rollouts it closes {', '.join(closed)}."
 
 
 def _key_figures(result: Mapping[str, Any], effects: list[Any]) -> list[KeyFigure]:
@@ -120,7 +139,7 @@ def _gap(gap: Mapping[str, Any]) -> list[Part]:
     parts: list[Part] = [TablePart(columns, rows, caption)]
     # Metrics have scales of their own, so each is drawn in units of what it was before.
     data: list[dict[str, Any]] = []
-    for name in names:
+    for name, color in zip(names, SERIES, strict=False):
         shares = {
             metric: values[name] / values["before"]
             for metric, values in gap.items()
@@ -128,7 +147,13 @@ def _gap(gap: Mapping[str, Any]) -> list[Part]:
         }
         label = name.replace("_", " ")
         data.append(
-            {"type": "bar", "name": label, "x": list(shares), "y": rounded(list(shares.values()))}
+            {
+                "type": "bar",
+                "name": label,
+                "marker": {"color": color},
+                "x": list(shares),
+                "y": rounded(list(shares.values())),
+            }
         )
     layout: dict[str, Any] = {
         "barmode": "group",

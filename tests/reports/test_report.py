@@ -92,6 +92,7 @@ def test_training_shows_every_decision(runs, pages):
 def test_discovery_shows_what_changed(runs):
     report = read_run(runs["discover"])
     assert "coulomb_friction at hinge" in report.verdict.word
+    assert "93% in rmse" in report.verdict.sentence
     (diff,) = [part for s in report.sections for part in s.parts if isinstance(part, DiffPart)]
     assert [line for line in diff.lines if line[0] == "+"][1:] == ["+    friction = '<script>'"]
 
