@@ -7,7 +7,7 @@ WORKERS ?= 2
 # A worker per core: torch's own threads would only get in each other's way.
 TEST_ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NPDR_NUM_THREADS=1
 
-.PHONY: demo test style types bench clean
+.PHONY: demo test style types docs dist bench clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@echo "==> making $(VENV) with $$($(PYTHON) --version)"
@@ -35,6 +35,16 @@ style: $(VENV)/installed
 types: $(VENV)/installed
 	@echo "==> types"
 	$(BIN)/pyright
+
+# Material's notice about the future of MkDocs is no warning about these pages.
+docs: $(VENV)/installed
+	@echo "==> documentation, in build/site"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+dist: $(VENV)/installed
+	@echo "==> source distribution and wheel, in dist/"
+	$(BIN)/python -m build
 
 bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev,bench]"

@@ -1,16 +1,21 @@
 """One import package from four folders: what ships, what links, what imports what."""
 
+import re
 import shutil
 import subprocess
 import sys
 import tomllib
 import venv
+import zipfile
 from pathlib import Path
 
 import pytest
 
+import npdr_ppl
+
 ROOT = Path(__file__).parents[1]
 LINKED = ("models", "inference", "policies")
+DATA_FILES = ("py.typed", "models/furuta.xml", "reports/templates/report.html")
 
 
 def packages():
@@ -26,6 +31,13 @@ def test_packages_on_disk_are_the_ones_that_ship():
                 parts = ("npdr_ppl", *parts)
             found.add(".".join(parts))
     assert found == set(packages())
+
+
+def test_the_citation_has_the_packages_version():
+    citation = (ROOT / "CITATION.cff").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert re.search(r"^version: (.+)$", citation, re.MULTILINE)[1] == project["version"]
+    assert npdr_ppl.__version__ == project["version"]
 
 
 @pytest.mark.parametrize("folder", LINKED)
@@ -56,14 +68,20 @@ def test_import_is_quick_and_brings_no_engine_or_plots():
 
 
 @pytest.mark.slow
-def test_the_wheel_imports_everything_outside_the_checkout(tmp_path):
+def test_the_distributions_hold_everything_outside_the_checkout(tmp_path):
     # From a copy, because setuptools leaves a build folder that would ship stale files next time.
     source = tmp_path / "source"
     ignored = shutil.ignore_patterns(".venv", ".git", "build", "*.egg-info", "__pycache__")
     shutil.copytree(ROOT, source, symlinks=True, ignore=ignored)
-    build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--quiet", "-w", str(tmp_path)]
-    subprocess.run([*build, str(source)], check=True, cwd=tmp_path)
-    (wheel,) = tmp_path.glob("*.whl")
+    # The wheel is made of the source distribution, so that neither lacks a file.
+    build = [sys.executable, "-m", "build", "--outdir", str(tmp_path / "dist"), str(source)]
+    built = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True)
+    assert built.returncode == 0, built.stdout + built.stderr
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    assert len(list((tmp_path / "dist").glob("*.tar.gz"))) == 1
+    with zipfile.ZipFile(wheel) as archive:
+        shipped = set(archive.namelist())
+    assert {f"npdr_ppl/{name}" for name in DATA_FILES} <= shipped
     environment = tmp_path / "environment"
     # Dependencies come from this environment, the package itself from the wheel alone.
     venv.create(environment, with_pip=False)
@@ -73,9 +91,9 @@ def test_the_wheel_imports_everything_outside_the_checkout(tmp_path):
          str(wheel)],
         check=True,
     )  # fmt: skip
-    dependencies = next(Path(p) for p in sys.path if p.endswith("site-packages"))
+    dependencies = [path for path in sys.path if path.endswith("site-packages")]
     script = (
-        f"import sys; sys.path.append({str(dependencies)!r})\n"
+        f"import sys; sys.path.extend({dependencies!r})\n"
         "import importlib, pkgutil, npdr_ppl\n"
         f"assert npdr_ppl.__file__.startswith({str(site)!r}), npdr_ppl.__file__\n"
         f"for name in {packages()!r}:\n"

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from npdr_ppl.cli.fit import InitialState, Noise, Precision
+from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -54,7 +55,9 @@ def compare(
     workers: WorkersOption = None,
     address: Address = None,
     time_limit: TimeLimit = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Compare inference backends with the same budget of simulations and the same seed.
 
@@ -71,11 +74,16 @@ def compare(
     from npdr_ppl.workflows.binding import BindingOptions
     from npdr_ppl.workflows.candidates import candidates, split_candidates
     from npdr_ppl.workflows.compare import compare as run_compare
+    from npdr_ppl.workflows.progress import reporter
 
     chosen = resolve_effects(resolve_model(model), effect or [])
     named = candidates(split_candidates(backends))
     train, test = resolve_rollouts(data, holdout)
-    with chosen_workers(executor, workers, address, time_limit):
+    with (
+        resumable(f"the same command again continues the comparison in {out}."),
+        reporter(False if quiet else None) as report,
+        chosen_workers(executor, workers, address, time_limit),
+    ):
         comparison = run_compare(
             chosen,
             train,
@@ -90,9 +98,12 @@ def compare(
             noise=noise.value,
             device=device,
             out=out,
-            progress=False if quiet else None,
+            progress=report,
         )
         shown = train if test is None else test
-        write_comparison_figures(comparison, chosen, shown, out, seed=seed)
-    if not quiet:
+        step = report.stage("draw figures")
+        write_comparison_figures(comparison, chosen, shown, out, seed=seed, progress=step)
+    if as_json:
+        typer.echo((out / "comparison.json").read_text(), nl=False)
+    elif not quiet:
         show_comparison(comparison.to_dict(), out)

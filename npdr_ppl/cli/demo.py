@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from npdr_ppl.cli.fit import InitialState
+from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
 
 __all__ = ["demo"]
 
@@ -20,7 +21,9 @@ def demo(
         InitialState, typer.Option(help="State at a segment's start.")
     ] = InitialState.ESTIMATED,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Fit the Furuta pendulum to a recording, and draw what was learnt.
 
@@ -35,22 +38,33 @@ def demo(
     from npdr_ppl.models.furuta import furuta
     from npdr_ppl.plots.fit_figures import write_fit_figures
     from npdr_ppl.workflows.demo import run_demo
+    from npdr_ppl.workflows.progress import reporter
 
-    console = Console(quiet=quiet)
+    console = Console(quiet=quiet or as_json)
     console.print(
         "Recording a Furuta pendulum in MuJoCo, with parameters unlike the nominal ones …"
         if data is None
         else f"Reading {data} …"
     )
-    outcome = run_demo(
-        out,
-        data=data,
-        initial_state=initial_state.value,
-        seed=seed,
-        progress=False if quiet else None,
-    )
-    marks = {"truth": outcome.truth} if outcome.truth else None
-    paths = write_fit_figures(outcome.posterior, furuta, outcome.test, out, marks=marks, seed=seed)
-    if not quiet:
+    with (
+        resumable(f"the same command again continues the run in {out}."),
+        reporter(False if quiet else None) as report,
+    ):
+        outcome = run_demo(
+            out, data=data, initial_state=initial_state.value, seed=seed, progress=report
+        )
+        marks = {"truth": outcome.truth} if outcome.truth else None
+        paths = write_fit_figures(
+            outcome.posterior,
+            furuta,
+            outcome.test,
+            out,
+            marks=marks,
+            seed=seed,
+            progress=report.stage("draw figures"),
+        )
+    if as_json:
+        typer.echo((out / "fit.json").read_text(), nl=False)
+    elif not quiet:
         show_fit(outcome.result, out)
         console.print("Look at " + ", ".join(str(path) for path in paths))

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -71,7 +72,9 @@ def fit(
     workers: WorkersOption = None,
     address: Address = None,
     time_limit: TimeLimit = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Infer the posterior over a model's parameters from measured rollouts.
 
@@ -84,10 +87,15 @@ def fit(
     from npdr_ppl.plots.fit_figures import write_fit_figures
     from npdr_ppl.workflows.binding import BindingOptions
     from npdr_ppl.workflows.fit import fit as run_fit
+    from npdr_ppl.workflows.progress import reporter
 
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_rollouts(data, holdout)
-    with chosen_workers(executor, workers, address, time_limit):
+    with (
+        resumable(f"the same command again continues the run in {out}."),
+        reporter(False if quiet else None) as report,
+        chosen_workers(executor, workers, address, time_limit),
+    ):
         posterior, result = run_fit(
             chosen,
             train,
@@ -102,8 +110,12 @@ def fit(
             ),
             noise=noise.value,
             device=device,
-            progress=False if quiet else None,
+            progress=report,
         )
-        write_fit_figures(posterior, chosen, train if test is None else test, out, seed=seed)
-    if not quiet:
+        shown = train if test is None else test
+        step = report.stage("draw figures")
+        write_fit_figures(posterior, chosen, shown, out, seed=seed, progress=step)
+    if as_json:
+        typer.echo((out / "fit.json").read_text(), nl=False)
+    elif not quiet:
         show_fit(result, out)

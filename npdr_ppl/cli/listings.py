@@ -2,16 +2,15 @@
 
 import json
 from collections.abc import Sequence
-from typing import Annotated
 
 import typer
 
+from npdr_ppl.cli.manners import AsJson
+
 __all__ = ["backends", "effects", "models", "searches", "targets", "tasks"]
 
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 
-
-def models(as_json: Json = False) -> None:
+def models(as_json: AsJson = False) -> None:
     """List the models of the zoo.
 
     Example: npdr models
@@ -34,7 +33,7 @@ def models(as_json: Json = False) -> None:
     _show(rows, as_json)
 
 
-def backends(as_json: Json = False) -> None:
+def backends(as_json: AsJson = False) -> None:
     """List the inference backends.
 
     Example: npdr backends
@@ -44,7 +43,7 @@ def backends(as_json: Json = False) -> None:
     _show([{"name": n, "summary": s} for n, s in registered().items()], as_json)
 
 
-def effects(as_json: Json = False) -> None:
+def effects(as_json: AsJson = False) -> None:
     """List the catalogue of effects.
 
     Example: npdr effects --json
@@ -65,7 +64,7 @@ def effects(as_json: Json = False) -> None:
     _show(rows, as_json)
 
 
-def targets(as_json: Json = False) -> None:
+def targets(as_json: AsJson = False) -> None:
     """List the target domains of the zoo.
 
     Example: npdr targets
@@ -87,7 +86,7 @@ def targets(as_json: Json = False) -> None:
     _show(rows, as_json)
 
 
-def tasks(as_json: Json = False) -> None:
+def tasks(as_json: AsJson = False) -> None:
     """List what policies can be trained to do.
 
     Example: npdr tasks
@@ -110,7 +109,7 @@ def tasks(as_json: Json = False) -> None:
     _show(rows, as_json)
 
 
-def searches(as_json: Json = False) -> None:
+def searches(as_json: AsJson = False) -> None:
     """List the policy searches.
 
     Example: npdr searches

@@ -5,7 +5,7 @@ import sys
 
 import typer
 
-from npdr_ppl.cli import compare, demo, fit, listings, reproduce, train
+from npdr_ppl.cli import compare, demo, fit, listings, report, reproduce, train
 from npdr_ppl.errors import NpdrError
 
 __all__ = ["app", "main"]
@@ -22,6 +22,7 @@ app.command(rich_help_panel="See it work")(demo.demo)
 app.command(rich_help_panel="Infer parameters")(fit.fit)
 app.command(rich_help_panel="Infer parameters")(compare.compare)
 app.command(rich_help_panel="Train policies")(train.train)
+app.command(rich_help_panel="Show results")(report.report)
 app.command(rich_help_panel="See it work")(reproduce.reproduce)
 app.command("models", rich_help_panel="What there is")(listings.models)
 app.command("backends", rich_help_panel="What there is")(listings.backends)

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from npdr_ppl.cli.fit import InitialState
+from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
 
 __all__ = ["reproduce"]
 
@@ -45,7 +46,9 @@ def reproduce(
         ),
     ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Reproduce an experiment of the NPDR paper, and compare with its figures.
 
@@ -58,43 +61,48 @@ def reproduce(
     progress = False if quiet else None
     out = out / experiment.value
     chosen = split_candidates(backends) if backends else None
-    if experiment is Experiment.PENDULUM:
-        from npdr_ppl.plots.pendulum import write_pendulum_figures
-        from npdr_ppl.workflows.pendulum_ridge import reproduce_pendulum
+    with resumable(f"the same command again continues the experiment in {out}."):
+        if experiment is Experiment.PENDULUM:
+            from npdr_ppl.plots.pendulum import write_pendulum_figures
+            from npdr_ppl.workflows.pendulum_ridge import reproduce_pendulum
 
-        ridges, result = reproduce_pendulum(out, backends=chosen, seed=seed, progress=progress)
-        write_pendulum_figures(ridges, out)
-    elif experiment is Experiment.MINI_GOLF:
-        from npdr_ppl.plots.mini_golf import write_mini_golf_figures
-        from npdr_ppl.rollouts import Rollouts
-        from npdr_ppl.workflows.mini_golf_table import reproduce_mini_golf
+            ridges, result = reproduce_pendulum(out, backends=chosen, seed=seed, progress=progress)
+            write_pendulum_figures(ridges, out)
+        elif experiment is Experiment.MINI_GOLF:
+            from npdr_ppl.plots.mini_golf import write_mini_golf_figures
+            from npdr_ppl.rollouts import Rollouts
+            from npdr_ppl.workflows.mini_golf_table import reproduce_mini_golf
 
-        if data is None:
-            raise DataError("mini-golf needs the paper's recordings: pass --data FILE.")
-        posteriors, result = reproduce_mini_golf(
-            Rollouts.load(data), out, backends=chosen, seed=seed, progress=progress
-        )
-        write_mini_golf_figures({label: p[-1] for label, p in posteriors.items()}, out, seed=seed)
-    else:
-        from npdr_ppl.models.furuta import furuta
-        from npdr_ppl.plots.comparison_figures import write_comparison_figures
-        from npdr_ppl.rollouts import Rollouts
-        from npdr_ppl.workflows.table2 import add_returns, reproduce_table2
+            if data is None:
+                raise DataError("mini-golf needs the paper's recordings: pass --data FILE.")
+            posteriors, result = reproduce_mini_golf(
+                Rollouts.load(data), out, backends=chosen, seed=seed, progress=progress
+            )
+            write_mini_golf_figures(
+                {label: p[-1] for label, p in posteriors.items()}, out, seed=seed
+            )
+        else:
+            from npdr_ppl.models.furuta import furuta
+            from npdr_ppl.plots.comparison_figures import write_comparison_figures
+            from npdr_ppl.rollouts import Rollouts
+            from npdr_ppl.workflows.table2 import add_returns, reproduce_table2
 
-        if data is None:
-            raise DataError("table2 needs the paper's recordings: pass --data FILE.")
-        rollouts = Rollouts.load(data)
-        comparison, result = reproduce_table2(
-            rollouts,
-            out,
-            backends=chosen,
-            initial_state=initial_state.value,
-            seed=seed,
-            progress=progress,
-        )
-        held_out = rollouts[result["held_out"]]
-        write_comparison_figures(comparison, furuta, held_out, out, seed=seed)
-        if returns:
-            result = add_returns(result, out, num_seeds=returns, progress=progress)
-    if not quiet:
+            if data is None:
+                raise DataError("table2 needs the paper's recordings: pass --data FILE.")
+            rollouts = Rollouts.load(data)
+            comparison, result = reproduce_table2(
+                rollouts,
+                out,
+                backends=chosen,
+                initial_state=initial_state.value,
+                seed=seed,
+                progress=progress,
+            )
+            held_out = rollouts[result["held_out"]]
+            write_comparison_figures(comparison, furuta, held_out, out, seed=seed)
+            if returns:
+                result = add_returns(result, out, num_seeds=returns, progress=progress)
+    if as_json:
+        typer.echo((out / f"{experiment.value}.json").read_text(), nl=False)
+    elif not quiet:
         show_rows(experiment.value, result)

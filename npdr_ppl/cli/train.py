@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from npdr_ppl.cli.fit import InitialState
+from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -16,9 +17,6 @@ from npdr_ppl.cli.worker_options import (
 )
 
 __all__ = ["train"]
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 
 
 class InternalModel(StrEnum):
@@ -105,10 +103,9 @@ def train(
     workers: WorkersOption = None,
     address: Address = None,
     time_limit: TimeLimit = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON instead of a table.")
-    ] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    as_json: AsJson = False,
 ) -> None:
     """Train a policy for a target domain: run it, infer the parameters, train, and again.
 
@@ -133,6 +130,7 @@ def train(
     from npdr_ppl.workflows.binding import BindingOptions
     from npdr_ppl.workflows.loop_options import LoopOptions
     from npdr_ppl.workflows.npdr_loop import train as run_train
+    from npdr_ppl.workflows.progress import reporter
 
     _check_folder(out, resume)
     chosen = resolve_effects(resolve_model(model), effect or [])
@@ -162,24 +160,18 @@ def train(
         follows_decisions=decisions,
         stop_return=stop_return,
     )
-    try:
-        with chosen_workers(executor, workers, address, time_limit):
+    with resumable(f"the same command with --resume continues the run in {out}."):
+        with (
+            reporter(False if quiet else None) as report,
+            chosen_workers(executor, workers, address, time_limit),
+        ):
             training = run_train(
-                chosen,
-                device,
-                chosen_task,
-                options,
-                out=out,
-                seed=seed,
-                progress=False if quiet else None,
+                chosen, device, chosen_task, options, out=out, seed=seed, progress=report
             )
-    except KeyboardInterrupt:
-        typer.echo(
-            f"npdr: interrupted; the same command with --resume continues the run in {out}.",
-            err=True,
-        )
-        raise typer.Exit(INTERRUPTED) from None
-    write_training_figures(training, device, chosen_task, out)
+            step = report.stage("draw figures")
+            step(0.0, "returns, rollouts, parameters")
+            write_training_figures(training, device, chosen_task, out)
+            step(1.0, "")
     if animate:
         rollout = training.rollouts[[last_rollout(training.iterations)]]
         write_furuta_animation(rollout, out / "rollout.gif", domain=training.domain)

@@ -15,6 +15,7 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.comparison import Comparison
 from npdr_ppl.workflows.evaluation import replay
+from npdr_ppl.workflows.progress import Step
 from npdr_ppl.workflows.units import parameter_units
 
 __all__ = ["write_comparison_figures"]
@@ -35,6 +36,7 @@ def write_comparison_figures(
     *,
     marks: dict[str, dict[str, float]] | None = None,
     seed: int = 0,
+    progress: Step | None = None,
 ) -> list[Path]:
     """Draws all posteriors that a comparison found, and their predictions for one rollout.
 
@@ -45,7 +47,10 @@ def write_comparison_figures(
         out: Folder for ``marginals.png``, ``pairs.png``, ``bands.png`` and ``seconds.png``.
         marks: Values to mark, by legend entry and parameter.
         seed: Seed of the draws.
+        progress: Called with the fraction done and a short status.
     """
+    step = progress or (lambda fraction, status: None)
+    step(0.0, "marginals")
     posteriors = {label: comparison.posteriors[label] for label in comparison.ranking}
     some = next(iter(posteriors.values()))
     draws = {label: q.sample(NUM_DRAWS, seed=seed) for label, q in posteriors.items()}
@@ -55,6 +60,7 @@ def write_comparison_figures(
     units = parameter_units(some)
     figure = plot_overlaid_marginals(samples, prior, marks=marks, units=units)
     paths = [save_figure(figure, out / "marginals.png")]
+    step(0.25, "pairs")
     if len(prior) > 1:
         x, y = most_informative(samples, prior)
         rows = _wrapped(samples)
@@ -66,6 +72,7 @@ def write_comparison_figures(
             smoothing=SMOOTHING,
         )  # fmt: skip
         paths.append(save_figure(figure, out / "pairs.png"))
+    step(0.5, "predictions")
     options = some.bound.options
     shown = rollouts[[0]]
     replays = {
@@ -83,8 +90,10 @@ def write_comparison_figures(
         resets=replayed.inputs.start.double().numpy() * shown.time_step,
     )
     paths.append(save_figure(figure, out / "bands.png"))
+    step(0.9, "seconds")
     seconds = {label: comparison.rows[label].seconds for label in comparison.ranking}
     paths.append(save_figure(plot_seconds(seconds), out / "seconds.png"))
+    step(1.0, "")
     return paths
 
 

@@ -3,10 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from npdr_ppl.displays.columns import scalar_columns
 from npdr_ppl.plots.bands import plot_bands
 from npdr_ppl.plots.marginals import plot_marginals
 from npdr_ppl.plots.pair import plot_pair
@@ -15,6 +14,7 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.evaluation import replay
 from npdr_ppl.workflows.posterior import PosteriorBase
+from npdr_ppl.workflows.progress import Step
 from npdr_ppl.workflows.units import parameter_units
 
 __all__ = ["scalar_columns", "write_fit_figures"]
@@ -33,6 +33,7 @@ def write_fit_figures(
     *,
     marks: dict[str, dict[str, float]] | None = None,
     seed: int = 0,
+    progress: Step | None = None,
 ) -> list[Path]:
     """Draws a posterior and its predictions for one rollout.
 
@@ -43,7 +44,10 @@ def write_fit_figures(
         out: Folder for ``marginals.png``, ``pairs.png`` and ``bands.png``.
         marks: Values to mark, by legend entry and parameter.
         seed: Seed of the draws.
+        progress: Called with the fraction done and a short status.
     """
+    step = progress or (lambda fraction, status: None)
+    step(0.0, "marginals")
     draws = posterior.sample(NUM_DRAWS, seed=seed)
     prior = posterior.prior
     samples = scalar_columns(draws)
@@ -57,9 +61,11 @@ def write_fit_figures(
             out / "marginals.png",
         )
     ]
+    step(0.25, "pairs")
     if 1 < len(samples) <= MAX_PAIRS:
         figure = plot_pair(samples, prior_samples, marks=marks)
         paths.append(save_figure(figure, out / "pairs.png"))
+    step(0.7, "predictions")
     few = {name: value[:NUM_PREDICTIVE] for name, value in draws.items()}
     options = posterior.bound.options
     shown = rollouts[[0]]
@@ -76,19 +82,8 @@ def write_fit_figures(
         resets=replayed.inputs.start.double().numpy() * shown.time_step,
     )
     paths.append(save_figure(figure, out / "bands.png"))
+    step(1.0, "")
     return paths
-
-
-def scalar_columns(parameters: dict[str, Tensor]) -> dict[str, NDArray[np.float64]]:
-    """Returns one column per scalar parameter."""
-    columns: dict[str, NDArray[np.float64]] = {}
-    for name, value in parameters.items():
-        flat = value.reshape(len(value), -1).double().numpy()
-        if flat.shape[1] == 1:
-            columns[name] = flat[:, 0]
-        else:
-            columns |= {f"{name}[{i}]": flat[:, i] for i in range(flat.shape[1])}
-    return columns
 
 
 def _values(parameters: dict[str, Tensor]) -> dict[str, float]:

@@ -1,50 +1,5 @@
-"""One look for all figures."""
+"""One look for all figures; see :mod:`npdr_ppl.displays.theme`."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
-
-import matplotlib as mpl
-from matplotlib.figure import Figure
+from npdr_ppl.displays.theme import COLORS, SERIES, save_figure, theme
 
 __all__ = ["COLORS", "SERIES", "save_figure", "theme"]
-
-# Okabe and Ito's palette, which colour-blind readers can tell apart.
-COLORS = {
-    "posterior": "#0072B2",
-    "prior": "#999999",
-    "measured": "#000000",
-    "nominal": "#D55E00",
-    "most likely": "#009E73",
-    "truth": "#CC79A7",
-}
-
-SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
-"""The same palette for several posteriors in one panel, in this order, over and over."""
-
-_STYLE: Any = {
-    "figure.dpi": 120,
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 9,
-    "axes.labelsize": 9,
-    "legend.frameon": False,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-}
-
-
-@contextmanager
-def theme() -> Iterator[None]:
-    """Applies the look inside the block."""
-    with mpl.rc_context(_STYLE):
-        yield
-
-
-def save_figure(figure: Figure, path: Path) -> Path:
-    """Writes a figure, without needing a display, and returns its path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, bbox_inches="tight", dpi=150)
-    return path

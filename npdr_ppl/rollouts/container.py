@@ -300,6 +300,24 @@ class Rollouts:
             f"{'' if self.rewards is None else '; rewards'})"
         )
 
+    def _repr_html_(self) -> str:
+        from npdr_ppl.rollouts.notebook import rollouts_html
+
+        return rollouts_html(self)
+
+    def plot(self, axes: Any = None) -> NDArray[Any]:
+        """Draws every channel and action over time, all rollouts over each other.
+
+        Args:
+            axes: Axes to draw on, one per channel and action; ``None`` makes a figure.
+
+        Returns:
+            The axes, ``(channels + actions,)``.
+        """
+        from npdr_ppl.rollouts.notebook import plot_rollouts
+
+        return plot_rollouts(self, axes)
+
     def split(
         self,
         train: Sequence[int] | float,

@@ -24,6 +24,7 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.evaluation import declares_noise
+from npdr_ppl.workflows.progress import Step
 from npdr_ppl.workflows.segment_fit import (
     Linearisation,
     SegmentFit,
@@ -114,6 +115,7 @@ def prepare(
     noise: Literal["auto", "model"] = "auto",
     wants_neighbourhood: bool = False,
     seed: int = 0,
+    progress: Step | None = None,
 ) -> Prepared:
     """Gives a model the noise, and the embedding the point of expansion, that they lack.
 
@@ -125,12 +127,13 @@ def prepare(
             it as it is.
         wants_neighbourhood: Whether inference is to start near the closest fit.
         seed: Seed of the search.
+        progress: Called with the fraction done and a short status.
     """
     lacks_noise = noise == "auto" and not declares_noise(model, rollouts, options)
     lacks_point = options.embedding == "score"
     if not (lacks_noise or lacks_point or wants_neighbourhood):
         return Prepared(model, options, None)
-    found = closest_fit(model, rollouts, options, seed=seed)
+    found = closest_fit(model, rollouts, options, seed=seed, progress=progress)
     if lacks_point:
         options = replace(options, embedding=score_embedding(found))
     return Prepared(
@@ -142,7 +145,12 @@ def prepare(
 
 
 def closest_fit(
-    model: Callable[..., Any], rollouts: Rollouts, options: BindingOptions, *, seed: int = 0
+    model: Callable[..., Any],
+    rollouts: Rollouts,
+    options: BindingOptions,
+    *,
+    seed: int = 0,
+    progress: Step | None = None,
 ) -> ClosestFit:
     """Searches for the parameters of least residual along a recording.
 
@@ -156,6 +164,7 @@ def closest_fit(
         rollouts: The recording to be fitted; never the held-out one.
         options: Segments, initial states and precision.
         seed: Seed of the search.
+        progress: Called with the fraction done and a short status.
 
     Raises:
         DataError: No parameters could be simulated along the recording.
@@ -183,6 +192,8 @@ def closest_fit(
         centre, spread = tried[elite].mean(0), tried[elite].std(0)
         if float(error[elite[0]]) < least:
             least, z = float(error[elite[0]]), tried[elite[0]]
+        if progress is not None:
+            progress((iteration + 1) / ITERATIONS, f"error {least:.3g} of the range")
     if not math.isfinite(least):
         raise DataError("No parameters of the prior could be simulated along the recording.")
     if segments.num_offsets:

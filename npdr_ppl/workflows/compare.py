@@ -41,7 +41,7 @@ def compare(
     noise: Literal["auto", "model"] = "auto",
     device: str = "cpu",
     out: Path | None = None,
-    progress: bool | None = None,
+    progress: bool | Reporter | None = None,
 ) -> Comparison:
     """Compares inference backends on one model and recording.
 
@@ -71,7 +71,7 @@ def compare(
         device: Where the backends train.
         out: Folder for ``comparison.json`` and, for every backend, ``posterior.nc`` and the run,
             from which an interrupted comparison continues; nothing is written if ``None``.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Raises:
         BackendError: A backend or an option does not exist, the folder holds another comparison,
@@ -105,23 +105,30 @@ def compare(
         "evaluated_on": "fitted" if test is None else "held-out",
         "elpd": "PSIS-LOO" if test is None else "held-out segments",
     }
-    error_model = find_error_model(model, train, options, noise=noise, seed=seed)
-    exact = dataclasses.replace(options.with_certain_start(), precision="float64")
-    if exact.embedding == "score":  # posteriors are judged without features
-        exact = dataclasses.replace(exact, embedding="bayessim")
-    judge = _Judge(
-        error_model,
-        judged_by,
-        bind(error_model.judged, judged_by, exact, device),
-        exact,
-        is_held_out=test is not None,
-        seed=seed,
-    )
-    if out is not None:
-        _claim(out, settings)
-    rows: dict[str, Row] = {}
-    posteriors: dict[str, Posterior] = {}
     with reporter(progress) as report:
+        error_model = find_error_model(
+            model,
+            train,
+            options,
+            noise=noise,
+            seed=seed,
+            progress=report.stage("find the closest parameters"),
+        )
+        exact = dataclasses.replace(options.with_certain_start(), precision="float64")
+        if exact.embedding == "score":  # posteriors are judged without features
+            exact = dataclasses.replace(exact, embedding="bayessim")
+        judge = _Judge(
+            error_model,
+            judged_by,
+            bind(error_model.judged, judged_by, exact, device),
+            exact,
+            is_held_out=test is not None,
+            seed=seed,
+        )
+        if out is not None:
+            _claim(out, settings)
+        rows: dict[str, Row] = {}
+        posteriors: dict[str, Posterior] = {}
         for label, candidate in named.items():
             run = _Run(
                 candidate,

@@ -160,6 +160,24 @@ class Comparison:
         members = {label: self.posteriors[label] for label in self.weights}
         return StackedPosterior(members, self.weights)
 
+    def _repr_html_(self) -> str:
+        from npdr_ppl.workflows.notebook import comparison_html
+
+        return comparison_html(self)
+
+    def plot(self, axes: Any = None) -> NDArray[Any]:
+        """Draws how far each backend is behind the best, and the coverage of its predictions.
+
+        Args:
+            axes: Two axes to draw on; ``None`` makes a figure.
+
+        Returns:
+            The axes, ``(2,)``.
+        """
+        from npdr_ppl.workflows.notebook import plot_comparison
+
+        return plot_comparison(self, axes)
+
     def to_dict(self) -> dict[str, Any]:
         """Returns the content of ``comparison.json``; what is not finite is NaN or None."""
         return {

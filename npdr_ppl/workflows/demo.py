@@ -14,6 +14,7 @@ from npdr_ppl.rollouts.segments import InitialState
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.fit import fit
 from npdr_ppl.workflows.posterior import Posterior
+from npdr_ppl.workflows.progress import Reporter
 
 __all__ = ["TRUTH", "Demonstration", "record_rig", "run_demo"]
 
@@ -60,7 +61,7 @@ def run_demo(
     data: Path | None = None,
     initial_state: InitialState = "estimated",
     seed: int = 0,
-    progress: bool | None = None,
+    progress: bool | Reporter | None = None,
 ) -> Demonstration:
     """Fits the Furuta pendulum to a recording and holds its last rollout out.
 
@@ -69,7 +70,7 @@ def run_demo(
         data: A recording of one's own; ``None`` makes one in MuJoCo.
         initial_state: State at a segment's start.
         seed: Seed of everything random.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
     """
     out.mkdir(parents=True, exist_ok=True)
     if data is None:

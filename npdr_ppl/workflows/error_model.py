@@ -29,6 +29,7 @@ from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data
 from npdr_ppl.workflows.closest_fit import closest_fit
 from npdr_ppl.workflows.evaluation import declares_noise, replay
 from npdr_ppl.workflows.infer import MAX_READINGS_PER_CHUNK
+from npdr_ppl.workflows.progress import Step
 
 __all__ = ["ErrorModel", "find_error_model", "segment_log_likelihood"]
 
@@ -66,6 +67,7 @@ def find_error_model(
     *,
     noise: Literal["auto", "model"] = "auto",
     seed: int = 0,
+    progress: Step | None = None,
 ) -> ErrorModel:
     """Finds the common error model on the recording to be fitted.
 
@@ -77,6 +79,7 @@ def find_error_model(
         noise: ``"auto"`` gives a model without noise the estimated scale; ``"model"`` fits it as
             it is and estimates the scale for the comparison alone.
         seed: Seed of the search.
+        progress: Called with the fraction done and a short status.
 
     Raises:
         DataError: No parameters could be simulated along the recording.
@@ -84,7 +87,7 @@ def find_error_model(
     if not isinstance(train, Rollouts):
         return ErrorModel(model, model, None, {})
     declared = declares_noise(model, train, options)
-    closest = closest_fit(model, train, options, seed=seed)
+    closest = closest_fit(model, train, options, seed=seed, progress=progress)
     replayed = replay(model, train, closest.parameters, options)
     observed = train.observation(replayed.inputs, channels=replayed.channel_names)
     residual = (replayed.trajectory[0] - observed).double().cpu()

@@ -17,6 +17,7 @@ from npdr_ppl.workflows.diagnostics import diagnose
 from npdr_ppl.workflows.evaluation import score
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.posterior import Posterior
+from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.run_folder import engine_settings, write_json
 from npdr_ppl.workflows.units import parameter_units
 
@@ -39,7 +40,7 @@ def fit(
     options: BindingOptions | None = None,
     noise: Literal["auto", "model"] = "auto",
     device: str = "cpu",
-    progress: bool | None = None,
+    progress: bool | Reporter | None = None,
 ) -> tuple[Posterior, dict[str, Any]]:
     """Fits a model to measured rollouts and reports on held-out ones.
 
@@ -57,36 +58,49 @@ def fit(
         noise: ``"auto"`` gives a model without noise the scale of
             :func:`~npdr_ppl.workflows.closest_fit.closest_fit`; ``"model"`` takes it as it is.
         device: Where the backend trains.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Returns:
         The posterior and the content of ``fit.json``.
     """
-    with collect_faults() as before:
-        prepared = prepare(model, train, options or BindingOptions(), noise=noise, seed=seed)
-    options = prepared.options
-    posterior = infer(
-        prepared.model,
-        train,
-        backend=backend,
-        rounds=rounds,
-        num_simulations=num_simulations,
-        seed=seed,
-        embedding=options.embedding,
-        segment_length=options.segment_length,
-        initial_state=options.initial_state,
-        precision=options.precision,
-        device=device,
-        checkpoint=None if out is None else out / "run",
-        progress=progress,
-    )
-    started = time.perf_counter()
-    with collect_faults() as after:
-        most_likely = posterior.most_likely(seed=seed)
-        data = posterior.to_arviz(seed=seed)
-        sampled = time.perf_counter() - started
-        evaluated = train if test is None else test
-        metrics = score(model, evaluated, most_likely, options)
+    with reporter(progress) as report:
+        with collect_faults() as before:
+            prepared = prepare(
+                model,
+                train,
+                options or BindingOptions(),
+                noise=noise,
+                seed=seed,
+                progress=report.stage("find the closest parameters"),
+            )
+        options = prepared.options
+        posterior = infer(
+            prepared.model,
+            train,
+            backend=backend,
+            rounds=rounds,
+            num_simulations=num_simulations,
+            seed=seed,
+            embedding=options.embedding,
+            segment_length=options.segment_length,
+            initial_state=options.initial_state,
+            precision=options.precision,
+            device=device,
+            checkpoint=None if out is None else out / "run",
+            progress=report,
+        )
+        step = report.stage("sample and judge")
+        started = time.perf_counter()
+        with collect_faults() as after:
+            step(0.0, "most likely draw")
+            most_likely = posterior.most_likely(seed=seed)
+            step(0.1, "predictions")
+            data = posterior.to_arviz(seed=seed)
+            sampled = time.perf_counter() - started
+            step(0.8, "scores")
+            evaluated = train if test is None else test
+            metrics = score(model, evaluated, most_likely, options)
+            step(1.0, "")
     # A resumed run knows the faults of its finished rounds from disk.
     faults = Counter(posterior.provenance.faults)
     for part in (before, after):

@@ -1,5 +1,6 @@
 """`infer`: a model, data and a backend in, a posterior out (INFER of Algorithm 1)."""
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,6 +27,8 @@ from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.run_folder import RunFolder
 
 __all__ = ["infer", "run_round", "simulate_features"]
+
+_LOGGER = logging.getLogger(__name__)
 
 # Readings that one chunk of simulations may hold, 16 MiB in float64: larger arrays leave the cache
 # and are mapped afresh by the allocator every time, smaller ones pay the overhead of many calls.
@@ -127,6 +130,10 @@ def infer(
             states.append(state)
             seconds = {stage: seconds[stage] + spent[stage] for stage in seconds}
             infos.append(info)
+            _LOGGER.info(
+                "%s: %d simulations, %d failed; simulate %.1f s, train %.1f s",
+                label, info.num_simulations, info.num_failed, spent["simulate"], spent["train"],
+            )  # fmt: skip
             if store is not None:
                 store.save_round(index, *method.tensors(state), infos, seconds)
     provenance = Provenance(seed, num_simulations, tuple(infos), seconds)

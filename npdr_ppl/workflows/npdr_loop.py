@@ -327,6 +327,7 @@ class _Loop:
             noise=options.noise,
             wants_neighbourhood=options.start == "closest fit" and self.backend.continues,
             seed=seed,
+            progress=report.stage("find the closest parameters"),
         )
         binding = prepared.options
         return infer(

@@ -27,6 +27,8 @@ from npdr_ppl.workflows.binding import BindingOptions, BoundModel, bind, problem
 from npdr_ppl.workflows.run_folder import RunFolder
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from npdr_ppl.workflows.arviz_module import Data
 
 __all__ = ["Posterior", "PosteriorBase", "Provenance"]
@@ -194,6 +196,26 @@ class PosteriorBase(ABC):
         z = self.sample_mixture(num_samples, seed=seed)
         with seeded(seed, "predict"):
             return self.prior.execute(z)
+
+    def _repr_html_(self) -> str:
+        from npdr_ppl.workflows.notebook import posterior_html
+
+        return posterior_html(self)
+
+    def plot(self, axes: Any = None, *, num_samples: int = 2_000, seed: int = 0) -> "NDArray[Any]":
+        """Draws the marginal of every scalar parameter over its prior.
+
+        Args:
+            axes: Axes to draw on, one per scalar parameter; ``None`` makes a figure.
+            num_samples: Draws behind each density.
+            seed: Seed of the draws.
+
+        Returns:
+            The axes, ``(scalar parameters,)``.
+        """
+        from npdr_ppl.workflows.notebook import plot_posterior
+
+        return plot_posterior(self, axes, num_samples=num_samples, seed=seed)
 
     def to_arviz(self, num_samples: int = 1_000, *, seed: int = 0) -> "Data":
         """Returns an ArviZ object; see :func:`npdr_ppl.workflows.arviz_export.to_arviz`."""

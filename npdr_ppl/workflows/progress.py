@@ -3,10 +3,15 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-__all__ = ["Reporter", "reporter"]
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+__all__ = ["Reporter", "Step", "reporter"]
 
 Step = Callable[[float, str], None]
+"""Takes the fraction done and a short status."""
 
 
 class Reporter:
@@ -44,9 +49,13 @@ class _RichReporter(Reporter):
         )
 
     def stage(self, label: str) -> Step:
-        task = self.bars.add_task(label, total=1.0, status="")
+        # With its first step, because a stage may turn out to have nothing to do.
+        task: TaskID | None = None
 
         def step(fraction: float, status: str) -> None:
+            nonlocal task
+            if task is None:
+                task = self.bars.add_task(label, total=1.0, status="")
             self.bars.update(task, completed=fraction, status=status)
 
         return step

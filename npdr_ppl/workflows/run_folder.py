@@ -11,6 +11,7 @@ Every file replaces its predecessor in one step, so a run killed at any moment l
 """
 
 import dataclasses
+import functools
 import hashlib
 import inspect
 import json
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pyro.poutine.messenger import Messenger
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -222,6 +224,13 @@ def source_text(model: Any) -> str:
     if isinstance(model, ModelWithEffects):
         attached = "\n".join(f"# with {effect!r}" for effect, _ in model.effects)
         return f"{source_text(model.base)}\n{attached}"
+    if (
+        isinstance(model, functools.partial)
+        and model.args
+        and isinstance(model.args[0], Messenger)
+    ):
+        # Pyro's way to keep a model under a handler: both are arguments of the partial.
+        return f"{source_text(model.args[-1])}\n# under {type(model.args[0]).__name__}"
     try:
         return inspect.getsource(model)
     except (OSError, TypeError):

@@ -80,6 +80,18 @@ def test_fit_writes_what_the_documentation_promises(monkeypatch, capsys, tmp_pat
     assert again["parameters"] == fit["parameters"]
 
 
+def test_report_writes_one_file(monkeypatch, capsys, tmp_path):
+    (tmp_path / "discovery.json").write_text('{"verdict": "none"}')
+    page = tmp_path / "page.html"
+    code, text, _ = run(monkeypatch, capsys, "report", tmp_path, "--out", page)
+    assert code == 0
+    assert str(page) in text
+    assert "no effect is missing" in page.read_text()
+    code, _, err = run(monkeypatch, capsys, "report", tmp_path / "absent")
+    assert code == 2
+    assert err.count("\n") == 1
+
+
 def test_fit_takes_a_models_file_and_effects(monkeypatch, capsys, tmp_path, recording):
     file = tmp_path / "json.py"  # must not take the standard library's place
     file.write_text(

@@ -1,0 +1,36 @@
+"""`npdr report`: a finished run as one HTML file."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from npdr_ppl.cli.manners import AsJson, Quiet, Verbose
+
+__all__ = ["report"]
+
+
+def report(
+    run: Annotated[Path, typer.Argument(help="Folder that was passed as --out.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The file; report.html in the run's folder by default.")
+    ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Write a finished run as one HTML file that opens anywhere, without a network.
+
+    Verdict and key figures come first, then charts, diagnostics in plain language, the model's
+    source, and what it takes to make the result again.
+
+    Example: npdr report fit --out fit.html
+    """
+    from npdr_ppl.reports import write_report
+
+    path = write_report(run, out)
+    if as_json:
+        typer.echo(json.dumps({"report": str(path)}))
+    elif not quiet:
+        typer.echo(f"The report is in {path}")

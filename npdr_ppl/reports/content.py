@@ -1,0 +1,186 @@
+"""What a report says, apart from how it looks: each kind of run fills it in."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+__all__ = [
+    "ChartPart",
+    "CodePart",
+    "DiffPart",
+    "Finding",
+    "FindingsPart",
+    "KeyFigure",
+    "Part",
+    "PicturePart",
+    "Report",
+    "Section",
+    "TablePart",
+    "TextPart",
+    "Tone",
+    "Verdict",
+    "number",
+]
+
+Tone = Literal["good", "warn", "bad", "plain"]
+"""How a figure is to be taken; a word stands beside every colour, for those who see none."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The one thing to know.
+
+    Attributes:
+        word: Such as ``"accept"``.
+        sentence: Why.
+        tone: How to take it.
+    """
+
+    word: str
+    sentence: str
+    tone: Tone = "plain"
+
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """A number for the top of the page."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class TextPart:
+    """A paragraph."""
+
+    text: str
+    kind: str = field(default="text", init=False)
+
+
+@dataclass(frozen=True)
+class TablePart:
+    """A table; the first column holds names, the others mostly numbers.
+
+    Attributes:
+        columns: Headings.
+        rows: Cells as text.
+        caption: What the table shows.
+        layout: Whether cells are figures, which stay whole, or prose, which is wrapped.
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    layout: Literal["figures", "prose"] = "figures"
+    kind: str = field(default="table", init=False)
+
+
+@dataclass(frozen=True)
+class ChartPart:
+    """An interactive chart.
+
+    Attributes:
+        name: Identifier on the page.
+        caption: What is shown and how to read it.
+        data: Plotly's traces.
+        layout: Plotly's layout; colours of text and grid are the page's.
+        height: CSS pixels.
+    """
+
+    name: str
+    caption: str
+    data: Sequence[Mapping[str, Any]]
+    layout: Mapping[str, Any]
+    height: int = 320
+    kind: str = field(default="chart", init=False)
+
+
+@dataclass(frozen=True)
+class CodePart:
+    """Source text."""
+
+    text: str
+    caption: str = ""
+    kind: str = field(default="code", init=False)
+
+
+@dataclass(frozen=True)
+class DiffPart:
+    """A unified diff, line by line."""
+
+    lines: Sequence[str]
+    caption: str = ""
+    kind: str = field(default="diff", init=False)
+
+
+@dataclass(frozen=True)
+class PicturePart:
+    """A figure that was drawn by the run, embedded as data."""
+
+    data_uri: str
+    caption: str
+    kind: str = field(default="picture", init=False)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A diagnostic with its meaning in plain language.
+
+    Attributes:
+        name: The diagnostic.
+        value: Its value as text.
+        tone: How to take it.
+        meaning: What it measures, and what this value says.
+    """
+
+    name: str
+    value: str
+    tone: Tone
+    meaning: str
+
+
+@dataclass(frozen=True)
+class FindingsPart:
+    """Several diagnostics."""
+
+    findings: Sequence[Finding]
+    kind: str = field(default="findings", init=False)
+
+
+Part = TextPart | TablePart | ChartPart | CodePart | DiffPart | PicturePart | FindingsPart
+
+
+@dataclass(frozen=True)
+class Section:
+    """A chapter of the page."""
+
+    title: str
+    parts: Sequence[Part]
+
+
+@dataclass(frozen=True)
+class Report:
+    """A whole page.
+
+    Attributes:
+        kind: Command that made the run, such as ``"fit"``.
+        title: Heading.
+        verdict: What comes first.
+        figures: Key figures, which come second.
+        sections: The rest.
+    """
+
+    kind: str
+    title: str
+    verdict: Verdict
+    figures: Sequence[KeyFigure]
+    sections: Sequence[Section]
+
+
+def number(value: Any, format_spec: str = ".3g") -> str:
+    """Returns a number as text, and a dash for what is not known."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return "–"
+    return format(value, format_spec)
