@@ -151,7 +151,7 @@ def responses(hypothesis: Hypothesis) -> Responses:
             f"{pulse.name}.end": seconds[1:],
         }
         starts = fit.offsets[None].expand(len(edges) - 1, -1, -1)
-        moved = segments.run(simulator.with_effects(pulse), box.parameters | batch, starts)
+        moved = segments.run(simulator.with_effects(pulse), {**box.parameters, **batch}, starts)
         change = ((moved - base).double() * mask / fit.scale).flatten(-2) / height
         if bool(change.isfinite().all()):
             by_port[port.name] = change.permute(1, 2, 0)

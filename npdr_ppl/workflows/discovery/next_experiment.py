@@ -6,7 +6,7 @@ to do is the one whose smallest separation, over all pairs, is largest.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -106,7 +106,9 @@ def _excitations(time_step: float) -> dict[str, NDArray[np.float64]]:
     t = np.arange(round(SECONDS / time_step)) * time_step
     levels = np.array([0.5, -0.25, 1.0, -0.75, 0.25, -1.0, 0.75, -0.5])
     phase = 2 * np.pi * (0.3 * t + 0.5 * (8.0 - 0.3) / SECONDS * t**2)
-    waves = sum(np.sin(2 * np.pi * f * t + k) for k, f in enumerate((0.4, 0.9, 1.7, 3.1)))
+    waves = np.zeros_like(t)
+    for k, frequency in enumerate((0.4, 0.9, 1.7, 3.1)):
+        waves += np.sin(2 * np.pi * frequency * t + k)
     return {
         "slow_ramp": 2.0 * np.abs(2.0 * (t / SECONDS - np.floor(t / SECONDS + 0.5))) - 1.0,
         "reversals": np.sign(np.sin(2 * np.pi * 1.5 * t)),
@@ -125,14 +127,14 @@ def _recorded(
     names = rollouts.channel_names
     readings = rollouts.readings[0][0]
     inputs = Inputs.single(
-        torch.as_tensor(actions),
-        torch.as_tensor(readings),
+        torch.tensor(actions),
+        torch.tensor(readings),
         action_names=rollouts.action_names,
         state_names=names,
         time_step=rollouts.time_step,
         history=segments.inputs.past_actions.shape[-2],
     )
-    inputs = _with_rates(inputs)
+    inputs = replace(inputs, initial_rates=torch.zeros_like(inputs.initial_values))
     box = segments.black_box(hypothesis.fit.z[None])
     simulated = box.simulator.simulate(box.parameters, inputs)[0, 0].double().numpy()
     columns = [segments.sensor_names.index(name) for name in segments.channel_names]
@@ -145,12 +147,6 @@ def _recorded(
         action_names=rollouts.action_names,
         time_step=rollouts.time_step,
     )
-
-
-def _with_rates(inputs: Inputs) -> Inputs:
-    from dataclasses import replace
-
-    return replace(inputs, initial_rates=torch.zeros_like(inputs.initial_values))
 
 
 def _separation(
