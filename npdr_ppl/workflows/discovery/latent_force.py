@@ -23,7 +23,15 @@ from npdr_ppl.language.effects import ForceEffect
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
 
-__all__ = ["GenericLaw", "LatentForce", "Responses", "generic_laws", "latent_force", "responses"]
+__all__ = [
+    "GenericLaw",
+    "LatentForce",
+    "Responses",
+    "generic_laws",
+    "latent_force",
+    "responses",
+    "strongest_frequency",
+]
 
 PULSES = 10
 """Pulses per segment and joint."""
@@ -33,6 +41,10 @@ SMALL = 1e-3
 
 SIGN_WIDTH = 0.1
 """Over which part of a channel's spread a sign changes."""
+
+
+FREQUENCIES = 120
+"""Frequencies tried of a wave in time, spaced by half the resolution of the longest rollout."""
 
 
 class Pulse(ForceEffect):
@@ -180,6 +192,30 @@ def generic_laws(found: Responses, angles: frozenset[str] = frozenset()) -> list
         for port, change in found.by_port.items()
         for name, value in values.items()
     ]
+
+
+def strongest_frequency(projection: Projection, found: Responses, port: str) -> float:
+    """Returns the frequency in Hz of the wave in time that explains most as a force at a port.
+
+    Args:
+        projection: The fitted model.
+        found: The responses to pulses.
+        port: The port.
+    """
+    step = 0.5 / float(found.time.max() - found.time.min())
+    frequencies = step * torch.arange(1, FREQUENCIES + 1, dtype=torch.float64)
+    change = found.by_port[port]
+    gains = []
+    for chunk in frequencies.split(20):
+        angle = 2.0 * torch.pi * chunk * found.time[..., None]  # (S, pulses, F)
+        waves = torch.stack((angle.sin(), angle.cos()), dim=-1).flatten(-2)
+        scores = projection.scores(change @ waves)
+        for k in range(len(chunk)):
+            own = slice(2 * k, 2 * k + 2)
+            score = scores.score[own]
+            inverse = torch.linalg.pinv(scores.information[own, own], hermitian=True)
+            gains.append(float(score @ inverse @ score))
+    return float(frequencies[max(range(len(gains)), key=gains.__getitem__)])
 
 
 def latent_force(projection: Projection, found: Responses) -> list[LatentForce]:

@@ -15,7 +15,12 @@ from npdr_ppl.workflows.discovery.alarm import Alarm, sound_alarm
 from npdr_ppl.workflows.discovery.equivalents import irreducible
 from npdr_ppl.workflows.discovery.evidence import closest, weigh
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
-from npdr_ppl.workflows.discovery.latent_force import Responses, generic_laws, responses
+from npdr_ppl.workflows.discovery.latent_force import (
+    Responses,
+    generic_laws,
+    responses,
+    strongest_frequency,
+)
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.screening import Screened, screen
@@ -144,7 +149,7 @@ class Searcher:
         rounds = [first]
         removed: list[str] = []
         while now.alarm.fired and len(current.effects) < max_effects:
-            better, weights = self._extended(current, now.ranking)
+            better, weights = self._extended(current, now)
             rounds[-1] = replace(now, weights=weights)
             if better is None:
                 break
@@ -164,14 +169,28 @@ class Searcher:
     def look(self, hypothesis: Hypothesis) -> Round:
         """Screens all candidates at a fitted hypothesis."""
         projection = Projection(hypothesis)
-        ranking = screen(projection, sensitivities(hypothesis, self._candidates(hypothesis)))
         found = responses(hypothesis)
+        ranking = self._screened(projection, hypothesis, self._candidates(hypothesis), found)
         alarm = sound_alarm(
             projection, ranking, generic_laws(found, _angles(hypothesis)), self.options
         )
         best = ", ".join(s.name for s in ranking[:3]) or "none"
         self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
         return Round(hypothesis, alarm, ranking, found)
+
+    def _screened(
+        self,
+        projection: Projection,
+        hypothesis: Hypothesis,
+        candidates: tuple[Effect, ...],
+        found: Responses,
+    ) -> list[Screened]:
+        hints = {
+            effect.name: {"frequency": strongest_frequency(projection, found, effect.port)}
+            for effect in candidates
+            if effect.id == "periodic_disturbance" and effect.port in found.by_port
+        }
+        return screen(projection, sensitivities(hypothesis, candidates, hints))
 
     def _candidates(self, hypothesis: Hypothesis) -> tuple[Effect, ...]:
         """Returns the effects that may be added."""
@@ -180,9 +199,14 @@ class Searcher:
         return irreducible(candidate_effects(hypothesis.simulator), hypothesis.names)
 
     def _extended(
-        self, current: Hypothesis, ranking: list[Screened]
+        self, current: Hypothesis, now: Round
     ) -> tuple[Hypothesis | None, dict[str, float]]:
-        """Returns the model with the candidate that explains most, unless none does."""
+        """Returns the model with the candidate that explains most, unless none does.
+
+        A candidate explains something if chance does not, as the alarm counts, or if the evidence
+        against the model without it is strong.
+        """
+        ranking = now.ranking
         trials: dict[str, Hypothesis] = {}
         for candidate in ranking[:SHORTLIST]:
             found = self._fitted(current, candidate)
@@ -197,7 +221,8 @@ class Searcher:
         log_prior = [math.log(1 - PRIOR_OF_ANY), *(each for _ in trials)]
         weights = dict(zip(("", *trials), weigh(hypotheses, log_prior, seed=0), strict=True))
         best = max(trials, key=lambda name: weights[name])
-        if weights[""] > 1.0 - self.options.confidence:
+        is_chance = now.alarm.p_values[best] > self.options.false_alarm_rate
+        if is_chance and weights[""] > 1.0 - self.options.confidence:
             return None, weights
         self._report(f"adding {best}")
         return trials[best], weights
@@ -269,7 +294,7 @@ class Searcher:
         if without is None:
             return current, Added(effect, effect.name, 1.0, {effect.name: 1.0}), {}
         candidates = tuple(e for e in self._candidates(without) if e.name != effect.name)
-        ranking = screen(Projection(without), sensitivities(without, candidates))
+        ranking = self._screened(Projection(without), without, candidates, responses(without))
         trials = {effect.name: current}
         for candidate in ranking[:SHORTLIST]:
             found = self._fitted(without, candidate)

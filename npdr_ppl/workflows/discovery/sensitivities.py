@@ -17,12 +17,16 @@ from torch.distributions import Distribution
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 
 __all__ = ["Variant", "sensitivities"]
 
 SIZES = (1.0, 0.25)
 """Sizes of an effect that is not smooth, in those its probe gives."""
+
+BITES = 0.7
+"""Where in the commands' range a limit is tried first."""
 
 SMALL = 0.05
 """Size of one that is smooth: small enough for the linear term to rule."""
@@ -66,7 +70,11 @@ class Variant:
         return {f"{self.effect.name}.{name}": value for name, value in values.items()}
 
 
-def sensitivities(hypothesis: Hypothesis, effects: tuple[Effect, ...]) -> list[Variant]:
+def sensitivities(
+    hypothesis: Hypothesis,
+    effects: tuple[Effect, ...],
+    hints: Mapping[str, Mapping[str, float]] | None = None,
+) -> list[Variant]:
     """Returns what each effect would change, in each shape and size.
 
     Effects whose simulation fails are left out.
@@ -74,6 +82,7 @@ def sensitivities(hypothesis: Hypothesis, effects: tuple[Effect, ...]) -> list[V
     Args:
         hypothesis: Where the effects are to be added.
         effects: The candidates.
+        hints: Shapes to try besides, by effect's name: values of its parameters.
     """
     segments, fit = hypothesis.segments, hypothesis.fit
     box = segments.black_box(fit.z[None])
@@ -86,11 +95,15 @@ def sensitivities(hypothesis: Hypothesis, effects: tuple[Effect, ...]) -> list[V
         probe = effect.probe(port)
         strengths = effect.strength or tuple(p.name for p in effect.parameters)
         resting = {p.name: p.nominal for p in effect.parameters}
+        if effect.port in segments.inputs.action_names:
+            probe = _within_reach(effect, probe, segments.inputs)
         try:
             changed = box.simulator.with_effects(effect)
         except ModelError:
             continue
         shapes = _shapes(effect, priors, strengths)
+        if effect.name in (hints or {}):
+            shapes.append({**shapes[0], **(hints or {})[effect.name]})
         sizes = (SMALL,) if effect.is_smooth else SIZES
         for shape, size in itertools.product(shapes, sizes):
             values = {**probe, **shape}
@@ -150,9 +163,19 @@ def _shapes(
     return shapes[:MOST_SHAPES]
 
 
+def _within_reach(effect: Effect, probe: dict[str, float], inputs: Inputs) -> dict[str, float]:
+    """Returns the probe with limits that the commands of the recording reach."""
+    k = inputs.action_names.index(effect.port)
+    peak = float(inputs.actions[..., k].abs().max())
+    return {
+        p.name: probe[p.name] if math.isfinite(p.nominal) else BITES * peak
+        for p in effect.parameters
+    }
+
+
 def _resting(nominal: float, probe: float) -> float:
-    """Returns zero strength as a number to interpolate from; a limit at infinity rests far off."""
-    return nominal if math.isfinite(nominal) else 2.0 * probe
+    """Returns zero strength as a number to interpolate from: a limit rests at the peak."""
+    return nominal if math.isfinite(nominal) else probe / BITES
 
 
 def _limits(

@@ -1,0 +1,210 @@
+"""The blind benchmark of discovery: hidden effects, verdicts, and how often they are right.
+
+    python benchmarks/discovery.py --part tune --out tune.jsonl            # thresholds were set here
+    python benchmarks/discovery.py --part test --out test.jsonl --workers 2
+    python benchmarks/discovery.py --summary test.jsonl
+
+The truths are made by :mod:`hidden_rigs`: other equations, integrators and laws than the package's.
+An effect's strength is set by its separation d: the distance, in standard deviations of the
+readings, between the recordings with and without it once all nominal parameters are refitted.
+Rows are written as they come, and a run given again continues. Tuning and reporting use other
+seeds, hence other parameters, excitations and noise.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from discovery_summary import print_summary
+from hidden_rigs import RIGS, Case, Condition, make_case, places
+
+import npdr_ppl as npdr
+from npdr_ppl.workflows.discovery.search import Searcher
+
+SEEDS = {"tune": range(100), "test": range(1000, 1100)}
+"""Seeds of both parts."""
+
+SEPARATIONS = (5.0, 10.0, 30.0)
+NULLS: tuple[Condition, ...] = ("null", "null_noise3", "null_coloured", "null_outliers")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One case to be judged.
+
+    Attributes:
+        rig: Name of the rig.
+        condition: What is hidden, or ``"without"``: one effect, its entry taken from the
+            catalogue.
+        place: Index of what is hidden among the rig's places.
+        separation: Separation to set the strength by; 0 for the rig's typical size.
+        seed: The case's seed.
+    """
+
+    rig: str
+    condition: str
+    place: int
+    separation: float
+    seed: int
+
+
+def tasks(
+    conditions: list[str], rigs: list[str], seeds: list[int], separations: list[float]
+) -> Iterator[Task]:
+    """Returns all cases, seed by seed so that a run stopped early is balanced."""
+    for number, seed in enumerate(seeds):
+        for condition in conditions:
+            for rig in rigs:
+                hidden = "one" if condition == "without" else condition
+                count = len(places(rig, hidden, seed))  # pyright: ignore[reportArgumentType]
+                for place in range(count):
+                    if condition in ("one", "without"):
+                        # One separation per place and seed, in turn.
+                        wanted = separations[(place + number) % len(separations)]
+                    else:
+                        wanted = separations[-1] if condition in ("two", "outside") else 0.0
+                    yield Task(rig, condition, place, wanted, seed)
+
+
+def judge(task: Task) -> dict[str, Any]:
+    """Makes a case, discovers, and returns the row."""
+    torch.set_num_threads(1)
+    row: dict[str, Any] = asdict(task)
+    start = time.process_time()
+    try:
+        case, strength, separation = _case(task)
+        row |= {
+            "strength": strength,
+            "d": separation,
+            "truth": list(case.names),
+            "alternatives": [list(a) for a in case.alternatives],
+            "true_parameters": {
+                f"{h.name}.{n}": float(v) for h in case.truth for n, v in h.parameters.items()
+            },
+        }
+        options = npdr.DiscoveryOptions(seed=task.seed, effects=_catalogue(task, case))
+        found = npdr.discover(case.model, case.fit, holdout=case.holdout, options=options)
+        row |= {
+            "verdict": found.verdict,
+            "problems": list(found.problems),
+            "p_value": found.alarm.p_value,
+            "left_p_value": found.remainder.p_value,
+            "unexplained": found.unexplained,
+            "effects": [finding.to_dict() for finding in found.effects],
+            "ranking": [candidate.name for candidate in found.ranking[:5]],
+            "gap": {name: gap.to_dict() for name, gap in found.gap.items()},
+        }
+    except Exception as error:  # a failure is a row with its message
+        row["error"] = f"{type(error).__name__}: {error}"[:300]
+    return row | {"cpu": time.process_time() - start}
+
+
+def _case(task: Task) -> tuple[Case, float, float]:
+    """Returns a case, its strength and its separation."""
+    condition: Any = "one" if task.condition == "without" else task.condition
+    chosen = places(task.rig, condition, task.seed)[task.place]
+
+    def at(strength: float) -> Case:
+        return make_case(task.rig, condition, chosen, strength=strength, seed=task.seed)
+
+    if not task.separation:
+        return at(1.0), 1.0, float("nan")
+    strength, case = 1.0, at(1.0)
+    for _ in range(4):
+        found = separation(case)
+        if not found or 0.8 < found / task.separation < 1.25:
+            break
+        strength *= min(20.0, max(0.03, task.separation / found))
+        case = at(strength)
+    return case, strength, separation(case)
+
+
+def separation(case: Case) -> float:
+    """Returns how far the recording is from what the refitted model explains.
+
+    The square root of the misfit that goes beyond what the noise alone leaves, which the same
+    case without anything hidden shows; it needs no law of the catalogue.
+    """
+    quiet = make_case(case.rig, "null", (), seed=case.seed)
+    options = npdr.DiscoveryOptions()
+    hidden, null = (Searcher(c.model, c.fit, options).fit_base() for c in (case, quiet))
+    scale = null.fit.scale
+    excess = 2.0 * float((hidden.losses(scale) - null.losses(scale)).sum())
+    return max(excess, 0.0) ** 0.5
+
+
+def _catalogue(task: Task, case: Case) -> tuple[npdr.Effect, ...] | None:
+    """Returns the effects to search, without the true one where it is to be missing."""
+    if task.condition != "without":
+        return None
+    from npdr_ppl.models.effects import candidate_effects
+    from npdr_ppl.workflows.discovery.equivalents import irreducible
+
+    searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions())
+    every = irreducible(candidate_effects(searcher.fit_base().simulator))
+    gone = {name for names in (case.names, *case.alternatives) for name in names}
+    ids = {name.rsplit(".", 1)[1] for name in case.names}
+    return tuple(e for e in every if e.name not in gone and e.id not in ids)
+
+
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in ("rig", "condition", "place", "separation", "seed"))
+
+
+def main() -> None:
+    """Runs the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--part", choices=sorted(SEEDS), default="tune")
+    parser.add_argument("--conditions", default="null,null_noise3,null_coloured,null_outliers,one")
+    parser.add_argument("--rigs", default=",".join(RIGS))
+    parser.add_argument("--num-seeds", type=int, default=1)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--separations", default=",".join(map(str, SEPARATIONS)))
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("discovery.jsonl"))
+    parser.add_argument("--summary", type=Path, help="only summarise this file")
+    arguments = parser.parse_args()
+    if arguments.summary:
+        print_summary(arguments.summary)
+        return
+    done = set()
+    if arguments.out.exists():
+        done = {_key(json.loads(line)) for line in arguments.out.read_text().splitlines()}
+    first = arguments.first_seed
+    seeds = list(SEEDS[arguments.part])[first : first + arguments.num_seeds]
+    wanted = [
+        task
+        for task in tasks(
+            arguments.conditions.split(","),
+            arguments.rigs.split(","),
+            seeds,
+            [float(d) for d in arguments.separations.split(",")],
+        )
+        if _key(asdict(task)) not in done
+    ]
+    print(f"{len(wanted)} cases to judge, {len(done)} done", flush=True)
+    with (
+        arguments.out.open("a") as file,
+        ProcessPoolExecutor(arguments.workers) as pool,
+    ):
+        for future in as_completed(pool.submit(judge, task) for task in wanted):
+            row = future.result()
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+            found = [f"{e['port']}.{e['effect']}" for e in row.get("effects", [])]
+            print(
+                f"{row['rig']} {row['condition']} d {row.get('d', 0.0):.1f} {row.get('truth')} → "
+                f"{row.get('verdict', row.get('error'))} {found} {row['cpu']:.0f} s",
+                flush=True,
+            )
+    print_summary(arguments.out)
+
+
+if __name__ == "__main__":
+    main()
