@@ -1,11 +1,11 @@
 """The blind benchmark of discovery: hidden effects, verdicts, and how often they are right.
 
-    python benchmarks/discovery.py --part tune --out tune.jsonl            # thresholds were set here
+    python benchmarks/discovery.py --part tune --out tune.jsonl   # thresholds were set here
     python benchmarks/discovery.py --part test --out test.jsonl --workers 2
     python benchmarks/discovery.py --summary test.jsonl
 
-The truths are made by :mod:`hidden_rigs`: other equations, integrators and laws than the package's.
-An effect's strength is set by its separation d: the distance, in standard deviations of the
+The truths are made by :mod:`hidden_rigs`: equations, integrators and laws of their own. An
+effect's strength is set by its separation d: the distance, in standard deviations of the
 readings, between the recordings with and without it once all nominal parameters are refitted.
 Rows are written as they come, and a run given again continues. Tuning and reporting use other
 seeds, hence other parameters, excitations and noise.
@@ -13,6 +13,7 @@ seeds, hence other parameters, excitations and noise.
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -22,7 +23,7 @@ from typing import Any
 
 import torch
 from discovery_summary import print_summary
-from hidden_rigs import RIGS, Case, Condition, make_case, places
+from hidden_rigs import RIGS, Case, make_case, places
 
 import npdr_ppl as npdr
 from npdr_ppl.workflows.discovery.search import Searcher
@@ -31,7 +32,8 @@ SEEDS = {"tune": range(100), "test": range(1000, 1100)}
 """Seeds of both parts."""
 
 SEPARATIONS = (5.0, 10.0, 30.0)
-NULLS: tuple[Condition, ...] = ("null", "null_noise3", "null_coloured", "null_outliers")
+MEASURABLE = (25.0, 60.0)
+"""Separations that stand out of the noise and are not yet too far for refitting."""
 
 
 @dataclass(frozen=True)
@@ -115,14 +117,16 @@ def _case(task: Task) -> tuple[Case, float, float]:
 
     if not task.separation:
         return at(1.0), 1.0, float("nan")
-    strength, case = 1.0, at(1.0)
+    # Where it can be measured well; below, it is proportional to the strength.
+    strength, found = 1.0, separation(at(1.0))
     for _ in range(4):
-        found = separation(case)
-        if not found or 0.8 < found / task.separation < 1.25:
+        if MEASURABLE[0] < found < MEASURABLE[1]:
             break
-        strength *= min(20.0, max(0.03, task.separation / found))
-        case = at(strength)
-    return case, strength, separation(case)
+        aim = math.sqrt(MEASURABLE[0] * MEASURABLE[1])
+        strength *= 10.0 if found < 3.0 else aim / found
+        found = separation(at(strength))
+    wanted = strength * task.separation / max(found, 1e-9)
+    return at(wanted), wanted, task.separation
 
 
 def separation(case: Case) -> float:

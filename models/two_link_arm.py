@@ -34,7 +34,7 @@ class TwoLinkArm(MujocoSimulator):
         num_threads: Threads; ``None`` for as many as torch uses.
     """
 
-    def __init__(self, *, substeps: int = 5, num_threads: int | None = None) -> None:
+    def __init__(self, *, substeps: int = 1, num_threads: int | None = None) -> None:
         super().__init__(
             _XML,
             {
