@@ -52,6 +52,7 @@ class LikelihoodPreconditioner(Preconditioner):
         feature_knots: Quantiles of each feature, ``(F, K)``; beyond the outer ones, where a
             density would extrapolate, features are clipped.
         feature_scores: Normal scores of the quantiles, ``(K,)``.
+        is_bounded: Whether m and the density are functions of Phi(z) instead of z, a scalar.
     """
 
     degrees: Tensor
@@ -59,6 +60,11 @@ class LikelihoodPreconditioner(Preconditioner):
     directions: Tensor
     feature_knots: Tensor
     feature_scores: Tensor
+    is_bounded: Tensor
+
+    def features(self, x: Tensor) -> Tensor:
+        """Standardises parameters ``(n, d)``, in the coordinate that was chosen."""
+        return super().features(bounded(x) if bool(self.is_bounded) else x)
 
     def statistics(self, x: Tensor) -> Tensor:
         """Returns V^T s of features ``(n, F)``, ``(n, k)``."""
@@ -80,42 +86,69 @@ def fit_likelihood_preconditioner(
         x: Features, ``(n, F)``.
         max_features: Combinations k at most.
     """
-    knots = torch.stack((z.mean(0), z.std(0).clamp_min(1e-12)))
-    f = (z - knots[0]) / knots[1]
-    edges = torch.stack((f.amin(0), f.amax(0)))
     limit = min(MAX_TERMS, max(z.shape[1], len(z) // SIMULATIONS_PER_TERM))
     candidates = [
         degrees_of(z.shape[1], degree)
         for degree in range(1, MAX_DEGREE + 1)
         if comb(z.shape[1] + degree, degree) - 1 <= limit or degree == 1
     ]
-    bases = [polynomials(f, edges, degrees) for degrees in candidates]
+    coordinates = [_Coordinate.of(z), _Coordinate.of(bounded(z))]
+    bases = [[c.polynomials(degrees) for degrees in candidates] for c in coordinates]
     feature_knots, feature_scores = quantile_knots(x)
     seen = normal_scores(x, feature_knots, feature_scores)
     directions = x.new_zeros(x.shape[1], 0)
     if x.shape[1] > max_features:
-        directions = discriminants(seen, bases[-1], max_features)
+        directions = discriminants(seen, torch.cat([b[-1] for b in bases], dim=1), max_features)
         seen = seen @ directions
-    best: tuple[float, Tensor, Tensor, Tensor, Tensor] | None = None
-    for degrees, basis in zip(candidates, bases, strict=True):
-        gain, offset, residuals = ridge_regression(basis, seen)
-        error = residuals.double().var(0).clamp_min(1e-30).log().sum().item()
-        if best is None or error < best[0]:
-            best = error, degrees, gain, offset, residuals
+    best: tuple[float, int, Tensor, Tensor, Tensor, Tensor] | None = None
+    for k, own in enumerate(bases):
+        for degrees, basis in zip(candidates, own, strict=True):
+            gain, offset, residuals = ridge_regression(basis, seen)
+            error = residuals.double().var(0).clamp_min(1e-30).log().sum().item()
+            if best is None or error < best[0]:
+                best = error, k, degrees, gain, offset, residuals
     assert best is not None
-    _, degrees, gain, offset, residuals = best
+    _, chosen, degrees, gain, offset, residuals = best
     return LikelihoodPreconditioner(
-        knots=knots,
+        knots=coordinates[chosen].knots,
         scores=z.new_zeros(0),
         gain=gain,
         offset=offset,
         factor=residual_factor(residuals, seen),
         degrees=degrees,
-        edges=edges,
+        edges=coordinates[chosen].edges,
         directions=directions,
         feature_knots=feature_knots,
         feature_scores=feature_scores,
+        is_bounded=torch.tensor(bool(chosen)),
     )
+
+
+def bounded(z: Tensor) -> Tensor:
+    """Returns Phi(z) scaled to unit variance under a standard normal; linear in a uniform prior.
+
+    A parameter with a uniform prior hardly changes where z is large, so that what it does is
+    smooth in Phi(z) up to the prior's ends, and not in z.
+    """
+    return torch.special.ndtr(z) * 12.0**0.5
+
+
+@dataclass(frozen=True)
+class _Coordinate:
+    """One way to write the parameters, standardised."""
+
+    knots: Tensor
+    edges: Tensor
+    values: Tensor
+
+    @classmethod
+    def of(cls, z: Tensor) -> "_Coordinate":
+        knots = torch.stack((z.mean(0), z.std(0).clamp_min(1e-12)))
+        values = (z - knots[0]) / knots[1]
+        return cls(knots, torch.stack((values.amin(0), values.amax(0))), values)
+
+    def polynomials(self, degrees: Tensor) -> Tensor:
+        return polynomials(self.values, self.edges, degrees)
 
 
 def degrees_of(num_parameters: int, degree: int) -> Tensor:
