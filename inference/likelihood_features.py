@@ -63,7 +63,7 @@ class LikelihoodPreconditioner(Preconditioner):
     is_bounded: Tensor
 
     def features(self, x: Tensor) -> Tensor:
-        """Standardises parameters ``(n, d)``, in the coordinate that was chosen."""
+        """Standardises parameters ``(n, d)``, or Phi of them."""
         return super().features(bounded(x) if bool(self.is_bounded) else x)
 
     def statistics(self, x: Tensor) -> Tensor:
@@ -77,7 +77,7 @@ class LikelihoodPreconditioner(Preconditioner):
 
 
 def fit_likelihood_preconditioner(
-    z: Tensor, x: Tensor, max_features: int
+    z: Tensor, x: Tensor, max_features: int, *, is_bounded: bool = False
 ) -> LikelihoodPreconditioner:
     """Fits polynomial, combinations and whitening to simulations.
 
@@ -85,6 +85,7 @@ def fit_likelihood_preconditioner(
         z: Parameters, ``(n, d)``.
         x: Features, ``(n, F)``.
         max_features: Combinations k at most.
+        is_bounded: Whether m and the density are functions of Phi(z) instead of z.
     """
     limit = min(MAX_TERMS, max(z.shape[1], len(z) // SIMULATIONS_PER_TERM))
     candidates = [
@@ -92,35 +93,37 @@ def fit_likelihood_preconditioner(
         for degree in range(1, MAX_DEGREE + 1)
         if comb(z.shape[1] + degree, degree) - 1 <= limit or degree == 1
     ]
-    coordinates = [_Coordinate.of(z), _Coordinate.of(bounded(z))]
-    bases = [[c.polynomials(degrees) for degrees in candidates] for c in coordinates]
+    values = bounded(z) if is_bounded else z
+    knots = torch.stack((values.mean(0), values.std(0).clamp_min(1e-12)))
+    f = (values - knots[0]) / knots[1]
+    edges = torch.stack((f.amin(0), f.amax(0)))
+    bases = [polynomials(f, edges, degrees) for degrees in candidates]
     feature_knots, feature_scores = quantile_knots(x)
     seen = normal_scores(x, feature_knots, feature_scores)
     directions = x.new_zeros(x.shape[1], 0)
     if x.shape[1] > max_features:
-        directions = discriminants(seen, torch.cat([b[-1] for b in bases], dim=1), max_features)
+        directions = discriminants(seen, bases[-1], max_features)
         seen = seen @ directions
-    best: tuple[float, int, Tensor, Tensor, Tensor, Tensor] | None = None
-    for k, own in enumerate(bases):
-        for degrees, basis in zip(candidates, own, strict=True):
-            gain, offset, residuals = ridge_regression(basis, seen)
-            error = residuals.double().var(0).clamp_min(1e-30).log().sum().item()
-            if best is None or error < best[0]:
-                best = error, k, degrees, gain, offset, residuals
+    best: tuple[float, Tensor, Tensor, Tensor, Tensor] | None = None
+    for degrees, basis in zip(candidates, bases, strict=True):
+        gain, offset, residuals = ridge_regression(basis, seen)
+        error = residuals.double().var(0).clamp_min(1e-30).log().sum().item()
+        if best is None or error < best[0]:
+            best = error, degrees, gain, offset, residuals
     assert best is not None
-    _, chosen, degrees, gain, offset, residuals = best
+    _, degrees, gain, offset, residuals = best
     return LikelihoodPreconditioner(
-        knots=coordinates[chosen].knots,
+        knots=knots,
         scores=z.new_zeros(0),
         gain=gain,
         offset=offset,
         factor=residual_factor(residuals, seen),
         degrees=degrees,
-        edges=coordinates[chosen].edges,
+        edges=edges,
         directions=directions,
         feature_knots=feature_knots,
         feature_scores=feature_scores,
-        is_bounded=torch.tensor(bool(chosen)),
+        is_bounded=torch.tensor(is_bounded),
     )
 
 
@@ -131,24 +134,6 @@ def bounded(z: Tensor) -> Tensor:
     smooth in Phi(z) up to the prior's ends, and not in z.
     """
     return torch.special.ndtr(z) * 12.0**0.5
-
-
-@dataclass(frozen=True)
-class _Coordinate:
-    """One way to write the parameters, standardised."""
-
-    knots: Tensor
-    edges: Tensor
-    values: Tensor
-
-    @classmethod
-    def of(cls, z: Tensor) -> "_Coordinate":
-        knots = torch.stack((z.mean(0), z.std(0).clamp_min(1e-12)))
-        values = (z - knots[0]) / knots[1]
-        return cls(knots, torch.stack((values.amin(0), values.amax(0))), values)
-
-    def polynomials(self, degrees: Tensor) -> Tensor:
-        return polynomials(self.values, self.edges, degrees)
 
 
 def degrees_of(num_parameters: int, degree: int) -> Tensor:
