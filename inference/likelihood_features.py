@@ -52,6 +52,7 @@ class LikelihoodPreconditioner(Preconditioner):
         feature_knots: Quantiles of each feature, ``(F, K)``; beyond the outer ones, where a
             density would extrapolate, features are clipped.
         feature_scores: Normal scores of the quantiles, ``(K,)``.
+        is_bounded: Whether m and the density are functions of Phi(z) instead of z, a scalar.
     """
 
     degrees: Tensor
@@ -59,6 +60,11 @@ class LikelihoodPreconditioner(Preconditioner):
     directions: Tensor
     feature_knots: Tensor
     feature_scores: Tensor
+    is_bounded: Tensor
+
+    def features(self, x: Tensor) -> Tensor:
+        """Standardises parameters ``(n, d)``, or Phi of them."""
+        return super().features(bounded(x) if bool(self.is_bounded) else x)
 
     def statistics(self, x: Tensor) -> Tensor:
         """Returns V^T s of features ``(n, F)``, ``(n, k)``."""
@@ -71,7 +77,7 @@ class LikelihoodPreconditioner(Preconditioner):
 
 
 def fit_likelihood_preconditioner(
-    z: Tensor, x: Tensor, max_features: int
+    z: Tensor, x: Tensor, max_features: int, *, is_bounded: bool = False
 ) -> LikelihoodPreconditioner:
     """Fits polynomial, combinations and whitening to simulations.
 
@@ -79,16 +85,18 @@ def fit_likelihood_preconditioner(
         z: Parameters, ``(n, d)``.
         x: Features, ``(n, F)``.
         max_features: Combinations k at most.
+        is_bounded: Whether m and the density are functions of Phi(z) instead of z.
     """
-    knots = torch.stack((z.mean(0), z.std(0).clamp_min(1e-12)))
-    f = (z - knots[0]) / knots[1]
-    edges = torch.stack((f.amin(0), f.amax(0)))
     limit = min(MAX_TERMS, max(z.shape[1], len(z) // SIMULATIONS_PER_TERM))
     candidates = [
         degrees_of(z.shape[1], degree)
         for degree in range(1, MAX_DEGREE + 1)
         if comb(z.shape[1] + degree, degree) - 1 <= limit or degree == 1
     ]
+    values = bounded(z) if is_bounded else z
+    knots = torch.stack((values.mean(0), values.std(0).clamp_min(1e-12)))
+    f = (values - knots[0]) / knots[1]
+    edges = torch.stack((f.amin(0), f.amax(0)))
     bases = [polynomials(f, edges, degrees) for degrees in candidates]
     feature_knots, feature_scores = quantile_knots(x)
     seen = normal_scores(x, feature_knots, feature_scores)
@@ -115,7 +123,17 @@ def fit_likelihood_preconditioner(
         directions=directions,
         feature_knots=feature_knots,
         feature_scores=feature_scores,
+        is_bounded=torch.tensor(is_bounded),
     )
+
+
+def bounded(z: Tensor) -> Tensor:
+    """Returns Phi(z) scaled to unit variance under a standard normal; linear in a uniform prior.
+
+    A parameter with a uniform prior hardly changes where z is large, so that what it does is
+    smooth in Phi(z) up to the prior's ends, and not in z.
+    """
+    return torch.special.ndtr(z) * 12.0**0.5
 
 
 def degrees_of(num_parameters: int, degree: int) -> Tensor:

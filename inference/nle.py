@@ -18,7 +18,7 @@ E[x | z] are a sufficient statistic.
 
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -36,6 +36,8 @@ from npdr_ppl.inference.training import Loss
 
 __all__ = ["NLE"]
 
+Coordinates = Literal["normal", "bounded"]
+
 
 @dataclass(frozen=True)
 class NLE(LikelihoodBackend):
@@ -47,6 +49,10 @@ class NLE(LikelihoodBackend):
         hidden: Widths of the hidden layers of each transform's conditioner.
         bins: Bins of a spline.
         max_features: Combinations of the features that the flow sees at most.
+        coordinates: ``"normal"``, in which every prior is, or ``"bounded"``, Phi of them, in
+            which uniform priors are. A parameter near its range's end hardly moves in the first,
+            and what it does there is learnt badly; choose the second where a posterior, a
+            hierarchical one above all, reaches the ends of uniform ranges.
 
     The other options are those of :class:`~npdr_ppl.inference.neural.NeuralBackend`.
     """
@@ -63,11 +69,13 @@ class NLE(LikelihoodBackend):
     hidden: tuple[int, ...] = (128, 128)
     bins: int = 8
     max_features: int = 16
+    coordinates: Coordinates = "normal"
 
     def __post_init__(self) -> None:
         """Validates the options."""
         super().__post_init__()
         self._check_choice("flow", FLOWS)
+        self._check_choice("coordinates", get_args(Coordinates))
         self._check_widths("hidden")
         self._check_ranges(
             transforms=(1, float("inf")), bins=(1, float("inf")), max_features=(1, float("inf"))
@@ -100,7 +108,10 @@ class NLE(LikelihoodBackend):
         return [partial(log_likelihood, network) for network in networks]
 
     def _precondition(self, problem: Problem, simulations: Simulations) -> Preconditioner:
-        return fit_likelihood_preconditioner(simulations.z, simulations.x, self.max_features)
+        is_bounded = self.coordinates == "bounded"
+        return fit_likelihood_preconditioner(
+            simulations.z, simulations.x, self.max_features, is_bounded=is_bounded
+        )
 
     def _outside(self, problem: Problem, preconditioner: Preconditioner) -> Tensor:
         assert isinstance(preconditioner, LikelihoodPreconditioner)

@@ -149,6 +149,37 @@ def test_a_smooth_mean_is_regressed_away_and_the_posterior_recovered():
     assert 0.7 < draws.std() / exact_sd < 1.4
 
 
+def distance_at_the_end_of_a_range(coordinates):
+    """Total variation between learnt and exact posterior of a parameter at 99 % of its range."""
+    amplitudes, noise = torch.linspace(0.5, 2.0, 8), 0.02
+    with seeded(5):
+        z = torch.randn(8000, 1)
+        x = torch.special.ndtr(z) ** 2 * amplitudes + noise * torch.randn(8000, 8)
+        observation = 0.99**2 * amplitudes + noise * torch.randn(8)
+    problem, method = make_problem(1, observation), NLE(coordinates=coordinates)
+    with seeded(6):
+        state, _ = method.tell(problem, method.init(problem), z, x)
+    grid = torch.linspace(1.6, 3.2, 60)[:, None]
+    (log_likelihood,) = method.log_likelihoods(problem, state)
+    with torch.no_grad():
+        learnt = log_likelihood(grid, observation.expand(60, 8))
+    errors = (observation - torch.special.ndtr(grid) ** 2 * amplitudes) / noise
+    prior = -0.5 * grid[:, 0] ** 2
+    p, q = ((t + prior).softmax(0) for t in (learnt, -0.5 * errors.square().sum(-1)))
+    return float(0.5 * (p - q).abs().sum())
+
+
+def test_bounded_coordinates_learn_what_happens_at_the_end_of_a_range():
+    bounded = distance_at_the_end_of_a_range("bounded")
+    assert bounded < 0.1
+    assert bounded < distance_at_the_end_of_a_range("normal")
+
+
+def test_unknown_coordinates_are_refused():
+    with pytest.raises(BackendError, match="coordinates"):
+        NLE(coordinates="polar")
+
+
 @pytest.mark.parametrize("name", ["nle", "nre"])
 def test_refuses_an_embedding_that_is_learnt(name):
     problem = make_problem(1, torch.zeros(5), build_network=lambda: nn.Linear(5, 2))
