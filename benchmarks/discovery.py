@@ -125,7 +125,12 @@ def _case(task: Task) -> tuple[Case, float, float]:
         aim = math.sqrt(MEASURABLE[0] * MEASURABLE[1])
         strength *= 10.0 if found < 3.0 else aim / found
         found = separation(at(strength))
-    wanted = strength * task.separation / max(found, 1e-9)
+    if found < MEASURABLE[0]:
+        raise ValueError(f"{chosen} cannot be made strong enough")
+    # Elasticity and play grow faster than their strength.
+    half = separation(at(0.5 * strength))
+    power = min(3.0, max(1.0, math.log2(found / max(half, 1e-9))))
+    wanted = strength * (task.separation / found) ** (1.0 / power)
     return at(wanted), wanted, task.separation
 
 

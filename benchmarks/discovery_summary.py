@@ -12,6 +12,9 @@ from scipy.stats import beta
 
 __all__ = ["is_class_right", "is_first_right", "print_summary"]
 
+RATE = 0.03
+"""The rate of false alarms that was asked for."""
+
 Row = dict[str, Any]
 
 
@@ -39,7 +42,11 @@ def is_class_right(row: Row) -> bool:
         return False
     alternatives = row["effects"][0]["alternatives"]
     named = {name for name, p in alternatives.items() if p >= 0.05}
-    return any(named & right for right in right_sets(row))
+    ids = set(row["effects"][0]["equivalent_to"])
+    return any(
+        named & right or ids & {name.rsplit(".", 1)[1] for name in right}
+        for right in right_sets(row)
+    )
 
 
 def is_confident_and_wrong(row: Row) -> bool:
@@ -68,10 +75,10 @@ def print_summary(path: Path) -> None:
     rows = [row for row in rows if "error" not in row]
     print(f"{len(rows)} cases, {len(failed)} failed: {Counter(r['error'][:80] for r in failed)}")
     nulls = [row for row in rows if row["condition"].startswith("null")]
-    print("false alarms:", rate(nulls, lambda r: r["p_value"] <= 0.01))
+    print("false alarms:", rate(nulls, lambda r: r["p_value"] <= RATE))
     for kind in sorted({row["condition"] for row in nulls}):
         own = [row for row in nulls if row["condition"] == kind]
-        print(f"  {kind}:", rate(own, lambda r: r["p_value"] <= 0.01))
+        print(f"  {kind}:", rate(own, lambda r: r["p_value"] <= RATE))
         print(f"  {kind}, not 'none':", rate(own, lambda r: r["verdict"] != "none"))
     one = [row for row in rows if row["condition"] == "one"]
     for low, high in ((4.0, 7.0), (7.0, 15.0), (15.0, 1e9)):

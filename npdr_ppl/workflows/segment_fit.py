@@ -45,8 +45,9 @@ DAMPINGS = torch.logspace(-6, 2, 9, dtype=torch.float64)
 LARGEST_STEP = 1.0
 """Greatest change of a coordinate in one step, in standard deviations."""
 
-MAX_COORDINATE = 3.0
-"""How far from the prior's centre a fit may lie, in standard deviations."""
+MAX_COORDINATE = 5.0
+"""How far from the prior's centre a fit may lie, in standard deviations. A strength that is much
+smaller than its half-normal prior expects lies at −3 and beyond."""
 
 LEAST_GAIN = 1e-3
 """Relative reduction of the objective below which steps end."""

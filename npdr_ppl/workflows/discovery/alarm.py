@@ -14,6 +14,11 @@ from npdr_ppl.workflows.discovery.screening import Screened
 __all__ = ["Alarm", "sound_alarm"]
 
 
+CATALOGUE_SHARE = 0.75
+"""Share of the false alarms that the catalogue's candidates may raise; the rest is for generic
+laws."""
+
+
 @dataclass(frozen=True)
 class Alarm:
     """Whether a fitted model and the recording disagree.
@@ -63,7 +68,14 @@ def sound_alarm(
             gains.append(float(scores.score[k] ** 2 / information[k]))
     if not groups:
         return Alarm(1.0, False, "", 0.0, {})
-    values = LargestStatistic(projection, seed=options.seed).p_values(groups)
+    chance = LargestStatistic(projection, seed=options.seed)
+    # Each kind is a search of its own: a hundred laws that no one believes in must not make the
+    # catalogue's harder to hear.
+    num = len(ranking)
+    values = [
+        *(min(1.0, p / CATALOGUE_SHARE) for p in chance.p_values(groups[:num])),
+        *(min(1.0, p / (1.0 - CATALOGUE_SHARE)) for p in chance.p_values(groups[num:])),
+    ]
     p_value = min(values)
     loudest = max((k for k in range(len(names)) if values[k] == p_value), key=lambda k: gains[k])
     return Alarm(

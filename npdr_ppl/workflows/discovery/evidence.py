@@ -2,7 +2,7 @@
 
 Each segment's log density under each fitted hypothesis is computed with one scale of the readings
 and one share of independent readings, those of the hypothesis that leaves least. Evidence is their
-sum, less what the priors and the posteriors' narrowness cost (Laplace), plus the log of the prior
+sum, less what the priors and the number of parameters cost, plus the log of the prior
 probability. The weights are pseudo-BMA+ (Yao, Vehtari, Simpson & Gelman 2018): evidence is
 resampled over blocks of segments by the Bayesian bootstrap, so that two hypotheses which differ by
 a few lucky segments share the probability.
@@ -41,7 +41,7 @@ def evidence(
     rows = []
     for hypothesis, prior in zip(hypotheses, log_prior, strict=True):
         blocks = -share * block_sums(hypothesis.losses(scale)[:, None])[:, 0]
-        rows.append(blocks + (prior - hypothesis.complexity(scale, share)) / len(blocks))
+        rows.append(blocks + (prior - hypothesis.complexity) / len(blocks))
     return torch.stack(rows)
 
 

@@ -1,5 +1,6 @@
 """A hypothesis: the model with some effects, fitted to the recording."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,9 +24,13 @@ from npdr_ppl.workflows.segment_fit import (
 
 __all__ = ["Hypothesis", "fit_hypothesis"]
 
-START_LIMIT = 2.0
+START_LIMIT = 4.5
 """How far from the prior's centre a fit may begin, in standard deviations: at the ends of a range
 a parameter hardly moves in reference coordinates."""
+
+LEAST_PENALISED = -1.0
+"""Coordinate below which the prior no longer speaks against a hypothesis: that an effect is small
+is no reason to doubt it, and half-normal priors have zero strength at minus infinity."""
 
 Model = Callable[..., Any]
 
@@ -85,19 +90,17 @@ class Hypothesis:
         residual = self.segments.residuals(self.fit.z[None], self.fit.offsets[None], scale)[0]
         return 0.5 * (residual.square().sum(-1) + self.fit.offsets.square().sum(-1))
 
-    def complexity(self, scale: Tensor, share: float) -> float:
-        """Returns the loss that the prior and the posterior's narrowness add to the evidence.
+    @property
+    def complexity(self) -> float:
+        """The loss that the priors and the number of the effects' parameters add to the evidence.
 
-        ½|z|² + ½ log |1 + H|, by Laplace's approximation.
-
-        Args:
-            scale: Standard deviation of the readings per channel, ``(C,)``.
-            share: Share of independent readings.
+        Half the squared coordinates, and half the log of the number of segments for each parameter
+        of an effect: the prior of each is worth one segment (Kass & Wasserman 1995). Priors as
+        wide as typical sizes would speak against every effect that is small and yet plain.
         """
-        ratio = float((self.fit.scale / scale).square().mean())
-        information = self.linearisation.information() * ratio * share
-        eye = torch.eye(len(information), dtype=torch.float64)
-        return 0.5 * float(self.fit.z.square().sum() + torch.logdet(eye + information))
+        z = self.fit.z.clamp_min(LEAST_PENALISED)
+        num = sum(len(effect.parameters) for effect in self.effects)
+        return 0.5 * float(z.square().sum()) + 0.5 * num * math.log(len(self.fit.offsets))
 
 
 def fit_hypothesis(
