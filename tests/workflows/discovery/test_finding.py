@@ -1,0 +1,99 @@
+"""Effects hidden in recordings that another integrator made are found, named and proven.
+
+The true laws, equations and integrators are those of benchmarks/hidden_rigs, which share nothing
+with the package; the held-out rollouts have another excitation.
+"""
+
+import pytest
+from hidden_rigs import make_case
+
+import npdr_ppl as npdr
+
+SEED = 2000
+"""No seed of the benchmark's, neither of its tuning nor of its reporting."""
+
+
+def discover(rig, condition, places, *, strength=1.0, max_effects=3, effects=None):
+    case = make_case(rig, condition, places, strength=strength, seed=SEED)
+    options = npdr.DiscoveryOptions(max_effects=max_effects, effects=effects)
+    return case, npdr.discover(case.model, case.fit, holdout=case.holdout, options=options)
+
+
+def covers(finding, name, true):
+    low, high = finding.parameters[name].hdi_94
+    width = high - low
+    return low - 0.25 * width <= true <= high + 0.25 * width
+
+
+@pytest.mark.parametrize(
+    ("place", "parameter"),
+    [
+        (("hinge", "quadratic_drag"), "drag"),  # a force
+        (("torque", "saturation"), "limit"),  # an action
+        (("angle", "encoder_scale"), "error"),  # a sensor
+        (("clock", "clock_skew"), "skew"),  # the clock
+    ],
+)
+def test_one_effect_at_each_kind_of_port(place, parameter):
+    case, found = discover("pendulum", "one", (place,))
+    assert found.verdict == "named", found.reason
+    (finding,) = found.effects
+    assert finding.effect.name == case.names[0]
+    assert finding.probability > 0.9
+    assert covers(finding, parameter, case.truth[0].parameters[parameter])
+    gap = found.gap["rmse"]
+    assert gap.after < gap.before
+    assert gap.closed > 0.75
+
+
+def test_an_effect_of_the_environment_in_an_mjcf():
+    from npdr_ppl.models.effects import CoulombFriction, InputDelay, Payload, Spring
+
+    few = (
+        Payload("payload"),
+        CoulombFriction("shoulder"),
+        Spring("elbow"),
+        InputDelay("elbow_torque"),
+    )
+    case, found = discover("two_link_arm", "one", (("payload", "payload"),), effects=few)
+    assert [finding.effect.name for finding in found.effects] == ["payload.payload"], found.reason
+    assert covers(found.effects[0], "mass", case.truth[0].parameters["mass"])
+    assert found.gap["rmse"].after < found.gap["rmse"].before
+
+
+def test_a_pair_of_effects():
+    places = (("hinge", "spring"), ("torque", "dead_zone"))
+    case, found = discover("pendulum", "two", places)
+    assert {finding.effect.name for finding in found.effects} == set(case.names), found.reason
+    assert found.gap["rmse"].closed > 0.75
+
+
+def test_an_inseparable_pair_is_reported_as_a_class():
+    case, found = discover("pendulum", "inseparable", (("gravity", "tilt"),), strength=0.3)
+    (finding,) = found.effects
+    kinds = {finding.effect.id, *finding.equivalent_to}
+    assert {"tilt", "encoder_bias", "unbalance"} <= kinds
+    assert found.verdict == "ambiguous"
+    assert found.next_experiment is not None
+    assert found.next_experiment.separated_by
+
+
+def test_nothing_is_found_where_nothing_is_missing():
+    _, found = discover("pendulum", "null", ())
+    assert found.verdict == "none"
+    assert not found.effects
+    assert found.gap["rmse"].after == found.gap["rmse"].before
+
+
+def test_an_effect_outside_the_catalogue_is_unknown():
+    _, found = discover("pendulum", "outside", (("hinge", "detents"),), max_effects=2)
+    assert found.verdict == "unknown", found.effects
+    assert found.remainder.fired
+
+
+@pytest.mark.parametrize("kind", ["one_in_degrees", "flipped_action"])
+def test_bad_data_come_before_physics(kind):
+    _, found = discover("pendulum", "bad_data", (("data", kind),))
+    assert found.problems
+    assert found.verdict == "unknown"
+    assert not found.effects

@@ -1,0 +1,168 @@
+"""The parts of discovery, each alone."""
+
+import json
+import math
+import runpy
+
+import pytest
+import torch
+from hidden_rigs import make_case
+
+import npdr_ppl as npdr
+from npdr_ppl.errors import DataError
+from npdr_ppl.models.effects import (
+    AsymmetricCoulombFriction,
+    Bias,
+    CoulombFriction,
+    InputDelay,
+    QuadraticDrag,
+    candidate_effects,
+)
+from npdr_ppl.models.pendulum import Pendulum, pendulum
+from npdr_ppl.workflows.discovery.chance import LargestStatistic
+from npdr_ppl.workflows.discovery.equivalents import equivalents, irreducible
+from npdr_ppl.workflows.discovery.evidence import weigh
+from npdr_ppl.workflows.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.workflows.discovery.latent_force import latent_force, responses
+from npdr_ppl.workflows.discovery.projection import Projection
+from npdr_ppl.workflows.discovery.revised_model import revised_source
+from npdr_ppl.workflows.discovery.sensitivities import sensitivities
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    """A pendulum without anything hidden, fitted."""
+    case = make_case("pendulum", "null", (), seed=2001)
+    binding = npdr.DiscoveryOptions().binding(case.fit)
+    return fit_hypothesis(case.model, case.fit, binding)
+
+
+@pytest.fixture(scope="module")
+def dragged():
+    """A pendulum in a hidden drag, fitted without it."""
+    place = ("hinge", "quadratic_drag")
+    case = make_case("pendulum", "one", (place,), strength=0.3, seed=2001)
+    binding = npdr.DiscoveryOptions().binding(case.fit)
+    return case, fit_hypothesis(case.model, case.fit, binding)
+
+
+def test_parameters_cannot_explain_what_is_left_of_a_column(quiet):
+    projection = Projection(quiet)
+    own = quiet.linearisation.by_parameters
+    scores = projection.scores(own)
+    # The prior, worth one standard deviation, is all that keeps the rest from zero.
+    assert scores.information.diagonal().max() < 1.0
+    assert scores.absorbed.min() > 0.99
+
+
+def test_sensitivities_are_derivatives(quiet):
+    (variant,) = sensitivities(quiet, (QuadraticDrag("hinge"),))
+    segments, fit = quiet.segments, quiet.fit
+    box = segments.black_box(fit.z[None])
+    values = {k: v[None] for k, v in variant.parameters(torch.tensor([0.01]).double()).items()}
+    changed = box.simulator.with_effects(variant.effect)
+    moved = segments.run(changed, {**box.parameters, **values}, fit.offsets[None])[0]
+    base = segments.run(box.simulator, box.parameters, fit.offsets[None])[0]
+    expected = ((moved - base).double() / fit.scale).flatten(-2) / 0.01
+    difference = (variant.change[..., 0] - expected).norm() / expected.norm()
+    assert difference < 0.02
+
+
+def test_chance_gives_uniform_p_values(quiet):
+    projection = Projection(quiet)
+    generator = torch.Generator().manual_seed(3)
+    shape = (*quiet.linearisation.residual.shape, 1)
+    smallest = []
+    for seed in range(40):
+        columns = [torch.randn(shape, generator=generator).double() for _ in range(5)]
+        smallest.append(min(LargestStatistic(projection, seed=seed, draws=400).p_values(columns)))
+    # 40 uniform draws: fewer than three below 0.005, and a mean within four standard errors.
+    assert sum(p < 0.005 for p in smallest) < 3
+    assert abs(sum(smallest) / 40 - 0.5) < 4 * math.sqrt(1 / 12 / 40)
+
+
+def test_a_drag_is_no_chance(dragged):
+    _, hypothesis = dragged
+    (variant,) = sensitivities(hypothesis, (QuadraticDrag("hinge"),))
+    values = LargestStatistic(Projection(hypothesis), seed=0, draws=400).p_values([variant.change])
+    assert values == [1 / 400]
+
+
+def test_the_latent_force_is_the_drag(dragged):
+    case, hypothesis = dragged
+    found = responses(hypothesis)
+    (latent,) = latent_force(Projection(hypothesis), found)
+    speed = found.channels["velocity"]
+    drag = case.truth[0].parameters["drag"]
+    # Parameters were fitted, so part of the drag hides in them; its shape remains.
+    both = torch.stack((latent.force.flatten(), (-drag * speed * speed.abs()).flatten()))
+    assert torch.corrcoef(both)[0, 1] > 0.6
+    assert bool((latent.error > 0).all())
+
+
+def test_weights_prefer_the_true_effect_and_sum_to_one(dragged):
+    case, hypothesis = dragged
+    binding = npdr.DiscoveryOptions().binding(case.fit)
+    others = [
+        fit_hypothesis(case.model, case.fit, binding, effects=(effect,))
+        for effect in (QuadraticDrag("hinge"), CoulombFriction("hinge"))
+    ]
+    weights = weigh([hypothesis, *others], [0.0, 0.0, 0.0], seed=0)
+    assert sum(weights) == pytest.approx(1.0)
+    assert weights[1] > 0.99
+
+
+def test_sums_of_effects_are_not_searched_beside_their_parts():
+    every = candidate_effects(Pendulum())
+    names = {effect.name for effect in irreducible(every)}
+    assert "hinge.asymmetric_coulomb_friction" not in names
+    alone = irreducible((AsymmetricCoulombFriction("hinge"), InputDelay("torque")))
+    assert {effect.id for effect in alone} == {"asymmetric_coulomb_friction", "input_delay"}
+
+
+def test_equivalents_name_sums_only_with_all_their_parts():
+    without = equivalents(CoulombFriction("hinge"), ("hinge.coulomb_friction",))
+    both = equivalents(CoulombFriction("hinge"), ("hinge.coulomb_friction", "hinge.bias"))
+    assert "coulomb_friction + bias" not in without
+    assert "coulomb_friction + bias" in both
+
+
+def test_the_revised_source_is_a_model(tmp_path):
+    source = revised_source(pendulum, (QuadraticDrag("hinge"), Bias("hinge")), {"mass": 1.0})
+    path = tmp_path / "revised_model.py"
+    path.write_text(source)
+    model = runpy.run_path(str(path))["revised_model"]
+    assert [effect.name for effect, _ in model.effects] == ["hinge.quadratic_drag", "hinge.bias"]
+
+
+def test_saving_writes_json_with_the_names_of_the_architecture(tmp_path):
+    case = make_case("pendulum", "null", (), seed=2001)
+    options = npdr.DiscoveryOptions(effects=(QuadraticDrag("hinge"),))
+    found = npdr.discover(case.model, case.fit, holdout=case.holdout, options=options)
+    found.save(tmp_path)
+    written = json.loads((tmp_path / "discovery.json").read_text())
+    assert written["verdict"] == "none"
+    assert {"alarm", "where", "effects", "ranking", "gap", "next_experiment"} <= set(written)
+    assert {"before", "after", "noise_floor", "closed"} == set(written["gap"]["rmse"])
+    assert {"rollout", "time_span", "channel", "region", "z"} == set(written["where"][0])
+
+
+def test_the_same_seed_finds_the_same():
+    place = ("hinge", "quadratic_drag")
+    case = make_case("pendulum", "one", (place,), strength=0.3, seed=2001)
+    options = npdr.DiscoveryOptions(effects=(QuadraticDrag("hinge"), CoulombFriction("hinge")))
+    first, second = (npdr.discover(case.model, case.fit, options=options) for _ in range(2))
+    assert first.effects[0].to_dict() == second.effects[0].to_dict()
+    assert first.alarm == second.alarm
+
+
+def test_too_short_a_recording_is_refused():
+    case = make_case("pendulum", "null", (), seed=2001)
+    with pytest.raises(DataError, match="too few"):
+        npdr.discover(case.model, case.fit, options=npdr.DiscoveryOptions(segment_length=500))
+
+
+@pytest.mark.parametrize("wrong", [{"segment_length": 1}, {"false_alarm_rate": 0.0}])
+def test_options_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(DataError):
+        npdr.DiscoveryOptions(**wrong)
