@@ -11,10 +11,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["show_comparison", "show_fit", "show_rows", "show_training"]
+__all__ = ["show_comparison", "show_discovery", "show_fit", "show_rows", "show_training"]
 
 FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
 """Columns of figures with the width they need."""
+
+MOST_ROWS = 10
+"""Rows of a ranking."""
 
 WIDTH = 100
 """Columns of a table that is written to a file or a pipe."""
@@ -88,6 +91,111 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
         if row["error"] is not None:
             _print_reason(console, f"{label} failed", row["error"])
     console.print(f"Results and figures are in {out}/")
+
+
+def show_discovery(found: Mapping[str, Any], out: Path) -> None:
+    """Prints the content of ``discovery.json``, as far as the discovery went."""
+    console = _console()
+    for problem in found["data_problems"]:
+        _print_reason(console, "data problem", problem)
+    if "verdict" in found:
+        _show_findings(console, found)
+    elif "alarm" in found:
+        _show_candidates(console, found)
+    elif "where" in found:
+        _show_worst(console, found["where"])
+    elif not found["data_problems"]:
+        console.print("The recording shows none of the problems that are looked for.")
+    console.print(f"Results and figures are in {out}/")
+
+
+def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
+    if found["effects"]:
+        table = Table(title="What was missing", box=SIMPLE)
+        for column in ("effect", "parameter"):
+            table.add_column(column, overflow="fold")
+        for column in ("probability", "mean", "sd", "94 % HDI"):
+            table.add_column(column, justify="right", no_wrap=True)
+        for row in found["effects"]:
+            name, probability = f"{row['port']}.{row['effect']}", f"{row['probability']:.0%}"
+            for parameter, p in row["parameters"].items():
+                unit = "" if p["unit"] in ("", "1") else f" [{p['unit']}]"
+                low, high = p["hdi_94"]
+                table.add_row(
+                    escape(name),
+                    escape(parameter + unit),
+                    probability,
+                    f"{p['mean']:.4g}",
+                    f"{p['sd']:.2g}",
+                    f"{low:.4g} … {high:.4g}",
+                )
+                name = probability = ""
+        console.print(table)
+    if found["gap"]:
+        table = Table(title="Held-out rollouts", box=SIMPLE)
+        table.add_column("metric", no_wrap=True)
+        for column in ("before", "after", "noise floor", "closed"):
+            table.add_column(column, justify="right", no_wrap=True)
+        for metric, gap in found["gap"].items():
+            values = [_number(gap[k], ".4g") for k in ("before", "after", "noise_floor")]
+            table.add_row(metric, *values, _number(gap["closed"], ".0%"))
+        console.print(table)
+    _print_reason(console, found["verdict"], found["reason"])
+    if found["remainder"]["fired"] and found["verdict"] != "unknown":
+        share = found["remainder"]["unexplained"]
+        console.print(f"Something smaller is left over: {share:.1%} of the disagreement.")
+    if (experiment := found["next_experiment"]) is not None:
+        _print_reason(console, "next experiment", _advice(experiment))
+
+
+def _advice(experiment: Mapping[str, Any]) -> str:
+    """Returns a next experiment in a sentence."""
+    words = experiment["separated_by"]
+    if experiment["excitation"] is None:
+        return words or "none of the excitations that were tried would tell them apart."
+    kind = experiment["excitation"]
+    limits = ", ".join(f"{name} up to {v:.3g}" for name, v in experiment["amplitude"].items())
+    sentence = (
+        f"{kind.replace('_', ' ')} with {limits}, which sets the survivors "
+        f"{experiment['separations'][kind]:.0f} standard deviations apart"
+    )
+    return f"{sentence}; {words}" if words else f"{sentence}."
+
+
+def _show_candidates(console: Console, found: Mapping[str, Any]) -> None:
+    table = Table(title="Candidates at the model as it is", box=SIMPLE)
+    table.add_column("effect", overflow="fold")
+    for column in ("separation", "absorbed", "p"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for row in found["ranking"][:MOST_ROWS]:
+        table.add_row(
+            escape(f"{row['port']}.{row['effect']}"),
+            f"{row['separation']:.1f}",
+            f"{row['absorbed']:.0%}",
+            f"{row['p_value']:.2g}",
+        )
+    console.print(table)
+    alarm = found["alarm"]
+    word = "alarm" if alarm["fired"] else "no alarm"
+    console.print(f"[bold]{word}[/bold], p = {alarm['p_value']:.2g}", highlight=False)
+
+
+def _show_worst(console: Console, where: Sequence[Mapping[str, Any]]) -> None:
+    table = Table(title="Windows that the model misses most", box=SIMPLE)
+    for column in ("rollout", "seconds", "z"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for column in ("channel", "what went on there"):
+        table.add_column(column, overflow="fold")
+    for row in where:
+        begin, end = row["time_span"]
+        table.add_row(
+            str(row["rollout"]),
+            f"{begin:.2f} … {end:.2f}",
+            _number(row["z"], ".1f"),
+            escape(row["channel"]),
+            escape(row["region"]),
+        )
+    console.print(table)
 
 
 def show_training(result: Mapping[str, Any], out: Path) -> None:
