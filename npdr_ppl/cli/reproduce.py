@@ -12,17 +12,22 @@ __all__ = ["reproduce"]
 
 
 class Experiment(StrEnum):
-    """An experiment of Muratore et al. (2021)."""
+    """An experiment of Muratore et al. (2021), or on its recordings."""
 
     TABLE2 = "table2"
     PENDULUM = "pendulum"
     MINI_GOLF = "mini-golf"
+    MISSING_EFFECT = "missing-effect"
 
 
 def reproduce(
     experiment: Annotated[Experiment, typer.Argument(help="Which table or figure.")],
     data: Annotated[
-        Path | None, typer.Option(help="The paper's recordings; needed for table2 and mini-golf.")
+        Path | None,
+        typer.Option(
+            help="The paper's recordings; needed for table2, mini-golf and missing-effect, which "
+            "also takes a folder with two of them."
+        ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("reproduction"),
     backends: Annotated[
@@ -75,6 +80,20 @@ def reproduce(
             Rollouts.load(data), out, backends=chosen, seed=seed, progress=progress
         )
         write_mini_golf_figures({label: p[-1] for label, p in posteriors.items()}, out, seed=seed)
+    elif experiment is Experiment.MISSING_EFFECT:
+        from npdr_ppl.plots.missing_effect_figures import write_missing_effect_figures
+        from npdr_ppl.workflows.discovery import DiscoveryOptions
+        from npdr_ppl.workflows.missing_effect import load_recordings, reproduce_missing_effect
+
+        if data is None:
+            raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")
+        swing_ups, chirps = load_recordings(data)
+        discovery, result = reproduce_missing_effect(
+            swing_ups, chirps, out, options=DiscoveryOptions(seed=seed), progress=progress
+        )
+        if discovery is not None:
+            held_out = swing_ups[result["held_out"]]
+            write_missing_effect_figures(discovery, held_out, chirps, out)
     else:
         from npdr_ppl.models.furuta import furuta
         from npdr_ppl.plots.comparison_figures import write_comparison_figures

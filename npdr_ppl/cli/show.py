@@ -111,13 +111,13 @@ def show_discovery(found: Mapping[str, Any], out: Path) -> None:
 
 def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
     if found["effects"]:
-        table = Table(title="What was missing", box=SIMPLE)
-        for column in ("effect", "parameter"):
-            table.add_column(column, overflow="fold")
+        table = Table(title="What was missing", box=SIMPLE, padding=(0, 1, 0, 0))
+        table.add_column("effect", overflow="fold")
+        table.add_column("parameter", no_wrap=True)
         for column in ("probability", "mean", "sd", "94 % HDI"):
             table.add_column(column, justify="right", no_wrap=True)
         for row in found["effects"]:
-            name, probability = f"{row['port']}.{row['effect']}", f"{row['probability']:.0%}"
+            name, probability = f"{row['effect']}\nat {row['port']}", f"{row['probability']:.0%}"
             for parameter, p in row["parameters"].items():
                 unit = "" if p["unit"] in ("", "1") else f" [{p['unit']}]"
                 low, high = p["hdi_94"]

@@ -9,7 +9,6 @@ from npdr_ppl.plots.comparison import plot_overlaid_marginals
 from npdr_ppl.plots.discovery_panels import plot_gap, plot_ranking, plot_separation
 from npdr_ppl.plots.fit_figures import scalar_columns
 from npdr_ppl.plots.latent_force import AFTER, BEFORE, plot_latent_force
-from npdr_ppl.plots.marginals import plot_marginals
 from npdr_ppl.plots.residual_map import plot_residual_map
 from npdr_ppl.plots.theme import save_figure
 from npdr_ppl.randomness import seeded
@@ -17,6 +16,7 @@ from npdr_ppl.workflows.discovery import Discovery, Investigation
 from npdr_ppl.workflows.discovery.credible import parameter_density
 from npdr_ppl.workflows.discovery.folder import STAGES, Stage
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
+from npdr_ppl.workflows.discovery.notebook import short_name
 
 __all__ = ["write_discovery_figures", "write_stage_figures"]
 
@@ -52,10 +52,13 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
     posteriors = {BEFORE: draws}
     if after is not None:
         wide, narrow = _draws(after, seed)
-        posteriors[AFTER] = {name: narrow[name] for name in draws}
+        # First, so that it has the colour that it has in the other figures.
+        posteriors = {AFTER: {name: narrow[name] for name in draws}, **posteriors}
         new = [name for name in narrow if name not in draws]
-        figures["effects"] = plot_marginals(
-            {name: narrow[name] for name in new}, {name: wide[name] for name in new}, units=units
+        figures["effects"] = plot_overlaid_marginals(
+            {AFTER: {_label(name): narrow[name] for name in new}},
+            {_label(name): wide[name] for name in new},
+            units={_label(name): units.get(name, "") for name in new},
         )
     figures["parameters"] = plot_overlaid_marginals(posteriors, prior, units=units)
     if discovery.gap:
@@ -92,6 +95,12 @@ def write_stage_figures(investigation: Investigation, stage: Stage, out: Path) -
 def _channel_units(hypothesis: Hypothesis) -> dict[str, str]:
     simulator = hypothesis.simulator
     return {c.name: c.unit for c in (*simulator.sensors, *simulator.actions)}
+
+
+def _label(site: str) -> str:
+    """Returns the name of an effect's parameter in lines short enough for a panel."""
+    name, _, parameter = site.rpartition(".")
+    return f"{short_name(name)}\n{parameter.replace('_', ' ')}"
 
 
 def _draws(hypothesis: Hypothesis, seed: int) -> tuple[Columns, Columns]:

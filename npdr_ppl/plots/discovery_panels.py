@@ -7,10 +7,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
+from npdr_ppl.plots.marginals import add_legend
 from npdr_ppl.plots.theme import COLORS, theme
 from npdr_ppl.workflows.discovery.notebook import (
+    MOST_BARS,
     draw_gap,
     draw_probabilities,
     probabilities,
@@ -42,7 +45,11 @@ def plot_ranking(ranking: Sequence[Screened], discovery: "Discovery | None" = No
     columns = min(MOST_COLUMNS, 1 + len(panels))
     rows = -(-(1 + len(panels)) // columns)
     with theme():
-        figure = Figure(figsize=(3.3 * columns, 3.2 * rows), layout="constrained")
+        most = max(
+            len(ranking[:MOST_CANDIDATES]), *(min(len(b), MOST_BARS) for _, b, _ in panels), 2
+        )
+        size = (3.3 * columns, (0.27 * most + 0.9) * rows)
+        figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         _draw_candidates(axes[0], ranking[:MOST_CANDIDATES], found)
         for axis, (title, bars, chosen) in zip(axes[1:], panels, strict=False):
@@ -60,6 +67,8 @@ def _draw_candidates(axis: Axes, ranking: Sequence[Screened], found: Sequence[st
     axis.set_yticks(range(len(values)), [short_name(c.name) for c in ranking], fontsize=6)
     axis.set_ylim(max(len(values), 2) - 0.4, -0.6)
     axis.set_xscale("log")
+    axis.set_xlim(1.0, 1.3 * max([*values, 10.0]))
+    axis.xaxis.set_minor_formatter(NullFormatter())
     axis.set_xlabel("separation from none [standard deviations]")
     axis.set_title("each alone, at the model as it was")
 
@@ -71,11 +80,12 @@ def plot_gap(gap: Mapping[str, Gap]) -> Figure:
         gap: The metrics by name.
     """
     with theme():
-        figure = Figure(figsize=(1.9 * len(gap) + 0.3, 2.5), layout="constrained")
+        figure = Figure(figsize=(1.9 * len(gap) + 0.3, 2.9), layout="constrained")
         for axis, (metric, values) in zip(
             figure.subplots(1, len(gap), squeeze=False)[0], gap.items(), strict=True
         ):
             draw_gap(axis, metric, values)
+        add_legend(figure, loc="outside upper center", ncols=2)
     return figure
 
 
@@ -103,7 +113,7 @@ def plot_separation(distance: NDArray[np.float64], names: Sequence[str]) -> Figu
                     color="w" if norm(shown[i, j]) < 0.55 else "k",
                     weight="bold" if close else "normal",
                 )  # fmt: skip
-        labels = [f"{short_name(name)}  {k}" for k, name in enumerate(names, start=1)]
+        labels = [f"{k}  {short_name(name)}" for k, name in enumerate(names, start=1)]
         axis.set_yticks(range(count), labels, fontsize=7)
         axis.set_xticks(range(count), [str(k) for k in range(1, count + 1)])
         axis.tick_params(length=0)

@@ -16,10 +16,10 @@ from npdr_ppl.workflows.discovery.search import Round
 __all__ = ["plot_latent_force"]
 
 BINS = 15
-"""Bins along a channel, each with as many estimates as the others."""
+"""Bins along a channel, of equal width between its lowest and highest hundredth."""
 
 FEWEST = 8
-"""Estimates in a bin."""
+"""Estimates in a bin that is drawn."""
 
 WIDTH = 2.0
 """Half the band's width, in standard errors of a bin's mean."""
@@ -36,8 +36,9 @@ def plot_latent_force(
 ) -> Figure | None:
     """Draws the missing force at every joint against every channel, command and time.
 
-    Each dot is the mean force over a pulse; the line is their mean in bins of equal numbers,
-    weighted by the estimates' precision, the band two standard errors of it.
+    Each dot is the mean force over a pulse; the line is their mean in bins, weighted by the
+    estimates' precision, the band two standard errors of it. The axis is the lines': some dots
+    lie outside.
 
     Args:
         first: What was seen at the model as it was.
@@ -61,16 +62,16 @@ def plot_latent_force(
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(len(ports), len(names), sharex="col", sharey="row", squeeze=False)
         for row, port in zip(axes, ports, strict=True):
-            for title, found in forces.items():
-                for axis, name in zip(row, names, strict=True):
-                    if port in found:
-                        _draw(axis, against[title][name], found[port], title)
+            reach = [
+                _draw(axis, against[title][name], found[port], title)
+                for title, found in forces.items()
+                for axis, name in zip(row, names, strict=True)
+                if port in found
+            ]
             for axis in row:
                 axis.axhline(0.0, color="0.8", lw=0.6, zorder=0)
                 axis.ticklabel_format(axis="y", scilimits=(-2, 3))
-            spread = np.concatenate([f[port].force.numpy().ravel() for f in forces.values()])
-            # A few wild estimates, of pulses that hardly show, must not set the scale.
-            limit = 1.2 * float(np.quantile(np.abs(spread), 0.99)) + np.finfo(float).tiny
+            limit = 1.5 * max(reach) + np.finfo(float).tiny
             row[0].set_ylim(-limit, limit)
             row[0].set_ylabel(f"missing at {port}\n[{forces[BEFORE][port].unit}]")
         for axis, name in zip(axes[-1], names, strict=True):
@@ -80,7 +81,8 @@ def plot_latent_force(
     return figure
 
 
-def _draw(axis: Axes, x: Array, found: LatentForce, title: str) -> None:
+def _draw(axis: Axes, x: Array, found: LatentForce, title: str) -> float:
+    """Draws one joint's force against one channel; returns how far the band reaches."""
     force = found.force.numpy().ravel()
     precision = found.error.numpy().ravel().clip(1e-12) ** -2.0
     axis.plot(x, force, ".", ms=1.5, alpha=0.25, color=LOOKS[title], rasterized=True, zorder=1)
@@ -90,19 +92,23 @@ def _draw(axis: Axes, x: Array, found: LatentForce, title: str) -> None:
         color=LOOKS[title], alpha=0.3, lw=0, zorder=2,
     )  # fmt: skip
     axis.plot(centre, mean, color=LOOKS[title], lw=1.2, label=title, zorder=3)
+    return float((np.abs(mean) + WIDTH * error).max(initial=0.0))
 
 
 def _binned(x: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
     """Returns centres, weighted means and their standard errors."""
-    order = np.argsort(x, kind="stable")
-    count = max(1, min(BINS, len(x) // FEWEST))
+    edges = np.linspace(*np.quantile(x, [0.01, 0.99]), BINS + 1)
+    place = np.digitize(x, edges[1:-1])
     rows = []
-    for part in np.array_split(order, count):
+    for bin_index in range(BINS):
+        part = place == bin_index
+        if part.sum() < FEWEST:
+            continue
         share = weight[part] / weight[part].sum()
         mean = float(share @ y[part])
         error = float(np.sqrt((share**2) @ (y[part] - mean) ** 2))
         rows.append((float(share @ x[part]), mean, error))
-    centre, mean, error = np.array(rows).T
+    centre, mean, error = np.array(rows).reshape(-1, 3).T
     return centre, mean, error
 
 

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from npdr_ppl.plots.theme import COLORS, theme
@@ -78,7 +79,7 @@ def plot_residual_map(
 
 
 def _mark(axis: Axes, rollout: int, where: Sequence[Spot], names: Sequence[str]) -> None:
-    """Frames a rollout's worst windows and writes their ranks above."""
+    """Frames a rollout's worst windows and writes their ranks inside."""
     for rank, spot in enumerate(where, start=1):
         if spot.rollout != rollout:
             continue
@@ -89,8 +90,9 @@ def _mark(axis: Axes, rollout: int, where: Sequence[Spot], names: Sequence[str])
         )  # fmt: skip
         axis.add_patch(frame)
         axis.text(
-            0.5 * (begin + end), -0.05, str(rank), ha="center", va="bottom", fontsize=7,
-            color=COLORS["posterior"],
+            0.5 * (begin + end), names.index(spot.channel) + 0.5, str(rank), ha="center",
+            va="center", fontsize=7, color="w", clip_on=True,
+            path_effects=[withStroke(linewidth=1.5, foreground=COLORS["posterior"])],
         )  # fmt: skip
 
 

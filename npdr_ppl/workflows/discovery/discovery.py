@@ -80,7 +80,11 @@ class Investigation:
     def start(self) -> Hypothesis:
         """The model as it is, fitted."""
         with _timed(self.seconds, "fit"):
-            return self._searcher.fit_base()
+            fitted = self._searcher.fit_base()
+        for effect in self.options.effects or ():
+            # Screening leaves out what the simulator cannot have; who asks by name is told.
+            fitted.simulator.with_effects(effect)
+        return fitted
 
     @cached_property
     def problems(self) -> tuple[str, ...]:

@@ -43,6 +43,8 @@ def plot_discovery(discovery: "Discovery", axes: Any = None) -> Any:
         draw_probabilities(left.pop(0), bars, chosen=chosen, title=title)
     for metric, gap in metrics.items():
         draw_gap(left.pop(0), metric, gap)
+    if metrics:
+        axes[-1].legend()
     return axes
 
 
@@ -56,7 +58,7 @@ def probabilities(
     """
     if discovery.effects:
         return [
-            (f"missing, {k}", f.alternatives, (f.effect.name,))
+            (f"what effect {k} could be", f.alternatives, (f.effect.name,))
             for k, f in enumerate(discovery.effects, start=1)
         ]
     weights = discovery.search.rounds[-1].weights or {"": 1.0}
@@ -98,15 +100,14 @@ def draw_gap(axis: "Axes", metric: str, gap: Gap) -> None:
     """
     values = [gap.before, gap.after]
     axis.bar([0, 1], values, color=[BEFORE, CHOSEN], width=0.65)
-    for place, value in enumerate(values):
-        axis.text(place, value, f"{value:.3g}", ha="center", va="bottom", fontsize=8)
     if gap.noise_floor is not None:
-        axis.axhline(gap.noise_floor, color="k", ls="--", lw=1.0)
-        axis.text(1.45, gap.noise_floor, "noise floor", ha="right", va="bottom", fontsize=7)
+        axis.axhline(gap.noise_floor, color="k", ls="--", lw=1.0, label="noise floor")
     elif metric == "coverage":
-        axis.axhline(LEVEL, color="k", ls="--", lw=1.0)
-        axis.text(1.45, LEVEL, "should be", ha="right", va="bottom", fontsize=7)
-    axis.set_xticks([0, 1], ["before", "after"])
+        axis.axhline(LEVEL, color="k", ls=":", lw=1.2, label="what it should be")
+    # Below the axis, where no line crosses the figures.
+    axis.set_xticks(
+        [0, 1], [f"{w}\n{v:.3g}" for w, v in zip(("before", "after"), values, strict=True)]
+    )
     axis.set_xlim(-0.5, 1.5)
     finite = [v for v in (*values, gap.noise_floor or 0.0) if math.isfinite(v)]
     axis.set_ylim(0.0, 1.15 * max([*finite, 1e-12]))
