@@ -81,9 +81,11 @@ def reproduce(
         )
         write_mini_golf_figures({label: p[-1] for label, p in posteriors.items()}, out, seed=seed)
     elif experiment is Experiment.MISSING_EFFECT:
+        from npdr_ppl.cli.show import show_missing_effect
         from npdr_ppl.plots.missing_effect_figures import write_missing_effect_figures
         from npdr_ppl.workflows.discovery import DiscoveryOptions
         from npdr_ppl.workflows.missing_effect import load_recordings, reproduce_missing_effect
+        from npdr_ppl.workflows.run_folder import read_json
 
         if data is None:
             raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")
@@ -94,6 +96,9 @@ def reproduce(
         if discovery is not None:
             held_out = swing_ups[result["held_out"]]
             write_missing_effect_figures(discovery, held_out, chirps, out)
+        if not quiet:
+            show_missing_effect(read_json(out / "discovery.json"), result, out)
+        return
     else:
         from npdr_ppl.models.furuta import furuta
         from npdr_ppl.plots.comparison_figures import write_comparison_figures

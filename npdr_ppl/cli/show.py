@@ -11,13 +11,23 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["show_comparison", "show_discovery", "show_fit", "show_rows", "show_training"]
+__all__ = [
+    "show_comparison",
+    "show_discovery",
+    "show_fit",
+    "show_missing_effect",
+    "show_rows",
+    "show_training",
+]
 
 FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
 """Columns of figures with the width they need."""
 
 MOST_ROWS = 10
 """Rows of a ranking."""
+
+WIDEST_NAME = 29
+"""Columns that an effect's name may take from its parameters'."""
 
 WIDTH = 100
 """Columns of a table that is written to a file or a pipe."""
@@ -112,9 +122,10 @@ def show_discovery(found: Mapping[str, Any], out: Path) -> None:
 def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
     if found["effects"]:
         table = Table(title="What was missing", box=SIMPLE, padding=(0, 1, 0, 0))
-        table.add_column("effect", overflow="fold")
-        table.add_column("parameter", no_wrap=True)
-        for column in ("probability", "mean", "sd", "94 % HDI"):
+        width = min(WIDEST_NAME, max(len(f"at {row['port']}") for row in found["effects"]))
+        table.add_column("effect", overflow="fold", min_width=width)
+        table.add_column("parameter", overflow="fold")
+        for column in ("prob.", "mean", "sd", "94 % HDI"):
             table.add_column(column, justify="right", no_wrap=True)
         for row in found["effects"]:
             name, probability = f"{row['effect']}\nat {row['port']}", f"{row['probability']:.0%}"
@@ -220,6 +231,26 @@ def show_training(result: Mapping[str, Any], out: Path) -> None:
     last = result["iterations"][-1]
     _print_reason(console, last["decision"], last["reason"])
     console.print(f"Results and figures are in {out}/")
+
+
+def show_missing_effect(found: Mapping[str, Any], result: Mapping[str, Any], out: Path) -> None:
+    """Prints the content of ``missing-effect.json`` after what was found."""
+    show_discovery(found, out)
+    tables = {
+        "Held-out swing-ups": ("", {}),
+        "The same from recorded states, as in the paper": ("_recorded", result["paper"]),
+        "Another excitation": ("_chirp", {}),
+    }
+    for title, (suffix, paper) in tables.items():
+        names = {metric: f"{metric}{suffix}" for metric in ("rmse", "dtw")}
+        rows = {
+            method: {metric: row[name] for metric, name in names.items() if name in row}
+            for method, row in result["rows"].items()
+        }
+        if any(rows.values()):
+            show_rows(title, {"rows": rows, "paper": paper})
+    for what, reason in result["skipped"].items():
+        _print_reason(_console(), f"{what} skipped", reason)
 
 
 def show_rows(title: str, result: Mapping[str, Any]) -> None:

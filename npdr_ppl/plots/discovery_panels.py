@@ -48,7 +48,7 @@ def plot_ranking(ranking: Sequence[Screened], discovery: "Discovery | None" = No
         most = max(
             len(ranking[:MOST_CANDIDATES]), *(min(len(b), MOST_BARS) for _, b, _ in panels), 2
         )
-        size = (3.3 * columns, (0.27 * most + 0.9) * rows)
+        size = (3.7 * columns, (0.27 * most + 0.9) * rows)
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
         _draw_candidates(axes[0], ranking[:MOST_CANDIDATES], found)
@@ -106,12 +106,12 @@ def plot_separation(distance: NDArray[np.float64], names: Sequence[str]) -> Figu
         image = axis.imshow(shown, norm=norm, cmap="cividis", aspect="auto")
         for i in range(count):
             for j in range(count):
-                close = distance[i, j] < DETECTABLE
+                value = distance[i, j]
                 axis.text(
-                    j, i, f"{distance[i, j]:.2g}" if distance[i, j] < 100 else
-                    f"{distance[i, j]:.0f}", ha="center", va="center", fontsize=6,
+                    j, i, f"{value:.1f}" if value < 9.95 else f"{value:.0f}",
+                    ha="center", va="center", fontsize=6,
                     color="w" if norm(shown[i, j]) < 0.55 else "k",
-                    weight="bold" if close else "normal",
+                    weight="bold" if value < DETECTABLE else "normal",
                 )  # fmt: skip
         labels = [f"{k}  {short_name(name)}" for k, name in enumerate(names, start=1)]
         axis.set_yticks(range(count), labels, fontsize=7)

@@ -1,23 +1,24 @@
 """The figures of the real Furuta pendulum's missing effects."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
-from npdr_ppl.plots.bands import plot_bands
+from matplotlib.figure import Figure
+
+from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.plots.discovery_figures import write_discovery_figures
-from npdr_ppl.plots.latent_force import BEFORE
-from npdr_ppl.plots.theme import save_figure
-from npdr_ppl.randomness import seeded
+from npdr_ppl.plots.latent_force import AFTER, BEFORE, LOOKS
+from npdr_ppl.plots.marginals import add_legend
+from npdr_ppl.plots.theme import COLORS, save_figure, theme
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery import Discovery
-from npdr_ppl.workflows.discovery.credible import parameter_density
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.evaluation import replay
 from npdr_ppl.workflows.missing_effect import CHIRP_SEGMENT_LENGTH
 from npdr_ppl.workflows.table2 import SEGMENT_LENGTH
 
-__all__ = ["write_missing_effect_figures"]
-
-NUM_PREDICTIVE = 40
+__all__ = ["plot_replays", "write_missing_effect_figures"]
 
 
 def write_missing_effect_figures(
@@ -35,27 +36,42 @@ def write_missing_effect_figures(
     shown = {"held_out": (held_out, SEGMENT_LENGTH)}
     if chirps is not None:
         shown["chirp"] = (chirps, CHIRP_SEGMENT_LENGTH)
-    start, final = discovery.search.rounds[0].hypothesis, discovery.search.final
-    prior = final.segments.prior
-    with seeded(discovery.options.seed, "discovery", "bands"):
-        draws = prior.to_parameters(parameter_density(final).sample(NUM_PREDICTIVE).double())
-    single = {name: value[None] for name, value in start.parameters.items()}
+    models = {BEFORE: discovery.search.rounds[0].hypothesis, AFTER: discovery.search.final}
     for name, (rollouts, length) in shown.items():
-        one = rollouts[[0]]
-        options = BindingOptions(None, length, "estimated", "float64")
-        after, before = (
-            replay(final.model, one, draws, options),
-            replay(start.model, one, single, options),
-        )
-        channels = after.channel_names
-        figure = plot_bands(
-            one.time[0][:-1],
-            one.series(channels)[0].numpy(),
-            after.series()[0].double().numpy(),
-            channel_names=channels,
-            units=[one.channel_units[one.channel_names.index(c)] for c in channels],
-            lines={BEFORE: before.series()[0][0].double().numpy()},
-            resets=after.inputs.start.double().numpy() * one.time_step,
-        )
+        figure = plot_replays(models, rollouts[[0]], length)
         paths.append(save_figure(figure, out / f"{name}.png"))
     return paths
+
+
+def plot_replays(models: Mapping[str, Hypothesis], rollouts: Rollouts, length: int) -> Figure:
+    """Draws what fitted models simulate over one recorded rollout.
+
+    Args:
+        models: The models by legend entry.
+        rollouts: One rollout.
+        length: Steps between re-synchronisations.
+    """
+    options = BindingOptions(None, length, "estimated", "float64")
+    replays = {
+        label: replay(h.model, rollouts, {n: v[None] for n, v in h.parameters.items()}, options)
+        for label, h in models.items()
+    }
+    found = next(iter(replays.values()))
+    units = {sensor.name: sensor.unit for sensor in Furuta.sensors}
+    measured = rollouts.series(found.channel_names)[0].numpy()
+    time = rollouts.time[0][:-1]
+    with theme():
+        figure = Figure(figsize=(7.5, 1.5 * len(units) + 0.4), layout="constrained")
+        axes = figure.subplots(len(found.channel_names), 1, sharex=True, squeeze=False)[:, 0]
+        for c, (axis, name) in enumerate(zip(axes, found.channel_names, strict=True)):
+            for start in found.inputs.start.tolist():
+                axis.axvline(start * rollouts.time_step, color="0.85", lw=0.6, zorder=0)
+            axis.plot(time, measured[:, c], color=COLORS["measured"], lw=1.6, label="measured")
+            for label, replayed in replays.items():
+                series = replayed.series()[0][0, :, c].double().numpy()
+                axis.plot(time, series, color=LOOKS[label], lw=0.9, label=label)
+            axis.set_ylabel(f"{name}\n[{units[name]}]")
+        axes[-1].set_xlabel("time [s]")
+        axes[0].set_xlim(time[0], time[-1])
+        add_legend(figure, loc="outside upper center", ncols=3)
+    return figure

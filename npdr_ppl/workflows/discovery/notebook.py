@@ -5,6 +5,9 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from npdr_ppl.errors import ShapeError
 from npdr_ppl.workflows.discovery.proof import LEVEL, Gap
 
 if TYPE_CHECKING:
@@ -14,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["discovery_html", "draw_gap", "draw_probabilities", "plot_discovery", "short_name"]
 
-MOST_BARS = 8
+MOST_BARS = 5
 """Alternatives drawn of one effect."""
 
 CHOSEN, OTHERS, BEFORE = "#0072B2", "#999999", "#D55E00"
@@ -22,30 +25,35 @@ CHOSEN, OTHERS, BEFORE = "#0072B2", "#999999", "#D55E00"
 
 
 def short_name(name: str) -> str:
-    """Returns an effect's name in two lines: the port and what it is."""
+    """Returns an effect's name in two lines: what it is, and the port."""
     port, _, effect = name.rpartition(".")
-    return f"{effect.replace('_', ' ')}\n{port.replace(',', ', ')}"
+    channels = port.split(",")
+    where = ", ".join(channels) if len(channels) < 3 else f"{channels[0]} … {channels[-1]}"
+    return f"{effect.replace('_', ' ')}\n{where}"
 
 
 def plot_discovery(discovery: "Discovery", axes: Any = None) -> Any:
     """Draws what was found and the gap; see :meth:`Discovery.plot`."""
+    shown = probabilities(discovery)
     metrics = {m: gap for m, gap in discovery.gap.items() if gap.noise_floor is not None}
-    count = max(1, len(discovery.effects)) + len(metrics)
+    count = max(1, len(shown) + len(metrics))
     if axes is None:
         import matplotlib.pyplot as plt
 
-        _, axes = plt.subplots(
+        _, made = plt.subplots(
             1, count, figsize=(2.8 * count, 2.6), layout="constrained", squeeze=False
         )
-        axes = axes[0]
-    left = list(axes)
-    for title, bars, chosen in probabilities(discovery):
-        draw_probabilities(left.pop(0), bars, chosen=chosen, title=title)
-    for metric, gap in metrics.items():
-        draw_gap(left.pop(0), metric, gap)
-    if metrics:
-        axes[-1].legend()
-    return axes
+        axes = made[0]
+    given = np.atleast_1d(np.asarray(axes, dtype=object)).ravel()
+    if len(given) != count:
+        raise ShapeError(f"There are {count} panels to draw; got {len(given)} axes.")
+    given[0].set_title(f"verdict: {discovery.verdict}")
+    for axis, (title, bars, chosen) in zip(given, shown, strict=False):
+        draw_probabilities(axis, bars, chosen=chosen, title=title)
+    for axis, (metric, gap) in zip(given[len(shown) :], metrics.items(), strict=False):
+        draw_gap(axis, metric, gap)
+        axis.legend()
+    return given
 
 
 def probabilities(
@@ -54,15 +62,15 @@ def probabilities(
     """Returns title, probabilities and the chosen name of each panel.
 
     One panel for each effect that was found, with what could stand in its place; where none was
-    found, one with what was tried, ``""`` standing for none.
+    found, one with what was tried, if anything, ``""`` standing for none.
     """
     if discovery.effects:
         return [
             (f"what effect {k} could be", f.alternatives, (f.effect.name,))
             for k, f in enumerate(discovery.effects, start=1)
         ]
-    weights = discovery.search.rounds[-1].weights or {"": 1.0}
-    return [("nothing was added", weights, ("",))]
+    weights = discovery.search.rounds[-1].weights
+    return [("nothing was added", weights, ("",))] if weights else []
 
 
 def draw_probabilities(

@@ -159,11 +159,11 @@ class Discovery:
         :func:`~npdr_ppl.plots.discovery_figures.write_discovery_figures` draws all the rest.
 
         Args:
-            axes: Where to draw: a panel for each effect, or one where there is none, and one for
-                each metric that has a noise floor; ``None`` for a new figure.
+            axes: Where to draw: a panel for each effect, or one of what was tried where none was
+                added, and one for each metric that has a noise floor; ``None`` for a new figure.
 
         Returns:
-            The axes.
+            The axes, one per panel.
         """
         from npdr_ppl.workflows.discovery.notebook import plot_discovery
 
