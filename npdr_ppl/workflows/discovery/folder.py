@@ -58,7 +58,10 @@ class DiscoveryFolder:
         description = plain(
             {
                 "command": "discover",
-                "model": {"name": repr(model), "source": source_text(model)},
+                "model": {
+                    "name": getattr(model, "__name__", type(model).__name__),
+                    "source": source_text(model),
+                },
                 "options": settings,
                 "seed": seed,
                 "recordings": [_checksum(r) for r in (rollouts, holdout) if r is not None],
