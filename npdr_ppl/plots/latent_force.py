@@ -97,7 +97,8 @@ def _draw(axis: Axes, x: Array, found: LatentForce, title: str) -> float:
 
 def _binned(x: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
     """Returns centres, weighted means and their standard errors."""
-    edges = np.linspace(*np.quantile(x, [0.01, 0.99]), BINS + 1)
+    low, high = np.quantile(x, 0.01), np.quantile(x, 0.99)
+    edges = np.linspace(low, high, BINS + 1)
     place = np.digitize(x, edges[1:-1])
     rows = []
     for bin_index in range(BINS):
