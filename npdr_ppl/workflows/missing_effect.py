@@ -45,6 +45,8 @@ def load_recordings(path: Path) -> tuple[Rollouts, Rollouts | None]:
     Raises:
         DataError: There are no swing-ups, or they are of another device.
     """
+    if not path.exists():
+        raise DataError(f"{path} does not exist.")
     file = path / SWING_UP if path.is_dir() else path
     if path.is_dir() and not file.exists():
         raise DataError(f"{path} has no {SWING_UP}.")
