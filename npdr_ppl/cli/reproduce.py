@@ -56,6 +56,9 @@ def reproduce(
 
     Example: npdr reproduce table2 --data swing_up_500hz_5s.csv --out table2
     """
+    if experiment is Experiment.MISSING_EFFECT:
+        _reproduce_missing_effect(data, out / experiment.value, seed, quiet)
+        return
     from npdr_ppl.cli.show import show_rows
     from npdr_ppl.errors import DataError
     from npdr_ppl.workflows.candidates import split_candidates
@@ -80,25 +83,6 @@ def reproduce(
             Rollouts.load(data), out, backends=chosen, seed=seed, progress=progress
         )
         write_mini_golf_figures({label: p[-1] for label, p in posteriors.items()}, out, seed=seed)
-    elif experiment is Experiment.MISSING_EFFECT:
-        from npdr_ppl.cli.show import show_missing_effect
-        from npdr_ppl.plots.missing_effect_figures import write_missing_effect_figures
-        from npdr_ppl.workflows.discovery import DiscoveryOptions
-        from npdr_ppl.workflows.missing_effect import load_recordings, reproduce_missing_effect
-        from npdr_ppl.workflows.run_folder import read_json
-
-        if data is None:
-            raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")
-        swing_ups, chirps = load_recordings(data)
-        discovery, result = reproduce_missing_effect(
-            swing_ups, chirps, out, options=DiscoveryOptions(seed=seed), progress=progress
-        )
-        if discovery is not None:
-            held_out = swing_ups[result["held_out"]]
-            write_missing_effect_figures(discovery, held_out, chirps, out)
-        if not quiet:
-            show_missing_effect(read_json(out / "discovery.json"), result, out)
-        return
     else:
         from npdr_ppl.models.furuta import furuta
         from npdr_ppl.plots.comparison_figures import write_comparison_figures
@@ -122,3 +106,28 @@ def reproduce(
             result = add_returns(result, out, num_seeds=returns, progress=progress)
     if not quiet:
         show_rows(experiment.value, result)
+
+
+def _reproduce_missing_effect(data: Path | None, out: Path, seed: int, quiet: bool) -> None:
+    from npdr_ppl.cli.show import show_missing_effect
+    from npdr_ppl.errors import DataError
+    from npdr_ppl.plots.missing_effect_figures import write_missing_effect_figures
+    from npdr_ppl.workflows.discovery import DiscoveryOptions
+    from npdr_ppl.workflows.missing_effect import load_recordings, reproduce_missing_effect
+    from npdr_ppl.workflows.run_folder import read_json
+
+    if data is None:
+        raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")
+    swing_ups, chirps = load_recordings(data)
+    discovery, result = reproduce_missing_effect(
+        swing_ups,
+        chirps,
+        out,
+        options=DiscoveryOptions(seed=seed),
+        progress=False if quiet else None,
+    )
+    if discovery is not None:
+        held_out = swing_ups[result["held_out"]]
+        write_missing_effect_figures(discovery, held_out, chirps, out)
+    if not quiet:
+        show_missing_effect(read_json(out / "discovery.json"), result, out)
