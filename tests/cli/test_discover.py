@@ -10,7 +10,7 @@ from rich.console import Console
 
 from npdr_ppl.cli import main as cli
 from npdr_ppl.cli import show
-from npdr_ppl.cli.resolve import resolve_model
+from npdr_ppl.cli.resolve import resolve_holdout, resolve_model
 from npdr_ppl.workflows.discovery import Investigation
 from tests.cli.discovery_recording import CANDIDATES, FRICTION, MISSING, pendulum_recording
 
@@ -175,6 +175,16 @@ def test_bad_input_gets_one_sentence(words, recording, tmp_path, changed, senten
     assert code == 2
     assert sentence in err and "Traceback" not in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_held_out_rollouts_come_from_the_same_file_or_another(recording, tmp_path):
+    other = tmp_path / "other.csv"
+    pendulum_recording(num_rollouts=2, num_steps=50).to_csv(other)
+    fitted, held_out = resolve_holdout(recording, "1,3", None)
+    assert (len(fitted), len(held_out)) == (2, 2)
+    fitted, held_out = resolve_holdout(recording, "", other)
+    assert (len(fitted), len(held_out)) == (4, 2)
+    assert resolve_holdout(recording, "", None)[1] is None
 
 
 def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, tmp_path):
