@@ -119,15 +119,15 @@ def _reproduce_missing_effect(data: Path | None, out: Path, seed: int, quiet: bo
     if data is None:
         raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")
     swing_ups, chirps = load_recordings(data)
-    discovery, result = reproduce_missing_effect(
+    story, result = reproduce_missing_effect(
         swing_ups,
         chirps,
         out,
         options=DiscoveryOptions(seed=seed),
         progress=False if quiet else None,
     )
-    if discovery is not None:
+    if story is not None:
         held_out = swing_ups[result["held_out"]]
-        write_missing_effect_figures(discovery, held_out, chirps, out)
+        write_missing_effect_figures(story, held_out, chirps, out)
     if not quiet:
         show_missing_effect(read_json(out / "discovery.json"), result, out)

@@ -154,7 +154,7 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
     _print_reason(console, found["verdict"], found["reason"])
     if found["remainder"]["fired"] and found["verdict"] != "unknown":
         share = found["remainder"]["unexplained"]
-        console.print(f"Something smaller is left over: {share:.1%} of the disagreement.")
+        console.print(f"Something smaller is left over: {share:.2%} of the disagreement.")
     if (experiment := found["next_experiment"]) is not None:
         _print_reason(console, "next experiment", _advice(experiment))
 

@@ -21,6 +21,9 @@ BINS = 15
 FEWEST = 8
 """Estimates in a bin that is drawn."""
 
+MOST_DOTS = 250
+"""Estimates drawn as dots, picked at random; all count for the line."""
+
 WIDTH = 2.0
 """Half the band's width, in standard errors of a bin's mean."""
 
@@ -85,7 +88,10 @@ def _draw(axis: Axes, x: Array, found: LatentForce, title: str) -> float:
     """Draws one joint's force against one channel; returns how far the band reaches."""
     force = found.force.numpy().ravel()
     precision = found.error.numpy().ravel().clip(1e-12) ** -2.0
-    axis.plot(x, force, ".", ms=1.5, alpha=0.25, color=LOOKS[title], rasterized=True, zorder=1)
+    few = np.random.default_rng(0).permutation(len(x))[:MOST_DOTS]
+    axis.plot(
+        x[few], force[few], ".", ms=1.5, alpha=0.4, color=LOOKS[title], rasterized=True, zorder=1
+    )
     centre, mean, error = _binned(x, force, precision)
     axis.fill_between(
         centre, mean - WIDTH * error, mean + WIDTH * error,

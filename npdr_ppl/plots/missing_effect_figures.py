@@ -12,31 +12,30 @@ from npdr_ppl.plots.marginals import add_legend
 from npdr_ppl.plots.theme import COLORS, save_figure, theme
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.discovery import Discovery
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.evaluation import replay
-from npdr_ppl.workflows.missing_effect import CHIRP_SEGMENT_LENGTH
+from npdr_ppl.workflows.missing_effect import CHIRP_SEGMENT_LENGTH, Story
 from npdr_ppl.workflows.table2 import SEGMENT_LENGTH
 
 __all__ = ["plot_replays", "write_missing_effect_figures"]
 
 
 def write_missing_effect_figures(
-    discovery: Discovery, held_out: Rollouts, chirps: Rollouts | None, out: Path
+    story: Story, held_out: Rollouts, chirps: Rollouts | None, out: Path
 ) -> list[Path]:
     """Draws the discovery, and both models' predictions for recordings that neither has seen.
 
     Args:
-        discovery: The discovery.
+        story: The discovery and the models before and after.
         held_out: Held-out swing-ups, of which the first is drawn.
         chirps: Rollouts of the other excitation, likewise.
         out: Folder for the figures of a discovery, ``held_out.png`` and ``chirp.png``.
     """
-    paths = write_discovery_figures(discovery, out)
+    paths = write_discovery_figures(story.discovery, out)
     shown = {"held_out": (held_out, SEGMENT_LENGTH)}
     if chirps is not None:
         shown["chirp"] = (chirps, CHIRP_SEGMENT_LENGTH)
-    models = {BEFORE: discovery.search.rounds[0].hypothesis, AFTER: discovery.search.final}
+    models = {BEFORE: story.refitted, AFTER: story.revised}
     for name, (rollouts, length) in shown.items():
         figure = plot_replays(models, rollouts[[0]], length)
         paths.append(save_figure(figure, out / f"{name}.png"))

@@ -202,4 +202,4 @@ def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, t
     shown = " ".join(text.getvalue().split())
     assert "ambiguous: It cannot tell." in shown
     assert "slow ramp with torque up to 4, which sets the survivors 12 standard" in shown
-    assert "a change of load" in shown and "5.0%" in shown
+    assert "a change of load" in shown and "5.00%" in shown

@@ -38,7 +38,7 @@ def recordings():
 def test_the_drivers_filter_is_found_and_helps_on_another_excitation(recordings, tmp_path, capsys):
     swing_ups, chirps = recordings
     part = swing_ups[[0, 3, 4]]
-    discovery, result = reproduce_missing_effect(
+    story, result = reproduce_missing_effect(
         part, chirps[[0]], tmp_path, holdout=(1, 2), options=OPTIONS, progress=False
     )
     (effect,) = result["effects"]
@@ -52,7 +52,7 @@ def test_the_drivers_filter_is_found_and_helps_on_another_excitation(recordings,
     for metric in ("rmse", "dtw"):
         assert after[metric]["mean"] < 0.75 * before[metric]["mean"]
         assert after[f"{metric}_chirp"]["mean"] < 0.75 * before[f"{metric}_chirp"]["mean"]
-    paths = write_missing_effect_figures(discovery, part[[1, 2]], chirps[[0]], tmp_path)
+    paths = write_missing_effect_figures(story, part[[1, 2]], chirps[[0]], tmp_path)
     assert {"held_out", "chirp", "residual_map", "gap"} <= {path.stem for path in paths}
     found = json.loads((tmp_path / "discovery.json").read_text())
     show.show_missing_effect(found, result, tmp_path)
