@@ -125,8 +125,8 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         width = min(WIDEST_NAME, max(len(f"at {row['port']}") for row in found["effects"]))
         table.add_column("effect", overflow="fold", min_width=width)
         table.add_column("parameter", overflow="fold")
-        for column in ("prob.", "mean", "sd", "94 % HDI"):
-            table.add_column(column, justify="right", no_wrap=True)
+        for column, wide in {"prob.": 5, "mean": 10, "sd": 7, "94 % HDI": 21}.items():
+            table.add_column(column, justify="right", no_wrap=True, min_width=wide)
         for row in found["effects"]:
             name, probability = f"{row['effect']}\nat {row['port']}", f"{row['probability']:.0%}"
             for parameter, p in row["parameters"].items():
@@ -138,7 +138,7 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
                     probability,
                     f"{p['mean']:.4g}",
                     f"{p['sd']:.2g}",
-                    f"{low:.4g} … {high:.4g}",
+                    f"{low:.3g} … {high:.3g}",
                 )
                 name = probability = ""
         console.print(table)
