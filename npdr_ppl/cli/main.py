@@ -5,7 +5,7 @@ import sys
 
 import typer
 
-from npdr_ppl.cli import compare, demo, fit, listings, report, reproduce, train
+from npdr_ppl.cli import compare, demo, discover, fit, listings, report, reproduce, train
 from npdr_ppl.errors import NpdrError
 
 __all__ = ["app", "main"]
@@ -21,6 +21,7 @@ app = typer.Typer(
 app.command(rich_help_panel="See it work")(demo.demo)
 app.command(rich_help_panel="Infer parameters")(fit.fit)
 app.command(rich_help_panel="Infer parameters")(compare.compare)
+app.command(rich_help_panel="Find what is missing")(discover.discover)
 app.command(rich_help_panel="Train policies")(train.train)
 app.command(rich_help_panel="Show results")(report.report)
 app.command(rich_help_panel="See it work")(reproduce.reproduce)

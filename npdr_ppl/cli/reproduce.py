@@ -13,17 +13,22 @@ __all__ = ["reproduce"]
 
 
 class Experiment(StrEnum):
-    """An experiment of Muratore et al. (2021)."""
+    """An experiment of Muratore et al. (2021), or on its recordings."""
 
     TABLE2 = "table2"
     PENDULUM = "pendulum"
     MINI_GOLF = "mini-golf"
+    MISSING_EFFECT = "missing-effect"
 
 
 def reproduce(
     experiment: Annotated[Experiment, typer.Argument(help="Which table or figure.")],
     data: Annotated[
-        Path | None, typer.Option(help="The paper's recordings; needed for table2 and mini-golf.")
+        Path | None,
+        typer.Option(
+            help="The paper's recordings; needed for table2, mini-golf and missing-effect, which "
+            "also takes a folder with two of them."
+        ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("reproduction"),
     backends: Annotated[
@@ -54,6 +59,9 @@ def reproduce(
 
     Example: npdr reproduce table2 --data swing_up_500hz_5s.csv --out table2
     """
+    if experiment is Experiment.MISSING_EFFECT:
+        _reproduce_missing_effect(data, out / experiment.value, seed, as_json, quiet)
+        return
     from npdr_ppl.cli.show import show_rows
     from npdr_ppl.errors import DataError
     from npdr_ppl.workflows.candidates import split_candidates
@@ -106,3 +114,33 @@ def reproduce(
         typer.echo((out / f"{experiment.value}.json").read_text(), nl=False)
     elif not quiet:
         show_rows(experiment.value, result)
+
+
+def _reproduce_missing_effect(
+    data: Path | None, out: Path, seed: int, as_json: bool, quiet: bool
+) -> None:
+    from npdr_ppl.cli.show import show_missing_effect
+    from npdr_ppl.errors import DataError
+    from npdr_ppl.plots.missing_effect_figures import write_missing_effect_figures
+    from npdr_ppl.workflows.discovery import DiscoveryOptions
+    from npdr_ppl.workflows.missing_effect import load_recordings, reproduce_missing_effect
+    from npdr_ppl.workflows.run_folder import read_json
+
+    if data is None:
+        raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")
+    swing_ups, chirps = load_recordings(data)
+    with resumable(f"the same command again begins the search in {out} anew."):
+        story, result = reproduce_missing_effect(
+            swing_ups,
+            chirps,
+            out,
+            options=DiscoveryOptions(seed=seed),
+            progress=False if quiet else None,
+        )
+        if story is not None:
+            held_out = swing_ups[result["held_out"]]
+            write_missing_effect_figures(story, held_out, chirps, out)
+    if as_json:
+        typer.echo((out / "missing-effect.json").read_text(), nl=False)
+    elif not quiet:
+        show_missing_effect(read_json(out / "discovery.json"), result, out)

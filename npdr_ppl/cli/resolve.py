@@ -13,13 +13,16 @@ from npdr_ppl.errors import DataError, ModelError, NpdrError
 
 if TYPE_CHECKING:
     from npdr_ppl.inference.base import Backend
+    from npdr_ppl.language.effects import Effect
     from npdr_ppl.policies.search import PolicySearch
     from npdr_ppl.targets.base import TargetDomain
     from npdr_ppl.workflows.control_task import ControlTask
 
 __all__ = [
+    "named_effects",
     "resolve_backend",
     "resolve_effects",
+    "resolve_holdout",
     "resolve_model",
     "resolve_rollouts",
     "resolve_search",
@@ -88,9 +91,22 @@ def resolve_effects(model: Callable[..., Any], words: Sequence[str]) -> Callable
         ModelError: There is no such effect.
     """
     from npdr_ppl.language.handlers import add_effect
+
+    for effect in named_effects(words):
+        model = add_effect(model, effect)
+    return model
+
+
+def named_effects(words: Sequence[str]) -> "list[Effect]":
+    """Returns effects given as ``port.effect``; a word may hold several, with commas in between.
+
+    Raises:
+        ModelError: There is no such effect.
+    """
     from npdr_ppl.models.effects import effects
 
     catalogue = effects()
+    found = []
     for word in (part for text in words for part in _split_effects(text, catalogue)):
         port, separator, name = word.rpartition(".")
         if not separator or name not in catalogue:
@@ -99,8 +115,8 @@ def resolve_effects(model: Callable[..., Any], words: Sequence[str]) -> Callable
             raise ModelError(
                 f"{word!r} is not port.effect with an effect of the catalogue; {hint}"
             )
-        model = add_effect(model, catalogue[name](port))
-    return model
+        found.append(catalogue[name](port))
+    return found
 
 
 def _split_effects(text: str, known: Collection[str]) -> list[str]:
@@ -143,6 +159,29 @@ def resolve_rollouts(path: Path, holdout: str = "") -> tuple[Any, Any]:
         )
     train = [i for i in range(len(rollouts)) if i not in test]
     return rollouts[train], rollouts[test]
+
+
+def resolve_holdout(path: Path, holdout: str, file: Path | None) -> tuple[Any, Any]:
+    """Loads rollouts, and held-out ones from the same file or from another.
+
+    Args:
+        path: CSV, Parquet, NPZ or NetCDF.
+        holdout: Positions of held-out rollouts, e.g. ``"3,4"``.
+        file: Another file, all of whose rollouts are held out.
+
+    Returns:
+        Rollouts to fit, and held-out rollouts or ``None``.
+
+    Raises:
+        DataError: A file is bad, a position does not exist, or both were given.
+    """
+    from npdr_ppl.rollouts import Rollouts
+
+    if file is None:
+        return resolve_rollouts(path, holdout)
+    if holdout:
+        raise DataError("--holdout and --holdout-data are two ways to say one thing; give one.")
+    return Rollouts.load(path), Rollouts.load(file)
 
 
 def resolve_target(word: str) -> "TargetDomain":

@@ -11,10 +11,23 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["show_comparison", "show_fit", "show_rows", "show_training"]
+__all__ = [
+    "show_comparison",
+    "show_discovery",
+    "show_fit",
+    "show_missing_effect",
+    "show_rows",
+    "show_training",
+]
 
 FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
 """Columns of figures with the width they need."""
+
+MOST_ROWS = 10
+"""Rows of a ranking."""
+
+WIDEST_NAME = 29
+"""Columns that an effect's name may take from its parameters'."""
 
 WIDTH = 100
 """Columns of a table that is written to a file or a pipe."""
@@ -90,6 +103,112 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
     console.print(f"Results and figures are in {out}/")
 
 
+def show_discovery(found: Mapping[str, Any], out: Path) -> None:
+    """Prints the content of ``discovery.json``, as far as the discovery went."""
+    console = _console()
+    for problem in found["data_problems"]:
+        _print_reason(console, "data problem", problem)
+    if "verdict" in found:
+        _show_findings(console, found)
+    elif "alarm" in found:
+        _show_candidates(console, found)
+    elif "where" in found:
+        _show_worst(console, found["where"])
+    elif not found["data_problems"]:
+        console.print("The recording shows none of the problems that are looked for.")
+    console.print(f"Results and figures are in {out}/")
+
+
+def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
+    if found["effects"]:
+        table = Table(title="What was missing", box=SIMPLE, padding=(0, 1, 0, 0))
+        width = min(WIDEST_NAME, max(len(f"at {row['port']}") for row in found["effects"]))
+        table.add_column("effect", overflow="fold", min_width=width)
+        table.add_column("parameter", overflow="fold")
+        for column, wide in {"prob.": 5, "mean": 10, "sd": 7, "94 % HDI": 21}.items():
+            table.add_column(column, justify="right", no_wrap=True, min_width=wide)
+        for row in found["effects"]:
+            name, probability = f"{row['effect']}\nat {row['port']}", f"{row['probability']:.0%}"
+            for parameter, p in row["parameters"].items():
+                unit = "" if p["unit"] in ("", "1") else f" [{p['unit']}]"
+                low, high = p["hdi_94"]
+                table.add_row(
+                    escape(name),
+                    escape(parameter + unit),
+                    probability,
+                    f"{p['mean']:.4g}",
+                    f"{p['sd']:.2g}",
+                    f"{low:.3g} … {high:.3g}",
+                )
+                name = probability = ""
+        console.print(table)
+    if found["gap"]:
+        table = Table(title="Held-out rollouts", box=SIMPLE)
+        table.add_column("metric", no_wrap=True)
+        for column in ("before", "after", "noise floor", "closed"):
+            table.add_column(column, justify="right", no_wrap=True)
+        for metric, gap in found["gap"].items():
+            values = [_number(gap[k], ".4g") for k in ("before", "after", "noise_floor")]
+            table.add_row(metric, *values, _number(gap["closed"], ".0%"))
+        console.print(table)
+    _print_reason(console, found["verdict"], found["reason"])
+    if found["remainder"]["fired"] and found["verdict"] != "unknown":
+        share = found["remainder"]["unexplained"]
+        console.print(f"Something smaller is left over: {share:.2%} of the disagreement.")
+    if (experiment := found["next_experiment"]) is not None:
+        _print_reason(console, "next experiment", _advice(experiment))
+
+
+def _advice(experiment: Mapping[str, Any]) -> str:
+    """Returns a next experiment in a sentence."""
+    words = experiment["separated_by"]
+    if experiment["excitation"] is None:
+        return words or "none of the excitations that were tried would tell them apart."
+    kind = experiment["excitation"]
+    limits = ", ".join(f"{name} up to {v:.3g}" for name, v in experiment["amplitude"].items())
+    sentence = (
+        f"{kind.replace('_', ' ')} with {limits}, which sets the survivors "
+        f"{experiment['separations'][kind]:.0f} standard deviations apart"
+    )
+    return f"{sentence}; {words}" if words else f"{sentence}."
+
+
+def _show_candidates(console: Console, found: Mapping[str, Any]) -> None:
+    table = Table(title="Candidates at the model as it is", box=SIMPLE)
+    table.add_column("effect", overflow="fold")
+    for column in ("separation", "absorbed", "p"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for row in found["ranking"][:MOST_ROWS]:
+        table.add_row(
+            escape(f"{row['port']}.{row['effect']}"),
+            f"{row['separation']:.1f}",
+            f"{row['absorbed']:.0%}",
+            f"{row['p_value']:.2g}",
+        )
+    console.print(table)
+    alarm = found["alarm"]
+    word = "alarm" if alarm["fired"] else "no alarm"
+    console.print(f"[bold]{word}[/bold], p = {alarm['p_value']:.2g}", highlight=False)
+
+
+def _show_worst(console: Console, where: Sequence[Mapping[str, Any]]) -> None:
+    table = Table(title="Windows that the model misses most", box=SIMPLE)
+    for column in ("rollout", "seconds", "z"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for column in ("channel", "what went on there"):
+        table.add_column(column, overflow="fold")
+    for row in where:
+        begin, end = row["time_span"]
+        table.add_row(
+            str(row["rollout"]),
+            f"{begin:.2f} … {end:.2f}",
+            _number(row["z"], ".1f"),
+            escape(row["channel"]),
+            escape(row["region"]),
+        )
+    console.print(table)
+
+
 def show_training(result: Mapping[str, Any], out: Path) -> None:
     """Prints the content of ``train.json``, a row for each iteration."""
     console = _console()
@@ -112,6 +231,26 @@ def show_training(result: Mapping[str, Any], out: Path) -> None:
     last = result["iterations"][-1]
     _print_reason(console, last["decision"], last["reason"])
     console.print(f"Results and figures are in {out}/")
+
+
+def show_missing_effect(found: Mapping[str, Any], result: Mapping[str, Any], out: Path) -> None:
+    """Prints the content of ``missing-effect.json`` after what was found."""
+    show_discovery(found, out)
+    tables = {
+        "Held-out swing-ups": ("", {}),
+        "The same from recorded states, as in the paper": ("_recorded", result["paper"]),
+        "Another excitation": ("_chirp", {}),
+    }
+    for title, (suffix, paper) in tables.items():
+        names = {metric: f"{metric}{suffix}" for metric in ("rmse", "dtw")}
+        rows = {
+            method: {metric: row[name] for metric, name in names.items() if name in row}
+            for method, row in result["rows"].items()
+        }
+        if any(rows.values()):
+            show_rows(title, {"rows": rows, "paper": paper})
+    for what, reason in result["skipped"].items():
+        _print_reason(_console(), f"{what} skipped", reason)
 
 
 def show_rows(title: str, result: Mapping[str, Any]) -> None:

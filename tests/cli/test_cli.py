@@ -188,6 +188,8 @@ def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path
          "cannot be told apart"),
         (["reproduce", "table2"], "pass --data"),
         (["reproduce", "mini-golf"], "pass --data"),
+        (["reproduce", "missing-effect"], "pass --data"),
+        (["reproduce", "missing-effect", "--data", "OUT"], "does not exist"),
         (["reproduce", "pendulum", "--backends", "mcmc"], "mcmc"),
     ],
 )  # fmt: skip

@@ -18,7 +18,7 @@ from npdr_ppl.workflows import progress
 
 NPDR = [sys.executable, "-m", "npdr_ppl.cli"]
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-WITH_RESULTS = ("demo", "fit", "compare", "train", "reproduce", "report")
+WITH_RESULTS = ("demo", "discover", "fit", "compare", "train", "reproduce", "report")
 
 
 def npdr(*words, **environment):

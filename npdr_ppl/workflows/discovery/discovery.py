@@ -3,7 +3,10 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any
+
+from torch import Tensor
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
@@ -16,13 +19,13 @@ from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.next_experiment import NextExperiment, next_experiment
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.projection import Projection
-from npdr_ppl.workflows.discovery.proof import prove
-from npdr_ppl.workflows.discovery.residual_map import worst_windows
+from npdr_ppl.workflows.discovery.proof import Gap, prove
+from npdr_ppl.workflows.discovery.residual_map import Spot, worst_windows
 from npdr_ppl.workflows.discovery.result import Discovery, Finding, Verdict
-from npdr_ppl.workflows.discovery.search import Added, Search, Searcher
+from npdr_ppl.workflows.discovery.search import Added, Round, Search, Searcher
 from npdr_ppl.workflows.discovery.separation import separation_matrix
 
-__all__ = ["discover"]
+__all__ = ["Investigation", "discover"]
 
 MOST_UNEXPLAINED = 0.1
 """Share of the misfit that may stay unexplained where what was found is to be called the cause."""
@@ -32,6 +35,134 @@ SURVIVES = 0.05
 
 LEADING = 10
 """Candidates in the separation matrix."""
+
+
+class Investigation:
+    """A model and a recording, examined stage by stage; each stage can be asked for alone.
+
+    A stage does what it needs of the stages before, and nothing is done twice.
+
+    Args:
+        model: A Pyro model with one black-box site; a simulator with ports is all it needs.
+        rollouts: The recording that effects are found and fitted on.
+        holdout: Rollouts to prove it on, of another excitation where there are some; never used
+            to choose or fit anything.
+        options: How to search.
+        report: Called with a sentence at each step.
+
+    Attributes:
+        seconds: Time spent, by stage.
+
+    Raises:
+        DataError: The held-out rollouts have other channels.
+    """
+
+    def __init__(
+        self,
+        model: Callable[..., Any],
+        rollouts: Rollouts,
+        *,
+        holdout: Rollouts | None = None,
+        options: DiscoveryOptions | None = None,
+        report: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        if holdout is not None and holdout.channel_names != rollouts.channel_names:
+            raise DataError("The held-out rollouts have other channels than those to fit.")
+        self.model = model
+        self.rollouts = rollouts
+        self.holdout = holdout
+        self.options = options or DiscoveryOptions()
+        self.seconds: dict[str, float] = {}
+        self._binding = self.options.binding(rollouts)
+        self._searcher = Searcher(model, rollouts, self.options, report)
+
+    @cached_property
+    def start(self) -> Hypothesis:
+        """The model as it is, fitted."""
+        with _timed(self.seconds, "fit"):
+            fitted = self._searcher.fit_base()
+        for effect in self.options.effects or ():
+            # Screening leaves out what the simulator cannot have; who asks by name is told.
+            fitted.simulator.with_effects(effect)
+        return fitted
+
+    @cached_property
+    def problems(self) -> tuple[str, ...]:
+        """What is wrong with the recording itself."""
+        start = self.start
+        with _timed(self.seconds, "check data"):
+            return tuple(data_problems(start, self.rollouts, self._binding))
+
+    @cached_property
+    def where(self) -> list[Spot]:
+        """The windows that the model as it is misses most, the worst first."""
+        return worst_windows(self.start, self.rollouts)
+
+    @cached_property
+    def first(self) -> Round:
+        """Alarm and ranking at the model as it is."""
+        start = self.start
+        with _timed(self.seconds, "screen"):
+            return self._searcher.look(start)
+
+    @cached_property
+    def separation(self) -> Tensor:
+        """Distance between the leading candidates once parameters are refitted, ``(n, n)``."""
+        return separation_matrix(Projection(self.start), self.first.ranking[:LEADING])
+
+    @cached_property
+    def search(self) -> Search:
+        """The effects that were missing; none are looked for in a recording with problems."""
+        problems, first = self.problems, self.first
+        with _timed(self.seconds, "search"):
+            return self._searcher.run(
+                first, max_effects=0 if problems else self.options.max_effects
+            )
+
+    @cached_property
+    def gap(self) -> dict[str, Gap]:
+        """Metrics on the held-out recording; empty without one."""
+        if self.holdout is None:
+            return {}
+        start, final = self.start, self.search.final
+        with _timed(self.seconds, "prove"):
+            binding = _like(self._binding, self.rollouts, self.holdout)
+            return prove(start, final, self.holdout, binding, seed=self.options.seed)
+
+    def conclude(self) -> Discovery:
+        """Returns what all stages came to."""
+        search = self.search
+        final = search.final
+        unexplained = _unexplained(search)
+        every = estimates(final, _units(final), seed=self.options.seed)
+        effects = [_finding(added, search, every) for added in search.added]
+        verdict, reason = _judge(search, effects, self.problems, unexplained, self.options)
+        gap = self.gap
+        with _timed(self.seconds, "next experiment"):
+            advice = None
+            if verdict == "ambiguous":
+                advice = _advice(search, self.rollouts, self._binding)
+        return Discovery(
+            verdict=verdict,
+            reason=reason,
+            problems=self.problems,
+            alarm=self.first.alarm,
+            remainder=search.rounds[-1].alarm,
+            unexplained=unexplained,
+            where=self.where,
+            effects=effects,
+            ranking=self.first.ranking,
+            separation=self.separation,
+            separation_names=tuple(c.name for c in self.first.ranking[:LEADING]),
+            gap=gap,
+            next_experiment=advice,
+            model=self.model,
+            revised=final.model,
+            parameters=every,
+            search=search,
+            options=self.options,
+            seconds=self.seconds,
+        )
 
 
 def discover(
@@ -56,56 +187,9 @@ def discover(
         DataError: The recording is too short, or does not fit the model.
         ModelError: The model cannot be inferred.
     """
-    options = options or DiscoveryOptions()
-    if holdout is not None and holdout.channel_names != rollouts.channel_names:
-        raise DataError("The held-out rollouts have other channels than those to fit.")
-    seconds: dict[str, float] = {}
-    binding = options.binding(rollouts)
-    searcher = Searcher(model, rollouts, options, report)
-    with _timed(seconds, "fit"):
-        start = searcher.fit_base()
-    with _timed(seconds, "check data"):
-        problems = tuple(data_problems(start, rollouts, binding))
-    with _timed(seconds, "screen"):
-        first = searcher.look(start)
-    with _timed(seconds, "search"):
-        search = searcher.run(first, max_effects=0 if problems else options.max_effects)
-    final, last = search.final, search.rounds[-1]
-    unexplained = _unexplained(search)
-    units = _units(final)
-    every = estimates(final, units, seed=options.seed)
-    effects = [_finding(added, search, every) for added in search.added]
-    verdict, reason = _judge(search, effects, problems, unexplained, options)
-    with _timed(seconds, "prove"):
-        gap = {}
-        if holdout is not None:
-            gap = prove(
-                start, final, holdout, _like(binding, rollouts, holdout), seed=options.seed
-            )
-    with _timed(seconds, "next experiment"):
-        advice = _advice(search, rollouts, binding) if verdict == "ambiguous" else None
-    leading = first.ranking[:LEADING]
-    return Discovery(
-        verdict=verdict,
-        reason=reason,
-        problems=problems,
-        alarm=first.alarm,
-        remainder=last.alarm,
-        unexplained=unexplained,
-        where=worst_windows(start, rollouts),
-        effects=effects,
-        ranking=first.ranking,
-        separation=separation_matrix(Projection(start), leading),
-        separation_names=tuple(candidate.name for candidate in leading),
-        gap=gap,
-        next_experiment=advice,
-        model=model,
-        revised=final.model,
-        parameters=every,
-        search=search,
-        options=options,
-        seconds=seconds,
-    )
+    return Investigation(
+        model, rollouts, holdout=holdout, options=options, report=report
+    ).conclude()
 
 
 def _judge(

@@ -20,7 +20,7 @@ from npdr_ppl.workflows.discovery.revised_model import revised_source
 from npdr_ppl.workflows.discovery.screening import Screened
 from npdr_ppl.workflows.discovery.search import Search
 
-__all__ = ["Discovery", "Finding", "Verdict"]
+__all__ = ["Discovery", "Finding", "Verdict", "describe_candidate"]
 
 Verdict = Literal["none", "named", "ambiguous", "unknown"]
 """Nothing is missing; what is missing has a name; it has several names that the recording cannot
@@ -121,7 +121,7 @@ class Discovery:
             },
             "where": [spot.to_dict() for spot in self.where],
             "effects": [finding.to_dict() for finding in self.effects],
-            "ranking": [_ranked(s, self.alarm.p_values[s.name]) for s in self.ranking],
+            "ranking": [describe_candidate(s, self.alarm.p_values[s.name]) for s in self.ranking],
             "separation": {
                 "names": list(self.separation_names),
                 "distance": self.separation.tolist(),
@@ -153,12 +153,34 @@ class Discovery:
         (folder / "discovery.json").write_text(text + "\n", encoding="utf-8")
         (folder / "revised_model.py").write_text(self.source(), encoding="utf-8")
 
+    def plot(self, axes: Any = None) -> Any:
+        """Draws the probabilities of what was missing and the gap on held-out rollouts.
+
+        :func:`~npdr_ppl.plots.discovery_figures.write_discovery_figures` draws all the rest.
+
+        Args:
+            axes: Where to draw: a panel for each effect, or one of what was tried where none was
+                added, and one for each metric that has a noise floor; ``None`` for a new figure.
+
+        Returns:
+            The axes, one per panel.
+        """
+        from npdr_ppl.workflows.discovery.notebook import plot_discovery
+
+        return plot_discovery(self, axes)
+
+    def _repr_html_(self) -> str:
+        from npdr_ppl.workflows.discovery.notebook import discovery_html
+
+        return discovery_html(self)
+
     def __repr__(self) -> str:
         found = ", ".join(f"{f.effect.name} ({f.probability:.0%})" for f in self.effects)
         return f"Discovery({self.verdict}{': ' + found if found else ''})"
 
 
-def _ranked(candidate: Screened, p_value: float) -> dict[str, Any]:
+def describe_candidate(candidate: Screened, p_value: float) -> dict[str, Any]:
+    """Returns a candidate of the ranking as JSON-serialisable values."""
     effect = candidate.variant.effect
     return {
         "effect": effect.id,

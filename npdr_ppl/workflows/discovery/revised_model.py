@@ -1,8 +1,8 @@
 """The revised model as a Python file."""
 
-import importlib.util
 import inspect
 from collections.abc import Callable, Mapping
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +56,5 @@ def _base(model: Callable[..., Any]) -> tuple[str, str]:
 
 
 def _is_installed(module: str) -> bool:
-    if module == "__main__":
-        return False
-    try:
-        return importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError):
-        return False
+    # Not importlib.util.find_spec, which also finds what was loaded from a file by its path.
+    return PathFinder.find_spec(module.partition(".")[0]) is not None

@@ -1,0 +1,119 @@
+"""`npdr discover`: find what a model misses, name it, add it, prove it."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
+from npdr_ppl.cli.worker_options import (
+    Address,
+    ExecutorOption,
+    TimeLimit,
+    WorkersOption,
+    chosen_workers,
+)
+
+__all__ = ["discover"]
+
+
+class LastStage(StrEnum):
+    """Where to stop; each stage includes those before."""
+
+    CHECK = "check"
+    LOCATE = "locate"
+    ALARM = "alarm"
+    NAME = "name"
+    PROVE = "prove"
+
+
+def discover(
+    model: Annotated[str, typer.Argument(help="Zoo name, or path/to/file.py:function.")],
+    data: Annotated[Path, typer.Option(help="Rollouts: CSV, Parquet, NPZ or NetCDF.")],
+    out: Annotated[Path, typer.Option(help="Folder for results.")],
+    holdout: Annotated[str, typer.Option(help="Rollouts to prove it on, e.g. 3,4.")] = "",
+    holdout_data: Annotated[
+        Path | None,
+        typer.Option(help="File of rollouts to prove it on: another excitation is better proof."),
+    ] = None,
+    segment_length: Annotated[
+        int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for 0.2 s.")
+    ] = 0,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(help="Effect that the model has already, port.effect; may be repeated."),
+    ] = None,
+    effects: Annotated[
+        str, typer.Option(help="Effects to search, port.effect,port.effect; all if not given.")
+    ] = "",
+    max_effects: Annotated[int, typer.Option(min=0, help="Greatest number to add.")] = 4,
+    false_alarm_rate: Annotated[
+        float, typer.Option(help="Probability of an alarm although nothing is missing.")
+    ] = 0.01,
+    stage: Annotated[
+        LastStage, typer.Option(help="Stop after this stage and write what there is.")
+    ] = LastStage.PROVE,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    executor: ExecutorOption = None,
+    workers: WorkersOption = None,
+    address: Address = None,
+    time_limit: TimeLimit = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Find what a model misses in a recording, name it, add it and prove that it helps.
+
+    Writes discovery.json, revised_model.py (a model for every other command) and figures. An
+    interrupted search begins anew when the same command is given again; a finished one is shown.
+
+    Example: npdr discover furuta --data measured.csv --holdout 3,4 --out discovery
+    """
+    from npdr_ppl.cli.resolve import (
+        named_effects,
+        resolve_effects,
+        resolve_holdout,
+        resolve_model,
+    )
+    from npdr_ppl.cli.show import show_discovery
+    from npdr_ppl.plots.discovery_figures import write_discovery_figures, write_stage_figures
+    from npdr_ppl.workflows.discovery import DiscoveryOptions, Investigation
+    from npdr_ppl.workflows.discovery.folder import DiscoveryFolder, findings_until
+    from npdr_ppl.workflows.discovery.progress import sentences
+
+    chosen = resolve_effects(resolve_model(model), effect or [])
+    train, test = resolve_holdout(data, holdout, holdout_data)
+    options = DiscoveryOptions(
+        segment_length=segment_length or None,
+        effects=tuple(named_effects([effects])) if effects else None,
+        max_effects=max_effects,
+        false_alarm_rate=false_alarm_rate,
+        seed=seed,
+    )
+    folder = DiscoveryFolder(out)
+    folder.begin(chosen, train, test, options)
+    found = folder.finished(stage.value)
+    if found is None:
+        with (
+            resumable(f"the same command again begins the search in {out} anew."),
+            chosen_workers(executor, workers, address, time_limit),
+        ):
+            with sentences(options, False if quiet else None) as report:
+                investigation = Investigation(
+                    chosen,
+                    train,
+                    holdout=test if stage is LastStage.PROVE else None,
+                    options=options,
+                    report=report,
+                )
+                found, discovery = findings_until(investigation, stage.value)
+            if discovery is None:
+                write_stage_figures(investigation, stage.value, out)
+            else:
+                write_discovery_figures(discovery, out)
+        folder.finish(found, None if discovery is None else discovery.source())
+    if as_json:
+        typer.echo((out / "discovery.json").read_text(), nl=False)
+    elif not quiet:
+        show_discovery(found, out)

@@ -1,0 +1,205 @@
+"""`npdr discover`: what it writes, where it stops, what it refuses, and that others accept it."""
+
+import json
+import sys
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from npdr_ppl.cli import main as cli
+from npdr_ppl.cli import show
+from npdr_ppl.cli.resolve import resolve_holdout, resolve_model
+from npdr_ppl.workflows.discovery import Investigation
+from tests.cli.discovery_recording import CANDIDATES, FRICTION, MISSING, pendulum_recording
+
+NAMES = {
+    "alarm", "where", "verdict", "effects", "ranking", "gap", "next_experiment", "data_problems",
+    "separation", "parameters", "seconds", "stage",
+}  # fmt: skip
+
+FIGURES = {
+    "residual_map", "latent_force", "ranking", "separation", "parameters", "effects", "gap"
+}  # fmt: skip
+
+
+def run(words):
+    """Runs the command line in this process; returns exit code, output and error text."""
+    with pytest.MonkeyPatch.context() as patch:
+        out, err = StringIO(), StringIO()
+        patch.setattr(sys, "argv", ["npdr", *map(str, words)])
+        patch.setattr(sys, "stdout", out)
+        patch.setattr(sys, "stderr", err)
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+    return stop.value.code or 0, out.getvalue(), err.getvalue()
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "pendulum.csv"
+    pendulum_recording().to_csv(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def model_file(tmp_path_factory):
+    """A model that no package has."""
+    file = tmp_path_factory.mktemp("model") / "mine.py"
+    file.write_text(
+        "import pyro, pyro.distributions as dist\n"
+        "import npdr_ppl as npdr\n"
+        "from npdr_ppl.models.pendulum import Pendulum\n\n"
+        "def rod(inputs):\n"
+        "    mass = pyro.sample('mass', dist.Uniform(0.3, 1.7))\n"
+        "    length = pyro.sample('length', dist.Uniform(0.3, 1.7))\n"
+        "    values = {'mass': mass, 'length': length}\n"
+        "    return npdr.simulate('trajectory', Pendulum(), values, inputs)\n"
+    )
+    return file
+
+
+@pytest.fixture(scope="module")
+def words(recording, model_file, tmp_path_factory):
+    return [
+        "discover", f"{model_file}:rod", "--data", recording, "--holdout", 3, "--effects",
+        CANDIDATES, "--max-effects", 1, "--out", tmp_path_factory.mktemp("out") / "discovery",
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def finished(words):
+    """A finished discovery: its folder and what was printed."""
+    code, text, err = run(words)
+    assert code == 0, err
+    return Path(words[-1]), text
+
+
+def test_it_names_what_is_missing(finished):
+    folder, text = finished
+    found = json.loads((folder / "discovery.json").read_text())
+    assert NAMES <= set(found)
+    assert found["verdict"] == "named"
+    (effect,) = found["effects"]
+    assert f"{effect['port']}.{effect['effect']}" == MISSING
+    assert {"probability", "equivalent_to", "parameters"} <= set(effect)
+    magnitude = effect["parameters"]["magnitude"]
+    assert set(magnitude) == {"mean", "sd", "hdi_94", "unit"}
+    assert abs(magnitude["mean"] - FRICTION) < 0.2 * FRICTION
+    assert found["alarm"]["fired"] is True and found["alarm"]["p_value"] < 0.01
+    assert set(found["where"][0]) == {"rollout", "time_span", "channel", "region", "z"}
+    for metric in ("rmse", "dtw", "crps"):
+        gap = found["gap"][metric]
+        assert set(gap) == {"before", "after", "noise_floor", "closed"}
+        assert gap["after"] < gap["before"]
+    assert "coulomb_friction" in text and "named" in text and "rmse" in text
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_it_draws_its_figures(finished):
+    folder, _ = finished
+    assert {file.stem for file in folder.glob("*.png")} == FIGURES
+    assert all(file.stat().st_size > 1_000 for file in folder.glob("*.png"))
+
+
+def test_other_commands_accept_the_revised_model(finished, recording, tmp_path):
+    folder, _ = finished
+    model = f"{folder}/revised_model.py:revised_model"
+    assert repr(resolve_model(model)) == f"rod + {MISSING}"
+    code, _, err = run(
+        [
+            "fit", model, "--data", recording, "--out", tmp_path / "fit", "--rounds", 1,
+            "--simulations", 60, "--segment-length", 50, "--embedding", "all/5", "--quiet",
+        ]
+    )  # fmt: skip
+    assert code == 0, err
+    fit = json.loads((tmp_path / "fit/fit.json").read_text())
+    assert set(fit["parameters"]) == {"mass", "length", f"{MISSING}.magnitude"}
+
+
+def test_a_finished_discovery_is_not_repeated(finished, words, monkeypatch):
+    def never(*_):
+        raise AssertionError("it was searched again")
+
+    monkeypatch.setattr(Investigation, "conclude", never)
+    code, text, _ = run(words)
+    assert (code, text) == (0, finished[1])
+    code, text, _ = run([*words, "--quiet"])
+    assert (code, text) == (0, "")
+    code, _, err = run([*words, "--seed", 1])
+    assert code == 2 and "differs in seed" in err
+
+
+def test_stages_stop_where_they_are_told_and_an_unfinished_run_goes_on(words, tmp_path):
+    words = [*words[:-1], tmp_path / "stages", "--stage"]
+    folder = tmp_path / "stages"
+    expected = {
+        "check": ({"data_problems"}, set()),
+        "locate": ({"data_problems", "where"}, {"residual_map"}),
+        "alarm": (
+            {"data_problems", "where", "alarm", "ranking"},
+            {"residual_map", "latent_force", "ranking", "separation"},
+        ),
+    }
+    for stage, (names, figures) in expected.items():
+        code, text, err = run([*words, stage])
+        assert code == 0, err
+        found = json.loads((folder / "discovery.json").read_text())
+        assert set(found) == names | {"stage", "seconds"}
+        assert {file.stem for file in folder.glob("*.png")} == figures
+        assert not (folder / "revised_model.py").exists()
+    assert "alarm" in text
+    # As if killed before the end: nothing says that it is finished, so it begins anew.
+    (folder / "discovery.json").unlink()
+    assert run([*words, "check"])[0] == 0
+    assert json.loads((folder / "discovery.json").read_text())["stage"] == "check"
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        (["--effects", "hinge.coulomb"], "did you mean 'coulomb_friction'"),
+        (["--effects", "knee.bias"], "knee"),
+        (["--effects", "hinge.input_delay"], "hinge"),
+        (["--effect", "hinge.coulomb"], "did you mean 'coulomb_friction'"),
+        (["--holdout", "9"], "has 4"),
+        (["--holdout-data", "DATA"], "give one"),
+        (["--false-alarm-rate", "2"], "between 0 and 1"),
+        (["--segment-length", "400"], "too few"),
+    ],
+)
+def test_bad_input_gets_one_sentence(words, recording, tmp_path, changed, sentence):
+    changed = [recording if word == "DATA" else word for word in changed]
+    code, _, err = run([*words[:-1], tmp_path / "out", *changed, "--stage", "check"])
+    assert code == 2
+    assert sentence in err and "Traceback" not in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_held_out_rollouts_come_from_the_same_file_or_another(recording, tmp_path):
+    other = tmp_path / "other.csv"
+    pendulum_recording(num_rollouts=2, num_steps=50).to_csv(other)
+    fitted, held_out = resolve_holdout(recording, "1,3", None)
+    assert (len(fitted), len(held_out)) == (2, 2)
+    fitted, held_out = resolve_holdout(recording, "", other)
+    assert (len(fitted), len(held_out)) == (4, 2)
+    assert resolve_holdout(recording, "", None)[1] is None
+
+
+def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, tmp_path):
+    text = StringIO()
+    monkeypatch.setattr(show, "_console", lambda: Console(file=text, width=100))
+    found = {
+        "data_problems": [], "verdict": "ambiguous", "reason": "It cannot tell.", "effects": [],
+        "gap": {}, "remainder": {"fired": True, "unexplained": 0.05},
+        "next_experiment": {
+            "excitation": "slow_ramp", "separations": {"slow_ramp": 12.3, "hold": None},
+            "amplitude": {"torque": 4.0}, "separated_by": "a change of load",
+        },
+    }  # fmt: skip
+    show.show_discovery(found, tmp_path)
+    shown = " ".join(text.getvalue().split())
+    assert "ambiguous: It cannot tell." in shown
+    assert "slow ramp with torque up to 4, which sets the survivors 12 standard" in shown
+    assert "a change of load" in shown and "5.00%" in shown
