@@ -49,8 +49,9 @@ MAX_COORDINATE = 5.0
 """How far from the prior's centre a fit may lie, in standard deviations. A strength that is much
 smaller than its half-normal prior expects lies at −3 and beyond."""
 
-LEAST_GAIN = 1e-3
-"""Relative reduction of the objective below which steps end."""
+LEAST_GAIN = 0.05
+"""Reduction of the objective, in units of the readings' variance, below which steps end: far less
+than what makes a difference between two models."""
 
 
 @dataclass(frozen=True)
@@ -284,7 +285,7 @@ def _steps(
         tried, begun = torch.stack(points), torch.stack(starts)
         outcome = objective(segments.residuals(tried, begun, scale), tried, begun)
         best = int(outcome.argmin())
-        gain = 1.0 - float(outcome[best]) / present
+        gain = present - float(outcome[best])
         if gain <= 0.0:
             break
         z, offsets = tried[best], begun[best]

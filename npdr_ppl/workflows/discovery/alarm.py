@@ -6,10 +6,16 @@ from dataclasses import dataclass
 import torch
 
 from npdr_ppl.workflows.discovery.chance import LargestStatistic
-from npdr_ppl.workflows.discovery.latent_force import GenericLaw
+from npdr_ppl.workflows.discovery.latent_force import (
+    GenericLaw,
+    Responses,
+    generic_laws,
+    wave_laws,
+)
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.screening import Screened
+from npdr_ppl.workflows.discovery.sensitivities import Variant
 
 __all__ = ["Alarm", "sound_alarm"]
 
@@ -40,48 +46,61 @@ class Alarm:
 
 def sound_alarm(
     projection: Projection,
+    variants: Sequence[Variant],
     ranking: Sequence[Screened],
-    laws: Sequence[GenericLaw],
+    found: Responses,
+    angles: frozenset[str],
     options: DiscoveryOptions,
 ) -> Alarm:
     """Tests a fitted hypothesis against every candidate and every generic law at once.
 
+    Every shape and size of a candidate that was tried counts, and every frequency of a wave.
+
     Args:
         projection: The fitted hypothesis.
-        ranking: The candidates.
-        laws: The generic laws.
+        variants: All candidates in all their shapes and sizes.
+        ranking: The candidates that explain anything.
+        found: The responses to pulses of force.
+        angles: Names of the channels in radians.
         options: The rate of false alarms and the seed.
     """
-    groups, names, gains = [], [], []
-    for candidate in ranking:
-        groups.append(candidate.variant.change)
-        names.append(candidate.name)
-        gains.append(candidate.gain)
-    if laws:
-        scores = projection.scores(torch.cat([law.change for law in laws], dim=-1))
-        information = scores.information.diagonal()
-        # What the refitted parameters explain leaves nothing but rounding errors.
-        known = scores.absorbed < 1.0 - 1e-6
-        for k in torch.nonzero(known)[:, 0].tolist():
-            groups.append(laws[k].change)
-            names.append(laws[k].name)
-            gains.append(float(scores.score[k] ** 2 / information[k]))
-    if not groups:
-        return Alarm(1.0, False, "", 0.0, {})
     chance = LargestStatistic(projection, seed=options.seed)
+    laws = _learnable(projection, generic_laws(found, angles))
+    waves = wave_laws(found)
+    listed = [wave for port in waves.values() for wave in port]
     # Each kind is a search of its own: a hundred laws that no one believes in must not make the
     # catalogue's harder to hear.
-    num = len(ranking)
-    values = [
-        *(min(1.0, p / CATALOGUE_SHARE) for p in chance.p_values(groups[:num])),
-        *(min(1.0, p / (1.0 - CATALOGUE_SHARE)) for p in chance.p_values(groups[num:])),
-    ]
-    p_value = min(values)
-    loudest = max((k for k in range(len(names)) if values[k] == p_value), key=lambda k: gains[k])
+    values: dict[str, float] = {}
+    for variant, p in zip(variants, chance.p_values([v.change for v in variants]), strict=True):
+        name = variant.effect.name
+        values[name] = min(values.get(name, 1.0), p / CATALOGUE_SHARE)
+    groups = [law.change for law in (*laws, *listed)]
+    for law, p in zip((*laws, *listed), chance.p_values(groups), strict=True):
+        values[law.name] = min(1.0, p / (1.0 - CATALOGUE_SHARE))
+    for port, own in waves.items():
+        name = f"{port}.periodic_disturbance"
+        if name in values:
+            values[name] = min(values[name], *(values[wave.name] for wave in own))
+    gains = {candidate.name: candidate.gain for candidate in ranking}
+    for law in laws:
+        scores = projection.scores(law.change)
+        gains[law.name] = float(scores.score[0] ** 2 / scores.information[0, 0])
+    if not values:
+        return Alarm(1.0, False, "", 0.0, {})
+    p_value = min(values.values())
+    loudest = [name for name, p in values.items() if p == p_value]
     return Alarm(
         p_value,
         p_value <= options.false_alarm_rate,
-        names[loudest],
-        max(gains),
-        dict(zip(names, values, strict=True)),
+        max(loudest, key=lambda name: gains.get(name, 0.0)),
+        max(gains.values(), default=0.0),
+        values,
     )
+
+
+def _learnable(projection: Projection, laws: list[GenericLaw]) -> list[GenericLaw]:
+    """Returns the laws that refitted parameters do not explain up to rounding errors."""
+    if not laws:
+        return []
+    scores = projection.scores(torch.cat([law.change for law in laws], dim=-1))
+    return [law for law, a in zip(laws, scores.absorbed.tolist(), strict=True) if a < 1.0 - 1e-6]

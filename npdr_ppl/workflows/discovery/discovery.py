@@ -27,8 +27,11 @@ from npdr_ppl.workflows.discovery.separation import separation_matrix
 
 __all__ = ["Investigation", "discover"]
 
-MOST_UNEXPLAINED = 0.1
+MOST_UNEXPLAINED = 0.02
 """Share of the misfit that may stay unexplained where what was found is to be called the cause."""
+
+MINOR = 0.1
+"""Share of the findings that may be ambiguous where the rest is to be called named."""
 
 SURVIVES = 0.05
 """Probability from which an alternative has to be reckoned with."""
@@ -213,7 +216,7 @@ def _judge(
         )
     unsure = [f for f in effects if f.probability < options.confidence]
     sure = [f for f in effects if f.probability >= options.confidence]
-    if sure and sum(f.share for f in unsure) <= MOST_UNEXPLAINED * sum(f.share for f in effects):
+    if sure and sum(f.share for f in unsure) <= MINOR * sum(f.share for f in effects):
         return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
     names = " or ".join(n for n, p in unsure[0].alternatives.items() if p >= SURVIVES)
     return "ambiguous", f"The recording cannot tell which it is: {names}."

@@ -24,6 +24,7 @@ from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
 
 __all__ = [
+    "FREQUENCIES",
     "GenericLaw",
     "LatentForce",
     "Responses",
@@ -31,6 +32,7 @@ __all__ = [
     "latent_force",
     "responses",
     "strongest_frequency",
+    "wave_laws",
 ]
 
 PULSES = 10
@@ -113,7 +115,7 @@ class GenericLaw:
 
     Attributes:
         name: What it is, e.g. ``"arm: arm_velocity²"``.
-        change: What it would change in the whitened readings, ``(S, N, 1)``.
+        change: What it would change in the whitened readings, ``(S, N, k)``.
     """
 
     name: str
@@ -194,6 +196,21 @@ def generic_laws(found: Responses, angles: frozenset[str] = frozenset()) -> list
     ]
 
 
+def wave_laws(found: Responses) -> dict[str, list[GenericLaw]]:
+    """Returns what waves in time of many frequencies would change, by port.
+
+    Args:
+        found: The responses to pulses.
+    """
+    return {
+        port: [
+            GenericLaw(f"{port}: wave of {frequency:.3g} Hz", change @ _wave(found, frequency))
+            for frequency in _frequencies(found).tolist()
+        ]
+        for port, change in found.by_port.items()
+    }
+
+
 def strongest_frequency(projection: Projection, found: Responses, port: str) -> float:
     """Returns the frequency in Hz of the wave in time that explains most as a force at a port.
 
@@ -202,13 +219,11 @@ def strongest_frequency(projection: Projection, found: Responses, port: str) -> 
         found: The responses to pulses.
         port: The port.
     """
-    step = 0.5 / float(found.time.max() - found.time.min())
-    frequencies = step * torch.arange(1, FREQUENCIES + 1, dtype=torch.float64)
+    frequencies = _frequencies(found)
     change = found.by_port[port]
     gains = []
     for chunk in frequencies.split(20):
-        angle = 2.0 * torch.pi * chunk * found.time[..., None]  # (S, pulses, F)
-        waves = torch.stack((angle.sin(), angle.cos()), dim=-1).flatten(-2)
+        waves = torch.cat([_wave(found, frequency) for frequency in chunk.tolist()], dim=-1)
         scores = projection.scores(change @ waves)
         for k in range(len(chunk)):
             own = slice(2 * k, 2 * k + 2)
@@ -216,6 +231,17 @@ def strongest_frequency(projection: Projection, found: Responses, port: str) -> 
             inverse = torch.linalg.pinv(scores.information[own, own], hermitian=True)
             gains.append(float(score @ inverse @ score))
     return float(frequencies[max(range(len(gains)), key=gains.__getitem__)])
+
+
+def _frequencies(found: Responses) -> Tensor:
+    step = 0.5 / float(found.time.max() - found.time.min())
+    return step * torch.arange(1, FREQUENCIES + 1, dtype=torch.float64)
+
+
+def _wave(found: Responses, frequency: float) -> Tensor:
+    """Returns sine and cosine at the pulses, ``(S, pulses, 2)``."""
+    angle = 2.0 * torch.pi * frequency * found.time
+    return torch.stack((angle.sin(), angle.cos()), dim=-1)
 
 
 def latent_force(projection: Projection, found: Responses) -> list[LatentForce]:

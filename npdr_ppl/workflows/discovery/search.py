@@ -16,15 +16,15 @@ from npdr_ppl.workflows.discovery.equivalents import irreducible
 from npdr_ppl.workflows.discovery.evidence import closest, weigh
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
 from npdr_ppl.workflows.discovery.latent_force import (
+    FREQUENCIES,
     Responses,
-    generic_laws,
     responses,
     strongest_frequency,
 )
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.screening import Screened, screen
-from npdr_ppl.workflows.discovery.sensitivities import sensitivities
+from npdr_ppl.workflows.discovery.sensitivities import Variant, sensitivities
 
 __all__ = ["Added", "Round", "Search", "Searcher"]
 
@@ -170,27 +170,28 @@ class Searcher:
         """Screens all candidates at a fitted hypothesis."""
         projection = Projection(hypothesis)
         found = responses(hypothesis)
-        ranking = self._screened(projection, hypothesis, self._candidates(hypothesis), found)
-        alarm = sound_alarm(
-            projection, ranking, generic_laws(found, _angles(hypothesis)), self.options
-        )
+        variants = self._variants(projection, hypothesis, self._candidates(hypothesis), found)
+        ranking = screen(projection, variants)
+        angles = frozenset(c.name for c in hypothesis.simulator.sensors if c.unit == "rad")
+        plain = [variant for variant in variants if not variant.is_hinted]
+        alarm = sound_alarm(projection, plain, ranking, found, angles, self.options)
         best = ", ".join(s.name for s in ranking[:3]) or "none"
         self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
         return Round(hypothesis, alarm, ranking, found)
 
-    def _screened(
+    def _variants(
         self,
         projection: Projection,
         hypothesis: Hypothesis,
         candidates: tuple[Effect, ...],
         found: Responses,
-    ) -> list[Screened]:
+    ) -> list[Variant]:
         hints = {
             effect.name: {"frequency": strongest_frequency(projection, found, effect.port)}
             for effect in candidates
             if effect.id == "periodic_disturbance" and effect.port in found.by_port
         }
-        return screen(projection, sensitivities(hypothesis, candidates, hints))
+        return sensitivities(hypothesis, candidates, hints)
 
     def _candidates(self, hypothesis: Hypothesis) -> tuple[Effect, ...]:
         """Returns the effects that may be added."""
@@ -218,10 +219,10 @@ class Searcher:
         trials = self._converged(trials)
         each = math.log(PRIOR_OF_ANY / max(1, len(ranking)))
         hypotheses = [current, *trials.values()]
-        log_prior = [math.log(1 - PRIOR_OF_ANY), *(each for _ in trials)]
+        log_prior = [math.log(1 - PRIOR_OF_ANY), *(each + _log_prior(t) for t in trials.values())]
         weights = dict(zip(("", *trials), weigh(hypotheses, log_prior, seed=0), strict=True))
         best = max(trials, key=lambda name: weights[name])
-        is_chance = now.alarm.p_values[best] > self.options.false_alarm_rate
+        is_chance = now.alarm.p_values.get(best, 1.0) > self.options.false_alarm_rate
         if is_chance and weights[""] > 1.0 - self.options.confidence:
             return None, weights
         self._report(f"adding {best}")
@@ -294,14 +295,17 @@ class Searcher:
         if without is None:
             return current, Added(effect, effect.name, 1.0, {effect.name: 1.0}), {}
         candidates = tuple(e for e in self._candidates(without) if e.name != effect.name)
-        ranking = self._screened(Projection(without), without, candidates, responses(without))
+        projection = Projection(without)
+        found = responses(without)
+        ranking = screen(projection, self._variants(projection, without, candidates, found))
         trials = {effect.name: current}
         for candidate in ranking[:SHORTLIST]:
             found = self._fitted(without, candidate)
             if found is not None:
                 trials[candidate.name] = found
         trials = self._converged(trials)
-        weights = weigh(list(trials.values()), [0.0] * len(trials), seed=0)
+        log_prior = [_log_prior(trial) for trial in trials.values()]
+        weights = weigh(list(trials.values()), log_prior, seed=0)
         alternatives = dict(zip(trials, weights, strict=True))
         best = max(alternatives, key=lambda name: alternatives[name])
         swapped = trials[best]
@@ -325,5 +329,7 @@ def _shown(hypothesis: Hypothesis) -> str:
     )
 
 
-def _angles(hypothesis: Hypothesis) -> frozenset[str]:
-    return frozenset(c.name for c in hypothesis.simulator.sensors if c.unit == "rad")
+def _log_prior(hypothesis: Hypothesis) -> float:
+    """Returns what the search over frequencies costs, as so many hypotheses share one's prior."""
+    waves = sum(effect.id == "periodic_disturbance" for effect in hypothesis.effects)
+    return -waves * math.log(FREQUENCIES)

@@ -51,6 +51,7 @@ class Variant:
         upper: Greatest number of sizes, by strength.
         deviation: Standard deviation of the priors in sizes, by strength.
         change: What one size changes in the whitened readings, ``(S, N, k)``.
+        is_hinted: Whether its shape was found on the recording itself.
     """
 
     effect: Effect
@@ -61,6 +62,7 @@ class Variant:
     upper: Tensor
     deviation: Tensor
     change: Tensor
+    is_hinted: bool = False
 
     def parameters(self, sizes: Tensor) -> dict[str, Tensor]:
         """Returns the parameters by site name for numbers of sizes, ``(k,)``."""
@@ -145,6 +147,7 @@ def sensitivities(
                     upper,
                     deviation,
                     difference.permute(1, 2, 0),
+                    effect.name in (hints or {}) and shape is shapes[-1],
                 )
             )
     return result

@@ -26,16 +26,16 @@ def covers(finding, name, true):
 
 
 @pytest.mark.parametrize(
-    ("place", "parameter"),
+    ("place", "parameter", "strength"),
     [
-        (("hinge", "quadratic_drag"), "drag"),  # a force
-        (("torque", "saturation"), "limit"),  # an action
-        (("angle", "encoder_scale"), "error"),  # a sensor
-        (("clock", "clock_skew"), "skew"),  # the clock
+        (("hinge", "quadratic_drag"), "drag", 1.0),  # a force
+        (("torque", "saturation"), "limit", 1.0),  # an action
+        (("angle", "encoder_scale"), "error", 2.0),  # a sensor
+        (("clock", "clock_skew"), "skew", 3.0),  # the clock
     ],
 )
-def test_one_effect_at_each_kind_of_port(place, parameter):
-    case, found = discover("pendulum", "one", (place,))
+def test_one_effect_at_each_kind_of_port(place, parameter, strength):
+    case, found = discover("pendulum", "one", (place,), strength=strength)
     assert found.verdict == "named", found.reason
     (finding,) = found.effects
     assert finding.effect.name == case.names[0]
