@@ -12,7 +12,7 @@ from scipy.stats import beta
 
 __all__ = ["is_class_right", "is_first_right", "print_summary"]
 
-RATE = 0.03
+RATE = 0.01
 """The rate of false alarms that was asked for."""
 
 Row = dict[str, Any]

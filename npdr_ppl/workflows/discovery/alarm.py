@@ -51,6 +51,7 @@ def sound_alarm(
     found: Responses,
     angles: frozenset[str],
     options: DiscoveryOptions,
+    num_looks: int = 0,
 ) -> Alarm:
     """Tests a fitted hypothesis against every candidate and every generic law at once.
 
@@ -63,6 +64,7 @@ def sound_alarm(
         found: The responses to pulses of force.
         angles: Names of the channels in radians.
         options: The rate of false alarms and the seed.
+        num_looks: How often the recording was looked at before.
     """
     chance = LargestStatistic(projection, seed=options.seed)
     laws = _learnable(projection, generic_laws(found, angles))
@@ -91,7 +93,8 @@ def sound_alarm(
     loudest = [name for name, p in values.items() if p == p_value]
     return Alarm(
         p_value,
-        p_value <= options.false_alarm_rate,
+        # Every effect that was added is one more look.
+        p_value <= options.false_alarm_rate / (1 + num_looks),
         max(loudest, key=lambda name: gains.get(name, 0.0)),
         max(gains.values(), default=0.0),
         values,

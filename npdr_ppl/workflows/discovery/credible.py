@@ -17,6 +17,9 @@ __all__ = ["Estimate", "estimates", "parameter_density"]
 
 NUM_DRAWS = 4000
 
+LEAST_LEFT = 0.1
+"""Least share of the information that is taken to be left without a block."""
+
 MASS = 0.94
 """Of the interval of highest density."""
 
@@ -45,19 +48,33 @@ class Estimate:
 def parameter_density(hypothesis: Hypothesis) -> GaussianMixture:
     """Returns the normal approximation of the posterior, in reference coordinates.
 
-    Its covariance is the robust one, H⁻¹ V H⁻¹ with V from how the segments' scores scatter
-    (Huber 1967; White 1982; Müller 2013 for posteriors), which holds when readings within a
-    segment are correlated or the scale is wrong, and never narrower than Laplace's H⁻¹ by chance
-    in few segments: V is at least the information's share of independent readings.
+    Its covariance is the robust one, H⁻¹ V H⁻¹ with V from how the blocks' scores scatter (Huber
+    1967; White 1982; Müller 2013 for posteriors), which holds when readings within a block are
+    correlated or the scale is wrong. Each block's score is what it would be had the block not been
+    fitted (the jackknife, CR3 of Bell & McCaffrey 2002): few blocks may carry most of what is
+    known. No parameter is taken to be surer than Laplace's approximation has it.
+
+    Args:
+        hypothesis: The fitted model.
     """
     projection = Projection(hypothesis)
-    blocks = block_sums(projection.parameter_scores)
-    num, d = blocks.shape
-    correction = num / max(1, num - min(d, num - 1))
-    scatter = correction * blocks.mT @ blocks
+    information = projection.parameter_information
+    d = len(information)
     eye = torch.eye(d, dtype=torch.float64)
-    inverse = torch.linalg.inv(projection.parameter_information)
-    covariance = inverse @ (scatter + eye) @ inverse
+    scores = block_sums(projection.parameter_scores)
+    parts = block_sums(projection.parameter_information_by_segment.flatten(1)).unflatten(1, (d, d))
+    inverse = torch.linalg.inv(information)
+    left = eye - parts @ inverse
+    # A block that alone determines a direction cannot be left out of it.
+    values, vectors = torch.linalg.eig(left)
+    values = torch.complex(values.real.clamp_min(LEAST_LEFT), values.imag)
+    freed = vectors @ (
+        torch.linalg.solve(vectors, scores[..., None].to(vectors)) / values[..., None]
+    )
+    scatter = freed.real[..., 0].mT @ freed.real[..., 0]
+    robust = inverse @ (scatter + eye) @ inverse
+    wider = (inverse.diagonal() / robust.diagonal()).clamp_min(1.0).sqrt()
+    covariance = wider[:, None] * robust * wider
     one = torch.ones(1, dtype=torch.float64)
     covariance = 0.5 * (covariance + covariance.mT) + 1e-12 * eye
     return GaussianMixture.from_moments(one, hypothesis.fit.z[None], covariance[None])

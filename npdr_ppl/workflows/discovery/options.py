@@ -38,7 +38,7 @@ class DiscoveryOptions:
     segment_length: int | None = None
     effects: tuple[Effect, ...] | None = None
     max_effects: int = 4
-    false_alarm_rate: float = 0.03
+    false_alarm_rate: float = 0.01
     confidence: float = 0.9
     precision: Literal["float64", "float32"] = "float64"
     seed: int = 0

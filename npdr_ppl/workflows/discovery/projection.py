@@ -93,6 +93,11 @@ class Projection:
         return self._score
 
     @property
+    def parameter_information_by_segment(self) -> Tensor:
+        """Information of the parameters in each segment, ``(S, d, d)``."""
+        return self._by_z.mT @ self._weights
+
+    @property
     def parameter_information(self) -> Tensor:
         """Information of the parameters with their prior, ``(d, d)``."""
         return self._information

@@ -174,7 +174,8 @@ class Searcher:
         ranking = screen(projection, variants)
         angles = frozenset(c.name for c in hypothesis.simulator.sensors if c.unit == "rad")
         plain = [variant for variant in variants if not variant.is_hinted]
-        alarm = sound_alarm(projection, plain, ranking, found, angles, self.options)
+        looks = len(hypothesis.effects)
+        alarm = sound_alarm(projection, plain, ranking, found, angles, self.options, looks)
         best = ", ".join(s.name for s in ranking[:3]) or "none"
         self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
         return Round(hypothesis, alarm, ranking, found)
