@@ -31,7 +31,6 @@ from npdr_ppl.policies.search_registry import policy_search
 from npdr_ppl.randomness import derived_seed, seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.targets.base import TargetDomain
-from npdr_ppl.workflows.closest_fit import prepare
 from npdr_ppl.workflows.control_task import ControlTask
 from npdr_ppl.workflows.diagnostics import Decision, diagnose
 from npdr_ppl.workflows.domains import (
@@ -42,9 +41,10 @@ from npdr_ppl.workflows.domains import (
     simulator_of,
 )
 from npdr_ppl.workflows.fit import describe
-from npdr_ppl.workflows.infer import infer
+from npdr_ppl.workflows.loop_discovery import LoopDiscovery, effect_names
 from npdr_ppl.workflows.loop_domains import training_domains
 from npdr_ppl.workflows.loop_folder import LoopFolder
+from npdr_ppl.workflows.loop_inference import infer_posterior
 from npdr_ppl.workflows.loop_options import (
     NEW_ATTEMPTS,
     Action,
@@ -128,6 +128,9 @@ class _Loop:
         self.options = options
         self.folder = folder
         self.revise = revise
+        self.discovery = LoopDiscovery(
+            model, options.discovery, derived_seed(seed, "discovery in the loop")
+        )
         self.seed = seed
         self.report = report
         search, backend = options.search, options.backend
@@ -213,6 +216,7 @@ class _Loop:
             "real_returns": returns,
             "num_rollouts": len(self.rollouts),
             "decisions": settled.decisions,
+            "effects": effect_names(self.model),
             "internal_model": self.domain,
             "parameters": describe(settled.data)["parameters"],
         }
@@ -233,7 +237,7 @@ class _Loop:
             if action == Action.ANOTHER_ROLLOUT:
                 self._collect(self.task.excitation or self.policy)
             if action == Action.REVISED:
-                self._revised(index)
+                self._revised(index, report)
             rounds += action == Action.MORE_ROUNDS
             attempt += action in NEW_ATTEMPTS
         if self.folder.iteration(index + 1) is None:
@@ -253,8 +257,23 @@ class _Loop:
         decisions: list[dict[str, Any]] = []
         rounds = self._rounds()
         extra_rounds = options.extra_rounds if self.backend.is_sequential else 0
-        has_revised = self.revise is None
+        has_revised = self.revise is None and not options.discovers
         attempt = 0
+        if options.discovers and options.follows_decisions and self.revise is None:
+            # Not only where a diagnosis asks for it: the noise that a model without some effect
+            # gets from its closest fit can make up for the effect in every diagnosis.
+            has_revised = True
+            is_found, reason = self._revised(index, report)
+            if is_found:
+                attempt = 1
+                decisions.append(
+                    {
+                        "decision": Decision.REVISE_MODEL.value,
+                        "reason": reason,
+                        "action": Action.REVISED.value,
+                        "diagnosis": {},
+                    }
+                )
         while True:
             posterior = self._infer(index, attempt, rounds, report)
             data = posterior.to_arviz(PREDICTIVE_DRAWS, seed=self.seed)
@@ -274,8 +293,9 @@ class _Loop:
                 self._collect(self.task.excitation or self.policy)
             elif decision is Decision.REVISE_MODEL and not has_revised:
                 has_revised = True
-                is_found = self._revised(index)
+                is_found, finding = self._revised(index, report)
                 action = Action.REVISED if is_found else Action.NOTHING_FOUND
+                reason = f"{reason} {finding}".strip()
             elif decision is Decision.REVISE_MODEL:
                 action = Action.SPREAD
             elif decision is Decision.WIDEN:
@@ -303,57 +323,42 @@ class _Loop:
         left = self.options.extra_rollouts - used
         return left if self._can_collect(1) else 0
 
-    def _revised(self, index: int) -> bool:
-        """Returns whether an effect was found that the model lacked; the model then has it."""
-        assert self.revise is not None
-        found = self.revise(self.model, _joined(self.rollouts), self.folder.revision(index))
+    def _revised(self, index: int, report: Reporter) -> tuple[bool, str]:
+        """Looks for effects that the model lacks, and gives it what is found.
+
+        Returns:
+            Whether the model has effects now that were found, and what was found in a sentence.
+        """
+        rollouts, folder = _joined(self.rollouts), self.folder.revision(index)
+        if self.revise is not None:
+            found, finding = self.revise(self.model, rollouts, folder), ""
+        else:
+            step = report.stage("look for a missing effect")
+            revision = self.discovery.look(rollouts, folder, step)
+            found, finding = revision.model, revision.reason
         if found is None:
-            return False
+            return False, finding
         target = self.target
         self.model = found
         self.prior = prior_of(found, target.sensors, target.actions, target.time_step)
-        return True
+        return True, finding
 
     def _infer(self, index: int, attempt: int, rounds: int, report: Reporter) -> Posterior:
         """Infers the posterior; rounds that are on disk are not repeated."""
         options = self.options
         number = len(self.rollouts) if options.rollouts_used == "all" else options.rollouts
-        data = _joined(self.rollouts[-number:])
-        seed = derived_seed(self.seed, "inference", index, attempt)
-        prepared = prepare(
+        return infer_posterior(
             self.model,
-            data,
-            options.binding,
-            noise=options.noise,
-            wants_neighbourhood=options.start == "closest fit" and self.backend.continues,
-            seed=seed,
-            progress=report.stage("find the closest parameters"),
-        )
-        binding = prepared.options
-        return infer(
-            prepared.model,
-            data,
-            backend=self.backend,
+            _joined(self.rollouts[-number:]),
+            options,
+            self.backend,
             rounds=rounds,
-            num_simulations=options.num_simulations,
-            seed=seed,
-            embedding=binding.embedding,
-            segment_length=binding.segment_length,
-            initial_state=binding.initial_state,
-            precision=binding.precision,
-            start=prepared.neighbourhood or self._start(index),
+            prior=self.prior,
+            last=self.posterior,
+            seed=derived_seed(self.seed, "inference", index, attempt),
             checkpoint=self.folder.inference(index, attempt),
-            progress=report,
+            report=report,
         )
-
-    def _start(self, index: int) -> Posterior | None:
-        """Returns the last iteration's posterior if inference is to start from it."""
-        if self.options.start != "posterior" or not self.backend.continues or index == 0:
-            return None
-        last = self.posterior
-        if last is None or last.prior.num_parameters != self.prior.num_parameters:
-            return None  # the model was revised
-        return last
 
     def _prior_domains(self, number: int) -> Domains:
         with seeded(self.seed, "prior domains"):
