@@ -7,6 +7,7 @@ domains drawn from it::
     policy ← POLOPT(prior)
     repeat
         rollouts ← run the policy on the target, its internal model being the most likely sample
+        model ← discover(model, rollouts), if the options say so
         posterior ← INFER(model, rollouts), in rounds
         decision ← diagnose(posterior): accept, more rounds, another rollout, revise the model,
                    widen, stop
@@ -18,11 +19,10 @@ killed continues to the same result; see :mod:`npdr_ppl.workflows.loop_folder`.
 
 import logging
 from contextlib import ExitStack
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.inference.registry import backend as backend_by_name
@@ -41,6 +41,7 @@ from npdr_ppl.workflows.domains import (
     simulator_of,
 )
 from npdr_ppl.workflows.fit import describe
+from npdr_ppl.workflows.loop_decisions import Settled, action_for, decision_record, is_final
 from npdr_ppl.workflows.loop_discovery import LoopDiscovery, effect_names
 from npdr_ppl.workflows.loop_domains import training_domains
 from npdr_ppl.workflows.loop_folder import LoopFolder
@@ -58,9 +59,6 @@ from npdr_ppl.workflows.posterior import Posterior
 from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.real_rollouts import RealRollouts
 from npdr_ppl.workflows.run_folder import plain
-
-if TYPE_CHECKING:
-    from npdr_ppl.workflows.arviz_module import Data
 
 __all__ = ["Training", "train"]
 
@@ -165,7 +163,7 @@ class _Loop:
                 break
             self.records.append(self._iterate(index, report))
             self.folder.write_result(self._result().to_dict())
-            if _is_final(self.records[-1]):
+            if is_final(self.records[-1]):
                 break
         return self._result()
 
@@ -206,7 +204,7 @@ class _Loop:
         settled = self._infer_and_decide(index, real_return, report)
         self.posterior = settled.posterior
         last = settled.decisions[-1]
-        is_last = _is_final({"decisions": settled.decisions})
+        is_last = is_final({"decisions": settled.decisions})
         if self.options.internal_model == "most likely" and not is_last:
             self.domain = most_likely_domain(settled.posterior, seed=self.seed)
         record: dict[str, Any] = {
@@ -244,36 +242,20 @@ class _Loop:
             # The last one finished: its posterior is read from disk.
             self.posterior = self._infer(index, attempt, rounds, report)
         self.domain = saved["internal_model"]
-        if not _is_final(saved):
+        if not is_final(saved):
             self._optimise(index + 1, None, report)
 
     def _rounds(self) -> int:
         """Returns how many rounds inference has before any is added."""
         return self.options.rounds if self.backend.is_sequential else 1
 
-    def _infer_and_decide(self, index: int, real_return: float, report: Reporter) -> "_Settled":
+    def _infer_and_decide(self, index: int, real_return: float, report: Reporter) -> Settled:
         """Infers the posterior and does what its diagnosis asks for until that settles it."""
         options = self.options
-        decisions: list[dict[str, Any]] = []
-        rounds = self._rounds()
+        decisions = self._discover_first(index, report)
+        rounds, attempt = self._rounds(), len(decisions)
         extra_rounds = options.extra_rounds if self.backend.is_sequential else 0
-        has_revised = self.revise is None and not options.discovers
-        attempt = 0
-        if options.discovers and options.follows_decisions and self.revise is None:
-            # Not only where a diagnosis asks for it: the noise that a model without some effect
-            # gets from its closest fit can make up for the effect in every diagnosis.
-            has_revised = True
-            is_found, reason = self._revised(index, report)
-            if is_found:
-                attempt = 1
-                decisions.append(
-                    {
-                        "decision": Decision.REVISE_MODEL.value,
-                        "reason": reason,
-                        "action": Action.REVISED.value,
-                        "diagnosis": {},
-                    }
-                )
+        may_revise = self.revise is not None
         while True:
             posterior = self._infer(index, attempt, rounds, report)
             data = posterior.to_arviz(PREDICTIVE_DRAWS, seed=self.seed)
@@ -284,38 +266,37 @@ class _Loop:
                 rollouts_left=self._extra_rollouts_left(index),
             )
             decision, reason = diagnosis.decision, diagnosis.reason
-            if not options.follows_decisions:
-                action = Action.LOGGED
-            elif decision is Decision.MORE_ROUNDS:
-                action, rounds, extra_rounds = Action.MORE_ROUNDS, rounds + 1, extra_rounds - 1
-            elif decision is Decision.NEW_ROLLOUT:
-                action = Action.ANOTHER_ROLLOUT
+            action = action_for(decision, options, may_revise=may_revise, real_return=real_return)
+            if action is Action.MORE_ROUNDS:
+                rounds, extra_rounds = rounds + 1, extra_rounds - 1
+            elif action is Action.ANOTHER_ROLLOUT:
                 self._collect(self.task.excitation or self.policy)
-            elif decision is Decision.REVISE_MODEL and not has_revised:
-                has_revised = True
+            elif action is Action.REVISED:
+                may_revise = False
                 is_found, finding = self._revised(index, report)
                 action = Action.REVISED if is_found else Action.NOTHING_FOUND
                 reason = f"{reason} {finding}".strip()
-            elif decision is Decision.REVISE_MODEL:
-                action = Action.SPREAD
-            elif decision is Decision.WIDEN:
-                action = Action.MIXED
-            elif decision is Decision.ACCEPT and _reaches(real_return, options.stop_return):
-                action, decision = Action.KEPT, Decision.STOP
+            elif action is Action.KEPT and decision is Decision.ACCEPT:
+                decision = Decision.STOP
                 reason = f"The return on the target, {real_return:.0f}, is what was asked for."
-            else:
-                action = Action.KEPT if decision is Decision.STOP else Action.TRAINED
-            decisions.append(
-                {
-                    "decision": decision.value,
-                    "reason": reason,
-                    "action": action.value,
-                    "diagnosis": diagnosis.to_dict(),
-                }
-            )
+            decisions.append(decision_record(decision, reason, action, diagnosis.to_dict()))
             attempt += action in NEW_ATTEMPTS
             if action not in (Action.MORE_ROUNDS, *NEW_ATTEMPTS):
-                return _Settled(posterior, data, decisions, action)
+                return Settled(posterior, data, decisions, action)
+
+    def _discover_first(self, index: int, report: Reporter) -> list[dict[str, Any]]:
+        """Looks for missing effects before anything is inferred, and returns what was decided.
+
+        A diagnosis would come too late and may never ask for it: the noise that a model without
+        some effect gets from its closest fit makes up for the effect.
+        """
+        options = self.options
+        if not options.discovers or not options.follows_decisions or self.revise is not None:
+            return []
+        is_found, reason = self._revised(index, report)
+        if not is_found:
+            return []
+        return [decision_record(Decision.REVISE_MODEL, reason, Action.REVISED, {})]
 
     def _extra_rollouts_left(self, index: int) -> int:
         """Returns how many more episodes a diagnosis may ask for."""
@@ -364,7 +345,7 @@ class _Loop:
         with seeded(self.seed, "prior domains"):
             return domains_at(self.prior, self.prior.sample(number))
 
-    def _posterior_domains(self, index: int, settled: "_Settled") -> Domains:
+    def _posterior_domains(self, index: int, settled: Settled) -> Domains:
         """Returns what the policy is trained in next."""
         return training_domains(
             settled.posterior,
@@ -399,25 +380,6 @@ class _Loop:
             self.folder.save_policy(number, parameters, figures)
         self.policy = self.task.policy.with_parameters(parameters.to(self.task.policy.parameters))
         return figures
-
-
-@dataclass(frozen=True)
-class _Settled:
-    """A posterior, and what was decided about it."""
-
-    posterior: Posterior
-    data: "Data"
-    decisions: list[dict[str, Any]]
-    action: "Action"
-
-
-def _is_final(record: dict[str, Any]) -> bool:
-    """Returns whether the loop ends with an iteration."""
-    return record["decisions"][-1]["action"] == Action.KEPT
-
-
-def _reaches(real_return: float, wanted: float | None) -> bool:
-    return wanted is not None and real_return >= wanted
 
 
 def _joined(rollouts: list[Rollouts]) -> Rollouts:
