@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["show_comparison", "show_fit", "show_rows", "show_training"]
+__all__ = ["show_comparison", "show_demo", "show_fit", "show_rows", "show_training"]
 
 FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
 """Columns of figures with the width they need."""
@@ -112,6 +112,28 @@ def show_training(result: Mapping[str, Any], out: Path) -> None:
     last = result["iterations"][-1]
     _print_reason(console, last["decision"], last["reason"])
     console.print(f"Results and figures are in {out}/")
+
+
+def show_demo(result: Mapping[str, Any]) -> None:
+    """Prints the content of ``demo.json`` as a story."""
+    console = _console()
+    before, after = result["returns"].values()
+    console.print(f"The policy from the prior earns {before:.0f} on the rig.")
+    for row in result["decisions"]:
+        _print_reason(console, row["decision"], row["reason"])
+    for effect in result["effects"]:
+        values = ", ".join(
+            f"{name} {row['mean']:.3g} {row['unit']}"
+            for name, row in effect["parameters"].items()
+            if row["mean"] is not None
+        )
+        share = f"{effect['probability']:.0%}"
+        what = f"{effect['effect']} at {effect['port']}, {share}"
+        _print_reason(console, what, values)
+    console.print(
+        f"The policy from the revised model earns {after:.0f}; above {result['success']:.0f} the "
+        "pole is swung up and balanced."
+    )
 
 
 def show_rows(title: str, result: Mapping[str, Any]) -> None:

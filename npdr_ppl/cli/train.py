@@ -167,7 +167,7 @@ def train(
         ),
         follows_decisions=decisions,
         stop_return=stop_return,
-        discovers=discover,
+        discovers="before inference" if discover else "never",
     )
     with resumable(f"the same command with --resume continues the run in {out}."):
         with (

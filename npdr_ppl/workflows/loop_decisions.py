@@ -51,14 +51,14 @@ def action_for(
 
 
 def decision_record(
-    decision: Decision, reason: str, action: Action, diagnosis: Mapping[str, Any]
+    decision: Decision, reason: str, action: Action, diagnosis: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Returns a decision as ``train.json`` has it; one of discovery alone has no diagnosis."""
+    """Returns a decision as ``train.json`` has it; what discovery asks for has no diagnosis."""
     return {
         "decision": decision.value,
         "reason": reason,
         "action": action.value,
-        "diagnosis": dict(diagnosis),
+        "diagnosis": dict(diagnosis or {}),
     }
 
 

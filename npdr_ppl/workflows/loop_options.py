@@ -82,8 +82,11 @@ class LoopOptions:
         stop_return: Mean real return of an iteration at which an accepted posterior ends the
             loop; ``None`` to use all iterations.
         thresholds: Limits behind the decisions.
-        discovers: Whether discovery looks for effects that the model lacks: in all real rollouts
-            so far, before each inference and where a diagnosis asks for it.
+        discovers: When discovery looks in all real rollouts so far for effects that the model
+            lacks: in each iteration before anything is inferred, or after the posterior of the
+            model as it is has been diagnosed, whatever the diagnosis. The noise that a model gets
+            from its closest fit can make up for an effect in every diagnosis, so discovery's own
+            alarm has the last word.
         discovery: How it searches.
     """
 
@@ -114,7 +117,7 @@ class LoopOptions:
     follows_decisions: bool = True
     stop_return: float | None = None
     thresholds: Thresholds = field(default_factory=Thresholds)
-    discovers: bool = False
+    discovers: Literal["never", "before inference", "after diagnosis"] = "never"
     discovery: DiscoveryOptions = field(default_factory=DiscoveryOptions)
 
     def __post_init__(self) -> None:

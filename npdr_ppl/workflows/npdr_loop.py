@@ -46,13 +46,7 @@ from npdr_ppl.workflows.loop_discovery import LoopDiscovery, effect_names
 from npdr_ppl.workflows.loop_domains import training_domains
 from npdr_ppl.workflows.loop_folder import LoopFolder
 from npdr_ppl.workflows.loop_inference import infer_posterior
-from npdr_ppl.workflows.loop_options import (
-    NEW_ATTEMPTS,
-    Action,
-    LoopOptions,
-    Model,
-    Revise,
-)
+from npdr_ppl.workflows.loop_options import NEW_ATTEMPTS, Action, LoopOptions, Model, Revise
 from npdr_ppl.workflows.loop_result import Training, Tried, best_measured
 from npdr_ppl.workflows.policy_optimisation import optimise_policy
 from npdr_ppl.workflows.posterior import Posterior
@@ -66,6 +60,10 @@ _LOGGER = logging.getLogger(__name__)
 
 PREDICTIVE_DRAWS = 500
 """Draws per ensemble member that a diagnosis reads."""
+
+LEAST_SHARE = 0.5
+"""Share of an episode's steps that discovery wants: effects that show in few segments of a rollout
+that ended early are told from chance, but not from each other."""
 
 
 def train(
@@ -126,6 +124,9 @@ class _Loop:
         self.options = options
         self.folder = folder
         self.revise = revise
+        # A way of one's own to look for effects takes the place of discovery.
+        may_discover = options.follows_decisions and revise is None
+        self.discovers = options.discovers if may_discover else "never"
         self.discovery = LoopDiscovery(
             model, options.discovery, derived_seed(seed, "discovery in the loop")
         )
@@ -255,7 +256,7 @@ class _Loop:
         decisions = self._discover_first(index, report)
         rounds, attempt = self._rounds(), len(decisions)
         extra_rounds = options.extra_rounds if self.backend.is_sequential else 0
-        may_revise = self.revise is not None
+        may_revise = self.revise is not None or self.discovers == "after diagnosis"
         while True:
             posterior = self._infer(index, attempt, rounds, report)
             data = posterior.to_arviz(PREDICTIVE_DRAWS, seed=self.seed)
@@ -271,12 +272,15 @@ class _Loop:
                 rounds, extra_rounds = rounds + 1, extra_rounds - 1
             elif action is Action.ANOTHER_ROLLOUT:
                 self._collect(self.task.excitation or self.policy)
-            elif action is Action.REVISED:
+            elif may_revise and (action is Action.REVISED or self.discovers != "never"):
                 may_revise = False
                 is_found, finding = self._revised(index, report)
-                action = Action.REVISED if is_found else Action.NOTHING_FOUND
                 reason = f"{reason} {finding}".strip()
-            elif action is Action.KEPT and decision is Decision.ACCEPT:
+                if is_found:
+                    decision, action = Decision.REVISE_MODEL, Action.REVISED
+                elif action is Action.REVISED:
+                    action = Action.NOTHING_FOUND
+            if action is Action.KEPT and decision is Decision.ACCEPT:
                 decision = Decision.STOP
                 reason = f"The return on the target, {real_return:.0f}, is what was asked for."
             decisions.append(decision_record(decision, reason, action, diagnosis.to_dict()))
@@ -285,18 +289,19 @@ class _Loop:
                 return Settled(posterior, data, decisions, action)
 
     def _discover_first(self, index: int, report: Reporter) -> list[dict[str, Any]]:
-        """Looks for missing effects before anything is inferred, and returns what was decided.
-
-        A diagnosis would come too late and may never ask for it: the noise that a model without
-        some effect gets from its closest fit makes up for the effect.
-        """
-        options = self.options
-        if not options.discovers or not options.follows_decisions or self.revise is not None:
-            return []
-        is_found, reason = self._revised(index, report)
-        if not is_found:
-            return []
-        return [decision_record(Decision.REVISE_MODEL, reason, Action.REVISED, {})]
+        """Does what discovery wants before anything is inferred, and returns what was decided."""
+        decisions: list[dict[str, Any]] = []
+        steps, wanted = sum(sum(r.lengths) for r in self.rollouts), self.task.num_steps
+        is_short = steps < LEAST_SHARE * wanted
+        if self.discovers != "never" and is_short and self._extra_rollouts_left(index) > 0:
+            self._collect(self.task.excitation or self.policy)
+            reason = f"The rollouts ended early, after {steps} steps of {wanted}: record another."
+            decisions.append(decision_record(Decision.NEW_ROLLOUT, reason, Action.ANOTHER_ROLLOUT))
+        if self.discovers == "before inference":
+            is_found, reason = self._revised(index, report)
+            if is_found:
+                decisions.append(decision_record(Decision.REVISE_MODEL, reason, Action.REVISED))
+        return decisions
 
     def _extra_rollouts_left(self, index: int) -> int:
         """Returns how many more episodes a diagnosis may ask for."""

@@ -134,9 +134,8 @@ def run_method(
         binding = options.binding
         if method.embedding is not None:
             binding = replace(binding, embedding=method.embedding)
-        chosen = replace(
-            options, backend=method.backend, binding=binding, discovers=method.discovers
-        )
+        discovers = "before inference" if method.discovers else "never"
+        chosen = replace(options, backend=method.backend, binding=binding, discovers=discovers)
         try:
             trained = train(model, target, task, chosen, out=out, seed=seed, progress=progress)
             policy, domain, records = trained.policy, trained.domain, trained.iterations
