@@ -99,11 +99,7 @@ def _key_figures(records: Records) -> list[KeyFigure]:
             "Last return in simulation", number(last.get("sim_return"), ".4g"), "over domains"
         ),
         KeyFigure("Real rollouts", str(last.get("num_rollouts", count))),
-        *(
-            [KeyFigure("Effects of the model", str(len(effects)), ", ".join(effects))]
-            if effects
-            else []
-        ),
+        *added,
         KeyFigure("Last decision", str(last.get("decision", "–"))),
     ]
 
