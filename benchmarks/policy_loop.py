@@ -46,17 +46,20 @@ ABLATION = {
 DISCOVER = {
     "iterations": 2,
     "rounds": 1,
-    "num_simulations": 5_000,
+    "num_simulations": 2_000,
     "search": "cma-es",
-    "search_iterations": 60,
+    "search_iterations": 30,
+    "num_domains": 30,
+    "num_initial_states": 2,
     "starts_from_prior": False,
+    "discovery.segment_length": 50,
     "discovery.max_effects": 3,
     "discovery.precision": "float32",
 }
 """Two real rollouts, the first of the default gains: a policy trained on the prior knocks the arm
 of most rigs against its stop within a second, which leaves too little to tell effects by."""
 
-COMPARED = "npdr,npdr with discovery"
+COMPARED = "npdr with discovery,npdr"
 
 
 def changed(options: LoopOptions, changes: dict) -> LoopOptions:
