@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from npdr_ppl.errors import DataError
+from npdr_ppl.errors import DataError, NpdrError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect
 from npdr_ppl.models.effects.registry import effect_class
 from npdr_ppl.rollouts import Rollouts
@@ -73,7 +73,7 @@ class LoopDiscovery:
                     options=_fitting(self.options, rollouts),
                     report=_reports(progress),
                 )
-            except DataError as error:
+            except NpdrError as error:
                 # A rollout that ended early may be too short to tell anything by.
                 _LOGGER.warning("Discovery: %s", error)
                 return Revision(None, str(error))

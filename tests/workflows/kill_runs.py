@@ -86,7 +86,8 @@ def main():
         is_done = False
         # Short lives, so that a run is killed several times on its way; longer ones after each
         # kill, so that it comes to its end also where the machine has become slower since.
-        longest = 0.4 * seconds
+        # Discovery begins anew after a kill, so it needs lives that are longer than it is.
+        longest = (1.0 if discovers else 0.4) * seconds
         while not is_done:
             child = fork(folder, seed, discovers)
             time.sleep(moments.uniform(0.0, longest))
