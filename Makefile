@@ -18,7 +18,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(VENV)/installed
-	@echo "==> fitting the Furuta model to a recording made by MuJoCo; figures go to demo-output/"
+	@echo "==> training a policy for a Furuta pendulum made by MuJoCo; figures go to demo-output/"
 	$(BIN)/npdr demo --out demo-output
 
 test: style

@@ -1,11 +1,10 @@
-"""`npdr demo`: from a recording to a posterior in two minutes."""
+"""`npdr demo`: from a policy that fails on a rig to what the model lacked, and to success."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from npdr_ppl.cli.fit import InitialState
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
 
 __all__ = ["demo"]
@@ -13,58 +12,40 @@ __all__ = ["demo"]
 
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("demo-output"),
-    data: Annotated[
-        Path | None,
-        typer.Option(help="Your own Furuta recording instead of a synthetic one."),
-    ] = None,
-    initial_state: Annotated[
-        InitialState, typer.Option(help="State at a segment's start.")
-    ] = InitialState.ESTIMATED,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     as_json: AsJson = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Fit the Furuta pendulum to a recording, and draw what was learnt.
+    """Train a policy, find what the model lacks where it fails, and train it again.
 
-    Without --data the recording is made by MuJoCo, another engine than the one that is fitted,
-    with perturbed parameters; the figures then show the truth as well.
+    The rig is a Furuta pendulum in MuJoCo, another engine than the model's, with dry friction and
+    filtered rates that the model knows nothing of. Figures and a report tell the story.
 
     Example: npdr demo --out demo-output
     """
     from rich.console import Console
 
-    from npdr_ppl.cli.show import show_fit
-    from npdr_ppl.models.furuta import furuta
-    from npdr_ppl.plots.fit_figures import write_fit_figures
+    from npdr_ppl.cli.show import show_demo
+    from npdr_ppl.plots.training_figures import write_training_figures
+    from npdr_ppl.reports import write_report
     from npdr_ppl.workflows.demo import run_demo
     from npdr_ppl.workflows.progress import reporter
 
     console = Console(quiet=quiet or as_json)
-    console.print(
-        "Recording a Furuta pendulum in MuJoCo, with parameters unlike the nominal ones …"
-        if data is None
-        else f"Reading {data} …"
-    )
+    console.print("A Furuta pendulum in MuJoCo is the rig; the model has the paper's equations …")
     with (
         resumable(f"the same command again continues the run in {out}."),
         reporter(False if quiet else None) as report,
     ):
-        outcome = run_demo(
-            out, data=data, initial_state=initial_state.value, seed=seed, progress=report
-        )
-        marks = {"truth": outcome.truth} if outcome.truth else None
-        paths = write_fit_figures(
-            outcome.posterior,
-            furuta,
-            outcome.test,
-            out,
-            marks=marks,
-            seed=seed,
-            progress=report.stage("draw figures"),
-        )
+        told = run_demo(out, seed=seed, progress=report)
+        step = report.stage("draw figures, write the report")
+        step(0.0, "returns, rollouts, parameters")
+        write_training_figures(told.training, told.target, told.task, out)
+        page = write_report(out)
+        step(1.0, "")
     if as_json:
-        typer.echo((out / "fit.json").read_text(), nl=False)
+        typer.echo((out / "demo.json").read_text(), nl=False)
     elif not quiet:
-        show_fit(outcome.result, out)
-        console.print("Look at " + ", ".join(str(path) for path in paths))
+        show_demo(told.result)
+        console.print(f"Figures are in {out}/, the whole story in {page}")

@@ -13,6 +13,7 @@ from rich.table import Table
 
 __all__ = [
     "show_comparison",
+    "show_demo",
     "show_discovery",
     "show_fit",
     "show_missing_effect",
@@ -251,6 +252,28 @@ def show_missing_effect(found: Mapping[str, Any], result: Mapping[str, Any], out
             show_rows(title, {"rows": rows, "paper": paper})
     for what, reason in result["skipped"].items():
         _print_reason(_console(), f"{what} skipped", reason)
+
+
+def show_demo(result: Mapping[str, Any]) -> None:
+    """Prints the content of ``demo.json`` as a story."""
+    console = _console()
+    before, after = result["returns"].values()
+    console.print(f"The policy from the prior earns {before:.0f} on the rig.")
+    for row in result["decisions"]:
+        _print_reason(console, row["decision"], row["reason"])
+    for effect in result["effects"]:
+        values = ", ".join(
+            f"{name} {row['mean']:.3g} {row['unit']}"
+            for name, row in effect["parameters"].items()
+            if row["mean"] is not None
+        )
+        share = f"{effect['probability']:.0%}"
+        what = f"{effect['effect']} at {effect['port']}, {share}"
+        _print_reason(console, what, values)
+    console.print(
+        f"The policy from the revised model earns {after:.0f}; above {result['success']:.0f} the "
+        "pole is swung up and balanced."
+    )
 
 
 def show_rows(title: str, result: Mapping[str, Any]) -> None:

@@ -90,6 +90,13 @@ def train(
     extra_rollouts: Annotated[
         int, typer.Option(min=0, help="Real rollouts that diagnoses may ask for in all.")
     ] = 0,
+    discover: Annotated[
+        bool,
+        typer.Option(
+            "--discover",
+            help="Look in the real rollouts for effects that the model lacks, and add them.",
+        ),
+    ] = False,
     stop_return: Annotated[
         float | None, typer.Option(help="Real return at which an accepted posterior is the end.")
     ] = None,
@@ -110,7 +117,8 @@ def train(
     """Train a policy for a target domain: run it, infer the parameters, train, and again.
 
     The simulator is fitted to what the policy does on the target, and the policy is trained in
-    simulators drawn from the posterior. An interrupted run continues with --resume.
+    simulators drawn from the posterior. With --discover the model gets what the rollouts say it
+    lacks. An interrupted run continues with --resume.
 
     Example: npdr train furuta --target furuta-hard --effects
     arm.coulomb_friction,pole.coulomb_friction --iterations 3 --out run
@@ -159,6 +167,7 @@ def train(
         ),
         follows_decisions=decisions,
         stop_return=stop_return,
+        discovers="before inference" if discover else "never",
     )
     with resumable(f"the same command with --resume continues the run in {out}."):
         with (

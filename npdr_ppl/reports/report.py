@@ -6,6 +6,7 @@ from pathlib import Path
 from npdr_ppl.errors import DataError
 from npdr_ppl.reports.comparison import comparison_report
 from npdr_ppl.reports.content import Report
+from npdr_ppl.reports.demo import demo_report
 from npdr_ppl.reports.discovery import discovery_report
 from npdr_ppl.reports.fit import fit_report
 from npdr_ppl.reports.page import render
@@ -17,6 +18,7 @@ __all__ = ["read_run", "write_report"]
 # A training run may hold a discovery in a folder of its own, and every kind holds runs of
 # inference, so the file at the top decides.
 _READERS: dict[str, Callable[[Path], Report]] = {
+    "demo.json": demo_report,
     "discovery.json": discovery_report,
     "comparison.json": comparison_report,
     "train.json": training_report,

@@ -89,6 +89,8 @@ def _real(records: Records) -> list[float]:
 def _key_figures(records: Records) -> list[KeyFigure]:
     last = records[-1] if records else {}
     real = _real(records)
+    effects = ", ".join(str(name) for name in last.get("effects") or [])
+    added = [KeyFigure("Effects of the model", effects)] if effects else []
     count = sum(len(record.get("real_returns") or []) for record in records)
     return [
         KeyFigure("Best return on the target", number(max(real, default=None), ".4g")),
@@ -97,6 +99,7 @@ def _key_figures(records: Records) -> list[KeyFigure]:
             "Last return in simulation", number(last.get("sim_return"), ".4g"), "over domains"
         ),
         KeyFigure("Real rollouts", str(last.get("num_rollouts", count))),
+        *added,
         KeyFigure("Last decision", str(last.get("decision", "–"))),
     ]
 

@@ -4,7 +4,7 @@
     rollouts/rollout_<n>.nc           real rollouts, each with its journal ``.jsonl``
     policy_<k>.safetensors, .json     the policy that POLOPT number k came to, 0 being the prior's
     inference_<i>_<attempt>/          runs of inference, see :mod:`npdr_ppl.workflows.run_folder`
-    revision_<i>/                     what was looked for where the model was to be revised
+    revision_<i>/                     what discovery found: revised_model.py, then discovery.json
     iteration_<i>.json                the record of a finished iteration
     train.json                        the result so far
 

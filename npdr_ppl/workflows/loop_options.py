@@ -12,6 +12,7 @@ from npdr_ppl.policies.search import PolicySearch
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.diagnostics import Thresholds
+from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 
 __all__ = ["NEW_ATTEMPTS", "SPREAD_WIDER", "Action", "LoopOptions", "Model", "Revise"]
 
@@ -81,6 +82,12 @@ class LoopOptions:
         stop_return: Mean real return of an iteration at which an accepted posterior ends the
             loop; ``None`` to use all iterations.
         thresholds: Limits behind the decisions.
+        discovers: When discovery looks in all real rollouts so far for effects that the model
+            lacks: in each iteration before anything is inferred, or after the posterior of the
+            model as it is has been diagnosed, whatever the diagnosis. The noise that a model gets
+            from its closest fit can make up for an effect in every diagnosis, so discovery's own
+            alarm has the last word.
+        discovery: How it searches.
     """
 
     iterations: int = 5
@@ -110,6 +117,8 @@ class LoopOptions:
     follows_decisions: bool = True
     stop_return: float | None = None
     thresholds: Thresholds = field(default_factory=Thresholds)
+    discovers: Literal["never", "before inference", "after diagnosis"] = "never"
+    discovery: DiscoveryOptions = field(default_factory=DiscoveryOptions)
 
     def __post_init__(self) -> None:
         """Checks the options.

@@ -7,6 +7,7 @@ domains drawn from it::
     policy ← POLOPT(prior)
     repeat
         rollouts ← run the policy on the target, its internal model being the most likely sample
+        model ← discover(model, rollouts), if the options say so
         posterior ← INFER(model, rollouts), in rounds
         decision ← diagnose(posterior): accept, more rounds, another rollout, revise the model,
                    widen, stop
@@ -18,11 +19,10 @@ killed continues to the same result; see :mod:`npdr_ppl.workflows.loop_folder`.
 
 import logging
 from contextlib import ExitStack
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.inference.registry import backend as backend_by_name
@@ -31,7 +31,6 @@ from npdr_ppl.policies.search_registry import policy_search
 from npdr_ppl.randomness import derived_seed, seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.targets.base import TargetDomain
-from npdr_ppl.workflows.closest_fit import prepare
 from npdr_ppl.workflows.control_task import ControlTask
 from npdr_ppl.workflows.diagnostics import Decision, diagnose
 from npdr_ppl.workflows.domains import (
@@ -42,16 +41,12 @@ from npdr_ppl.workflows.domains import (
     simulator_of,
 )
 from npdr_ppl.workflows.fit import describe
-from npdr_ppl.workflows.infer import infer
+from npdr_ppl.workflows.loop_decisions import Settled, action_for, decision_record, is_final
+from npdr_ppl.workflows.loop_discovery import LoopDiscovery, effect_names
 from npdr_ppl.workflows.loop_domains import training_domains
 from npdr_ppl.workflows.loop_folder import LoopFolder
-from npdr_ppl.workflows.loop_options import (
-    NEW_ATTEMPTS,
-    Action,
-    LoopOptions,
-    Model,
-    Revise,
-)
+from npdr_ppl.workflows.loop_inference import infer_posterior
+from npdr_ppl.workflows.loop_options import NEW_ATTEMPTS, Action, LoopOptions, Model, Revise
 from npdr_ppl.workflows.loop_result import Training, Tried, best_measured
 from npdr_ppl.workflows.policy_optimisation import optimise_policy
 from npdr_ppl.workflows.posterior import Posterior
@@ -59,15 +54,16 @@ from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.real_rollouts import RealRollouts
 from npdr_ppl.workflows.run_folder import plain
 
-if TYPE_CHECKING:
-    from npdr_ppl.workflows.arviz_module import Data
-
 __all__ = ["Training", "train"]
 
 _LOGGER = logging.getLogger(__name__)
 
 PREDICTIVE_DRAWS = 500
 """Draws per ensemble member that a diagnosis reads."""
+
+LEAST_SHARE = 0.5
+"""Share of an episode's steps that discovery wants: effects that show in few segments of a rollout
+that ended early are told from chance, but not from each other."""
 
 
 def train(
@@ -128,6 +124,12 @@ class _Loop:
         self.options = options
         self.folder = folder
         self.revise = revise
+        # A way of one's own to look for effects takes the place of discovery.
+        may_discover = options.follows_decisions and revise is None
+        self.discovers = options.discovers if may_discover else "never"
+        self.discovery = LoopDiscovery(
+            model, options.discovery, derived_seed(seed, "discovery in the loop")
+        )
         self.seed = seed
         self.report = report
         search, backend = options.search, options.backend
@@ -162,7 +164,7 @@ class _Loop:
                 break
             self.records.append(self._iterate(index, report))
             self.folder.write_result(self._result().to_dict())
-            if _is_final(self.records[-1]):
+            if is_final(self.records[-1]):
                 break
         return self._result()
 
@@ -203,7 +205,7 @@ class _Loop:
         settled = self._infer_and_decide(index, real_return, report)
         self.posterior = settled.posterior
         last = settled.decisions[-1]
-        is_last = _is_final({"decisions": settled.decisions})
+        is_last = is_final({"decisions": settled.decisions})
         if self.options.internal_model == "most likely" and not is_last:
             self.domain = most_likely_domain(settled.posterior, seed=self.seed)
         record: dict[str, Any] = {
@@ -213,6 +215,7 @@ class _Loop:
             "real_returns": returns,
             "num_rollouts": len(self.rollouts),
             "decisions": settled.decisions,
+            "effects": effect_names(self.model),
             "internal_model": self.domain,
             "parameters": describe(settled.data)["parameters"],
         }
@@ -233,28 +236,27 @@ class _Loop:
             if action == Action.ANOTHER_ROLLOUT:
                 self._collect(self.task.excitation or self.policy)
             if action == Action.REVISED:
-                self._revised(index)
+                self._revised(index, report)
             rounds += action == Action.MORE_ROUNDS
             attempt += action in NEW_ATTEMPTS
         if self.folder.iteration(index + 1) is None:
             # The last one finished: its posterior is read from disk.
             self.posterior = self._infer(index, attempt, rounds, report)
         self.domain = saved["internal_model"]
-        if not _is_final(saved):
+        if not is_final(saved):
             self._optimise(index + 1, None, report)
 
     def _rounds(self) -> int:
         """Returns how many rounds inference has before any is added."""
         return self.options.rounds if self.backend.is_sequential else 1
 
-    def _infer_and_decide(self, index: int, real_return: float, report: Reporter) -> "_Settled":
+    def _infer_and_decide(self, index: int, real_return: float, report: Reporter) -> Settled:
         """Infers the posterior and does what its diagnosis asks for until that settles it."""
         options = self.options
-        decisions: list[dict[str, Any]] = []
-        rounds = self._rounds()
+        decisions = self._discover_first(index, report)
+        rounds, attempt = self._rounds(), len(decisions)
         extra_rounds = options.extra_rounds if self.backend.is_sequential else 0
-        has_revised = self.revise is None
-        attempt = 0
+        may_revise = self.revise is not None or self.discovers == "after diagnosis"
         while True:
             posterior = self._infer(index, attempt, rounds, report)
             data = posterior.to_arviz(PREDICTIVE_DRAWS, seed=self.seed)
@@ -265,37 +267,41 @@ class _Loop:
                 rollouts_left=self._extra_rollouts_left(index),
             )
             decision, reason = diagnosis.decision, diagnosis.reason
-            if not options.follows_decisions:
-                action = Action.LOGGED
-            elif decision is Decision.MORE_ROUNDS:
-                action, rounds, extra_rounds = Action.MORE_ROUNDS, rounds + 1, extra_rounds - 1
-            elif decision is Decision.NEW_ROLLOUT:
-                action = Action.ANOTHER_ROLLOUT
+            action = action_for(decision, options, may_revise=may_revise, real_return=real_return)
+            if action is Action.MORE_ROUNDS:
+                rounds, extra_rounds = rounds + 1, extra_rounds - 1
+            elif action is Action.ANOTHER_ROLLOUT:
                 self._collect(self.task.excitation or self.policy)
-            elif decision is Decision.REVISE_MODEL and not has_revised:
-                has_revised = True
-                is_found = self._revised(index)
-                action = Action.REVISED if is_found else Action.NOTHING_FOUND
-            elif decision is Decision.REVISE_MODEL:
-                action = Action.SPREAD
-            elif decision is Decision.WIDEN:
-                action = Action.MIXED
-            elif decision is Decision.ACCEPT and _reaches(real_return, options.stop_return):
-                action, decision = Action.KEPT, Decision.STOP
+            elif may_revise and (action is Action.REVISED or self.discovers != "never"):
+                may_revise = False
+                is_found, finding = self._revised(index, report)
+                reason = f"{reason} {finding}".strip()
+                if is_found:
+                    decision, action = Decision.REVISE_MODEL, Action.REVISED
+                elif action is Action.REVISED:
+                    action = Action.NOTHING_FOUND
+            if action is Action.KEPT and decision is Decision.ACCEPT:
+                decision = Decision.STOP
                 reason = f"The return on the target, {real_return:.0f}, is what was asked for."
-            else:
-                action = Action.KEPT if decision is Decision.STOP else Action.TRAINED
-            decisions.append(
-                {
-                    "decision": decision.value,
-                    "reason": reason,
-                    "action": action.value,
-                    "diagnosis": diagnosis.to_dict(),
-                }
-            )
+            decisions.append(decision_record(decision, reason, action, diagnosis.to_dict()))
             attempt += action in NEW_ATTEMPTS
             if action not in (Action.MORE_ROUNDS, *NEW_ATTEMPTS):
-                return _Settled(posterior, data, decisions, action)
+                return Settled(posterior, data, decisions, action)
+
+    def _discover_first(self, index: int, report: Reporter) -> list[dict[str, Any]]:
+        """Does what discovery wants before anything is inferred, and returns what was decided."""
+        decisions: list[dict[str, Any]] = []
+        steps, wanted = sum(sum(r.lengths) for r in self.rollouts), self.task.num_steps
+        is_short = steps < LEAST_SHARE * wanted
+        if self.discovers != "never" and is_short and self._extra_rollouts_left(index) > 0:
+            self._collect(self.task.excitation or self.policy)
+            reason = f"The rollouts ended early, after {steps} steps of {wanted}: record another."
+            decisions.append(decision_record(Decision.NEW_ROLLOUT, reason, Action.ANOTHER_ROLLOUT))
+        if self.discovers == "before inference":
+            is_found, reason = self._revised(index, report)
+            if is_found:
+                decisions.append(decision_record(Decision.REVISE_MODEL, reason, Action.REVISED))
+        return decisions
 
     def _extra_rollouts_left(self, index: int) -> int:
         """Returns how many more episodes a diagnosis may ask for."""
@@ -303,63 +309,48 @@ class _Loop:
         left = self.options.extra_rollouts - used
         return left if self._can_collect(1) else 0
 
-    def _revised(self, index: int) -> bool:
-        """Returns whether an effect was found that the model lacked; the model then has it."""
-        assert self.revise is not None
-        found = self.revise(self.model, _joined(self.rollouts), self.folder.revision(index))
+    def _revised(self, index: int, report: Reporter) -> tuple[bool, str]:
+        """Looks for effects that the model lacks, and gives it what is found.
+
+        Returns:
+            Whether the model has effects now that were found, and what was found in a sentence.
+        """
+        rollouts, folder = _joined(self.rollouts), self.folder.revision(index)
+        if self.revise is not None:
+            found, finding = self.revise(self.model, rollouts, folder), ""
+        else:
+            step = report.stage("look for a missing effect")
+            revision = self.discovery.look(rollouts, folder, step)
+            found, finding = revision.model, revision.reason
         if found is None:
-            return False
+            return False, finding
         target = self.target
         self.model = found
         self.prior = prior_of(found, target.sensors, target.actions, target.time_step)
-        return True
+        return True, finding
 
     def _infer(self, index: int, attempt: int, rounds: int, report: Reporter) -> Posterior:
         """Infers the posterior; rounds that are on disk are not repeated."""
         options = self.options
         number = len(self.rollouts) if options.rollouts_used == "all" else options.rollouts
-        data = _joined(self.rollouts[-number:])
-        seed = derived_seed(self.seed, "inference", index, attempt)
-        prepared = prepare(
+        return infer_posterior(
             self.model,
-            data,
-            options.binding,
-            noise=options.noise,
-            wants_neighbourhood=options.start == "closest fit" and self.backend.continues,
-            seed=seed,
-            progress=report.stage("find the closest parameters"),
-        )
-        binding = prepared.options
-        return infer(
-            prepared.model,
-            data,
-            backend=self.backend,
+            _joined(self.rollouts[-number:]),
+            options,
+            self.backend,
             rounds=rounds,
-            num_simulations=options.num_simulations,
-            seed=seed,
-            embedding=binding.embedding,
-            segment_length=binding.segment_length,
-            initial_state=binding.initial_state,
-            precision=binding.precision,
-            start=prepared.neighbourhood or self._start(index),
+            prior=self.prior,
+            last=self.posterior,
+            seed=derived_seed(self.seed, "inference", index, attempt),
             checkpoint=self.folder.inference(index, attempt),
-            progress=report,
+            report=report,
         )
-
-    def _start(self, index: int) -> Posterior | None:
-        """Returns the last iteration's posterior if inference is to start from it."""
-        if self.options.start != "posterior" or not self.backend.continues or index == 0:
-            return None
-        last = self.posterior
-        if last is None or last.prior.num_parameters != self.prior.num_parameters:
-            return None  # the model was revised
-        return last
 
     def _prior_domains(self, number: int) -> Domains:
         with seeded(self.seed, "prior domains"):
             return domains_at(self.prior, self.prior.sample(number))
 
-    def _posterior_domains(self, index: int, settled: "_Settled") -> Domains:
+    def _posterior_domains(self, index: int, settled: Settled) -> Domains:
         """Returns what the policy is trained in next."""
         return training_domains(
             settled.posterior,
@@ -394,25 +385,6 @@ class _Loop:
             self.folder.save_policy(number, parameters, figures)
         self.policy = self.task.policy.with_parameters(parameters.to(self.task.policy.parameters))
         return figures
-
-
-@dataclass(frozen=True)
-class _Settled:
-    """A posterior, and what was decided about it."""
-
-    posterior: Posterior
-    data: "Data"
-    decisions: list[dict[str, Any]]
-    action: "Action"
-
-
-def _is_final(record: dict[str, Any]) -> bool:
-    """Returns whether the loop ends with an iteration."""
-    return record["decisions"][-1]["action"] == Action.KEPT
-
-
-def _reaches(real_return: float, wanted: float | None) -> bool:
-    return wanted is not None and real_return >= wanted
 
 
 def _joined(rollouts: list[Rollouts]) -> Rollouts:

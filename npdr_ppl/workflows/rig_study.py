@@ -64,12 +64,14 @@ class RigMethod:
         backend: The loop's backend.
         embedding: What it conditions on; ``None`` for the loop's.
         has_effects: Whether the model has the rigs' effects.
+        discovers: Whether the loop looks for effects that the model lacks.
     """
 
     domains: Literal["none", "nominal", "prior", "posterior"]
     backend: str = ""
     embedding: str | None = None
     has_effects: bool = False
+    discovers: bool = False
 
 
 METHODS: Mapping[str, RigMethod] = {
@@ -80,9 +82,10 @@ METHODS: Mapping[str, RigMethod] = {
     "bayessim": RigMethod("posterior", "bayessim", "bayessim"),
     "npdr": RigMethod("posterior", "snpe-c"),
     "npdr with effects": RigMethod("posterior", "snpe-c", has_effects=True),
+    "npdr with discovery": RigMethod("posterior", "snpe-c", discovers=True),
 }
 """The columns of the paper's Table 2, what a policy does untrained and trained on the prior, and
-the loop on a model that has the effects."""
+the loop on a model that has the effects, and the loop that has to find them."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +134,8 @@ def run_method(
         binding = options.binding
         if method.embedding is not None:
             binding = replace(binding, embedding=method.embedding)
-        chosen = replace(options, backend=method.backend, binding=binding)
+        discovers = "before inference" if method.discovers else "never"
+        chosen = replace(options, backend=method.backend, binding=binding, discovers=discovers)
         try:
             trained = train(model, target, task, chosen, out=out, seed=seed, progress=progress)
             policy, domain, records = trained.policy, trained.domain, trained.iterations

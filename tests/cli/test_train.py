@@ -109,6 +109,21 @@ def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
     assert (out / "learning_curve.png").exists()
 
 
+def test_what_the_model_lacks_is_looked_for_where_that_is_asked_for(
+    monkeypatch, capsys, tmp_path, rig
+):
+    out = tmp_path / "run"
+    code, _, err = run(
+        monkeypatch, capsys, "train", "furuta", "--target", "furuta-random-7", "--task",
+        f"{rig}:short", "--out", out, "--iterations", 1, "--discover", *QUICK,
+    )  # fmt: skip
+    assert code == 0, err
+    described = json.loads((out / "loop.json").read_text())["options"]
+    assert described["discovers"] == "before inference"
+    # Sixty steps are too few for any effect to show.
+    assert json.loads((out / "train.json").read_text())["iterations"][0]["effects"] == []
+
+
 def test_ctrl_c_says_how_to_go_on(monkeypatch, capsys, tmp_path, rig):
     out = tmp_path / "run"
     code, _, err = run(

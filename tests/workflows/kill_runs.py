@@ -1,6 +1,6 @@
 """Kills a run of the NPDR loop at random moments, resumes it, and compares what comes out.
 
-    python kill_runs.py FOLDER NUM_KILLS SEED
+    python kill_runs.py FOLDER NUM_KILLS SEED [discover]
 
 One process imports everything and forks a child for every attempt, so that a hundred take minutes.
 It exits with an error if a resumed run differs from the undisturbed one, or if the target ran an
@@ -17,22 +17,31 @@ import traceback
 from pathlib import Path
 
 import torch
-from small_loop import HandmadePendulum, small_options, small_task
+from small_loop import (
+    DryPendulum,
+    HandmadePendulum,
+    discovering_options,
+    small_options,
+    small_task,
+    swinging_task,
+)
 
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.workflows.npdr_loop import train
 
 
-def fork(folder, seed):
+def fork(folder, seed, discovers):
     """Starts the run, or goes on with it, in a process of its own."""
     child = os.fork()
     if child:
         return child
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        target = HandmadePendulum(folder / "episodes.log")
-        train(pendulum, target, small_task(), small_options(), out=folder / "run", seed=seed,
-              progress=False)  # fmt: skip
+        target, task, options = HandmadePendulum, small_task(), small_options()
+        if discovers:
+            target, task, options = DryPendulum, swinging_task(), discovering_options()
+        train(pendulum, target(folder / "episodes.log"), task, options, out=folder / "run",
+              seed=seed, progress=False)  # fmt: skip
         os._exit(0)
     except BaseException:
         traceback.print_exc()
@@ -62,10 +71,11 @@ def written(folder):
 
 def main():
     root, num_kills, seed = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    discovers = "discover" in sys.argv[4:]
     torch.set_num_threads(1)
     moments = random.Random(seed)
     started = time.monotonic()
-    finish(fork(root / "undisturbed", seed))
+    finish(fork(root / "undisturbed", seed, discovers))
     seconds = time.monotonic() - started
     expected = outcome(root / "undisturbed")
     kills = runs = 0
@@ -76,9 +86,10 @@ def main():
         is_done = False
         # Short lives, so that a run is killed several times on its way; longer ones after each
         # kill, so that it comes to its end also where the machine has become slower since.
-        longest = 0.4 * seconds
+        # Discovery begins anew after a kill, so it needs lives that are longer than it is.
+        longest = (1.0 if discovers else 0.4) * seconds
         while not is_done:
-            child = fork(folder, seed)
+            child = fork(folder, seed, discovers)
             time.sleep(moments.uniform(0.0, longest))
             longest *= 1.1
             if kills < num_kills:

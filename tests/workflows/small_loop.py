@@ -11,12 +11,14 @@ import numpy as np
 import torch
 
 from npdr_ppl.inference.registry import backend
+from npdr_ppl.models.effects import CoulombFriction, InputDelay, SensorLowPass
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.linear import Linear
 from npdr_ppl.policies.search_registry import policy_search
 from npdr_ppl.targets.base import TargetDomain
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.control_task import ControlTask
+from npdr_ppl.workflows.discovery import DiscoveryOptions
 from npdr_ppl.workflows.loop_options import LoopOptions
 
 NUM_STEPS = 40
@@ -61,6 +63,34 @@ def _heun(state, torque, h):
     return state + 0.5 * h * (first + rate(state + h * first))
 
 
+class DryPendulum(HandmadePendulum):
+    """The same with dry friction of 0.6 N m at the hinge, which the zoo's pendulum lacks."""
+
+    name = "dry"
+
+    def run(self, controller, num_steps, *, episode=0, seed):
+        rng = np.random.default_rng(seed)
+        state = np.array([0.5, 0.0]) + 0.02 * rng.standard_normal(2)
+        readings, actions = [_read(state, rng)], []
+        for step in range(num_steps):
+            torque = self.limit(controller(readings[-1], step * self.time_step))
+            for _ in range(20):
+                friction = 0.6 * math.tanh(state[1] / 0.01)
+                state = _heun(state, torque[0] - friction, self.time_step / 20)
+            readings.append(_read(state, rng))
+            actions.append(torque)
+        if self.log is not None:
+            with open(self.log, "a") as file:
+                file.write(f"{episode}\n")
+                file.flush()
+                os.fsync(file.fileno())
+        return self.rollout(readings, actions)
+
+
+def _read(state, rng):
+    return state + np.array([1e-3, 1e-2]) * rng.standard_normal(2)
+
+
 def initial_states(num_states, generator):
     return torch.tensor([0.5, 0.0]) + 0.02 * torch.randn(num_states, 2, generator=generator)
 
@@ -73,6 +103,16 @@ def reward(positions, velocities, commands):
 def small_task(excitation=None):
     policy = Linear(("angle", "velocity"), ("torque",), max_gain=20.0)
     return ControlTask("hold", policy, reward, initial_states, NUM_STEPS, 30.0, excitation)
+
+
+def swinging_task():
+    """A task whose first policy moves the pendulum enough to tell something by."""
+    policy = Linear(("angle", "velocity"), ("torque",), max_gain=20.0)
+    gains = policy.parameters.clone()
+    gains[policy.names.index("torque.velocity")] = 0.5
+    return ControlTask(
+        "swing", policy.with_parameters(gains), reward, initial_states, 200, 30.0, None
+    )
 
 
 def small_options(**changed):
@@ -88,3 +128,11 @@ def small_options(**changed):
         "num_initial_states": 2,
     }
     return LoopOptions(**{**settings, **changed})
+
+
+def discovering_options(when="before inference", **changed):
+    """Looks for one of three effects in segments of 0.2 s."""
+    few = (CoulombFriction("hinge"), InputDelay("torque"), SensorLowPass("velocity"))
+    discovery = DiscoveryOptions(segment_length=10, effects=few, max_effects=1)
+    settings = {"iterations": 1, "discovers": when, "discovery": discovery}
+    return small_options(**{**settings, **changed})
