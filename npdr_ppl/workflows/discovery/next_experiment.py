@@ -109,7 +109,7 @@ def _excitations(time_step: float) -> dict[str, NDArray[np.float64]]:
     waves = np.zeros_like(t)
     for k, frequency in enumerate((0.4, 0.9, 1.7, 3.1)):
         waves += np.sin(2 * np.pi * frequency * t + k)
-    return {
+    shapes = {
         "slow_ramp": 2.0 * np.abs(2.0 * (t / SECONDS - np.floor(t / SECONDS + 0.5))) - 1.0,
         "reversals": np.sign(np.sin(2 * np.pi * 1.5 * t)),
         "steps": levels[(t / SECONDS * len(levels)).astype(int)],
@@ -117,6 +117,7 @@ def _excitations(time_step: float) -> dict[str, NDArray[np.float64]]:
         "hold": np.full_like(t, 0.3),
         "wide_range": waves / np.abs(waves).max(),
     }
+    return {name: np.asarray(shape, dtype=np.float64) for name, shape in shapes.items()}
 
 
 def _recorded(
