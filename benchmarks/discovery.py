@@ -26,6 +26,7 @@ from discovery_summary import print_summary
 from hidden_rigs import RIGS, Case, make_case, places
 
 import npdr_ppl as npdr
+from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.search import Searcher
 
 SEEDS = {"tune": range(100), "test": range(1000, 1100)}
@@ -100,6 +101,7 @@ def judge(task: Task) -> dict[str, Any]:
             "unexplained": found.unexplained,
             "effects": [finding.to_dict() for finding in found.effects],
             "ranking": [candidate.name for candidate in found.ranking[:5]],
+            "bic": bic_choice(found),
             "gap": {name: gap.to_dict() for name, gap in found.gap.items()},
         }
     except Exception as error:  # a failure is a row with its message
@@ -160,6 +162,20 @@ def _catalogue(task: Task, case: Case) -> tuple[npdr.Effect, ...] | None:
     gone = {name for names in (case.names, *case.alternatives) for name in names}
     ids = {name.rsplit(".", 1)[1] for name in case.names}
     return tuple(e for e in every if e.name not in gone and e.id not in ids)
+
+
+def bic_choice(found: npdr.Discovery) -> str | None:
+    """Returns what forward selection by BIC would add first, every reading counted; a baseline."""
+    first = found.search.rounds[0].hypothesis
+    misfit = Projection(first).misfit
+    num = first.linearisation.residual.numel()
+    best, name = 0.0, None
+    for candidate in found.ranking:
+        left = max(misfit - candidate.gain, 1e-12 * misfit)
+        gain = num * math.log(misfit / left) - len(candidate.sizes) * math.log(num)
+        if gain > best:
+            best, name = gain, candidate.name
+    return name
 
 
 def _key(row: dict[str, Any]) -> tuple[Any, ...]:

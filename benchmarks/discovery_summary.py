@@ -76,6 +76,7 @@ def print_summary(path: Path) -> None:
     print(f"{len(rows)} cases, {len(failed)} failed: {Counter(r['error'][:80] for r in failed)}")
     nulls = [row for row in rows if row["condition"].startswith("null")]
     print("false alarms:", rate(nulls, lambda r: r["p_value"] <= RATE))
+    print("BIC forward selection, false alarms:", rate(nulls, lambda r: r.get("bic") is not None))
     for kind in sorted({row["condition"] for row in nulls}):
         own = [row for row in nulls if row["condition"] == kind]
         print(f"  {kind}:", rate(own, lambda r: r["p_value"] <= RATE))
@@ -87,6 +88,7 @@ def print_summary(path: Path) -> None:
         print("   or in its class", rate(own, is_class_right))
         print("   confident and wrong", rate(own, is_confident_and_wrong))
         print("   spurious others", rate(own, lambda r: len(r["effects"]) > _size(r)))
+        print("   BIC forward selection: first right", rate(own, _is_bic_right))
     by_effect: dict[str, list[Row]] = defaultdict(list)
     for row in one:
         if row["d"] >= 7.0:
@@ -116,6 +118,10 @@ def print_summary(path: Path) -> None:
     _print_calibration([row for row in rows if row["condition"] in ("one", "inseparable", "two")])
     seconds = [row["cpu"] for row in rows]
     print(f"CPU seconds: median {np.median(seconds):.1f}, greatest {max(seconds):.1f}")
+
+
+def _is_bic_right(row: Row) -> bool:
+    return any(row.get("bic") in right for right in right_sets(row))
 
 
 def _size(row: Row) -> int:
