@@ -184,7 +184,7 @@ def _key(row: dict[str, Any]) -> tuple[Any, ...]:
 
 def main() -> None:
     """Runs the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="The blind benchmark of discovery.")
     parser.add_argument("--part", choices=sorted(SEEDS), default="tune")
     parser.add_argument("--conditions", default="null,null_noise3,null_coloured,null_outliers,one")
     parser.add_argument("--rigs", default=",".join(RIGS))
