@@ -14,7 +14,6 @@ from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.credible import Estimate, estimates
 from npdr_ppl.workflows.discovery.data_checks import data_problems
 from npdr_ppl.workflows.discovery.equivalents import equivalents
-from npdr_ppl.workflows.discovery.evidence import closest
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.next_experiment import NextExperiment, next_experiment
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
@@ -22,7 +21,7 @@ from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.proof import Gap, prove
 from npdr_ppl.workflows.discovery.residual_map import Spot, worst_windows
 from npdr_ppl.workflows.discovery.result import Discovery, Finding, Verdict
-from npdr_ppl.workflows.discovery.search import Added, Round, Search, Searcher
+from npdr_ppl.workflows.discovery.search import Added, Round, Search, Searcher, explained
 from npdr_ppl.workflows.discovery.separation import separation_matrix
 
 __all__ = ["Investigation", "discover"]
@@ -247,11 +246,9 @@ def _finding(added: Added, search: Search, every: dict[str, Estimate]) -> Findin
 
 def _unexplained(search: Search) -> float:
     """Returns the share of the misfit that the last model leaves and one law could explain."""
-    first, final = search.rounds[0].hypothesis, search.final
-    scale = closest([first, final]).fit.scale
-    explained = 2.0 * float((first.losses(scale) - final.losses(scale)).sum())
+    done = explained(search.rounds[0].hypothesis, search.final)
     left = search.rounds[-1].alarm.gain
-    return left / max(left + max(explained, 0.0), 1e-12)
+    return left / max(left + done, 1e-12)
 
 
 def _units(hypothesis: Hypothesis) -> dict[str, str]:
