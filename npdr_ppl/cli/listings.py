@@ -19,7 +19,7 @@ def models(as_json: AsJson = False) -> None:
 
     rows = []
     for name, entry in zoo().items():
-        simulator = entry.simulator
+        simulator = entry.simulator()
         rows.append(
             {
                 "name": name,

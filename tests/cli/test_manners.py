@@ -139,7 +139,13 @@ def test_ctrl_c_leaves_a_run_that_continues(recording, tmp_path):
     words = small_fit(recording, out)
     words = [w if w != "abc" else "snpe-c" for w in map(str, words)]
     words[words.index("--simulations") + 1] = "2000"
-    process = subprocess.Popen([*NPDR, *words], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*NPDR, *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        # Where the tests run in the background, a shell has told them to ignore interrupts.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
     deadline = time.monotonic() + 60
     # Simulations are on disk before training, which takes the longest.
     while not (out / "run" / "round_0_simulations.safetensors").exists():

@@ -106,7 +106,7 @@ def sensitivities(
         shapes = _shapes(effect, priors, strengths)
         if effect.name in (hints or {}):
             shapes.append({**shapes[0], **(hints or {})[effect.name]})
-        sizes = (SMALL,) if effect.is_smooth else SIZES
+        sizes = SIZES if _needs_size(effect, strengths) else (SMALL,)
         for shape, size in itertools.product(shapes, sizes):
             values = {**probe, **shape}
             nominal = torch.tensor([_resting(resting[n], probe[n]) for n in strengths]).double()
@@ -164,6 +164,15 @@ def _shapes(
             value = float(priors[parameter.name].icdf(torch.tensor(quantile)))
             shapes.append({**shapes[0], parameter.name: value})
     return shapes[:MOST_SHAPES]
+
+
+def _needs_size(effect: Effect, strengths: tuple[str, ...]) -> bool:
+    """Returns whether an effect shows only at a size, not in the slope at zero.
+
+    A lag far below the sampling time changes nothing that is sampled.
+    """
+    units = {p.name: p.unit for p in effect.parameters}
+    return not effect.is_smooth or any(units[name] == "s" for name in strengths)
 
 
 def _within_reach(effect: Effect, probe: dict[str, float], inputs: Inputs) -> dict[str, float]:
