@@ -87,7 +87,7 @@ class LoopOptions:
             model as it is has been diagnosed, whatever the diagnosis. The noise that a model gets
             from its closest fit can make up for an effect in every diagnosis, so discovery's own
             alarm has the last word.
-        discovery: How it searches.
+        discovery: How it searches; its seed comes from that of the run.
     """
 
     iterations: int = 5
