@@ -1,5 +1,6 @@
 """How sure the parameters of a hypothesis are."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -41,8 +42,11 @@ class Estimate:
     unit: str
 
     def to_dict(self) -> dict[str, object]:
-        """Returns JSON-serialisable values."""
-        return {"mean": self.mean, "sd": self.sd, "hdi_94": list(self.hdi_94), "unit": self.unit}
+        """Returns JSON-serialisable values; what is not finite is null."""
+        mean, sd, low, high = (
+            value if math.isfinite(value) else None for value in (self.mean, self.sd, *self.hdi_94)
+        )
+        return {"mean": mean, "sd": sd, "hdi_94": [low, high], "unit": self.unit}
 
 
 def parameter_density(hypothesis: Hypothesis) -> GaussianMixture:

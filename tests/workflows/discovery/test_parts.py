@@ -20,6 +20,7 @@ from npdr_ppl.models.effects import (
 )
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.workflows.discovery.chance import LargestStatistic
+from npdr_ppl.workflows.discovery.credible import Estimate
 from npdr_ppl.workflows.discovery.equivalents import equivalents, irreducible
 from npdr_ppl.workflows.discovery.evidence import weigh
 from npdr_ppl.workflows.discovery.hypothesis import fit_hypothesis
@@ -145,6 +146,11 @@ def test_saving_writes_json_with_the_names_of_the_architecture(tmp_path):
     assert {"alarm", "where", "effects", "ranking", "gap", "next_experiment"} <= set(written)
     assert {"before", "after", "noise_floor", "closed"} == set(written["gap"]["rmse"])
     assert {"rollout", "time_span", "channel", "region", "z"} == set(written["where"][0])
+
+
+def test_an_infinite_estimate_is_null_in_json():
+    estimate = Estimate(math.inf, 1.0, (0.0, math.inf), "m")
+    assert estimate.to_dict() == {"mean": None, "sd": 1.0, "hdi_94": [0.0, None], "unit": "m"}
 
 
 def test_the_same_seed_finds_the_same():
