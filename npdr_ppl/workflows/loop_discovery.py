@@ -15,12 +15,11 @@ from npdr_ppl.errors import DataError, NpdrError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect
 from npdr_ppl.models.effects.registry import effect_class
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.atomic import replacing
-from npdr_ppl.workflows.discovery import Discovery, DiscoveryOptions, discover
+from npdr_ppl.workflows.discovery import DiscoveryOptions, discover
 from npdr_ppl.workflows.discovery.options import FEWEST_SEGMENTS, FEWEST_STEPS
 from npdr_ppl.workflows.loop_options import Model
 from npdr_ppl.workflows.progress import Step
-from npdr_ppl.workflows.run_folder import read_json, write_json
+from npdr_ppl.workflows.run_folder import read_json
 
 __all__ = ["LoopDiscovery", "Revision", "effect_names"]
 
@@ -77,7 +76,7 @@ class LoopDiscovery:
                 # A rollout that ended early may be too short to tell anything by.
                 _LOGGER.warning("Discovery: %s", error)
                 return Revision(None, str(error))
-            _save(found, folder)
+            found.save(folder)
         return self._read(read_json(file))
 
     def _read(self, result: Mapping[str, Any]) -> Revision:
@@ -105,14 +104,6 @@ def _fitting(options: DiscoveryOptions, rollouts: Rollouts) -> DiscoveryOptions:
             half = sum(rollouts.lengths) // (2 * FEWEST_SEGMENTS)
             return replace(options, segment_length=max(FEWEST_STEPS, half))
     return options
-
-
-def _save(found: Discovery, folder: Path) -> None:
-    """Writes what was found; the JSON goes last and makes it count."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / "revised_model.py") as temporary:
-        temporary.write_text(found.source(), encoding="utf-8")
-    write_json(folder / "discovery.json", found.to_dict())
 
 
 def _sentence(result: Mapping[str, Any]) -> str:

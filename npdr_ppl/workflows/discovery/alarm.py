@@ -67,7 +67,8 @@ def sound_alarm(
         num_looks: How often the recording was looked at before.
     """
     chance = LargestStatistic(projection, seed=options.seed)
-    laws = _learnable(projection, generic_laws(found, angles))
+    gained = _gains(projection, generic_laws(found, angles))
+    laws = [law for law, _ in gained]
     waves = wave_laws(found)
     listed = [wave for port in waves.values() for wave in port]
     # Each kind is a search of its own: a hundred laws that no one believes in must not make the
@@ -84,9 +85,7 @@ def sound_alarm(
         if name in values:
             values[name] = min(values[name], *(values[wave.name] for wave in own))
     gains = {candidate.name: candidate.gain for candidate in ranking}
-    for law in laws:
-        scores = projection.scores(law.change)
-        gains[law.name] = float(scores.score[0] ** 2 / scores.information[0, 0])
+    gains |= {law.name: gain for law, gain in gained}
     if not values:
         return Alarm(1.0, False, "", 0.0, {})
     p_value = min(values.values())
@@ -101,9 +100,12 @@ def sound_alarm(
     )
 
 
-def _learnable(projection: Projection, laws: list[GenericLaw]) -> list[GenericLaw]:
-    """Returns the laws that refitted parameters do not explain up to rounding errors."""
+def _gains(projection: Projection, laws: list[GenericLaw]) -> list[tuple[GenericLaw, float]]:
+    """Returns the laws that refitted parameters do not explain, and what each would gain."""
     if not laws:
         return []
     scores = projection.scores(torch.cat([law.change for law in laws], dim=-1))
-    return [law for law, a in zip(laws, scores.absorbed.tolist(), strict=True) if a < 1.0 - 1e-6]
+    gains = scores.score.square() / scores.information.diagonal().clamp_min(1e-30)
+    # What is absorbed up to rounding errors leaves nothing to judge.
+    rows = zip(laws, gains.tolist(), scores.absorbed.tolist(), strict=True)
+    return [(law, gain) for law, gain, absorbed in rows if absorbed < 1.0 - 1e-6]

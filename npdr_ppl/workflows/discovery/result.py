@@ -1,6 +1,5 @@
 """What discovery found."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.rollouts.atomic import replacing
 from npdr_ppl.workflows.discovery.alarm import Alarm
 from npdr_ppl.workflows.discovery.credible import Estimate
 from npdr_ppl.workflows.discovery.next_experiment import NextExperiment
@@ -19,6 +19,7 @@ from npdr_ppl.workflows.discovery.residual_map import Spot
 from npdr_ppl.workflows.discovery.revised_model import revised_source
 from npdr_ppl.workflows.discovery.screening import Screened
 from npdr_ppl.workflows.discovery.search import Search
+from npdr_ppl.workflows.run_folder import write_json
 
 __all__ = ["Discovery", "Finding", "Verdict", "describe_candidate"]
 
@@ -143,15 +144,15 @@ class Discovery:
         return revised_source(self.model, effects, fitted)
 
     def save(self, folder: Path) -> None:
-        """Writes ``discovery.json`` and ``revised_model.py``.
+        """Writes ``revised_model.py`` and then ``discovery.json``, which makes it count.
 
         Args:
             folder: Where to; made if it is not there.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(self.to_dict(), indent=2, allow_nan=False)
-        (folder / "discovery.json").write_text(text + "\n", encoding="utf-8")
-        (folder / "revised_model.py").write_text(self.source(), encoding="utf-8")
+        with replacing(folder / "revised_model.py") as temporary:
+            temporary.write_text(self.source(), encoding="utf-8")
+        write_json(folder / "discovery.json", self.to_dict())
 
     def plot(self, axes: Any = None) -> Any:
         """Draws the probabilities of what was missing and the gap on held-out rollouts.

@@ -305,8 +305,8 @@ class Searcher:
             return current, Added(effect, effect.name, 1.0, {effect.name: 1.0}), {}
         candidates = tuple(e for e in self._candidates(without) if e.name != effect.name)
         projection = Projection(without)
-        found = responses(without)
-        ranking = screen(projection, self._variants(projection, without, candidates, found))
+        pulses = responses(without)
+        ranking = screen(projection, self._variants(projection, without, candidates, pulses))
         trials = {effect.name: current}
         for candidate in ranking[:SHORTLIST]:
             found = self._fitted(without, candidate)
