@@ -62,8 +62,8 @@ def test_what_was_found_is_in_the_run_as_a_model_and_as_json(finished):
         assert found["verdict"] in ("named", "ambiguous", "unknown")
         (effect,) = found["effects"]
         assert effect["effect"] == "coulomb_friction"
-        # The true 0.6 fits these short, stiffly held rollouts hardly worse than 0.2, which the prior
-        # prefers (half-normal, 0.2): their size is for the tests of discovery itself, not these.
+        # The true 0.6 fits these short, stiffly held rollouts hardly worse than 0.2, which the
+        # half-normal prior prefers: sizes are for the tests of discovery itself.
         assert effect["parameters"]["magnitude"]["mean"] > 0.1
         source = (folder / f"revision_{index}/revised_model.py").read_text()
         names = {}
