@@ -103,6 +103,10 @@ class EncoderScale(SensorEffect):
         """Takes the scale error out."""
         return reading / (1.0 + parameters["error"])
 
+    def initial_rate(self, rate: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Takes the scale error out."""
+        return rate / (1.0 + parameters["error"])
+
     def read(
         self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
     ) -> tuple[Tensor, Any]:

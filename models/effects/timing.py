@@ -111,6 +111,10 @@ class ClockSkew(SensorEffect):
         """Returns κ t."""
         return parameters["skew"] * time
 
+    def initial_rate(self, rate: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Takes the time's scale out."""
+        return rate / (1.0 + parameters["skew"])
+
     def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> tuple[Tensor, ...]:
         """Returns the time, the present value and the one before it."""
         return start.time, value, _past(value, start)[0]

@@ -70,8 +70,8 @@ def true_start(
 ) -> Components:
     """Returns the true state behind what was recorded through the sensor effects.
 
-    A velocity that was derived from readings of its position has that sensor's timing, and none of
-    the offset or scale of the sensor for velocities.
+    A velocity that was derived from readings of its position has that sensor's scale and timing,
+    and none of the offset or scale of the sensor for velocities.
 
     Args:
         chain: The effects.
@@ -86,12 +86,15 @@ def true_start(
     true = list(recorded.states)
     for place, effect, columns in chain.sensor_effects:
         for i, state in enumerate(states):
-            if sensors.get(state.name) not in columns:
-                continue
-            value = effect.initial_value(true[i], tables.effects[place])
+            value = true[i]
+            if sensors.get(state.name) in columns:
+                value = effect.initial_value(value, tables.effects[place])
             if recorded.is_derived[i]:
+                rate = true[i]
+                if sensors.get(state.rate_of or "") in columns:
+                    rate = effect.initial_rate(rate, tables.effects[place])
                 # At a rollout's first sample velocities are read; see Simulator.initial_states.
-                value = torch.where(recorded.time == 0.0, value, true[i])
+                value = torch.where(recorded.time == 0.0, value, rate)
             true[i] = value
     leads = sensor_leads(chain.sensor_effects, tables.effects, recorded.time)
     if not leads:

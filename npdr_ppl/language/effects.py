@@ -294,6 +294,14 @@ class SensorEffect(Effect):
         """
         return reading
 
+    def initial_rate(self, rate: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns the true rate of change behind one that was derived from successive readings.
+
+        By default the rate itself; a wrong scale, of the readings or of their time stamps, has to
+        be taken out.
+        """
+        return rate
+
     def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor | None:
         """Returns by how many seconds readings are ahead of the truth; ``None`` for not at all.
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import ClockSkew, InputDelay, SensorDelay
+from npdr_ppl.models.effects import ClockSkew, EncoderScale, InputDelay, SensorDelay
 from npdr_ppl.models.emps import Emps
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.policies.linear import Linear
@@ -45,18 +45,32 @@ def test_delays_of_all_sensors_and_of_the_input_are_one_class():
     assert (difference < 0.15 * effect).all()
 
 
-def test_velocities_derived_from_late_positions_are_late_too():
-    """A falling body whose state is estimated from late positions at a segment's start."""
-    delay, fall, begin = 0.0107, 3.0, 400
+@pytest.mark.parametrize(
+    ("effect", "value"),
+    [
+        (SensorDelay("position"), 0.0107),
+        (EncoderScale("position"), 0.02),
+        (ClockSkew("clock"), 2e-3),
+    ],
+    ids=lambda x: getattr(x, "id", ""),
+)
+def test_velocities_derived_from_readings_have_their_errors(effect, value):
+    """A falling body whose state is estimated from readings at a segment's start."""
+    fall, begin = 3.0, 400
     time = Emps.time_step * torch.arange(begin, begin + 41, dtype=torch.float64)
-    position = 0.5 * fall * (time - delay) ** 2
-    late_rate = fall * (time[0] - delay)
+    scale, rate, late = {
+        "sensor_delay": (1.0, 1.0, value),
+        "encoder_scale": (1.0 + value, 1.0, 0.0),
+        "clock_skew": (1.0, 1.0 + value, 0.0),
+    }[effect.id]
+    position = scale * 0.5 * fall * (rate * time - late) ** 2
+    read_rate = scale * fall * (rate * time[0] - late) * rate
     inputs = Inputs(
         actions=torch.full((1, 40, 1), fall, dtype=torch.float64),
         action_names=("voltage",),
         initial_readings=position[:1, None],
         initial_values=position[:1, None],
-        initial_rates=late_rate.reshape(1, 1),
+        initial_rates=read_rate.reshape(1, 1),
         channel_names=("position",),
         past_actions=torch.full((1, 8, 1), fall, dtype=torch.float64),
         time_step=Emps.time_step,
@@ -64,15 +78,16 @@ def test_velocities_derived_from_late_positions_are_late_too():
         rollout=torch.zeros(1, dtype=torch.long),
         start=torch.tensor([begin]),
     )
-    simulator = Emps(integrator="constant-acceleration").with_effects(SensorDelay("position"))
-    given = FREE | {"position.sensor_delay.delay": delay}
+    simulator = Emps(integrator="constant-acceleration").with_effects(effect)
+    given = FREE | {effect.parameter_names[0]: value}
     given = {name: torch.tensor(value, dtype=torch.float64) for name, value in given.items()}
     out = simulator.simulate(given, inputs)[0]
     # Between steps positions are taken as linear, which is off by a h²/8 at most.
     torch.testing.assert_close(
         out[:, 0], position[1:], rtol=0.0, atol=fall * Emps.time_step**2 / 8.0
     )
-    torch.testing.assert_close(out[:, 1], fall * time[1:])
+    if effect.id != "clock_skew":  # which the velocity's reading has as well
+        torch.testing.assert_close(out[:, 1], fall * time[1:])
 
 
 def test_a_closed_loop_reads_late():
