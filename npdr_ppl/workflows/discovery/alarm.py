@@ -5,13 +5,15 @@ from dataclasses import dataclass
 
 import torch
 
+from npdr_ppl.language.channels import Channel
 from npdr_ppl.workflows.discovery.chance import LargestStatistic
-from npdr_ppl.workflows.discovery.latent_force import (
+from npdr_ppl.workflows.discovery.generic_laws import (
     GenericLaw,
-    Responses,
     generic_laws,
+    ripple_laws,
     wave_laws,
 )
+from npdr_ppl.workflows.discovery.latent_force import Responses
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.screening import Screened
@@ -49,7 +51,7 @@ def sound_alarm(
     variants: Sequence[Variant],
     ranking: Sequence[Screened],
     found: Responses,
-    angles: frozenset[str],
+    sensors: Sequence[Channel],
     options: DiscoveryOptions,
     num_looks: int = 0,
 ) -> Alarm:
@@ -62,15 +64,15 @@ def sound_alarm(
         variants: All candidates in all their shapes and sizes.
         ranking: The candidates that explain anything.
         found: The responses to pulses of force.
-        angles: Names of the channels in radians.
+        sensors: The simulator's sensors.
         options: The rate of false alarms and the seed.
         num_looks: How often the recording was looked at before.
     """
     chance = LargestStatistic(projection, seed=options.seed)
-    gained = _gains(projection, generic_laws(found, angles))
+    gained = _gains(projection, generic_laws(found, sensors))
     laws = [law for law, _ in gained]
     waves = wave_laws(found)
-    listed = [wave for port in waves.values() for wave in port]
+    listed = [wave for port in waves.values() for wave in port] + ripple_laws(found, sensors)
     # Each kind is a search of its own: a hundred laws that no one believes in must not make the
     # catalogue's harder to hear.
     values: dict[str, float] = {}

@@ -1,11 +1,10 @@
-"""The force that the model lacks, whatever its law: pulses, and what a law of any kind would do.
+"""The force that the model lacks, whatever its law.
 
 A pulse of force at a joint during a part of every segment changes the readings linearly while it
 is small. With the responses to all pulses, the effect of *any* force law along the recording is a
-weighted sum, without another simulation: the law's values at the pulses are the weights. That
-serves two ends. A dictionary of laws which no one would call physics – polynomials, signs and
-waves of whatever is recorded – notices that something is missing even where the catalogue has no
-word for it; and the missing force itself can be estimated and shown against the states.
+weighted sum, without another simulation: the law's values at the pulses are the weights. So many
+laws can be tried (:mod:`~npdr_ppl.workflows.discovery.generic_laws`), and the missing force itself
+can be estimated and shown against the states.
 """
 
 from collections.abc import Mapping
@@ -23,30 +22,13 @@ from npdr_ppl.language.effects import ForceEffect
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
 
-__all__ = [
-    "FREQUENCIES",
-    "GenericLaw",
-    "LatentForce",
-    "Responses",
-    "generic_laws",
-    "latent_force",
-    "responses",
-    "strongest_frequency",
-    "wave_laws",
-]
+__all__ = ["LatentForce", "Responses", "latent_force", "responses"]
 
 PULSES = 10
 """Pulses per segment and joint."""
 
 SMALL = 1e-3
 """Height of a pulse, in the port's rated force: a response is a derivative."""
-
-SIGN_WIDTH = 0.1
-"""Over which part of a channel's spread a sign changes."""
-
-
-FREQUENCIES = 120
-"""Frequencies tried of a wave in time, spaced by half the resolution of the longest rollout."""
 
 
 class Pulse(ForceEffect):
@@ -110,19 +92,6 @@ class Responses:
 
 
 @dataclass(frozen=True)
-class GenericLaw:
-    """A law that is no one's: a function of what is recorded, as a force at a port.
-
-    Attributes:
-        name: What it is, e.g. ``"arm: arm_velocity²"``.
-        change: What it would change in the whitened readings, ``(S, N, k)``.
-    """
-
-    name: str
-    change: Tensor
-
-
-@dataclass(frozen=True)
 class LatentForce:
     """The missing force at a joint, estimated without a law.
 
@@ -181,69 +150,6 @@ def responses(hypothesis: Hypothesis) -> Responses:
     return Responses(by_port, units, rated, channels, time.double(), inputs.rollout)
 
 
-def generic_laws(found: Responses, angles: frozenset[str] = frozenset()) -> list[GenericLaw]:
-    """Returns what a dictionary of laws would change.
-
-    Args:
-        found: The responses to pulses.
-        angles: Names of the channels in radians, of which waves are tried too.
-    """
-    values = _dictionary(found.channels, found.time, angles)
-    return [
-        GenericLaw(f"{port}: {name}", (change * value[:, None, :]).sum(-1, keepdim=True))
-        for port, change in found.by_port.items()
-        for name, value in values.items()
-    ]
-
-
-def wave_laws(found: Responses) -> dict[str, list[GenericLaw]]:
-    """Returns what waves in time of many frequencies would change, by port.
-
-    Args:
-        found: The responses to pulses.
-    """
-    return {
-        port: [
-            GenericLaw(f"{port}: wave of {frequency:.3g} Hz", change @ _wave(found, frequency))
-            for frequency in _frequencies(found).tolist()
-        ]
-        for port, change in found.by_port.items()
-    }
-
-
-def strongest_frequency(projection: Projection, found: Responses, port: str) -> float:
-    """Returns the frequency in Hz of the wave in time that explains most as a force at a port.
-
-    Args:
-        projection: The fitted model.
-        found: The responses to pulses.
-        port: The port.
-    """
-    frequencies = _frequencies(found)
-    change = found.by_port[port]
-    gains = []
-    for chunk in frequencies.split(20):
-        waves = torch.cat([_wave(found, frequency) for frequency in chunk.tolist()], dim=-1)
-        scores = projection.scores(change @ waves)
-        for k in range(len(chunk)):
-            own = slice(2 * k, 2 * k + 2)
-            score = scores.score[own]
-            inverse = torch.linalg.pinv(scores.information[own, own], hermitian=True)
-            gains.append(float(score @ inverse @ score))
-    return float(frequencies[max(range(len(gains)), key=gains.__getitem__)])
-
-
-def _frequencies(found: Responses) -> Tensor:
-    step = 0.5 / float(found.time.max() - found.time.min())
-    return step * torch.arange(1, FREQUENCIES + 1, dtype=torch.float64)
-
-
-def _wave(found: Responses, frequency: float) -> Tensor:
-    """Returns sine and cosine at the pulses, ``(S, pulses, 2)``."""
-    angle = 2.0 * torch.pi * frequency * found.time
-    return torch.stack((angle.sin(), angle.cos()), dim=-1)
-
-
 def latent_force(projection: Projection, found: Responses) -> list[LatentForce]:
     """Estimates the missing force at every joint, with the initial states integrated out.
 
@@ -271,36 +177,3 @@ def latent_force(projection: Projection, found: Responses) -> list[LatentForce]:
         error = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
         result.append(LatentForce(port, found.units[port], force, error))
     return result
-
-
-def _dictionary(
-    channels: Mapping[str, Tensor], time: Tensor, angles: frozenset[str]
-) -> dict[str, Tensor]:
-    """Returns the laws' values at the pulses, each of unit spread."""
-    values: dict[str, Tensor] = {"1": torch.ones_like(time), "t": time}
-    unit = {name: x / x.square().mean().sqrt().clamp_min(1e-12) for name, x in channels.items()}
-    for name, x in unit.items():
-        values[name] = x
-        values[f"{name}²"] = x.square()
-        values[f"{name}³"] = x**3
-        values[f"{name}|{name}|"] = x * x.abs()
-        values[f"|{name}|"] = x.abs()
-        values[f"sign {name}"] = torch.tanh(x / SIGN_WIDTH)
-        values[f"t·{name}"] = time * x
-        if name in angles:
-            for order in (1, 2, 3):
-                values[f"sin {order} {name}"] = torch.sin(order * channels[name])
-                values[f"cos {order} {name}"] = torch.cos(order * channels[name])
-    names = list(unit)
-    for i, one in enumerate(names):
-        for other in names[i + 1 :]:
-            values[f"{one}·{other}"] = unit[one] * unit[other]
-            values[f"{one}²·{other}"] = unit[one].square() * unit[other]
-            values[f"{one}·{other}²"] = unit[one] * unit[other].square()
-            values[f"|{one}|·sign {other}"] = unit[one].abs() * torch.tanh(
-                unit[other] / SIGN_WIDTH
-            )
-            values[f"|{other}|·sign {one}"] = unit[other].abs() * torch.tanh(
-                unit[one] / SIGN_WIDTH
-            )
-    return {k: v / v.square().mean().sqrt().clamp_min(1e-12) for k, v in values.items()}

@@ -14,13 +14,9 @@ from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.alarm import Alarm, sound_alarm
 from npdr_ppl.workflows.discovery.equivalents import irreducible
 from npdr_ppl.workflows.discovery.evidence import closest, weigh
+from npdr_ppl.workflows.discovery.generic_laws import FREQUENCIES, strongest_frequency
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
-from npdr_ppl.workflows.discovery.latent_force import (
-    FREQUENCIES,
-    Responses,
-    responses,
-    strongest_frequency,
-)
+from npdr_ppl.workflows.discovery.latent_force import Responses, responses
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.screening import Screened, screen
@@ -180,10 +176,10 @@ class Searcher:
         found = responses(hypothesis)
         variants = self._variants(projection, hypothesis, self._candidates(hypothesis), found)
         ranking = screen(projection, variants)
-        angles = frozenset(c.name for c in hypothesis.simulator.sensors if c.unit == "rad")
+        sensors = hypothesis.simulator.sensors
         plain = [variant for variant in variants if not variant.is_hinted]
         looks = len(hypothesis.effects)
-        alarm = sound_alarm(projection, plain, ranking, found, angles, self.options, looks)
+        alarm = sound_alarm(projection, plain, ranking, found, sensors, self.options, looks)
         best = ", ".join(s.name for s in ranking[:3]) or "none"
         self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
         return Round(hypothesis, alarm, ranking, found)

@@ -1,0 +1,178 @@
+"""Laws that no one would call physics, to notice what the catalogue has no word for.
+
+Polynomials, signs and products of whatever is recorded, waves in time, and ripples: waves in a
+position, by themselves or as a factor of a command or of the direction of motion. Each is a force
+at a joint, and what it would change is a weighted sum of the responses to pulses.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.language.channels import Channel
+from npdr_ppl.workflows.discovery.latent_force import Responses
+from npdr_ppl.workflows.discovery.projection import Projection
+
+__all__ = [
+    "FREQUENCIES",
+    "GenericLaw",
+    "generic_laws",
+    "ripple_laws",
+    "strongest_frequency",
+    "wave_laws",
+]
+
+SIGN_WIDTH = 0.1
+"""Over which part of a channel's spread a sign changes."""
+
+FREQUENCIES = 120
+"""Frequencies tried of a wave in time, spaced by half the resolution of the longest rollout."""
+
+RIPPLES = 40
+"""Wave numbers tried of a ripple, spaced by half the resolution of a position's range."""
+
+
+@dataclass(frozen=True)
+class GenericLaw:
+    """A law that is no one's: a function of what is recorded, as a force at a port.
+
+    Attributes:
+        name: What it is, e.g. ``"arm: arm_velocity²"``.
+        change: What it would change in the whitened readings, ``(S, N, k)``.
+    """
+
+    name: str
+    change: Tensor
+
+
+def generic_laws(found: Responses, sensors: Sequence[Channel] = ()) -> list[GenericLaw]:
+    """Returns what a dictionary of laws would change.
+
+    Args:
+        found: The responses to pulses.
+        sensors: The simulator's sensors; waves are tried of angles.
+    """
+    values = _dictionary(found, {sensor.name for sensor in sensors if sensor.unit == "rad"})
+    return [
+        GenericLaw(f"{port}: {name}", (change * value[:, None, :]).sum(-1, keepdim=True))
+        for port, change in found.by_port.items()
+        for name, value in values.items()
+    ]
+
+
+def wave_laws(found: Responses) -> dict[str, list[GenericLaw]]:
+    """Returns what waves in time of many frequencies would change, by port.
+
+    Args:
+        found: The responses to pulses.
+    """
+    return {
+        port: [
+            GenericLaw(f"{port}: wave of {frequency:.3g} Hz", change @ _wave(found, frequency))
+            for frequency in _frequencies(found).tolist()
+        ]
+        for port, change in found.by_port.items()
+    }
+
+
+def ripple_laws(found: Responses, sensors: Sequence[Channel]) -> list[GenericLaw]:
+    """Returns what ripples over every position would change at every port.
+
+    Args:
+        found: The responses to pulses.
+        sensors: The simulator's sensors, which say what is a position and what its velocity.
+    """
+    recorded = [sensor for sensor in sensors if sensor.name in found.channels]
+    velocities = {sensor.rate_of: sensor.name for sensor in recorded if sensor.rate_of}
+    commands = [name for name in found.channels if name not in {s.name for s in recorded}]
+    laws = []
+    for position in (s for s in recorded if not s.rate_of and not s.unit.endswith("/s")):
+        x = found.channels[position.name]
+        extent = float(x.max() - x.min())
+        if extent <= 0.0:
+            continue
+        factors = {"": torch.ones_like(x)}
+        factors |= {f"{name} times ": found.channels[name] for name in commands}
+        if position.name in velocities:
+            direction = _sign(found.channels[velocities[position.name]])
+            factors["direction times "] = direction
+        for j in range(1, RIPPLES + 1):
+            phase = (j * math.pi / extent) * (x - x.mean())
+            ripple = torch.stack((phase.sin(), phase.cos()), dim=-1)
+            name = f"ripple of {j * math.pi / extent:.3g} 1/{position.unit} in {position.name}"
+            laws += [
+                GenericLaw(f"{port}: {text}{name}", change @ (factor[..., None] * ripple))
+                for port, change in found.by_port.items()
+                for text, factor in factors.items()
+            ]
+    return laws
+
+
+def strongest_frequency(projection: Projection, found: Responses, port: str) -> float:
+    """Returns the frequency in Hz of the wave in time that explains most as a force at a port.
+
+    Args:
+        projection: The fitted model.
+        found: The responses to pulses.
+        port: The port.
+    """
+    frequencies = _frequencies(found)
+    change = found.by_port[port]
+    gains = []
+    for chunk in frequencies.split(20):
+        waves = torch.cat([_wave(found, frequency) for frequency in chunk.tolist()], dim=-1)
+        scores = projection.scores(change @ waves)
+        for k in range(len(chunk)):
+            own = slice(2 * k, 2 * k + 2)
+            score = scores.score[own]
+            inverse = torch.linalg.pinv(scores.information[own, own], hermitian=True)
+            gains.append(float(score @ inverse @ score))
+    return float(frequencies[max(range(len(gains)), key=gains.__getitem__)])
+
+
+def _frequencies(found: Responses) -> Tensor:
+    step = 0.5 / float(found.time.max() - found.time.min())
+    return step * torch.arange(1, FREQUENCIES + 1, dtype=torch.float64)
+
+
+def _wave(found: Responses, frequency: float) -> Tensor:
+    """Returns sine and cosine at the pulses, ``(S, pulses, 2)``."""
+    angle = 2.0 * torch.pi * frequency * found.time
+    return torch.stack((angle.sin(), angle.cos()), dim=-1)
+
+
+def _sign(x: Tensor) -> Tensor:
+    """Returns the sign of a channel, which changes over a part of its spread."""
+    return torch.tanh(x / x.square().mean().sqrt().clamp_min(1e-12) / SIGN_WIDTH)
+
+
+def _dictionary(found: Responses, angles: set[str]) -> dict[str, Tensor]:
+    """Returns the laws' values at the pulses, each of unit spread."""
+    channels, time = found.channels, found.time
+    values: dict[str, Tensor] = {"1": torch.ones_like(time), "t": time}
+    unit = {name: x / x.square().mean().sqrt().clamp_min(1e-12) for name, x in channels.items()}
+    signs = {name: _sign(x) for name, x in channels.items()}
+    for name, x in unit.items():
+        values[name] = x
+        values[f"{name}²"] = x.square()
+        values[f"{name}³"] = x**3
+        values[f"{name}|{name}|"] = x * x.abs()
+        values[f"|{name}|"] = x.abs()
+        values[f"sign {name}"] = signs[name]
+        values[f"t·{name}"] = time * x
+        if name in angles:
+            for order in (1, 2, 3):
+                values[f"sin {order} {name}"] = torch.sin(order * channels[name])
+                values[f"cos {order} {name}"] = torch.cos(order * channels[name])
+    names = list(unit)
+    for i, one in enumerate(names):
+        for other in names[i + 1 :]:
+            values[f"{one}·{other}"] = unit[one] * unit[other]
+            values[f"{one}²·{other}"] = unit[one].square() * unit[other]
+            values[f"{one}·{other}²"] = unit[one] * unit[other].square()
+            values[f"|{one}|·sign {other}"] = unit[one].abs() * signs[other]
+            values[f"|{other}|·sign {one}"] = unit[other].abs() * signs[one]
+    return {k: v / v.square().mean().sqrt().clamp_min(1e-12) for k, v in values.items()}
