@@ -47,7 +47,8 @@ stamps rounded to milliseconds at 30 Hz deviate by 0.03."""
 MAX_RATE_DIFFERENCE = 0.01
 """Relative difference between the time steps of two rollouts that a clock may explain."""
 
-DEGREES_PER_RADIAN = 180 / math.pi
+OTHER_UNITS = {"rad": ("degrees", 180 / math.pi), "m": ("millimetres", 1000.0)}
+"""What people record instead of SI units, and how many of them one SI unit has."""
 
 _FORBIDDEN_IN_NAMES = re.compile(r"[,;\"'/\\]")
 _MAX_NAME_LENGTH = 100
@@ -260,11 +261,11 @@ def check_channels(
 
 
 def check_units(rollouts: "Rollouts", channels: Sequence[Channel]) -> None:
-    """Looks for columns in degrees where radians are declared, and the reverse.
+    """Looks for columns in other units than declared, degrees or millimetres, or of wrong sign.
 
-    Two signs are read: a range that leaves the declared bounds by about 57.3 times, and a
-    position whose derivative is about 57.3 or 1/57.3 times the reading of its own rate. Declared
-    units are compared where the data carry units.
+    Two things tell: a range that leaves the declared bounds by the factor between the units, and
+    a position whose derivative is so many times the reading of its own rate. Declared units are
+    compared where the data carry units.
 
     Args:
         rollouts: The data.
@@ -284,7 +285,8 @@ def check_units(rollouts: "Rollouts", channels: Sequence[Channel]) -> None:
             _check_range(rollouts, channel)
     for channel in channels:
         if channel.name in rollouts.channel_names and channel.rate_of in rollouts.channel_names:
-            _check_rate(rollouts, channel.name, channel.rate_of)
+            unit = channel.unit.removesuffix("/s")
+            _check_rate(rollouts, channel.name, channel.rate_of, unit)
 
 
 def _column(rollouts: "Rollouts", name: str) -> list[NDArray[np.float64]]:
@@ -300,15 +302,16 @@ def _check_range(rollouts: "Rollouts", channel: Channel) -> None:
     bound = max(abs(channel.lower), abs(channel.upper))
     # A few per cent of overshoot is a sensor's business, several times the bound is not.
     if math.isfinite(bound) and largest > 3 * bound:
-        is_angle = channel.unit.startswith("rad") and largest <= 1.1 * bound * DEGREES_PER_RADIAN
-        reason = "are these degrees?" if is_angle else "check the unit."
+        other, factor = OTHER_UNITS.get(channel.unit.removesuffix("/s"), ("", 0.0))
+        is_other = largest <= 1.1 * bound * factor
+        reason = f"are these {other}?" if is_other else "check the unit."
         raise DataError(
             f"{channel.name} reaches {largest:.4g} {channel.unit}, far beyond its bound of "
             f"{bound:.4g} {channel.unit}; {reason}"
         )
 
 
-def _check_rate(rollouts: "Rollouts", rate: str, position: str) -> None:
+def _check_rate(rollouts: "Rollouts", rate: str, position: str, unit: str) -> None:
     """Compares how far the position went with the integral of its rate.
 
     Net displacements over a window are insensitive to quantisation and to a driver's low-pass,
@@ -327,11 +330,14 @@ def _check_rate(rollouts: "Rollouts", rate: str, position: str) -> None:
     # Without agreement in shape the ratio says nothing about units.
     if size == 0 or abs(float(x @ y)) < 0.7 * size:
         return
+    if float(x @ y) < 0:
+        raise DataError(f"{position} falls where {rate} says that it rises; one sign is wrong.")
     ratio = float(np.linalg.norm(y) / np.linalg.norm(x))
-    for name, factor in (("degrees", DEGREES_PER_RADIAN), ("radians", 1 / DEGREES_PER_RADIAN)):
-        if 0.7 < ratio / factor < 1.4:
-            other = "radians" if name == "degrees" else "degrees"
+    si = {"rad": "radians", "m": "metres"}.get(unit, "")
+    other, factor = OTHER_UNITS.get(unit, ("", 0.0))
+    for one, two, times in ((other, si, factor), (si, other, 1 / factor if factor else 0.0)):
+        if 0.7 * times < ratio < 1.4 * times:
             raise DataError(
                 f"the derivative of {position} is {ratio:.3g} times {rate}: {position} seems to "
-                f"be in {name} and {rate} in {other} per second."
+                f"be in {one} and {rate} in {two} per second."
             )

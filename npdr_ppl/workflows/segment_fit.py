@@ -112,7 +112,8 @@ class SegmentModel:
         prior: The model's prior.
         inputs: The segments.
         sensor_names: The channels that the simulator reports.
-        channel_names: The C of them that were measured.
+        measured: The C of them that were measured, as the simulator declares them.
+        channel_names: Their names.
         observed: What was measured, ``(S, K, C)``.
     """
 
@@ -128,7 +129,8 @@ class SegmentModel:
         if not isinstance(box, SimulatorBlackBox):
             raise DataError(f"Site {self._site!r} is a plain function and has no trajectory.")
         self.sensor_names = names = tuple(sensor.name for sensor in box.simulator.sensors)
-        self.channel_names = tuple(name for name in names if name in rollouts.channel_names)
+        self.measured = tuple(s for s in box.simulator.sensors if s.name in rollouts.channel_names)
+        self.channel_names = tuple(sensor.name for sensor in self.measured)
         self._columns = [names.index(name) for name in self.channel_names]
         self.observed = rollouts.observation(self.inputs, channels=self.channel_names)
         self._offsets = _uncertain_components(self.inputs)

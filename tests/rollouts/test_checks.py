@@ -74,6 +74,16 @@ def test_units_are_found_without_bounds(angle_factor, rate_factor, sentence):
     swing(DEGREES, DEGREES).check(unbounded, ACTIONS)  # nothing contradicts itself
 
 
+def test_millimetres_and_turned_signs_are_found():
+    metres = (Channel("angle", "m"), Channel("rate", "m/s", rate_of="angle"))
+    with pytest.raises(DataError, match="angle seems to be in millimetres and rate in metres"):
+        swing(1000.0).check(metres, ACTIONS)
+    with pytest.raises(DataError, match="angle falls where rate says that it rises"):
+        swing(-1.0).check(metres, ACTIONS)
+    with pytest.raises(DataError, match="angle reaches .* are these millimetres"):
+        swing(1000.0, 1000.0).check((Channel("angle", "m", -2.0, 2.0),), ACTIONS, allow_extra=True)
+
+
 def test_extra_columns():
     rollouts = swing()
     with pytest.raises(DataError, match="the column rate is not expected"):

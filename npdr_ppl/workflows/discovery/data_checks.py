@@ -6,28 +6,32 @@ that can be tried: the recording is changed back and the model fitted again. A r
 most of the misfit disappear names the problem.
 """
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from npdr_ppl.errors import NpdrError
+from npdr_ppl.errors import DataError, NpdrError
+from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.checks import OTHER_UNITS, check_units
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, fit_hypothesis
 
-__all__ = ["data_problems"]
+__all__ = ["data_problems", "recording_problems"]
 
-GROSS = 0.3
+GROSS = 0.1
 """Residual in units of what a window's readings change by, above which remedies are tried."""
 
 CURE = 0.5
 """By which factor a remedy has to reduce the residual to name the problem."""
 
-SHIFTS = (-8, -4, -2, -1)
-"""Steps by which commands may be stamped too late: no delay of a device does that."""
+SHIFTS = (1, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20)
+"""Steps by which commands may be stamped too late or too early."""
+
+LONGEST_DELAY = 0.04
+"""Seconds that a device may take to answer a command; commands stamped too early look the same."""
 
 SPIKE = 12.0
 """Jumps, in standard deviations of a channel's second differences, that tell lost samples."""
@@ -50,10 +54,24 @@ def data_problems(
         rollouts: The recording.
         options: Its segments.
     """
-    return [
-        *_lost_samples(rollouts, hypothesis.segments.channel_names),
-        *_wrong_readings(hypothesis, rollouts, options),
-    ]
+    return recording_problems(hypothesis.segments.measured, rollouts) or _wrong_readings(
+        hypothesis, rollouts, options
+    )
+
+
+def recording_problems(sensors: Sequence[Channel], rollouts: Rollouts) -> list[str]:
+    """Returns problems that show without simulating, a sentence each.
+
+    Args:
+        sensors: What the model says of the recorded channels.
+        rollouts: The recording.
+    """
+    problems = _lost_samples(rollouts, [sensor.name for sensor in sensors])
+    try:
+        check_units(rollouts, sensors)
+    except DataError as error:
+        problems.append(str(error))
+    return problems
 
 
 def _wrong_readings(
@@ -89,29 +107,37 @@ def _relative_misfit(hypothesis: Hypothesis) -> float:
     return float(ratio.clamp_max(10.0).log().mean().exp())
 
 
-def _remedies(hypothesis: Hypothesis, rollouts: Rollouts) -> list[tuple[str, Rollouts]]:
-    units = {sensor.name: sensor.unit for sensor in hypothesis.simulator.sensors}
-    result = []
-    for name in hypothesis.segments.channel_names:
-        result.append((f"The sign of {name} looks turned round.", _scaled(rollouts, name, -1.0)))
-        if units[name].startswith("rad"):
-            degrees = math.pi / 180.0
-            text = f"{name} looks recorded in degrees, not in {units[name]}."
-            result.append((text, _scaled(rollouts, name, degrees)))
+def _remedies(hypothesis: Hypothesis, rollouts: Rollouts) -> Iterator[tuple[str, Rollouts]]:
+    sensors = hypothesis.segments.measured
+    units = {sensor.name: sensor.unit.removesuffix("/s") for sensor in sensors}
+    pairs = [[s.rate_of, s.name] for s in sensors if s.rate_of in units]
+    for group in [[name] for name in units] + pairs:
+        text = f"The sign of {' and '.join(group)} looks turned round."
+        yield text, _scaled(rollouts, group, -1.0)
+    for si, (other, factor) in OTHER_UNITS.items():
+        chosen = [name for name, unit in units.items() if unit == si]
+        for group in [[name] for name in chosen] + ([chosen] if len(chosen) > 1 else []):
+            looks = "look" if len(group) > 1 else "looks"
+            sentence = f"{' and '.join(group)} {looks} recorded in {other}, not in SI units."
+            yield sentence, _scaled(rollouts, group, 1.0 / factor)
     for k, name in enumerate(rollouts.action_names):
         actions = [_column(a, k, lambda x: -x) for a in rollouts.actions]
         text = f"The sign of {name} looks turned round."
-        result.append((text, replace(rollouts, actions=tuple(actions))))
-    for shift in SHIFTS:
-        text = f"The commands look stamped {-shift} steps too late."
-        result.append((text, _earlier(rollouts, -shift)))
-    return result
+        yield text, replace(rollouts, actions=tuple(actions))
+    for steps in SHIFTS:
+        if 4 * steps < min(rollouts.lengths):
+            yield (
+                f"The commands look stamped about {steps} steps too late.",
+                _shifted(rollouts, steps),
+            )
+            if steps * rollouts.time_step > LONGEST_DELAY:
+                text = f"The commands look stamped about {steps} steps too early."
+                yield text, _shifted(rollouts, -steps)
 
 
-def _scaled(rollouts: Rollouts, channel: str, factor: float) -> Rollouts:
-    k = rollouts.channel_names.index(channel)
-    readings = [_column(r, k, lambda x: factor * x) for r in rollouts.readings]
-    return replace(rollouts, readings=tuple(readings))
+def _scaled(rollouts: Rollouts, channels: Sequence[str], factor: float) -> Rollouts:
+    factors = np.where([name in channels for name in rollouts.channel_names], factor, 1.0)
+    return replace(rollouts, readings=tuple(values * factors for values in rollouts.readings))
 
 
 def _column(values: Array, k: int, change: Callable[[Array], Array]) -> Array:
@@ -120,13 +146,19 @@ def _column(values: Array, k: int, change: Callable[[Array], Array]) -> Array:
     return result
 
 
-def _earlier(rollouts: Rollouts, steps: int) -> Rollouts:
-    """Returns the recording with every command given some steps earlier."""
-    actions = [np.concatenate((a[steps:], np.repeat(a[-1:], steps, 0))) for a in rollouts.actions]
-    return replace(rollouts, actions=tuple(actions))
+def _shifted(rollouts: Rollouts, steps: int) -> Rollouts:
+    """Returns the recording with every command given some steps earlier, or later if negative."""
+    size = abs(steps)
+
+    def moved(actions: Array) -> Array:
+        if steps > 0:
+            return np.concatenate((actions[size:], np.repeat(actions[-1:], size, 0)))
+        return np.concatenate((np.repeat(actions[:1], size, 0), actions[:-size]))
+
+    return replace(rollouts, actions=tuple(moved(actions) for actions in rollouts.actions))
 
 
-def _lost_samples(rollouts: Rollouts, channels: tuple[str, ...]) -> list[str]:
+def _lost_samples(rollouts: Rollouts, channels: Sequence[str]) -> list[str]:
     """Finds moments at which most channels jump at once and go on as if nothing had happened."""
     columns = [rollouts.channel_names.index(name) for name in channels]
     problems = []

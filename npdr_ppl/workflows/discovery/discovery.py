@@ -12,7 +12,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.credible import Estimate, estimates
-from npdr_ppl.workflows.discovery.data_checks import data_problems
+from npdr_ppl.workflows.discovery.data_checks import data_problems, recording_problems
 from npdr_ppl.workflows.discovery.equivalents import equivalents
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.next_experiment import NextExperiment, next_experiment
@@ -23,6 +23,7 @@ from npdr_ppl.workflows.discovery.residual_map import Spot, worst_windows
 from npdr_ppl.workflows.discovery.result import Discovery, Finding, Verdict
 from npdr_ppl.workflows.discovery.search import Added, Round, Search, Searcher, explained
 from npdr_ppl.workflows.discovery.separation import separation_matrix
+from npdr_ppl.workflows.segment_fit import SegmentModel
 
 __all__ = ["Investigation", "discover"]
 
@@ -82,7 +83,14 @@ class Investigation:
     def start(self) -> Hypothesis:
         """The model as it is, fitted."""
         with _timed(self.seconds, "fit"):
-            fitted = self._searcher.fit_base()
+            try:
+                fitted = self._searcher.fit_base()
+            except DataError as error:
+                measured = SegmentModel(self.model, self.rollouts, self._binding).measured
+                problems = recording_problems(measured, self.rollouts)
+                if not problems:
+                    raise
+                raise DataError(f"{error} {problems[0]}") from error
         for effect in self.options.effects or ():
             # Screening leaves out what the simulator cannot have; who asks by name is told.
             fitted.simulator.with_effects(effect)

@@ -93,7 +93,7 @@ def test_an_effect_outside_the_catalogue_is_unknown():
     assert found.remainder.fired
 
 
-@pytest.mark.parametrize("kind", ["one_in_degrees", "flipped_action"])
+@pytest.mark.parametrize("kind", ["degrees", "one_in_degrees", "misaligned"])
 def test_bad_data_come_before_physics(kind):
     _, found = discover("pendulum", "bad_data", (("data", kind),))
     assert found.problems
