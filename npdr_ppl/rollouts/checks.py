@@ -240,7 +240,8 @@ def check_channels(
         if action.name in recorded and action.name not in rollouts.action_names:
             raise DataError(
                 f"{action.name} is an action, but its cells in the last row of each rollout are "
-                f"not empty; empty them or read the file with actions=[{action.name!r}]."
+                "not empty; empty them if that row is the reading after the last step, otherwise "
+                f"append such a row (or, in Python, read with actions=[{action.name!r}])."
             )
     missing = [a.name for a in actions if a.name not in rollouts.action_names]
     missing += [c.name for c in channels if c.name not in recorded and c.rate_of not in recorded]
@@ -254,8 +255,8 @@ def check_channels(
         extra += [name for name in rollouts.channel_names if name not in expected]
     if extra:
         raise DataError(
-            f"the column {', '.join(extra)} is not expected; the model knows "
-            f"{', '.join(c.name for c in (*channels, *actions))}."
+            f"the column {', '.join(extra)} is not expected; remove it, or rename it to what it "
+            f"is: the model knows {', '.join(c.name for c in (*channels, *actions))}."
         )
 
 

@@ -1,0 +1,92 @@
+"""What newcomers get wrong in a recording is answered with one sentence that says what to do."""
+
+import math
+import sys
+
+import numpy as np
+import pytest
+
+from npdr_ppl.cli.main import main
+
+HEADER = "rollout,time,angle,velocity,torque"
+
+
+def rows():
+    """Returns the cells of a pendulum's recording; the last row's torque is empty."""
+    time = 0.02 * np.arange(101)
+    angle = 0.3 * np.sin(2 * math.pi * time)
+    velocity = 0.6 * math.pi * np.cos(2 * math.pi * time)
+    torque = [f"{value:.4f}" for value in np.sin(2 * math.pi * time[:-1])] + [""]
+    cells = zip(time, angle, velocity, torque, strict=True)
+    return [["0", f"{t:.2f}", f"{a:.5f}", f"{v:.5f}", u] for t, a, v, u in cells]
+
+
+def column(index, change):
+    """Returns a mistake that changes a column's cells."""
+
+    def mistake(header, cells):
+        return header, [[*r[:index], change(r[index]), *r[index + 1 :]] for r in cells]
+
+    return mistake
+
+
+def cell(line, index, text):
+    def mistake(header, cells):
+        cells[line][index] = text
+        return header, cells
+
+    return mistake
+
+
+def renamed(old, new):
+    return lambda header, cells: (header.replace(old, new), cells)
+
+
+def degrees(text):
+    return f"{math.degrees(float(text)):.4f}"
+
+
+MISTAKES = {
+    "wrong names": (renamed("angle,velocity", "q,dq"), "the column angle, velocity is missing; the data have q, dq, torque"),
+    "wrong name of time": (renamed("time", "t"), "there is no column time; the header is"),
+    "wrong name of an action": (renamed("torque", "tau"), "the column torque is missing; the data have angle, velocity, tau"),
+    "milliseconds": (column(1, lambda t: f"{1000 * float(t):.0f}"), "is it in milliseconds?"),
+    "no last row": (lambda header, cells: (header, cells[:-1]), "otherwise append such a row"),
+    "a full last row": (cell(-1, 4, "0.0"), "empty them if that row is the reading after the last step"),
+    "NaN": (cell(50, 2, "NaN"), "angle is 'NaN' in line 52, which is not a finite number. Interpolate single missing readings"),  # noqa: E501
+    "an empty cell": (cell(50, 2, ""), "angle is empty in line 52"),
+    "irregular time": (cell(50, 1, "1.007"), "resample the data to constant sampling"),
+    "degrees": (column(2, degrees), "angle seems to be in degrees"),
+    "semicolons": (
+        lambda header, cells: (header.replace(",", ";"), [[";".join(r)] for r in cells]),
+        "cells are separated by semicolons, but commas are needed",
+    ),
+    "one column more": (
+        lambda header, cells: (header + ",current", [[*r, "1.0" if r[-1] else ""] for r in cells]),
+        "the column current is not expected; remove it",
+    ),
+}  # fmt: skip
+
+
+def answered(monkeypatch, capsys, *words):
+    """Runs the command line; returns its exit code and what it said on standard error."""
+    monkeypatch.setattr(sys, "argv", ["npdr", *map(str, words)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    return stop.value.code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_in_a_recording(monkeypatch, capsys, tmp_path, name):
+    mistake, sentence = MISTAKES[name]
+    header, cells = mistake(HEADER, rows())
+    data = tmp_path / "measured.csv"
+    data.write_text("\n".join([header, *map(",".join, cells)]) + "\n")
+    code, err = answered(
+        monkeypatch, capsys, "fit", "pendulum", "--data", data, "--out", tmp_path / "fit",
+        "--backend", "abc", "--rounds", 1, "--simulations", 10, "--segment-length", 25,
+    )  # fmt: skip
+    assert code == 2
+    assert sentence in err
+    assert err.startswith("npdr: ") and err.count("\n") == 1, err
+    assert not (tmp_path / "fit").exists()
