@@ -87,7 +87,12 @@ def compare(
     Example: npdr compare furuta --data measured.csv --backends "snpe-c, maf = snpe-c(flow=maf)"
     --segment-length 200 --holdout 3,4 --out comparison
     """
-    from npdr_ppl.cli.resolve import resolve_effects, resolve_model, resolve_rollouts
+    from npdr_ppl.cli.resolve import (
+        resolve_device,
+        resolve_effects,
+        resolve_model,
+        resolve_rollouts,
+    )
     from npdr_ppl.cli.show import show_comparison
     from npdr_ppl.plots.comparison_figures import write_comparison_figures
     from npdr_ppl.workflows.binding import BindingOptions
@@ -95,6 +100,7 @@ def compare(
     from npdr_ppl.workflows.compare import compare as run_compare
     from npdr_ppl.workflows.progress import reporter
 
+    device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
     named = candidates(split_candidates(backends))
     train, test = resolve_rollouts(data, holdout)

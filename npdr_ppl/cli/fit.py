@@ -105,13 +105,19 @@ def fit(
 
     Example: npdr fit furuta --data measured.csv --segment-length 200 --holdout 3,4 --out fit
     """
-    from npdr_ppl.cli.resolve import resolve_effects, resolve_model, resolve_rollouts
+    from npdr_ppl.cli.resolve import (
+        resolve_device,
+        resolve_effects,
+        resolve_model,
+        resolve_rollouts,
+    )
     from npdr_ppl.cli.show import show_fit
     from npdr_ppl.plots.fit_figures import write_fit_figures
     from npdr_ppl.workflows.binding import BindingOptions
     from npdr_ppl.workflows.fit import fit as run_fit
     from npdr_ppl.workflows.progress import reporter
 
+    device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_rollouts(data, holdout)
     with (

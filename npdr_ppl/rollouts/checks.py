@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -70,7 +71,8 @@ def named(path: str | PathLike[str]) -> Iterator[None]:
     try:
         yield
     except DataError as error:
-        name = Path(path).name
+        # The folder "." has no name.
+        name = Path(path).name or str(path)
         raise DataError(f"{name if name.isprintable() else ascii(name)}: {error}") from None
 
 
@@ -87,7 +89,9 @@ def check_file(path: str | PathLike[str]) -> Path:
             is_file, is_directory = path.is_file(), path.is_dir()
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else None
-            raise DataError(f"cannot be opened ({reason or 'not a path'}).") from None
+            raise DataError(
+                f"cannot be opened ({reason or 'not a path'}).{_neighbour(path)}"
+            ) from None
         if is_directory:
             raise DataError("is a directory, but a file is needed.")
         if not is_file:
@@ -100,6 +104,16 @@ def check_file(path: str | PathLike[str]) -> Path:
                 f"{MAX_FILE_BYTES / 2**30:.0f} GiB that are read."
             )
     return path
+
+
+def _neighbour(path: Path) -> str:
+    """Returns a question for a file of nearly the same name, if there is one."""
+    try:
+        beside = [other.name for other in path.parent.iterdir()]
+    except (OSError, ValueError):
+        return ""
+    close = get_close_matches(path.name, beside, n=1)
+    return f" Did you mean {path.with_name(close[0])}?" if close else ""
 
 
 def check_names(names: Sequence[str], kind: str) -> tuple[str, ...]:

@@ -47,13 +47,13 @@ def degrees(text):
 
 
 MISTAKES = {
-    "wrong names": (renamed("angle,velocity", "q,dq"), "the column angle, velocity is missing; the data have q, dq, torque"),
+    "wrong names": (renamed("angle,velocity", "q,dq"), "the column angle, velocity is missing; the data have q"),
     "wrong name of time": (renamed("time", "t"), "there is no column time; the header is"),
-    "wrong name of an action": (renamed("torque", "tau"), "the column torque is missing; the data have angle, velocity, tau"),
+    "wrong name of an action": (renamed("torque", "tau"), "the column torque is missing"),
     "milliseconds": (column(1, lambda t: f"{1000 * float(t):.0f}"), "is it in milliseconds?"),
     "no last row": (lambda header, cells: (header, cells[:-1]), "otherwise append such a row"),
-    "a full last row": (cell(-1, 4, "0.0"), "empty them if that row is the reading after the last step"),
-    "NaN": (cell(50, 2, "NaN"), "angle is 'NaN' in line 52, which is not a finite number. Interpolate single missing readings"),  # noqa: E501
+    "a full last row": (cell(-1, 4, "0.0"), "empty them if that row is the"),
+    "NaN": (cell(50, 2, "NaN"), "not a finite number. Interpolate single missing"),
     "an empty cell": (cell(50, 2, ""), "angle is empty in line 52"),
     "irregular time": (cell(50, 1, "1.007"), "resample the data to constant sampling"),
     "degrees": (column(2, degrees), "angle seems to be in degrees"),
@@ -90,3 +90,35 @@ def test_a_mistake_in_a_recording(monkeypatch, capsys, tmp_path, name):
     assert sentence in err
     assert err.startswith("npdr: ") and err.count("\n") == 1, err
     assert not (tmp_path / "fit").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["mine.py"], "add the name of the model in it, as in mine.py:model."),
+        (["mine:model"], "did you mean mine.py:model?"),
+        (["mine.py:modle"], "Did you mean mine.py:model?"),
+        (["mne.py:model"], "mne.py does not exist. Did you mean mine.py:model?"),
+        (["arm.xml"], "see docs/bring_your_simulator.md."),
+        (["pendulum", "--effect", "coulomb_friction"], "as in JOINT.coulomb_friction."),
+        (["pendulum", "--effect", "hing.coulomb_friction"], "did you mean 'hinge'?"),
+        (["pendulum", "--embedding", "bayesim"], "did you mean 'bayessim'?"),
+        (["pendulum", "--holdout", "7"], "has 1, counted from 0, so the last is 0."),
+        (["pendulum", "--holdout", "0"], "leaves no rollouts to fit"),
+        (["pendulum", "--data", "measurd.csv"], "Did you mean measured.csv?"),
+        (["pendulum", "--data", "."], ".: is a directory, but a file is needed."),
+        (["pendulum", "--device", "cuda:99"], "--device cuda:99 is not to be had"),
+    ],
+)
+def test_a_mistake_in_a_command(monkeypatch, capsys, tmp_path, words, sentence):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text("def model(inputs):\n    return inputs\n")
+    (tmp_path / "measured.csv").write_text("\n".join([HEADER, *map(",".join, rows())]) + "\n")
+    words = words if "--data" in words else [*words, "--data", "measured.csv"]
+    code, err = answered(
+        monkeypatch, capsys, "fit", *words, "--out", "fit", "--backend", "abc", "--rounds", 1,
+        "--simulations", 10, "--segment-length", 25,
+    )  # fmt: skip
+    assert code == 2
+    assert sentence in err
+    assert err.startswith("npdr: ") and err.count("\n") == 1, err
