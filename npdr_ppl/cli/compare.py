@@ -35,7 +35,8 @@ def compare(
     backends: Annotated[
         str,
         typer.Option(
-            help="Backends, e.g. 'snpe-c, small = snpe-c(flow=maf, members=1)'; see npdr backends.",
+            help="Backends, e.g. 'snpe-c, small = snpe-c(flow=maf, members=1)'; see "
+            "npdr backends.",
             autocompletion=complete_backends,
         ),
     ],

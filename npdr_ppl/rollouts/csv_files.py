@@ -26,8 +26,8 @@ NOT_A_NUMBER = frozenset({"nan", "na", "n/a", "null", "none"})
 """How programs write a reading that is missing."""
 
 GAP = (
-    " Interpolate single missing readings, cut the rollout in two at longer gaps; the actions of a "
-    "rollout's last row stay empty."
+    " Interpolate single missing readings, cut the rollout in two at longer gaps; the actions of "
+    "a rollout's last row stay empty."
 )
 """What to do about it."""
 

@@ -47,7 +47,7 @@ def degrees(text):
 
 
 MISTAKES = {
-    "wrong names": (renamed("angle,velocity", "q,dq"), "the column angle, velocity is missing; the data have q"),
+    "wrong names": (renamed("angle,velocity", "q,dq"), "the column angle, velocity is missing"),
     "wrong name of time": (renamed("time", "t"), "there is no column time; the header is"),
     "wrong name of an action": (renamed("torque", "tau"), "the column torque is missing"),
     "milliseconds": (column(1, lambda t: f"{1000 * float(t):.0f}"), "is it in milliseconds?"),
