@@ -102,7 +102,7 @@ class RunFolder:
         file = self.path / "run.json"
         if file.exists():
             present = read_json(file)
-            differing = [k for k, v in plain(description).items() if present.get(k) != v]
+            differing = [str(k) for k, v in plain(description).items() if present.get(k) != v]
             if differing:
                 words = dict.fromkeys(IN_WORDS.get(key, key) for key in differing)
                 raise BackendError(
