@@ -83,9 +83,11 @@ class Simulator(ABC):
         for effect in effects:
             port = self.port(effect.port)
             if port.kind not in effect.port_kinds:
+                suitable = [p.name for p in self.all_ports if p.kind in effect.port_kinds]
                 raise ModelError(
                     f"{effect.id} attaches to a port of kind {' or '.join(effect.port_kinds)}, "
-                    f"but {port.name!r} of {self.name} is of kind {port.kind}."
+                    f"but {port.name!r} of {self.name} is of kind {port.kind}; suitable are "
+                    f"{', '.join(suitable) or 'none of its ports'}."
                 )
             if not effect.suits(port):
                 raise ModelError(

@@ -122,3 +122,15 @@ def test_a_mistake_in_a_command(monkeypatch, capsys, tmp_path, words, sentence):
     assert code == 2
     assert sentence in err
     assert err.startswith("npdr: ") and err.count("\n") == 1, err
+
+
+def test_an_actuator_does_not_hide_the_force_port_of_its_joint():
+    from npdr_ppl.engines.mujoco import MujocoSimulator
+
+    # The actuator has the name that a joint's force port gets where the joint's own is taken.
+    rod = MujocoSimulator(
+        "<mujoco><worldbody><body><joint name='elbow'/><geom size='0.1' mass='1'/></body>"
+        "</worldbody><actuator><motor name='elbow_torque' joint='elbow'/></actuator></mujoco>"
+    )
+    assert rod.port("elbow_torque").kind == "action"
+    assert rod.port("elbow_torque_at_joint").kind == "force"
