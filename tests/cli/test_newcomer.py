@@ -124,13 +124,14 @@ def test_a_mistake_in_a_command(monkeypatch, capsys, tmp_path, words, sentence):
     assert err.startswith("npdr: ") and err.count("\n") == 1, err
 
 
-def test_an_actuator_does_not_hide_the_force_port_of_its_joint():
+def test_an_actuator_does_not_hide_the_force_port_of_its_joint(tmp_path):
     from npdr_ppl.engines.mujoco import MujocoSimulator
 
     # The actuator has the name that a joint's force port gets where the joint's own is taken.
-    rod = MujocoSimulator(
+    (tmp_path / "rod.xml").write_text(
         "<mujoco><worldbody><body><joint name='elbow'/><geom size='0.1' mass='1'/></body>"
         "</worldbody><actuator><motor name='elbow_torque' joint='elbow'/></actuator></mujoco>"
     )
+    rod = MujocoSimulator(tmp_path / "rod.xml")
     assert rod.port("elbow_torque").kind == "action"
     assert rod.port("elbow_torque_at_joint").kind == "force"
