@@ -66,7 +66,8 @@ def test_the_pages_program_runs(page):
 
 def test_lines_of_the_readme_are_short():
     for line in (ROOT / "README.md").read_text().splitlines():
-        assert len(line) <= 100, line
+        # A row of a table cannot be broken.
+        assert len(line) <= 100 or line.startswith("|"), line
 
 
 def test_every_page_is_in_the_navigation():

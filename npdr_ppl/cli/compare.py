@@ -7,6 +7,12 @@ import typer
 
 from npdr_ppl.cli.fit import InitialState, Noise, Precision
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
+from npdr_ppl.cli.names import (
+    complete_backends,
+    complete_effect,
+    complete_embedding,
+    complete_model,
+)
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -19,12 +25,19 @@ __all__ = ["compare"]
 
 
 def compare(
-    model: Annotated[str, typer.Argument(help="Zoo name, or path/to/file.py:function.")],
+    model: Annotated[
+        str,
+        typer.Argument(
+            help="Zoo name, or path/to/file.py:function.", autocompletion=complete_model
+        ),
+    ],
     data: Annotated[Path, typer.Option(help="Rollouts: CSV, Parquet, NPZ or NetCDF.")],
     backends: Annotated[
         str,
         typer.Option(
-            help="Backends, e.g. 'snpe-c, small = snpe-c(flow=maf, members=1)'; see npdr backends."
+            help="Backends, e.g. 'snpe-c, small = snpe-c(flow=maf, members=1)'; see "
+            "npdr backends.",
+            autocompletion=complete_backends,
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for results.")],
@@ -33,10 +46,17 @@ def compare(
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     holdout: Annotated[str, typer.Option(help="Rollouts to judge by, e.g. 3,4.")] = "",
     effect: Annotated[
-        list[str] | None, typer.Option(help="Effect to attach, port.effect; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            help="Effect to attach, port.effect; may be repeated.", autocompletion=complete_effect
+        ),
     ] = None,
     embedding: Annotated[
-        str, typer.Option(help="Trajectory features: bayessim, score, all/50, gru/10, ...")
+        str,
+        typer.Option(
+            help="Trajectory features: bayessim, score, all/50, gru/10, ...",
+            autocompletion=complete_embedding,
+        ),
     ] = "bayessim",
     segment_length: Annotated[
         int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")
@@ -68,7 +88,12 @@ def compare(
     Example: npdr compare furuta --data measured.csv --backends "snpe-c, maf = snpe-c(flow=maf)"
     --segment-length 200 --holdout 3,4 --out comparison
     """
-    from npdr_ppl.cli.resolve import resolve_effects, resolve_model, resolve_rollouts
+    from npdr_ppl.cli.resolve import (
+        resolve_device,
+        resolve_effects,
+        resolve_model,
+        resolve_rollouts,
+    )
     from npdr_ppl.cli.show import show_comparison
     from npdr_ppl.plots.comparison_figures import write_comparison_figures
     from npdr_ppl.workflows.binding import BindingOptions
@@ -76,6 +101,7 @@ def compare(
     from npdr_ppl.workflows.compare import compare as run_compare
     from npdr_ppl.workflows.progress import reporter
 
+    device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
     named = candidates(split_candidates(backends))
     train, test = resolve_rollouts(data, holdout)

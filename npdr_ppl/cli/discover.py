@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
+from npdr_ppl.cli.names import complete_effect, complete_model
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -29,7 +30,12 @@ class LastStage(StrEnum):
 
 
 def discover(
-    model: Annotated[str, typer.Argument(help="Zoo name, or path/to/file.py:function.")],
+    model: Annotated[
+        str,
+        typer.Argument(
+            help="Zoo name, or path/to/file.py:function.", autocompletion=complete_model
+        ),
+    ],
     data: Annotated[Path, typer.Option(help="Rollouts: CSV, Parquet, NPZ or NetCDF.")],
     out: Annotated[Path, typer.Option(help="Folder for results.")],
     holdout: Annotated[str, typer.Option(help="Rollouts to prove it on, e.g. 3,4.")] = "",
@@ -42,10 +48,17 @@ def discover(
     ] = 0,
     effect: Annotated[
         list[str] | None,
-        typer.Option(help="Effect that the model has already, port.effect; may be repeated."),
+        typer.Option(
+            help="Effect that the model has already, port.effect; may be repeated.",
+            autocompletion=complete_effect,
+        ),
     ] = None,
     effects: Annotated[
-        str, typer.Option(help="Effects to search, port.effect,port.effect; all if not given.")
+        str,
+        typer.Option(
+            help="Effects to search, port.effect,port.effect; all if not given.",
+            autocompletion=complete_effect,
+        ),
     ] = "",
     max_effects: Annotated[int, typer.Option(min=0, help="Greatest number to add.")] = 4,
     false_alarm_rate: Annotated[

@@ -7,6 +7,12 @@ from typing import Annotated
 import typer
 
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
+from npdr_ppl.cli.names import (
+    complete_backend,
+    complete_effect,
+    complete_embedding,
+    complete_model,
+)
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -41,19 +47,36 @@ class Noise(StrEnum):
 
 
 def fit(
-    model: Annotated[str, typer.Argument(help="Zoo name, or path/to/file.py:function.")],
+    model: Annotated[
+        str,
+        typer.Argument(
+            help="Zoo name, or path/to/file.py:function.", autocompletion=complete_model
+        ),
+    ],
     data: Annotated[Path, typer.Option(help="Rollouts: CSV, Parquet, NPZ or NetCDF.")],
     out: Annotated[Path, typer.Option(help="Folder for results.")],
-    backend: Annotated[str, typer.Option(help="Inference backend; see npdr backends.")] = "snpe-c",
+    backend: Annotated[
+        str,
+        typer.Option(
+            help="Inference backend; see npdr backends.", autocompletion=complete_backend
+        ),
+    ] = "snpe-c",
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of simulating and training.")] = 2,
     simulations: Annotated[int, typer.Option(min=10, help="Simulations per round.")] = 2_000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     holdout: Annotated[str, typer.Option(help="Rollouts to hold out, e.g. 3,4.")] = "",
     effect: Annotated[
-        list[str] | None, typer.Option(help="Effect to attach, port.effect; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            help="Effect to attach, port.effect; may be repeated.", autocompletion=complete_effect
+        ),
     ] = None,
     embedding: Annotated[
-        str, typer.Option(help="Trajectory features: bayessim, score, all/50, gru/10, ...")
+        str,
+        typer.Option(
+            help="Trajectory features: bayessim, score, all/50, gru/10, ...",
+            autocompletion=complete_embedding,
+        ),
     ] = "bayessim",
     segment_length: Annotated[
         int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")
@@ -82,13 +105,19 @@ def fit(
 
     Example: npdr fit furuta --data measured.csv --segment-length 200 --holdout 3,4 --out fit
     """
-    from npdr_ppl.cli.resolve import resolve_effects, resolve_model, resolve_rollouts
+    from npdr_ppl.cli.resolve import (
+        resolve_device,
+        resolve_effects,
+        resolve_model,
+        resolve_rollouts,
+    )
     from npdr_ppl.cli.show import show_fit
     from npdr_ppl.plots.fit_figures import write_fit_figures
     from npdr_ppl.workflows.binding import BindingOptions
     from npdr_ppl.workflows.fit import fit as run_fit
     from npdr_ppl.workflows.progress import reporter
 
+    device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_rollouts(data, holdout)
     with (

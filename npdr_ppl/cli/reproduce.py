@@ -8,6 +8,7 @@ import typer
 
 from npdr_ppl.cli.fit import InitialState
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
+from npdr_ppl.cli.names import complete_backends
 
 __all__ = ["reproduce"]
 
@@ -37,6 +38,7 @@ def reproduce(
             "--backends",
             "--backend",
             help="Some of the paper's methods, or others; all if not given.",
+            autocompletion=complete_backends,
         ),
     ] = "",
     initial_state: Annotated[

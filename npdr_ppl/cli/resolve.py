@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import cloudpickle
 
-from npdr_ppl.errors import DataError, ModelError, NpdrError
+from npdr_ppl.errors import BackendError, DataError, ModelError, NpdrError
 
 if TYPE_CHECKING:
     from npdr_ppl.inference.base import Backend
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = [
     "named_effects",
     "resolve_backend",
+    "resolve_device",
     "resolve_effects",
     "resolve_holdout",
     "resolve_model",
@@ -34,6 +35,9 @@ T = TypeVar("T")
 
 DATA_FILES = (".csv", ".parquet", ".npz", ".nc")
 """Endings of files with rollouts."""
+
+SCENES = (".xml", ".mjcf", ".urdf")
+"""Endings of files that describe a robot."""
 
 DEFAULT_TASKS = {"furuta": "furuta-swing-up", "furuta_paper": "furuta-swing-up"}
 """What a policy is to do, by model of the zoo."""
@@ -53,6 +57,15 @@ def resolve_model(word: str) -> Callable[..., Any]:
     if not _is_function(word):
         close = get_close_matches(word, entries, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"the zoo has {', '.join(entries)}."
+        path = Path(word)
+        if path.suffix == ".py":
+            hint = f"add the name of the model in it, as in {word}:model."
+        elif Path(f"{word.partition(':')[0]}.py").is_file():
+            hint = f"did you mean {word.partition(':')[0]}.py:{word.partition(':')[2] or 'model'}?"
+        elif path.suffix.lower() in SCENES:
+            hint = (
+                f"{word} becomes one in a few lines of Python, see docs/bring_your_simulator.md."
+            )
         raise ModelError(
             f"{word!r} is neither a model of the zoo nor path/to/file.py:function; {hint}"
         )
@@ -62,7 +75,9 @@ def resolve_model(word: str) -> Callable[..., Any]:
 
 def _load_function(path: Path, function: str) -> Callable[..., Any]:
     if not path.is_file():
-        raise ModelError(f"{path} does not exist.")
+        close = get_close_matches(path.name, [p.name for p in path.parent.glob("*.py")], n=1)
+        hint = f" Did you mean {path.with_name(close[0])}:{function}?" if close else ""
+        raise ModelError(f"{path} does not exist.{hint}")
     # Under a name of its own: a file called json.py must not take the library's place.
     name = f"_npdr_model_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -78,7 +93,10 @@ def _load_function(path: Path, function: str) -> Callable[..., Any]:
         raise ModelError(f"{path} cannot be loaded: {type(error).__name__}: {error}.") from error
     model = getattr(module, function, None)
     if not callable(model):
-        raise ModelError(f"{path} has no function {function!r}.")
+        own = [n for n, v in vars(module).items() if getattr(v, "__module__", "") == name]
+        close = get_close_matches(function, own, n=1) or own[:1]
+        hint = f" Did you mean {path}:{close[0]}?" if close else ""
+        raise ModelError(f"{path} has no function {function!r}.{hint}")
     return model
 
 
@@ -112,6 +130,8 @@ def named_effects(words: Sequence[str]) -> "list[Effect]":
         if not separator or name not in catalogue:
             close = get_close_matches(name, catalogue, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(catalogue)}."
+            if not separator and word in catalogue:
+                hint = f"say where it attaches, as in JOINT.{word}."
             raise ModelError(
                 f"{word!r} is not port.effect with an effect of the catalogue; {hint}"
             )
@@ -152,10 +172,14 @@ def resolve_rollouts(path: Path, holdout: str = "") -> tuple[Any, Any]:
         test = sorted({int(part) for part in holdout.split(",")})
     except ValueError:
         raise DataError(f"--holdout takes positions such as 3,4; got {holdout!r}.") from None
-    if test[0] < 0 or test[-1] >= len(rollouts) or len(test) == len(rollouts):
+    if test[0] < 0 or test[-1] >= len(rollouts):
         raise DataError(
-            f"--holdout {holdout} does not leave rollouts to fit: {path} has {len(rollouts)}, "
-            "counted from 0."
+            f"--holdout {holdout} asks for rollouts that are not there: {path} has "
+            f"{len(rollouts)}, counted from 0, so the last is {len(rollouts) - 1}."
+        )
+    if len(test) == len(rollouts):
+        raise DataError(
+            f"--holdout {holdout} leaves no rollouts to fit: {path} has {len(rollouts)} in all."
         )
     train = [i for i in range(len(rollouts)) if i not in test]
     return rollouts[train], rollouts[test]
@@ -182,6 +206,22 @@ def resolve_holdout(path: Path, holdout: str, file: Path | None) -> tuple[Any, A
     if holdout:
         raise DataError("--holdout and --holdout-data are two ways to say one thing; give one.")
     return Rollouts.load(path), Rollouts.load(file)
+
+
+def resolve_device(word: str) -> str:
+    """Returns the device that ``--device`` names, once it is known to be there.
+
+    Raises:
+        BackendError: There is no such device.
+    """
+    import torch
+
+    try:
+        torch.empty(0, device=word)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).partition("\n")[0].rstrip(".")
+        raise BackendError(f"--device {word} is not to be had: {reason}; use cpu.") from error
+    return word
 
 
 def resolve_target(word: str) -> "TargetDomain":

@@ -8,6 +8,15 @@ import typer
 
 from npdr_ppl.cli.fit import InitialState
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
+from npdr_ppl.cli.names import (
+    complete_backend,
+    complete_effect,
+    complete_embedding,
+    complete_model,
+    complete_search,
+    complete_target,
+    complete_task,
+)
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -27,12 +36,18 @@ class InternalModel(StrEnum):
 
 
 def train(
-    model: Annotated[str, typer.Argument(help="Zoo name, or path/to/file.py:function.")],
+    model: Annotated[
+        str,
+        typer.Argument(
+            help="Zoo name, or path/to/file.py:function.", autocompletion=complete_model
+        ),
+    ],
     target: Annotated[
         str,
         typer.Option(
             help="What the policy is for: a target of the zoo (see npdr targets), a file of "
-            "rollouts, gym:ENVIRONMENT, or path/to/file.py:function."
+            "rollouts, gym:ENVIRONMENT, or path/to/file.py:function.",
+            autocompletion=complete_target,
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the run and its results.")],
@@ -40,14 +55,23 @@ def train(
         str,
         typer.Option(
             help="What the policy is to do: see npdr tasks, or path/to/file.py:function; the "
-            "model's own if not given."
+            "model's own if not given.",
+            autocompletion=complete_task,
         ),
     ] = "",
     backend: Annotated[
-        str, typer.Option(help="Inference backend, e.g. snpe-c(flow=maf); see npdr backends.")
+        str,
+        typer.Option(
+            help="Inference backend, e.g. snpe-c(flow=maf); see npdr backends.",
+            autocompletion=complete_backend,
+        ),
     ] = "snpe-c",
     search: Annotated[
-        str, typer.Option(help="Policy search, e.g. power(population=100); see npdr searches.")
+        str,
+        typer.Option(
+            help="Policy search, e.g. power(population=100); see npdr searches.",
+            autocompletion=complete_search,
+        ),
     ] = "power",
     iterations: Annotated[int, typer.Option(min=1, help="Iterations of the loop.")] = 5,
     rollouts: Annotated[int, typer.Option(min=1, help="Real rollouts per iteration.")] = 1,
@@ -60,10 +84,15 @@ def train(
             "--effect",
             "--effects",
             help="Effect to attach, port.effect; may be repeated, or several with commas.",
+            autocompletion=complete_effect,
         ),
     ] = None,
     embedding: Annotated[
-        str, typer.Option(help="Trajectory features: bayessim, score, all/50, gru/10, ...")
+        str,
+        typer.Option(
+            help="Trajectory features: bayessim, score, all/50, gru/10, ...",
+            autocompletion=complete_embedding,
+        ),
     ] = "score",
     segment_length: Annotated[
         int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from difflib import get_close_matches
 
 from npdr_ppl.embeddings.base import Embedding
 from npdr_ppl.embeddings.networks import Convolutional, Linear, Recurrent
@@ -49,8 +50,10 @@ def embedding_by_name(word: str) -> Embedding:
     """
     match = _WORD.fullmatch(word)
     if match is None or match["name"] not in _EMBEDDINGS:
+        close = get_close_matches(match["name"] if match else word, _EMBEDDINGS, n=1)
         raise ModelError(
-            f"there is no embedding {word!r}; write one of {', '.join(_EMBEDDINGS)}, with a "
+            f"there is no embedding {word!r}; {f'did you mean {close[0]!r}? ' if close else ''}"
+            f"{'Write' if close else 'write'} one of {', '.join(_EMBEDDINGS)}, with a "
             "stride as in all/10, means of blocks as in all~10, or channels as in all[x,y]/10."
         )
     result = _EMBEDDINGS[match["name"]]()

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Literal
 
 from npdr_ppl.errors import ModelError
@@ -94,7 +95,9 @@ def find_port(ports: tuple[Port, ...], name: str, simulator_name: str) -> Port:
     members = [by_name[part] for part in name.split(",") if part in by_name]
     if len(members) == len(name.split(",")) and all(port.kind == "sensor" for port in members):
         return Port(name, "sensor", members[0].unit, max(port.rated for port in members))
+    close = get_close_matches(name, by_name, n=1)
     raise ModelError(
-        f"{simulator_name} has no port {name!r}; its ports are "
+        f"{simulator_name} has no port {name!r}; "
+        f"{f'did you mean {close[0]!r}? Its' if close else 'its'} ports are "
         f"{', '.join(sorted(by_name)) or '(none)'}."
     )

@@ -16,6 +16,10 @@ from npdr_ppl.language.inverse_dynamics import InverseDynamics
 
 __all__ = ["Simulator"]
 
+MAX_STEP_RATIO = 200.0
+"""A recording's time step over the simulator's own beyond which its time cannot be in seconds:
+milliseconds are off by 1000, and by 250 where the recording is four times as dense."""
+
 
 class Simulator(ABC):
     """Maps domain parameters and inputs to the readings of a trajectory, in batches.
@@ -79,9 +83,11 @@ class Simulator(ABC):
         for effect in effects:
             port = self.port(effect.port)
             if port.kind not in effect.port_kinds:
+                suitable = [p.name for p in self.all_ports if p.kind in effect.port_kinds]
                 raise ModelError(
                     f"{effect.id} attaches to a port of kind {' or '.join(effect.port_kinds)}, "
-                    f"but {port.name!r} of {self.name} is of kind {port.kind}."
+                    f"but {port.name!r} of {self.name} is of kind {port.kind}; suitable are "
+                    f"{', '.join(suitable) or 'none of its ports'}."
                 )
             if not effect.suits(port):
                 raise ModelError(
@@ -133,6 +139,11 @@ class Simulator(ABC):
             raise DataError(
                 f"{self.name} needs the action {', '.join(missing)}; the data have "
                 f"{', '.join(inputs.action_names) or 'no actions'}."
+            )
+        if inputs.time_step > MAX_STEP_RATIO * self.time_step:
+            raise DataError(
+                f"The time steps of the data are {inputs.time_step:g} s, but {self.name} takes "
+                f"steps of {self.time_step:g} s; time has to be in seconds, is it in milliseconds?"
             )
 
     def initial_states(self, inputs: Inputs) -> tuple[Tensor, ...]:

@@ -46,7 +46,13 @@ def read_run(run: Path) -> Report:
                     f"{run / name} is not what npdr writes: {type(error).__name__} {error}."
                 ) from error
     hint = " Its run is not finished: give the same command again." if _is_begun(run) else ""
-    raise DataError(f"{run} holds none of {', '.join(_READERS)}.{hint}")
+    inside = sorted(f.parent for name in _READERS for f in run.glob(f"*/{name}"))
+    if not hint and inside:
+        hint = f" Did you mean {inside[0]}?"
+    raise DataError(
+        f"{run} holds none of {', '.join(_READERS)}; give the folder that was passed as --out."
+        f"{hint}"
+    )
 
 
 def write_report(run: Path, out: Path | None = None) -> Path:

@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -71,7 +72,8 @@ def named(path: str | PathLike[str]) -> Iterator[None]:
     try:
         yield
     except DataError as error:
-        name = Path(path).name
+        # The folder "." has no name.
+        name = Path(path).name or str(path)
         raise DataError(f"{name if name.isprintable() else ascii(name)}: {error}") from None
 
 
@@ -88,7 +90,9 @@ def check_file(path: str | PathLike[str]) -> Path:
             is_file, is_directory = path.is_file(), path.is_dir()
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else None
-            raise DataError(f"cannot be opened ({reason or 'not a path'}).") from None
+            raise DataError(
+                f"cannot be opened ({reason or 'not a path'}).{_neighbour(path)}"
+            ) from None
         if is_directory:
             raise DataError("is a directory, but a file is needed.")
         if not is_file:
@@ -101,6 +105,16 @@ def check_file(path: str | PathLike[str]) -> Path:
                 f"{MAX_FILE_BYTES / 2**30:.0f} GiB that are read."
             )
     return path
+
+
+def _neighbour(path: Path) -> str:
+    """Returns a question for a file of nearly the same name, if there is one."""
+    try:
+        beside = [other.name for other in path.parent.iterdir()]
+    except (OSError, ValueError):
+        return ""
+    close = get_close_matches(path.name, beside, n=1)
+    return f" Did you mean {path.with_name(close[0])}?" if close else ""
 
 
 def check_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
@@ -241,7 +255,8 @@ def check_channels(
         if action.name in recorded and action.name not in rollouts.action_names:
             raise DataError(
                 f"{action.name} is an action, but its cells in the last row of each rollout are "
-                f"not empty; empty them or read the file with actions=[{action.name!r}]."
+                "not empty; empty them if that row is the reading after the last step, otherwise "
+                f"append such a row (or, in Python, read with actions=[{action.name!r}])."
             )
     missing = [a.name for a in actions if a.name not in rollouts.action_names]
     missing += [c.name for c in channels if c.name not in recorded and c.rate_of not in recorded]
@@ -255,8 +270,8 @@ def check_channels(
         extra += [name for name in rollouts.channel_names if name not in expected]
     if extra:
         raise DataError(
-            f"the column {', '.join(extra)} is not expected; the model knows "
-            f"{', '.join(c.name for c in (*channels, *actions))}."
+            f"the column {', '.join(extra)} is not expected; remove it, or rename it to what it "
+            f"is: the model knows {', '.join(c.name for c in (*channels, *actions))}."
         )
 
 

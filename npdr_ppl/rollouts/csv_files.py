@@ -22,6 +22,15 @@ __all__ = ["read_csv", "write_csv"]
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NUMBER_CHARACTERS = frozenset("0123456789+-.eE")
 
+NOT_A_NUMBER = frozenset({"nan", "na", "n/a", "null", "none"})
+"""How programs write a reading that is missing."""
+
+GAP = (
+    " Interpolate single missing readings, cut the rollout in two at longer gaps; the actions of "
+    "a rollout's last row stay empty."
+)
+"""What to do about it."""
+
 
 def read_csv(path: str | PathLike[str], actions: Sequence[str] | None) -> Rollouts:
     """Reads rollouts; see :meth:`Rollouts.from_csv`."""
@@ -126,5 +135,6 @@ def _numbers(name: str, cells: list[str], lines: list[int]) -> NDArray[np.float6
         if cell and not _NUMBER.fullmatch(cell):
             raise DataError(
                 f"{name} is {checks.shown(cell)} in line {line}, which is not a finite number."
+                f"{GAP if cell.lower() in NOT_A_NUMBER else ''}"
             )
     raise DataError(f"{name} has a cell that is not a finite number.")

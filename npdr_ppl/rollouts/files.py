@@ -56,6 +56,7 @@ def load(path: AnyPath) -> Rollouts:
         ".npz": Rollouts.from_npz,
         ".nc": Rollouts.from_netcdf,
     }
+    checks.check_file(path)
     suffix = Path(path).suffix.lower()
     if suffix not in readers:
         with checks.named(path):

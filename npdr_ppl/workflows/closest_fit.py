@@ -170,6 +170,9 @@ def closest_fit(
         DataError: No parameters could be simulated along the recording.
     """
     segments = SegmentModel(model, rollouts, options)
+    # Wrong units are told apart here: the search would only find that nothing fits.
+    simulator = segments.simulator
+    rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
     starts = torch.zeros(segments.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
     mask = segments.inputs.mask[..., None]
     ranges = (segments.observed * mask).abs().amax((0, 1)).double()
@@ -195,7 +198,10 @@ def closest_fit(
         if progress is not None:
             progress((iteration + 1) / ITERATIONS, f"error {least:.3g} of the range")
     if not math.isfinite(least):
-        raise DataError("No parameters of the prior could be simulated along the recording.")
+        raise DataError(
+            "No parameters of the prior could be simulated along the recording; check its units "
+            "(radians, metres, seconds), the signs of its columns, and the prior."
+        )
     if segments.num_offsets:
         return ClosestFit(segments, fit_segments(segments, z))
     return ClosestFit(segments, SegmentFit(z, starts, segments.scale_of(z, starts)))

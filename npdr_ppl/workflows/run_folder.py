@@ -49,6 +49,14 @@ __all__ = [
     "write_json",
 ]
 
+IN_WORDS = {
+    "binding": "how the data are prepared",
+    "num_simulations": "the number of simulations",
+    "fingerprint": "the data or what is read from them",
+    "options": "the backend's options",
+}
+"""What the keys of ``run.json`` mean to whoever gave a command."""
+
 FORMAT = 1
 _PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
 
@@ -94,10 +102,11 @@ class RunFolder:
         file = self.path / "run.json"
         if file.exists():
             present = read_json(file)
-            differing = [k for k, v in plain(description).items() if present.get(k) != v]
+            differing = [str(k) for k, v in plain(description).items() if present.get(k) != v]
             if differing:
+                words = dict.fromkeys(IN_WORDS.get(key, key) for key in differing)
                 raise BackendError(
-                    f"{self.path} holds a run that differs in {', '.join(differing)}; choose "
+                    f"{self.path} holds a run that differs in {', '.join(words)}; choose "
                     "another folder, or remove it."
                 )
             return

@@ -69,6 +69,8 @@ def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
             speed = min(speed, rated / damping)
         if name in taken:
             name = f"{name}_{'force' if is_slide else 'torque'}"
+        if name in taken:  # by an actuator of that name, which is a port as well
+            name = f"{name}_at_joint"
         units = joint_units(model, joint)
         port = Port(
             name,
