@@ -168,6 +168,8 @@ class Searcher:
             current, alternatives, tried = self._alternatives(current, effect, first.hypothesis)
             trials |= tried
             added.append(alternatives)
+        if set(current.names) != set(rounds[-1].hypothesis.names):
+            rounds.append(self.look(current))  # something was swapped: what is left is another
         return Search(rounds, current, added, removed, trials)
 
     def look(self, hypothesis: Hypothesis) -> Round:
