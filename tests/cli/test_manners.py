@@ -63,9 +63,9 @@ def small_fit(recording, out):
 def test_help_is_quick_and_groups_commands():
     took = []
     for _ in range(3):
-        start = time.perf_counter()
+        before = sum(os.times()[2:4])  # of the processor: other tests run at the same time
         shown = npdr("--help")
-        took.append(time.perf_counter() - start)
+        took.append(sum(os.times()[2:4]) - before)
     assert min(took) < 1.0, took
     for group in ("See it work", "Infer parameters", "Train policies", "Show results"):
         assert group in shown.stdout
