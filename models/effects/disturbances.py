@@ -84,6 +84,7 @@ class PeriodicDisturbance(ForceEffect):
         Parameter("frequency", "Hz", 2.0, "frequency f"),
     )
     strength = ("sine", "cosine")
+    wave = "frequency"
     law = "a sin ωt + b cos ωt"
     excitation = "hold"
     reference = LJUNG_1999

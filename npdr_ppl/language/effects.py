@@ -53,6 +53,9 @@ class Effect(ABC):
             shape, and their nominal values are those of a typical device. Empty for all.
         is_smooth: Whether trajectories are differentiable in the strengths at zero. Where they
             are not, sensitivities take finite steps of the size that :meth:`probe` gives.
+        wave: Name of the parameter that is the frequency in Hz of a wave in time, empty if none
+            is. Priors are too wide to meet a wave's frequency, so a search reads it from the
+            spectrum of what the model leaves over, and counts all frequencies it looked at.
         law: The law in one formula.
         equivalence: Causes that it may not be told from.
         excitation: The experiment that reveals it best.
@@ -64,6 +67,7 @@ class Effect(ABC):
     parameters: ClassVar[tuple[Parameter, ...]]
     strength: ClassVar[tuple[str, ...]] = ()
     is_smooth: ClassVar[bool] = True
+    wave: ClassVar[str] = ""
     law: ClassVar[str] = ""
     equivalence: ClassVar[tuple[EquivalenceClass, ...]] = ()
     excitation: ClassVar[Excitation] = "wide_range"

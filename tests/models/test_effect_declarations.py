@@ -34,6 +34,7 @@ def test_the_catalogue_has_all_effects_with_what_discovery_needs():
         assert effect.law and effect.reference
         names = {parameter.name for parameter in effect.parameters}
         assert set(effect.strength) <= names
+        assert {effect.wave} - {""} <= names - set(effect.strength)
         assert effect.excitation in get_args(Excitation)
         for kind in effect.equivalence:
             assert any(name in member.split(" + ") for member in kind.members)

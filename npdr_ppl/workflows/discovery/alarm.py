@@ -80,10 +80,9 @@ def sound_alarm(
     groups = [law.change for law in (*laws, *listed)]
     for law, p in zip((*laws, *listed), chance.p_values(groups), strict=True):
         values[law.name] = min(1.0, p / (1.0 - CATALOGUE_SHARE))
-    for port, own in waves.items():
-        name = f"{port}.periodic_disturbance"
-        if name in values:
-            values[name] = min(values[name], *(values[wave.name] for wave in own))
+    for effect in {v.effect.name: v.effect for v in variants if v.effect.wave}.values():
+        own = [values[wave.name] for wave in waves.get(effect.port, [])]
+        values[effect.name] = min([values[effect.name], *own])
     gains = {candidate.name: candidate.gain for candidate in ranking}
     gains |= {law.name: gain for law, gain in gained}
     if not values:

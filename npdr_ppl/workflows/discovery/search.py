@@ -196,9 +196,9 @@ class Searcher:
         found: Responses,
     ) -> list[Variant]:
         hints = {
-            effect.name: {"frequency": strongest_frequency(projection, found, effect.port)}
+            effect.name: {effect.wave: strongest_frequency(projection, found, effect.port)}
             for effect in candidates
-            if effect.id == "periodic_disturbance" and effect.port in found.by_port
+            if effect.wave and effect.port in found.by_port
         }
         return sensitivities(hypothesis, candidates, hints)
 
@@ -346,5 +346,5 @@ def explained(first: Hypothesis, final: Hypothesis) -> float:
 
 def _log_prior(hypothesis: Hypothesis) -> float:
     """Returns what the search over frequencies costs, as so many hypotheses share one's prior."""
-    waves = sum(effect.id == "periodic_disturbance" for effect in hypothesis.effects)
+    waves = sum(bool(effect.wave) for effect in hypothesis.effects)
     return -waves * math.log(FREQUENCIES)
