@@ -24,6 +24,7 @@ from typing import Any
 import torch
 from discovery_summary import print_summary
 from hidden_rigs import RIGS, Case, make_case, places
+from sparse_regression import sparse_choice
 
 import npdr_ppl as npdr
 from npdr_ppl.workflows.discovery.projection import Projection
@@ -102,6 +103,7 @@ def judge(task: Task) -> dict[str, Any]:
             "effects": [finding.to_dict() for finding in found.effects],
             "ranking": [candidate.name for candidate in found.ranking[:5]],
             "bic": bic_choice(found),
+            "sparse": sparse_choice(found.search.rounds[0].hypothesis, case.fit).to_dict(),
             "gap": {name: gap.to_dict() for name, gap in found.gap.items()},
         }
     except Exception as error:  # a failure is a row with its message
