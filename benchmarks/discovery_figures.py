@@ -78,7 +78,8 @@ def confusion(rows: Iterable[Row]) -> dict[str, Counter[str]]:
             named += " elsewhere" if named == truth else ""
         hidden = f"{truth} ({'removed' if row['condition'] == 'without' else 'outside'})"
         table[hidden if row["condition"] in ("without", "outside") else truth][named] += 1
-    return dict(sorted(table.items()))
+    # Those that have no name to be given come last.
+    return dict(sorted(table.items(), key=lambda item: ("(" in item[0], item[0])))
 
 
 def write_figures(rows: Sequence[Row], folder: Path) -> list[Path]:
