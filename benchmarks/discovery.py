@@ -2,7 +2,7 @@
 
     python benchmarks/discovery.py --part tune --out tune.jsonl   # thresholds were set here
     python benchmarks/discovery.py --part test --out test.jsonl --workers 2
-    python benchmarks/discovery.py --summary test.jsonl
+    python benchmarks/discovery.py --summary test.jsonl --figures
 
 The truths are made by :mod:`hidden_rigs`: equations, integrators and laws of their own. An
 effect's strength is set by its separation d: the distance, in standard deviations of the
@@ -22,8 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from discovery_summary import print_summary
+from discovery_report import print_summary
 from hidden_rigs import RIGS, Case, make_case, places
+from sparse_regression import sparse_choice
 
 import npdr_ppl as npdr
 from npdr_ppl.workflows.discovery.projection import Projection
@@ -102,7 +103,9 @@ def judge(task: Task) -> dict[str, Any]:
             "effects": [finding.to_dict() for finding in found.effects],
             "ranking": [candidate.name for candidate in found.ranking[:5]],
             "bic": bic_choice(found),
+            "sparse": sparse_choice(found.search.rounds[0].hypothesis, case.fit).to_dict(),
             "gap": {name: gap.to_dict() for name, gap in found.gap.items()},
+            "seconds": found.seconds,
         }
     except Exception as error:  # a failure is a row with its message
         row["error"] = f"{type(error).__name__}: {error}"[:300]
@@ -194,9 +197,10 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("discovery.jsonl"))
     parser.add_argument("--summary", type=Path, help="only summarise this file")
+    parser.add_argument("--figures", action="store_true", help="draw them beside the rows")
     arguments = parser.parse_args()
     if arguments.summary:
-        print_summary(arguments.summary)
+        print_summary(arguments.summary, figures=arguments.figures)
         return
     done = set()
     if arguments.out.exists():
@@ -228,7 +232,7 @@ def main() -> None:
                 f"{row.get('verdict', row.get('error'))} {found} {row['cpu']:.0f} s",
                 flush=True,
             )
-    print_summary(arguments.out)
+    print_summary(arguments.out, figures=arguments.figures)
 
 
 if __name__ == "__main__":

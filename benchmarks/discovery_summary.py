@@ -1,193 +1,343 @@
-"""What the rows of the blind benchmark come to."""
+"""What the rows of the blind benchmark come to, as the lines of one table.
 
-import json
+A rate comes with its 95 % interval after Clopper and Pearson, a percentile with one by the
+bootstrap. "yes" and "no" say whether the figure itself meets its target; where the interval holds
+the target, so few cases cannot tell, and the table says "open" beside it.
+"""
+
 import math
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Any
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
-from scipy.stats import beta
+from discovery_figures import calibration_error, reliability
+from discovery_rows import (
+    Row,
+    effect_id,
+    estimates,
+    has_all,
+    has_any,
+    has_too_many,
+    is_bic_right,
+    is_class_right,
+    is_confident_and_wrong,
+    is_first_right,
+    is_sparse_effect,
+    is_sparse_right,
+    is_sparse_unknown,
+    sparse_name,
+)
+from discovery_table import Baselines, Line, Rate, bootstrap
 
-__all__ = ["is_class_right", "is_first_right", "print_summary"]
+__all__ = ["STRONG", "by_effect", "gap_closed", "summary_lines"]
 
-RATE = 0.01
+FALSE_ALARM_RATE = 0.01
 """The rate of false alarms that was asked for."""
 
-Row = dict[str, Any]
+WEAK, STRONG = 7.5, 9.9
+"""Separations up to which an effect counts as one of d = 5, and from which as d ≥ 10."""
+
+NULLS = {
+    "null": "plain noise",
+    "null_noise3": "three times the noise",
+    "null_coloured": "coloured noise",
+    "null_outliers": "outliers",
+}
+"""The conditions in which nothing is missing."""
+
+NO_BASELINES = Baselines()
+
+VISIBLE_GAP = 1.2
+"""Held-out error in that of a perfect model from which a gap can be seen to close."""
 
 
-def found_names(row: Row) -> list[str]:
-    """Returns the names of the effects that were found."""
-    return [f"{e['port']}.{e['effect']}" for e in row.get("effects", [])]
+def summary_lines(rows: Sequence[Row]) -> list[Line]:
+    """Returns the lines of the table.
+
+    Args:
+        rows: Rows that were judged.
+    """
+    of = defaultdict(list)
+    for row in rows:
+        of[row["condition"]].append(row)
+    nulls = [row for row in rows if row["condition"].startswith("null")]
+    two, missing = of["two"], of["outside"] + of["without"]
+    return [
+        *_null_lines(nulls),
+        *_one_lines(of["one"]),
+        _rate("inseparable: class reported", of["inseparable"], is_class_right, lower=0.95),
+        _wrong("inseparable: confident wrong name", of["inseparable"], upper=0.02),
+        _rate("two effects: both", two, has_all, lower=0.80),
+        _rate("two effects: at least one", two, has_any, lower=0.98, baselines=_naming(two)),
+        _rate("two effects: spurious third", two, has_too_many, upper=0.05),
+        *(
+            _rate(
+                f"{where}: “unknown”",
+                own,
+                lambda row: row["verdict"] == "unknown",
+                lower=0.85,
+                baselines=Baselines(sparse=_baseline(own, is_sparse_unknown, "sparse")),
+            )
+            for where, own in (
+                ("not in the catalogue", missing),
+                ("… no catalogue has it", of["outside"]),
+                ("… its entry removed", of["without"]),
+            )
+        ),
+        _wrong("not in the catalogue: confident impostor", missing, upper=0.05),
+        _rate("spoilt data: problem reported", of["bad_data"], lambda row: bool(row["problems"])),
+        *_gap_lines(rows),
+        *_parameter_lines([row for row in of["one"] if row["d"] >= STRONG]),
+        _calibration_line(rows),
+        *_time_lines(rows),
+    ]
 
 
-def right_sets(row: Row) -> list[set[str]]:
-    """Returns the sets of names that count as right."""
-    return [set(row["truth"]), *(set(names) for names in row.get("alternatives", []))]
+def _null_lines(nulls: list[Row]) -> list[Line]:
+    def is_alarm(row: Row) -> bool:
+        return row["p_value"] <= FALSE_ALARM_RATE
+
+    lines = []
+    kinds = sorted({row["condition"] for row in nulls})
+    for kind in ("", *kinds):
+        own = [row for row in nulls if not kind or row["condition"] == kind]
+        label = f"… {NULLS.get(kind, kind)}" if kind else "nothing missing"
+        lines.append(
+            _rate(
+                f"{label}: false alarms",
+                own,
+                is_alarm,
+                upper=0.05,
+                greatest_end=math.inf if kind else 0.08,
+                baselines=Baselines(
+                    _nothing(own),
+                    _baseline(own, lambda row: row["bic"] is not None, "bic"),
+                    _baseline(own, lambda row: sparse_name(row) is not None, "sparse"),
+                ),
+            )
+        )
+    worse = [row for row in nulls if row.get("gap")]
+    lines.append(
+        _rate("nothing missing: a name given", nulls, lambda row: row["verdict"] == "named"),
+    )
+    lines.append(
+        Line(
+            "nothing missing: greatest growth of the held-out error",
+            len(worse),
+            max((_ratio(row, "after", "before") - 1.0 for row in worse), default=math.nan),
+            upper=0.01,
+            baselines=Baselines(refit=_nothing(worse)),
+        )
+    )
+    return lines
 
 
-def is_first_right(row: Row) -> bool:
-    """Returns whether the first effect is the true one, or stands for it."""
-    names = found_names(row)
-    return bool(names) and any(names[0] in right for right in right_sets(row))
+def _one_lines(one: list[Row]) -> list[Line]:
+    strong = [row for row in one if row["d"] >= STRONG]
+    weak = [row for row in one if row["d"] <= WEAK]
+    lines = [
+        _rate(
+            "one effect, d ≥ 10: name or class first",
+            strong,
+            is_class_right,
+            lower=0.98,
+            baselines=_naming(strong),
+        ),
+        _rate("… the name itself", strong, is_first_right, baselines=_naming(strong)),
+    ]
+    effects = by_effect(strong)
+    if effects:
+        worst = min(effects, key=lambda name: Rate.of(effects[name], is_class_right).value)
+        own = effects[worst]
+        lines.append(
+            _rate(
+                f"… worst effect ({worst})",
+                own,
+                is_class_right,
+                lower=0.90,
+                baselines=_naming(own),
+            )
+        )
+    return [
+        *lines,
+        _rate(
+            "one effect, d = 5: name or class first",
+            weak,
+            is_class_right,
+            lower=0.85,
+            baselines=_naming(weak),
+        ),
+        _rate("… the name itself", weak, is_first_right, baselines=_naming(weak)),
+        _wrong("one effect: confident wrong name", one),
+        _rate("one effect: others beside it", one, has_too_many),
+    ]
 
 
-def is_class_right(row: Row) -> bool:
-    """Returns whether the truth is the first effect or among what could stand in its place."""
-    if is_first_right(row):
-        return True
-    if not row.get("effects"):
+def _gap_lines(rows: Sequence[Row]) -> list[Line]:
+    closed = gap_closed(rows)
+    lines = []
+    for label, percentile, aim in (("median", 50.0, 0.90), ("10th percentile", 10.0, 0.75)):
+        value = float(np.percentile(closed, percentile)) if closed else math.nan
+        lines.append(
+            Line(
+                f"held-out gap closed, d ≥ 10: {label}",
+                len(closed),
+                value,
+                bootstrap(closed, percentile),
+                lower=aim,
+                baselines=Baselines(refit="0 %" if closed else "–"),
+            )
+        )
+    own = [row for row in rows if _has_visible_gap(row)]
+    after = [_ratio(row, "after", "noise_floor") for row in own]
+    before = [_ratio(row, "before", "noise_floor") for row in own]
+    lines.append(
+        Line(
+            "held-out error in that of a perfect model, median",
+            len(own),
+            float(np.median(after)) if own else math.nan,
+            bootstrap(after, 50.0),
+            unit="",
+            baselines=Baselines(refit=f"{np.median(before):.3g}" if own else "–"),
+        )
+    )
+    return lines
+
+
+def gap_closed(rows: Iterable[Row]) -> list[float]:
+    """Returns the shares of the held-out gaps that were closed, of gaps that can be seen."""
+    return [row["gap"]["rmse"]["closed"] for row in rows if _has_visible_gap(row)]
+
+
+def _has_visible_gap(row: Row) -> bool:
+    if row["condition"] not in ("one", "two") or not row["d"] >= STRONG or not row.get("gap"):
         return False
-    alternatives = row["effects"][0]["alternatives"]
-    named = {name for name, p in alternatives.items() if p >= 0.05}
-    ids = set(row["effects"][0]["equivalent_to"])
-    return any(
-        named & right or ids & {name.rsplit(".", 1)[1] for name in right}
-        for right in right_sets(row)
+    gap = row["gap"]["rmse"]
+    return gap["closed"] is not None and gap["before"] > VISIBLE_GAP * gap["noise_floor"]
+
+
+def _ratio(row: Row, one: str, other: str) -> float:
+    return row["gap"]["rmse"][one] / row["gap"]["rmse"][other]
+
+
+def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
+    found = [pair for row in rows for pair in estimates(row)]
+    inside = Rate(sum(is_inside for is_inside, _ in found), len(found))
+    errors = [error for _, error in found if math.isfinite(error)]
+    return [
+        Line(
+            "parameters, d ≥ 10: 90 % intervals cover",
+            inside.total,
+            inside.value,
+            inside.interval if inside.total else None,
+            lower=0.85,
+            upper=0.95,
+        ),
+        Line(
+            "parameters, d ≥ 10: median relative error",
+            len(errors),
+            float(np.median(errors)) if errors else math.nan,
+            bootstrap(errors, 50.0),
+            upper=0.10,
+        ),
+    ]
+
+
+def _calibration_line(rows: Sequence[Row]) -> Line:
+    bins = reliability(rows)
+    total = sum(part.right.total for part in bins)
+    value = calibration_error(bins) if bins else math.nan
+    return Line("expected calibration error", total, value, upper=0.05, unit="")
+
+
+def _time_lines(rows: Sequence[Row]) -> list[Line]:
+    screening = [
+        sum(row["seconds"].get(stage, 0.0) for stage in ("fit", "check data", "screen"))
+        for row in rows
+        if "seconds" in row
+    ]
+    whole = [row["cpu"] for row in rows]
+    return [
+        Line(label, len(values), max(values, default=math.nan), upper=limit, unit=" s")
+        for label, values, limit in (
+            ("greatest time of screening, on the clock", screening, 20.0),
+            ("greatest time of everything, processor, case made and all", whole, 300.0),
+        )
+    ] + [
+        Line(
+            "median time of everything",
+            len(whole),
+            float(np.median(whole)) if whole else math.nan,
+            unit=" s",
+        )
+    ]
+
+
+def by_effect(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Returns the rows of each hidden effect."""
+    result: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        result[effect_id(row["truth"][0])].append(row)
+    return result
+
+
+def _rate(
+    condition: str,
+    rows: Sequence[Row],
+    is_hit: Callable[[Row], bool],
+    *,
+    lower: float = -math.inf,
+    upper: float = math.inf,
+    greatest_end: float = math.inf,
+    baselines: Baselines = NO_BASELINES,
+) -> Line:
+    share = Rate.of(rows, is_hit)
+    return Line(
+        condition,
+        share.total,
+        share.value,
+        share.interval if share.total else None,
+        lower=lower,
+        upper=upper,
+        greatest_end=greatest_end,
+        baselines=baselines,
     )
 
 
-def is_confident_and_wrong(row: Row) -> bool:
-    """Returns whether a wrong name was given without doubt."""
-    if row.get("verdict") != "named" or not row["effects"]:
-        return False
-    first = row["effects"][0]
-    return first["probability"] >= 0.9 and not is_first_right(row)
+def _wrong(condition: str, rows: Sequence[Row], *, upper: float = math.inf) -> Line:
+    """Returns a line of confident wrong names; the baselines know no doubt."""
+    return _rate(
+        condition,
+        rows,
+        is_confident_and_wrong,
+        upper=upper,
+        baselines=Baselines(
+            _nothing(rows),
+            _baseline(rows, lambda r: r["bic"] is not None and not is_bic_right(r), "bic"),
+            _baseline(rows, lambda r: is_sparse_effect(r) and not is_sparse_right(r), "sparse"),
+        ),
+    )
 
 
-def rate(rows: Iterable[Row], is_hit: Callable[[Row], bool]) -> str:
-    """Returns a rate with its 95 % interval (Clopper and Pearson)."""
-    hits = [bool(is_hit(row)) for row in rows]
-    n, k = len(hits), sum(hits)
-    if not n:
-        return "–"
-    low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
-    high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
-    return f"{k}/{n} = {k / n:.1%} ({low:.1%} to {high:.1%})"
+def _naming(rows: Sequence[Row]) -> Baselines:
+    """Returns how often each baseline names what is right; refitting names nothing."""
+    return Baselines(
+        _nothing(rows),
+        _baseline(rows, is_bic_right, "bic"),
+        _baseline(rows, is_sparse_right, "sparse"),
+    )
 
 
-def print_summary(path: Path) -> None:
-    """Prints all rates of a file of rows."""
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
-    failed = [row for row in rows if "error" in row]
-    rows = [row for row in rows if "error" not in row]
-    print(f"{len(rows)} cases, {len(failed)} failed: {Counter(r['error'][:80] for r in failed)}")
-    nulls = [row for row in rows if row["condition"].startswith("null")]
-    print("false alarms:", rate(nulls, lambda r: r["p_value"] <= RATE))
-    print("BIC forward selection, false alarms:", rate(nulls, lambda r: r.get("bic") is not None))
-    for kind in sorted({row["condition"] for row in nulls}):
-        own = [row for row in nulls if row["condition"] == kind]
-        print(f"  {kind}:", rate(own, lambda r: r["p_value"] <= RATE))
-        print(f"  {kind}, not 'none':", rate(own, lambda r: r["verdict"] != "none"))
-    one = [row for row in rows if row["condition"] == "one"]
-    for low, high in ((4.0, 7.0), (7.0, 15.0), (15.0, 1e9)):
-        own = [row for row in one if low <= row["d"] < high]
-        print(f"one effect, d {low:g} to {high:g}: first right", rate(own, is_first_right))
-        print("   or in its class", rate(own, is_class_right))
-        print("   confident and wrong", rate(own, is_confident_and_wrong))
-        print("   spurious others", rate(own, lambda r: len(r["effects"]) > _size(r)))
-        print("   BIC forward selection: first right", rate(own, _is_bic_right))
-    by_effect: dict[str, list[Row]] = defaultdict(list)
-    for row in one:
-        if row["d"] >= 7.0:
-            by_effect[row["truth"][0].rsplit(".", 1)[1]].append(row)
-    print("by effect, d ≥ 7:")
-    for name, own in sorted(by_effect.items()):
-        missed = [(r["rig"], r["verdict"], *found_names(r)) for r in own if not is_class_right(r)]
-        print(f"  {name}: {rate(own, is_class_right)} {missed}")
-    for kind in ("inseparable", "outside", "without", "two", "absorbed", "bad_data"):
-        own = [row for row in rows if row["condition"] == kind]
-        if own:
-            print(f"{kind}: verdicts {dict(Counter(r['verdict'] for r in own))}")
-            print("   confident wrong name", rate(own, is_confident_and_wrong))
-            if kind == "two":
-                print("   both", rate(own, lambda r: set(r["truth"]) <= set(found_names(r))))
-                print(
-                    "   at least one",
-                    rate(own, lambda r: bool(set(r["truth"]) & set(found_names(r)))),
-                )
-                print("   spurious third", rate(own, lambda r: len(r["effects"]) > _size(r)))
-            if kind == "inseparable":
-                print("   class", rate(own, is_class_right))
-            if kind == "bad_data":
-                print("   problem reported", rate(own, lambda r: bool(r["problems"])))
-    _print_gap(rows)
-    _print_parameters([row for row in one if row["d"] >= 7.0])
-    _print_calibration([row for row in rows if row["condition"] in ("one", "inseparable", "two")])
-    seconds = [row["cpu"] for row in rows]
-    print(f"CPU seconds: median {np.median(seconds):.1f}, greatest {max(seconds):.1f}")
+def _nothing(rows: Sequence[Row]) -> str:
+    return "0 %" if rows else "–"
 
 
-def _is_bic_right(row: Row) -> bool:
-    return any(row.get("bic") in right for right in right_sets(row))
-
-
-def _size(row: Row) -> int:
-    return max(len(right) for right in right_sets(row))
-
-
-def _print_gap(rows: list[Row]) -> None:
-    closed = [
-        row["gap"]["rmse"]["closed"]
-        for row in rows
-        if row["condition"] in ("one", "two")
-        and row["d"] >= 7.0
-        # A gap within the noise cannot be seen to close.
-        and row["gap"]["rmse"]["before"] > 1.2 * row["gap"]["rmse"]["noise_floor"]
-    ]
-    if closed:
-        low, middle = np.percentile(closed, [10, 50])
-        print(
-            f"held-out gap closed ({len(closed)}): median {middle:.1%}, 10th percentile {low:.1%}"
-        )
-    nulls = [row for row in rows if row["condition"].startswith("null")]
-    worse = [r["gap"]["rmse"]["after"] / r["gap"]["rmse"]["before"] for r in nulls]
-    if worse:
-        print(f"null: held-out error after / before at most {max(worse):.4f}")
-
-
-def _print_parameters(rows: list[Row]) -> None:
-    """Prints errors and coverage of the effects' strengths where the first is right."""
-    inside, errors = [], []
-    for row in rows:
-        for effect in row["effects"]:
-            name = f"{effect['port']}.{effect['effect']}"
-            for short, estimate in effect["parameters"].items():
-                true = row["true_parameters"].get(f"{name}.{short}")
-                if true is None or not math.isfinite(true):
-                    continue
-                low, high = estimate["hdi_94"]
-                middle, half = 0.5 * (low + high), 0.5 * (high - low)
-                half *= 1.645 / 1.881  # the 90 % interval
-                inside.append(abs(true - middle) <= half)
-                if true:
-                    errors.append(abs(estimate["mean"] / true - 1.0))
-    if inside:
-        print(
-            f"parameters ({len(inside)}): 90 % intervals cover {np.mean(inside):.1%}, "
-            f"median error {np.median(errors):.1%}"
-        )
-
-
-def _print_calibration(rows: list[Row]) -> None:
-    """Prints the expected calibration error of the first effect's probability."""
-    pairs = [
-        (row["effects"][0]["probability"], is_first_right(row)) for row in rows if row["effects"]
-    ]
-    if not pairs:
-        return
-    probability, right = map(np.array, zip(*pairs, strict=True))
-    edges = np.array([0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97, 1.0 + 1e-9])
-    error = 0.0
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
-        own = (probability >= low) & (probability < high)
-        if own.any():
-            gap = abs(probability[own].mean() - right[own].mean())
-            error += own.mean() * gap
-            print(
-                f"   probability {low:.2f} to {min(high, 1.0):.2f}: {own.sum()} cases, mean "
-                f"{probability[own].mean():.2f}, right {right[own].mean():.2f}"
-            )
-    print(f"expected calibration error {error:.3f}")
+def _baseline(rows: Iterable[Row], is_hit: Callable[[Row], bool], name: str) -> str:
+    """Returns a baseline's rate over the rows that have it."""
+    own = [row for row in rows if name in row]
+    if name == "sparse":
+        if own and all(row["sparse"]["left_out"] == "not installed" for row in own):
+            return "not installed"
+        own = [row for row in own if not row["sparse"]["left_out"]]
+    share = Rate.of(own, is_hit)
+    return f"{100.0 * share.value:.3g} % of {share.total}" if share.total else "–"

@@ -11,7 +11,6 @@ from torch.distributions import Distribution
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Parameter, Port
-from npdr_ppl.language.effect_context import Start
 from npdr_ppl.language.effects import ForceEffect, LinearForceEffect, ParameterEffect
 from npdr_ppl.models.effects.references import (
     ARMSTRONG_1994,
@@ -19,6 +18,7 @@ from npdr_ppl.models.effects.references import (
     LJUNG_1999,
     MUJOCO,
 )
+from npdr_ppl.models.effects.timed import TimedForceEffect
 
 __all__ = ["Cogging", "ParameterDrift", "PeriodicDisturbance", "Wind"]
 
@@ -74,7 +74,7 @@ class Cogging(LinearForceEffect):
         return f"Cogging(port={self.port!r}, order={self.order})"
 
 
-class PeriodicDisturbance(ForceEffect):
+class PeriodicDisturbance(TimedForceEffect):
     """a sin ωt + b cos ωt with ω = 2π f and the time t since the rollout began."""
 
     id = "periodic_disturbance"
@@ -98,27 +98,12 @@ class PeriodicDisturbance(ForceEffect):
             "frequency": dist.LogNormal(math.log(2.0), 1.0),
         }
 
-    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:
-        """Returns the time."""
-        return start.time
-
     def force(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Tensor
     ) -> Tensor:
         """Returns the force at the step's start."""
         angle = 2.0 * math.pi * parameters["frequency"] * memory
         return parameters["sine"] * torch.sin(angle) + parameters["cosine"] * torch.cos(angle)
-
-    def next_memory(
-        self,
-        position: Tensor,
-        velocity: Tensor,
-        parameters: Mapping[str, Tensor],
-        memory: Any,
-        time_step: float,
-    ) -> Tensor:
-        """Returns the time one step later."""
-        return memory + time_step
 
 
 class Wind(ForceEffect):

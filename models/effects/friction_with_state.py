@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import pyro.distributions as dist
 import torch
@@ -13,6 +12,7 @@ from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Joint, Start
 from npdr_ppl.language.effects import ForceEffect
 from npdr_ppl.models.effects.references import BITTENCOURT_2012, CANUDAS_1995
+from npdr_ppl.models.effects.timed import TimedForceEffect
 
 __all__ = ["FrictionDrift", "LoadDependentFriction", "PreslidingFriction"]
 
@@ -137,7 +137,7 @@ class LoadDependentFriction(ForceEffect):
         return parameters["coefficient"] * memory
 
 
-class FrictionDrift(ForceEffect):
+class FrictionDrift(TimedForceEffect):
     """−(F sign v + b v) exp(−t/T): friction of a cold device that is gone once it is warm.
 
     Attaches next to the friction that remains. A rollout begins cold: what happened before it is
@@ -163,10 +163,6 @@ class FrictionDrift(ForceEffect):
             "time_constant": dist.LogNormal(math.log(60.0), 1.0),
         }
 
-    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:
-        """Returns the time."""
-        return start.time
-
     def force(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Tensor
     ) -> Tensor:
@@ -178,17 +174,6 @@ class FrictionDrift(ForceEffect):
     ) -> Tensor:
         """Returns F exp(−t/T)."""
         return parameters["dry"] * _cold(parameters, memory)
-
-    def next_memory(
-        self,
-        position: Tensor,
-        velocity: Tensor,
-        parameters: Mapping[str, Tensor],
-        memory: Any,
-        time_step: float,
-    ) -> Tensor:
-        """Returns the time one step later."""
-        return memory + time_step
 
 
 def _cold(parameters: Mapping[str, Tensor], time: Tensor) -> Tensor:

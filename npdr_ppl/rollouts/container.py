@@ -1,8 +1,7 @@
 """Rollouts: an immutable set of recorded or simulated episodes."""
 
-import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ from torch import Tensor
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.rollouts import arrays, checks, indices, segments
+from npdr_ppl.rollouts import arrays, checks, collection, indices, segments
 from npdr_ppl.rollouts.arrays import Array
 
 if TYPE_CHECKING:
@@ -230,15 +229,7 @@ class Rollouts:
         T is the length of the longest rollout; shorter ones are zero-padded where the mask is
         false.
         """
-        longest = max(self.lengths)
-        readings = np.zeros((len(self), longest + 1, len(self.channel_names)))
-        actions = np.zeros((len(self), longest, len(self.action_names)))
-        mask = np.zeros((len(self), longest), dtype=bool)
-        for index, length in enumerate(self.lengths):
-            readings[index, : length + 1] = self.readings[index]
-            actions[index, :length] = self.actions[index]
-            mask[index, :length] = True
-        return readings, actions, mask
+        return collection.stacked(self)
 
     # -- As a collection ---------------------------------------------------------------------
 
@@ -255,50 +246,17 @@ class Rollouts:
 
     def __getitem__(self, index: indices.Index) -> "Rollouts":
         """Returns the chosen rollouts, always as Rollouts."""
-        chosen = indices.chosen(index, len(self))
-        return replace(
-            self,
-            readings=tuple(self.readings[i] for i in chosen),
-            actions=tuple(self.actions[i] for i in chosen),
-            time=tuple(self.time[i] for i in chosen),
-            rewards=None if self.rewards is None else tuple(self.rewards[i] for i in chosen),
-        )
+        return collection.picked(self, indices.chosen(index, len(self)))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Rollouts):
             return NotImplemented
-        mine, others = self.rewards or (), other.rewards or ()
-        return (
-            self.channel_names == other.channel_names
-            and self.action_names == other.action_names
-            and self.channel_units == other.channel_units
-            and self.action_units == other.action_units
-            and self.time_step == other.time_step
-            and self.lengths == other.lengths
-            and (self.rewards is None) == (other.rewards is None)
-            and all(
-                np.array_equal(a, b)
-                for left, right in (
-                    (self.readings, other.readings),
-                    (self.actions, other.actions),
-                    (self.time, other.time),
-                    (mine, others),
-                )
-                for a, b in zip(left, right, strict=True)
-            )
-        )
+        return collection.are_equal(self, other)
 
     __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        low, high = min(self.lengths), max(self.lengths)
-        steps = f"{low}" if low == high else f"{low}–{high}"
-        return (
-            f"Rollouts({len(self)} × {steps} steps of {self.time_step:.6g} s; "
-            f"channels {_listed(self.channel_names, self.channel_units)}; "
-            f"actions {_listed(self.action_names, self.action_units)}"
-            f"{'' if self.rewards is None else '; rewards'})"
-        )
+        return collection.summary(self)
 
     def _repr_html_(self) -> str:
         from npdr_ppl.rollouts.notebook import rollouts_html
@@ -348,38 +306,11 @@ class Rollouts:
         Raises:
             DataError: Columns or time steps differ.
         """
-        parts = (self, *others)
-        for other in others:
-            for field in ("channel_names", "action_names", "channel_units", "action_units"):
-                if getattr(self, field) != getattr(other, field):
-                    raise DataError(
-                        f"{field} differ: {', '.join(getattr(self, field))} and "
-                        f"{', '.join(getattr(other, field))}."
-                    )
-            if not math.isclose(self.time_step, other.time_step, rel_tol=1e-6):
-                raise DataError(f"time steps differ: {self.time_step} and {other.time_step} s.")
-            if (self.rewards is None) != (other.rewards is None):
-                raise DataError("some of the rollouts have rewards and some have not.")
-        rewards = None
-        if self.rewards is not None:
-            rewards = tuple(values for part in parts for values in part.rewards or ())
-        return replace(
-            self,
-            readings=tuple(values for part in parts for values in part.readings),
-            actions=tuple(values for part in parts for values in part.actions),
-            time=tuple(values for part in parts for values in part.time),
-            rewards=rewards,
-        )
+        return collection.joined((self, *others))
 
     def select(self, channels: Sequence[str]) -> "Rollouts":
         """Returns the rollouts with only these channels, in this order."""
-        columns = segments.columns_of(channels, self.channel_names)
-        return replace(
-            self,
-            readings=tuple(values[:, columns] for values in self.readings),
-            channel_names=tuple(channels),
-            channel_units=tuple(self.channel_units[i] for i in columns),
-        )
+        return collection.with_channels(self, channels)
 
     # -- For inference -----------------------------------------------------------------------
 
@@ -461,8 +392,3 @@ class Rollouts:
         names = self.channel_names if channels is None else tuple(channels)
         columns = segments.columns_of(names, self.channel_names)
         return [torch.from_numpy(values[:-1, columns].copy()) for values in self.readings]
-
-
-def _listed(names: Sequence[str], units: Sequence[str]) -> str:
-    entries = (f"{n} [{u}]" if u else n for n, u in zip(names, units, strict=True))
-    return ", ".join(entries) or "none"

@@ -28,6 +28,7 @@ __all__ = [
     "candidates",
     "folder_name",
     "name_and_options",
+    "requested",
     "split_candidates",
 ]
 
@@ -104,6 +105,27 @@ def available(texts: Mapping[str, str]) -> tuple[dict[str, Candidate], dict[str,
         except BackendError as error:
             skipped[label] = str(error)
     return found, skipped
+
+
+def requested(
+    texts: Sequence[str] | None, usual: Mapping[str, str]
+) -> tuple[dict[str, Candidate], dict[str, str]]:
+    """Returns the candidates that were asked for, usual ones by their label alone.
+
+    Args:
+        texts: Labels of usual candidates, or candidates' texts; ``None`` for the usual ones whose
+            backends there are.
+        usual: Texts of the usual candidates by label.
+
+    Returns:
+        The candidates by label, and why usual ones are left out, a sentence by label.
+
+    Raises:
+        BackendError: What was asked for is none, occurs twice or does not exist.
+    """
+    if texts is None:
+        return available(usual)
+    return candidates([f"{t} = {usual[t]}" if t in usual else t for t in texts]), {}
 
 
 def folder_name(label: str) -> str:

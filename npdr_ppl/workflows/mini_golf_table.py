@@ -22,7 +22,7 @@ from npdr_ppl import metrics
 from npdr_ppl.errors import BackendError, DataError, NpdrError
 from npdr_ppl.models.mini_golf import MiniGolf, mini_golf, mini_golf_two_restitutions
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows.candidates import Candidate, available, candidates
+from npdr_ppl.workflows.candidates import Candidate, requested
 from npdr_ppl.workflows.evaluation import nominal_parameters
 from npdr_ppl.workflows.mini_golf_fit import (
     BALL,
@@ -102,12 +102,7 @@ def reproduce_mini_golf(
             "Table 1 needs two strikes at least, all of one length, to leave one out; got "
             f"{rollouts.lengths} steps."
         )
-    skipped: dict[str, str] = {}
-    if backends is None:
-        chosen, skipped = available(COLUMNS)
-    else:
-        texts = [f"{text} = {COLUMNS[text]}" if text in COLUMNS else text for text in backends]
-        chosen = candidates(texts)
+    chosen, skipped = requested(backends, COLUMNS)
     out.mkdir(parents=True, exist_ok=True)
     budget = Budget(
         rounds or ROUNDS, num_simulations or NUM_SIMULATIONS, seed, out / "runs", progress

@@ -31,7 +31,7 @@ from npdr_ppl.metrics import c2st
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows.candidates import Candidate, available, candidates
+from npdr_ppl.workflows.candidates import Candidate, requested
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.posterior import Posterior
 from npdr_ppl.workflows.run_folder import write_json
@@ -100,11 +100,7 @@ def reproduce_pendulum(
     Raises:
         BackendError: Every backend failed.
     """
-    skipped: dict[str, str] = {}
-    if backends is None:
-        chosen, skipped = available(METHODS)
-    else:
-        chosen = candidates([f"{b} = {METHODS[b]}" if b in METHODS else b for b in backends])
+    chosen, skipped = requested(backends, METHODS)
     out.mkdir(parents=True, exist_ok=True)
     ridges: dict[str, Ridge] = {}
     rows: dict[str, dict[str, Any]] = {}

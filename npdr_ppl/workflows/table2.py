@@ -16,7 +16,7 @@ from npdr_ppl.models.furuta import Furuta, furuta
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import InitialState
 from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.candidates import available, candidates
+from npdr_ppl.workflows.candidates import requested
 from npdr_ppl.workflows.compare import compare
 from npdr_ppl.workflows.comparison import Comparison
 from npdr_ppl.workflows.control_task import control_task
@@ -118,12 +118,7 @@ def reproduce_table2(
     rollouts.check(Furuta.sensors, Furuta.actions)
     train = rollouts[[i for i in range(len(rollouts)) if i not in holdout]]
     test = rollouts[list(holdout)]
-    skipped: dict[str, str] = {}
-    if backends is None:
-        chosen, skipped = available(COLUMNS)
-    else:
-        texts = [f"{text} = {COLUMNS[text]}" if text in COLUMNS else text for text in backends]
-        chosen = candidates(texts)
+    chosen, skipped = requested(backends, COLUMNS)
     comparison = compare(
         furuta,
         train,

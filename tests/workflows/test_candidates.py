@@ -9,6 +9,7 @@ from npdr_ppl.workflows.candidates import (
     available,
     candidates,
     folder_name,
+    requested,
     split_candidates,
 )
 
@@ -72,3 +73,14 @@ def test_absent_backends_are_skipped_with_a_reason():
     found, skipped = available({"here": "snpe-c", "there": "no-such-method"})
     assert list(found) == ["here"]
     assert "no-such-method" in skipped["there"]
+
+
+def test_usual_candidates_are_requested_by_their_labels():
+    usual = {"small": "snpe-c(hidden=(8,))", "gone": "no-such-method"}
+    found, skipped = requested(["small", "snpe-c"], usual)
+    assert found == candidates(["small = snpe-c(hidden=(8,))", "snpe-c"])
+    assert skipped == {}
+    found, skipped = requested(None, usual)
+    assert (list(found), list(skipped)) == (["small"], ["gone"])
+    with pytest.raises(BackendError, match="no-such-method"):
+        requested(["gone"], usual)

@@ -18,7 +18,7 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Start
-from npdr_ppl.language.effects import ForceEffect
+from npdr_ppl.models.effects.timed import TimedForceEffect
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
 
@@ -31,7 +31,7 @@ SMALL = 1e-3
 """Height of a pulse, in the port's rated force: a response is a derivative."""
 
 
-class Pulse(ForceEffect):
+class Pulse(TimedForceEffect):
     """A constant force during a part of each segment."""
 
     id = "pulse"
@@ -56,17 +56,6 @@ class Pulse(ForceEffect):
         """Returns the height during the pulse."""
         is_on = (memory >= parameters["begin"]) & (memory < parameters["end"])
         return parameters["height"] * is_on
-
-    def next_memory(
-        self,
-        position: Tensor,
-        velocity: Tensor,
-        parameters: Mapping[str, Tensor],
-        memory: Any,
-        time_step: float,
-    ) -> Tensor:
-        """Returns the time one step later."""
-        return memory + time_step
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from npdr_ppl.errors import ShapeError
+from npdr_ppl.displays.html import table
+from npdr_ppl.displays.panels import panels
+from npdr_ppl.displays.theme import COLORS
 from npdr_ppl.workflows.discovery.proof import LEVEL, Gap
 
 if TYPE_CHECKING:
@@ -20,8 +20,7 @@ __all__ = ["discovery_html", "draw_gap", "draw_probabilities", "plot_discovery",
 MOST_BARS = 5
 """Alternatives drawn of one effect."""
 
-CHOSEN, OTHERS, BEFORE = "#0072B2", "#999999", "#D55E00"
-"""Colours of Okabe and Ito's palette, as in all figures."""
+CHOSEN, OTHERS, BEFORE = COLORS["posterior"], COLORS["prior"], COLORS["nominal"]
 
 
 def short_name(name: str) -> str:
@@ -37,16 +36,7 @@ def plot_discovery(discovery: "Discovery", axes: Any = None) -> Any:
     shown = probabilities(discovery)
     metrics = {m: gap for m, gap in discovery.gap.items() if gap.noise_floor is not None}
     count = max(1, len(shown) + len(metrics))
-    if axes is None:
-        import matplotlib.pyplot as plt
-
-        _, made = plt.subplots(
-            1, count, figsize=(2.8 * count, 2.6), layout="constrained", squeeze=False
-        )
-        axes = made[0]
-    given = np.atleast_1d(np.asarray(axes, dtype=object)).ravel()
-    if len(given) != count:
-        raise ShapeError(f"There are {count} panels to draw; got {len(given)} axes.")
+    given = panels(axes, count, columns=count, size=(2.8, 2.6))
     given[0].set_title(f"verdict: {discovery.verdict}")
     for axis, (title, bars, chosen) in zip(given, shown, strict=False):
         draw_probabilities(axis, bars, chosen=chosen, title=title)
@@ -143,7 +133,7 @@ def discovery_html(discovery: "Discovery") -> str:
             for k, (name, p) in enumerate(f.parameters.items())
         ]
         head = ["effect", "probability", "parameter", "estimate", "not told from"]
-        parts.append(_table(head, rows))
+        parts.append(table(head, rows))
     if discovery.gap:
         rows = [
             [
@@ -155,13 +145,5 @@ def discovery_html(discovery: "Discovery") -> str:
             ]
             for metric, gap in discovery.gap.items()
         ]
-        parts.append(_table(["held out", "before", "after", "noise floor", "closed"], rows))
+        parts.append(table(["held out", "before", "after", "noise floor", "closed"], rows))
     return "".join([*parts, "</div>"])
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    def cells(tag: str, row: Sequence[str]) -> str:
-        return "".join(f'<{tag} style="text-align:left">{escape(c)}</{tag}>' for c in row)
-
-    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return f"<table><thead><tr>{cells('th', head)}</tr></thead><tbody>{body}</tbody></table>"

@@ -1,0 +1,139 @@
+"""What one row of the blind benchmark says: found, right, confident."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+__all__ = [
+    "Row",
+    "effect_id",
+    "estimates",
+    "found_names",
+    "has_all",
+    "has_any",
+    "has_too_many",
+    "is_bic_right",
+    "is_class_right",
+    "is_confident_and_wrong",
+    "is_first_right",
+    "is_sparse_effect",
+    "is_sparse_right",
+    "is_sparse_unknown",
+    "right_sets",
+    "sparse_name",
+]
+
+NAMED = 0.05
+"""Probability from which an alternative counts as reported."""
+
+CONFIDENT = 0.9
+"""Probability from which a name is given without doubt."""
+
+Row = dict[str, Any]
+
+
+def effect_id(name: str) -> str:
+    """Returns the effect of ``"<port>.<effect>"``."""
+    return name.rsplit(".", 1)[-1]
+
+
+def found_names(row: Row) -> list[str]:
+    """Returns the names of the effects that were found."""
+    return [f"{e['port']}.{e['effect']}" for e in row.get("effects", [])]
+
+
+def right_sets(row: Row) -> list[set[str]]:
+    """Returns the sets of names that count as right."""
+    return [set(row["truth"]), *(set(names) for names in row.get("alternatives", []))]
+
+
+def is_right(row: Row, name: str | None) -> bool:
+    """Returns whether a name is a true one, or stands for it."""
+    return name is not None and any(name in right for right in right_sets(row))
+
+
+def is_first_right(row: Row) -> bool:
+    """Returns whether the first effect is the true one, or stands for it."""
+    return is_right(row, next(iter(found_names(row)), None))
+
+
+def is_class_right(row: Row) -> bool:
+    """Returns whether the truth is the first effect or among what could stand in its place."""
+    if is_first_right(row):
+        return True
+    if not row.get("effects"):
+        return False
+    alternatives = row["effects"][0]["alternatives"]
+    named = {name for name, p in alternatives.items() if p >= NAMED}
+    ids = set(row["effects"][0]["equivalent_to"])
+    return any(
+        named & right or ids & {effect_id(name) for name in right} for right in right_sets(row)
+    )
+
+
+def is_confident_and_wrong(row: Row) -> bool:
+    """Returns whether a wrong name was given without doubt."""
+    if row.get("verdict") != "named" or not row["effects"]:
+        return False
+    return row["effects"][0]["probability"] >= CONFIDENT and not is_first_right(row)
+
+
+def has_all(row: Row) -> bool:
+    """Returns whether all hidden effects were found, or what stands for all."""
+    return any(right <= set(found_names(row)) for right in right_sets(row))
+
+
+def has_any(row: Row) -> bool:
+    """Returns whether one of the hidden effects was found, or stands for one."""
+    return any(is_right(row, name) for name in found_names(row))
+
+
+def has_too_many(row: Row) -> bool:
+    """Returns whether more effects were found than any right answer has."""
+    return len(row["effects"]) > max(len(right) for right in right_sets(row))
+
+
+def is_bic_right(row: Row) -> bool:
+    """Returns whether forward selection by BIC begins with a right effect."""
+    return is_right(row, row["bic"])
+
+
+def is_sparse_right(row: Row) -> bool:
+    """Returns whether sparse regression names a right effect first."""
+    return is_right(row, sparse_name(row))
+
+
+def is_sparse_unknown(row: Row) -> bool:
+    """Returns whether sparse regression names a term first that is no effect's."""
+    return ": " in (sparse_name(row) or "")
+
+
+def is_sparse_effect(row: Row) -> bool:
+    """Returns whether sparse regression names an effect first."""
+    return sparse_name(row) is not None and not is_sparse_unknown(row)
+
+
+def sparse_name(row: Row) -> str | None:
+    """Returns what sparse regression names first."""
+    return row["sparse"]["first"]
+
+
+def estimates(row: Row) -> Iterator[tuple[bool, float]]:
+    """Yields for each parameter of an effect that is truly there how well it was estimated.
+
+    Yields:
+        Whether its 90 % interval holds the truth, and its relative error, NaN where the truth is
+        zero.
+    """
+    for effect in row["effects"]:
+        for short, estimate in effect["parameters"].items():
+            site = f"{effect['port']}.{effect['effect']}.{short}"
+            true = row["true_parameters"].get(site)
+            if true is None or not math.isfinite(true):
+                continue
+            low, high = (math.nan if end is None else end for end in estimate["hdi_94"])
+            middle, half = 0.5 * (low + high), 0.5 * (high - low)
+            half *= 1.645 / 1.881  # from 94 % to 90 % of a normal distribution
+            mean = math.nan if estimate["mean"] is None else estimate["mean"]
+            error = abs(mean / true - 1.0) if true else math.nan
+            yield abs(true - middle) <= half, error

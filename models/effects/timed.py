@@ -1,0 +1,30 @@
+"""Forces that depend on the time."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+
+from npdr_ppl.language.effect_context import Start
+from npdr_ppl.language.effects import ForceEffect
+
+__all__ = ["TimedForceEffect"]
+
+
+class TimedForceEffect(ForceEffect):
+    """A force effect whose memory is the time in s since the rollout began."""
+
+    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:
+        """Returns the time."""
+        return start.time
+
+    def next_memory(
+        self,
+        position: Tensor,
+        velocity: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: Any,
+        time_step: float,
+    ) -> Tensor:
+        """Returns the time one step later."""
+        return memory + time_step
