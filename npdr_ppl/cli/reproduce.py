@@ -52,6 +52,12 @@ def reproduce(
             "MuJoCo; minutes each. 0 leaves these rows out.",
         ),
     ] = 0,
+    rounds: Annotated[
+        int | None, typer.Option(min=1, help="mini-golf: rounds of inference.")
+    ] = None,
+    simulations: Annotated[
+        int | None, typer.Option(min=10, help="mini-golf: simulations of each round.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -86,7 +92,13 @@ def reproduce(
             if data is None:
                 raise DataError("mini-golf needs the paper's recordings: pass --data FILE.")
             posteriors, result = reproduce_mini_golf(
-                Rollouts.load(data), out, backends=chosen, seed=seed, progress=progress
+                Rollouts.load(data),
+                out,
+                backends=chosen,
+                rounds=rounds,
+                num_simulations=simulations,
+                seed=seed,
+                progress=progress,
             )
             write_mini_golf_figures(
                 {label: p[-1] for label, p in posteriors.items()}, out, seed=seed
