@@ -26,8 +26,8 @@ NOT_A_NUMBER = frozenset({"nan", "na", "n/a", "null", "none"})
 """How programs write a reading that is missing."""
 
 GAP = (
-    " Interpolate single missing readings, cut the rollout in two at longer gaps; the actions of "
-    "a rollout's last row stay empty."
+    "; interpolate single missing readings, and cut the rollout in two at longer gaps (the "
+    "actions of a rollout's last row stay empty)"
 )
 """What to do about it."""
 
@@ -134,7 +134,7 @@ def _numbers(name: str, cells: list[str], lines: list[int]) -> NDArray[np.float6
     for cell, line in zip(cells, lines, strict=True):
         if cell and not _NUMBER.fullmatch(cell):
             raise DataError(
-                f"{name} is {checks.shown(cell)} in line {line}, which is not a finite number."
-                f"{GAP if cell.lower() in NOT_A_NUMBER else ''}"
+                f"{name} is {checks.shown(cell)} in line {line}, which is not a finite number"
+                f"{GAP if cell.lower() in NOT_A_NUMBER else ''}."
             )
     raise DataError(f"{name} has a cell that is not a finite number.")

@@ -53,7 +53,7 @@ MISTAKES = {
     "milliseconds": (column(1, lambda t: f"{1000 * float(t):.0f}"), "is it in milliseconds?"),
     "no last row": (lambda header, cells: (header, cells[:-1]), "otherwise append such a row"),
     "a full last row": (cell(-1, 4, "0.0"), "empty them if that row is the"),
-    "NaN": (cell(50, 2, "NaN"), "not a finite number. Interpolate single missing"),
+    "NaN": (cell(50, 2, "NaN"), "not a finite number; interpolate single missing"),
     "an empty cell": (cell(50, 2, ""), "angle is empty in line 52"),
     "irregular time": (cell(50, 1, "1.007"), "resample the data to constant sampling"),
     "degrees": (column(2, degrees), "angle seems to be in degrees"),

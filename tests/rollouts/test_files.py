@@ -114,6 +114,7 @@ def test_measured_files_round_trip(shared, tmp_path):
 
 
 def test_unknown_suffix_and_missing_files(tmp_path):
+    (tmp_path / "x.pkl").write_text("x")
     with pytest.raises(DataError, match=r"x.pkl: the suffix '.pkl' is unknown"):
         Rollouts.load(tmp_path / "x.pkl")
     for name in FORMATS.values():
