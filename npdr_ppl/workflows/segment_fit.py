@@ -39,11 +39,25 @@ single precision and dry friction blur."""
 START_STEP = 0.1
 """The same for initial states, in standard deviations of the smoother's error."""
 
-DAMPINGS = torch.logspace(-6, 2, 9, dtype=torch.float64)
-"""Dampings tried at each step, relative to the mean curvature."""
+FIRST_DAMPING = 1e-2
+LIMITS = 1e-8, 1e6
+"""Of the parameters relative to the mean curvature, and of each segment's initial state."""
+
+NEAR = 0.1, 1.0, 10.0
+"""Multiples of the last good dampings that are tried next."""
+
+FAR = 1e-4, 1e-2, 1.0, 1e2, 1e4
+"""Tried before it is said that nothing is left to gain."""
+
+ROUGHLY = 1e-3
+"""Share of the objective below which rough steps end …"""
+
+SETTLED = 0.95
+"""… once each channel's scale is at least so much of what it was."""
 
 LARGEST_STEP = 1.0
-"""Greatest change of a coordinate in one step, in standard deviations."""
+"""Greatest change of a parameter's coordinate in one step, in standard deviations. Initial states
+need no such limit: segments on an unstable motion are off by many, and each is damped apart."""
 
 MAX_COORDINATE = 5.0
 """How far from the prior's centre a fit may lie, in standard deviations. A strength that is much
@@ -195,21 +209,39 @@ class SegmentModel:
         square = residual.square().unflatten(-1, (-1, len(ones))).sum((0, 1))
         return (square / self.inputs.mask.sum()).sqrt().clamp_min(1e-9)
 
-    def linearise(self, z: Tensor, offsets: Tensor, scale: Tensor) -> Linearisation:
-        """Returns residuals and derivatives at one point, ``(d,)`` and ``(S, m)``."""
+    def linearise(
+        self, z: Tensor, offsets: Tensor, scale: Tensor, *, is_rough: bool = False
+    ) -> Linearisation:
+        """Returns residuals and derivatives at one point.
+
+        Args:
+            z: Parameters, ``(d,)``.
+            offsets: Offsets of the initial states, ``(S, m)``.
+            scale: Standard deviation of each channel's residuals, ``(C,)``.
+            is_rough: Whether one-sided differences will do, at half the price.
+        """
         d, m = len(z), self.num_offsets
         shifts = PARAMETER_STEP * torch.eye(d, dtype=torch.float64)
         moves = START_STEP * torch.eye(m, dtype=torch.float64)[:, None]
-        points = z + torch.cat((shifts, -shifts, torch.zeros(2 * m + 1, d, dtype=torch.float64)))
-        still = torch.zeros(2 * d, 1, m, dtype=torch.float64)
-        last = torch.zeros(1, 1, m, dtype=torch.float64)
-        starts = offsets + torch.cat((still, moves, -moves, last))
-        residual = self.residuals(points, starts, scale)
-        up, down, right, left, here = residual.split((d, d, m, m, 1))
+        signs = (1.0,) if is_rough else (1.0, -1.0)
+        num = len(signs)
+        points = torch.cat([sign * shifts for sign in signs])
+        starts = torch.cat([sign * moves for sign in signs]).reshape(num * m, 1, m)
+        residual = self.residuals(
+            z + torch.cat((points, torch.zeros(num * m + 1, d, dtype=torch.float64))),
+            offsets + torch.cat((torch.zeros(num * d, 1, m), starts, torch.zeros(1, 1, m))),
+            scale,
+        )
+        by_z, by_start, here = residual.split((num * d, num * m, 1))
+        if is_rough:
+            down, right = here.expand_as(by_z), here.expand_as(by_start)
+            up, left = by_z, by_start
+        else:
+            up, down, left, right = by_z[:d], by_z[d:], by_start[:m], by_start[m:]
         return Linearisation(
             here[0],
-            ((down - up) / (2 * PARAMETER_STEP)).permute(1, 2, 0),
-            ((left - right) / (2 * START_STEP)).permute(1, 2, 0),
+            ((down - up) / (num * PARAMETER_STEP)).permute(1, 2, 0),
+            ((right - left) / (num * START_STEP)).permute(1, 2, 0),
         )
 
     def _shifted(self, offsets: Tensor) -> Inputs:
@@ -233,20 +265,20 @@ def fit_segments(
     *,
     offsets: Tensor | None = None,
     max_steps: int = 12,
-    max_rescalings: int = 4,
+    is_rough: bool = False,
 ) -> SegmentFit:
     """Fits parameters and initial states, and finds the scale of what is left.
 
     The scale is part of the problem: it weighs the channels against each other and the recording
-    against prior and smoother. It is that of the residuals at the start, and again each time the
-    steps have converged.
+    against prior and smoother. It is that of the residuals after every step, until it changes
+    little; the last steps are at one scale.
 
     Args:
         segments: The model and the recording.
         z: Where to begin, ``(d,)``.
         offsets: Offsets of the initial states to begin with, ``(S, m)``; zero by default.
-        max_steps: Greatest number of steps for one scale.
-        max_rescalings: Greatest number of scales.
+        max_steps: Greatest number of steps, first until the scale is known, then at that scale.
+        is_rough: Whether the first will do; enough to rank what differs much.
 
     Raises:
         DataError: The simulation fails where the search begins.
@@ -258,64 +290,134 @@ def fit_segments(
     scale = segments.scale_of(z, offsets)
     if not bool(scale.isfinite().all()):
         raise DataError("The simulation fails at the parameters that the fit begins with.")
-    for _ in range(max_rescalings):
-        before = scale
-        z, offsets = _steps(segments, z, offsets, scale, max_steps)
-        scale = segments.scale_of(z, offsets)
-        if bool((scale > 0.95 * before).all()):
-            break
+    z, offsets, scale = _steps(segments, z, offsets, scale, max_steps, is_rough=True)
+    if not is_rough:
+        z, offsets, scale = _steps(segments, z, offsets, scale, max_steps, is_rough=False)
     return SegmentFit(z, offsets, scale)
 
 
 def _steps(
-    segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor, max_steps: int
-) -> tuple[Tensor, Tensor]:
-    """Takes steps at one scale until they gain little."""
+    segments: SegmentModel,
+    z: Tensor,
+    offsets: Tensor,
+    scale: Tensor,
+    max_steps: int,
+    *,
+    is_rough: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Takes steps until they gain little.
 
-    def objective(residual: Tensor, points: Tensor, starts: Tensor) -> Tensor:
-        sides = starts.square().sum((-1, -2)) + points.square().sum(-1)
-        return (residual.square().sum((-1, -2)) + sides).nan_to_num(torch.inf)
+    Rough steps make do with one-sided differences, and take the scale of what is left after each.
+    Each segment has its own damping, because one that sticks, or slips when its neighbours stick,
+    must not hold up the others: of the offsets tried at the same parameters every segment keeps
+    its best.
 
+    Returns:
+        Parameters, offsets and the scale of what is left.
+    """
+    damping, dampings = FIRST_DAMPING, torch.full((len(offsets),), FIRST_DAMPING).double()
+    factors = NEAR
     for _ in range(max_steps):
-        now = segments.linearise(z, offsets, scale)
+        now = segments.linearise(z, offsets, scale, is_rough=is_rough)
         if not all(bool(part.isfinite().all()) for part in (now.by_parameters, now.by_starts)):
             break
-        present = float(objective(now.residual, z, offsets))
-        points, starts = zip(
-            *(_step(now, z, offsets, float(damping)) for damping in DAMPINGS), strict=True
-        )
-        tried, begun = torch.stack(points), torch.stack(starts)
-        outcome = objective(segments.residuals(tried, begun, scale), tried, begun)
+        present = float(_objective(now.residual[None], z[None], offsets[None])[0])
+        moves = [_step(now, z, offsets, damping * f, dampings, factors) for f in factors]
+        tried = torch.stack([point for point, _ in moves])
+        begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
+        losses = _segment_losses(segments, tried, begun, scale)
+        least, chosen = losses.min(1)  # (a, S)
+        outcome = least.sum(-1) + tried.square().sum(-1)
         best = int(outcome.argmin())
         gain = present - float(outcome[best])
-        if gain <= 0.0:
+        is_little = gain < max(LEAST_GAIN, ROUGHLY * present if is_rough else 0.0)
+        if gain > 0.0:
+            place = chosen[best]
+            z, offsets = tried[best], begun[best][place, torch.arange(len(place))]
+            damping = min(max(damping * factors[best], LIMITS[0]), LIMITS[1])
+            dampings = (dampings * torch.tensor(factors).double()[place]).clamp(*LIMITS)
+            if is_rough:
+                before, scale = scale, segments.scale_of(z, offsets)
+                is_little = is_little and bool((scale > SETTLED * before).all())
+        if not is_little:
+            factors = NEAR
+        elif factors == FAR or (is_rough and gain > 0.0):
             break
-        z, offsets = tried[best], begun[best]
-        if gain < LEAST_GAIN:
-            break
-    return z, offsets
+        else:
+            factors = FAR
+    return z, offsets, scale if is_rough else segments.scale_of(z, offsets)
 
 
-def _step(now: Linearisation, z: Tensor, offsets: Tensor, damping: float) -> tuple[Tensor, Tensor]:
-    """Returns parameters and offsets after one damped Gauss-Newton step."""
+def _objective(residual: Tensor, z: Tensor, offsets: Tensor) -> Tensor:
+    """Returns what is minimised, ``(n,)``."""
+    sides = offsets.square().sum((-1, -2)) + z.square().sum(-1)
+    return (residual.square().sum((-1, -2)) + sides).nan_to_num(torch.inf)
+
+
+def _segment_losses(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
+    """Returns the objective's part of each segment, ``(a, b, S)``.
+
+    Args:
+        segments: The model and the recording.
+        z: Parameters, ``(a, d)``.
+        offsets: For each of them, b sets of offsets, ``(a, b, S, m)``.
+        scale: Standard deviation of each channel's residuals, ``(C,)``.
+    """
+    a, b = offsets.shape[:2]
+    residual = segments.residuals(z.repeat_interleave(b, 0), offsets.flatten(0, 1), scale)
+    square = residual.square().sum(-1).unflatten(0, (a, b)) + offsets.square().sum(-1)
+    return square.nan_to_num(torch.inf)
+
+
+def _step(
+    now: Linearisation,
+    z: Tensor,
+    offsets: Tensor,
+    damping: float,
+    dampings: Tensor,
+    factors: tuple[float, ...],
+) -> tuple[Tensor, Tensor]:
+    """Returns parameters after one damped Gauss-Newton step, and offsets to try with them.
+
+    Args:
+        now: Residuals and derivatives.
+        z: Parameters, ``(d,)``.
+        offsets: Offsets, ``(S, m)``.
+        damping: Of the parameters, relative to the mean curvature.
+        dampings: Of the offsets, by segment, ``(S,)``.
+        factors: Multiples of ``dampings`` to try.
+
+    Returns:
+        Parameters ``(d,)``, and offsets for each factor, ``(b, S, m)``.
+    """
     by_z, by_start = now.by_parameters, now.by_starts
     d, m = by_z.shape[-1], by_start.shape[-1]
-    # Each segment's offsets are eliminated: they meet no other segment's readings.
-    inner = by_start.mT @ by_start + (1.0 + damping) * torch.eye(m, dtype=torch.float64)
+    own = by_start.mT @ by_start  # (S, m, m)
     pull = (by_start.mT @ now.residual[..., None])[..., 0] - offsets
     cross = by_start.mT @ by_z  # (S, m, d)
-    solved = torch.linalg.solve(inner, torch.cat((cross, pull[..., None]), dim=-1))
-    hessian = (by_z.mT @ by_z - cross.mT @ solved[..., :d]).sum(0)
-    gradient = (by_z.mT @ now.residual[..., None] - cross.mT @ solved[..., d:]).sum(0)[:, 0] - z
+    sides = torch.cat((cross, pull[..., None]), dim=-1)
+    eye = torch.eye(m, dtype=torch.float64)
+
+    def solved(factor: float) -> Tensor:
+        damped = own + (1.0 + factor * dampings)[:, None, None] * eye
+        return torch.linalg.solve(damped, sides)
+
+    # Each segment's offsets are eliminated: they meet no other segment's readings.
+    middle = solved(1.0)
+    hessian = (by_z.mT @ by_z - cross.mT @ middle[..., :d]).sum(0)
+    gradient = (by_z.mT @ now.residual[..., None] - cross.mT @ middle[..., d:]).sum(0)[:, 0] - z
     curvature = hessian.diagonal().mean().clamp_min(1.0)
     hessian = hessian + (1.0 + damping * curvature) * torch.eye(d, dtype=torch.float64)
     change = torch.linalg.solve(hessian, gradient)
     change = change * min(1.0, LARGEST_STEP / float(change.abs().max().clamp_min(1e-12)))
-    moved = solved[..., d] - (solved[..., :d] @ change)
-    return (
-        (z + change).clamp(-MAX_COORDINATE, MAX_COORDINATE),
-        (offsets + moved.clamp(-LARGEST_STEP, LARGEST_STEP)),
-    )
+    moved = z + change
+    moved = moved.clamp(-MAX_COORDINATE, MAX_COORDINATE)
+    begun = []
+    for factor in factors:
+        part = solved(factor)
+        by = part[..., d] - part[..., :d] @ (moved - z)
+        begun.append(offsets + by)
+    return moved, torch.stack(begun)
 
 
 def _uncertain_components(inputs: Inputs) -> list[tuple[str, int, Tensor]]:

@@ -83,9 +83,7 @@ def _wrong_readings(
     cured: dict[str, float] = {}
     for problem, changed in _remedies(hypothesis, rollouts):
         try:
-            tried = fit_hypothesis(
-                hypothesis.model, changed, options, max_steps=6, max_rescalings=1
-            )
+            tried = fit_hypothesis(hypothesis.model, changed, options, max_steps=6, is_rough=True)
         except NpdrError:
             continue
         cured[problem] = _relative_misfit(tried)

@@ -112,7 +112,7 @@ def fit_hypothesis(
     start: Mapping[str, Tensor] | None = None,
     offsets: Tensor | None = None,
     max_steps: int = 12,
-    max_rescalings: int = 4,
+    is_rough: bool = False,
 ) -> Hypothesis:
     """Fits a model with effects to a recording.
 
@@ -123,8 +123,8 @@ def fit_hypothesis(
         effects: Effects to add.
         start: Parameters to begin with by site; the others begin in the middle of their priors.
         offsets: Offsets of the initial states to begin with, ``(S, m)``.
-        max_steps: Greatest number of steps for one scale.
-        max_rescalings: Greatest number of scales.
+        max_steps: Greatest number of steps.
+        is_rough: Whether to leave it at rough steps.
 
     Raises:
         DataError: The simulation fails at the start, or the data do not fit the model.
@@ -138,7 +138,5 @@ def fit_hypothesis(
         known = {name: torch.as_tensor(value)[None] for name, value in start.items()}
         z = segments.prior.to_reference({name: known.get(name, v) for name, v in middle.items()})
         z = z[0].nan_to_num(0.0).clamp(-START_LIMIT, START_LIMIT)
-    fit = fit_segments(
-        segments, z, offsets=offsets, max_steps=max_steps, max_rescalings=max_rescalings
-    )
+    fit = fit_segments(segments, z, offsets=offsets, max_steps=max_steps, is_rough=is_rough)
     return Hypothesis(model, effects, segments, fit)

@@ -27,10 +27,11 @@ __all__ = ["Added", "Round", "Search", "Searcher", "explained"]
 SHORTLIST = 6
 """Candidates fitted in full in each round."""
 
-TRIAL = {"max_steps": 6, "max_rescalings": 2}
-"""Steps of a fit that shows whether a candidate is worth a longer one."""
+MAX_STEPS = 12
+"""Steps of a fit."""
 
-FULL = {"max_steps": 12, "max_rescalings": 4}
+TRIAL_STEPS = 6
+"""Steps of a fit that shows whether a candidate is worth a longer one."""
 
 CONTENDERS = 3
 """Candidates that are fitted to the end."""
@@ -59,6 +60,7 @@ class Round:
         ranking: The candidates by linear gain.
         responses: What pulses of force at the joints would change.
         weights: Probability of each candidate fitted in full, by name; ``""`` for none.
+        trials: The model with each of them, by name.
     """
 
     hypothesis: Hypothesis
@@ -66,6 +68,7 @@ class Round:
     ranking: list[Screened]
     responses: Responses
     weights: dict[str, float] = field(default_factory=dict)
+    trials: dict[str, Hypothesis] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -153,20 +156,21 @@ class Searcher:
             and len(current.effects) < max_effects
             and now.alarm.gain > LEAST_SHARE * explained(first.hypothesis, current)
         ):
-            better, weights = self._extended(current, now)
-            rounds[-1] = replace(now, weights=weights)
-            if better is None:
+            best, weights, tried = self._extended(current, now)
+            rounds[-1] = replace(now, weights=weights, trials=tried)
+            if best is None:
                 break
-            current, needless = self._pruned(better)
+            current, needless = self._pruned(tried[best])
             removed += needless
             if any(set(current.names) == set(r.hypothesis.names) for r in rounds):
                 break
             now = self.look(current)
             rounds.append(now)
-        added, trials = [], {}
+        added: list[Added] = []
+        trials: dict[tuple[str, str], Hypothesis] = {}
         for effect in current.effects:
-            current, alternatives, tried = self._alternatives(current, effect, first.hypothesis)
-            trials |= tried
+            current, alternatives, rivals = self._alternatives(current, effect, rounds)
+            trials |= rivals
             added.append(alternatives)
         if set(current.names) != set(rounds[-1].hypothesis.names):
             rounds.append(self.look(current))  # something was swapped: what is left is another
@@ -208,8 +212,8 @@ class Searcher:
 
     def _extended(
         self, current: Hypothesis, now: Round
-    ) -> tuple[Hypothesis | None, dict[str, float]]:
-        """Returns the model with the candidate that explains most, unless none does.
+    ) -> tuple[str | None, dict[str, float], dict[str, Hypothesis]]:
+        """Returns the candidate that explains most, unless none does, with weights and trials.
 
         A candidate explains something if chance does not, as the alarm counts, or if the evidence
         against the model without it is strong.
@@ -222,7 +226,7 @@ class Searcher:
                 trials[candidate.name] = found
                 self._report(f"tried {candidate.name}: {_shown(found)}")
         if not trials:
-            return None, {}
+            return None, {}, {}
         trials = self._converged(trials)
         each = math.log(PRIOR_OF_ANY / max(1, len(ranking)))
         hypotheses = [current, *trials.values()]
@@ -231,14 +235,15 @@ class Searcher:
         best = max(trials, key=lambda name: weights[name])
         is_chance = now.alarm.p_values.get(best, 1.0) > self.options.false_alarm_rate
         if is_chance and weights[""] > 1.0 - self.options.confidence:
-            return None, weights
+            return None, weights, trials
         self._report(f"adding {best}")
-        return trials[best], weights
+        return best, weights, trials
 
     def _fitted(self, current: Hypothesis, candidate: Screened) -> Hypothesis | None:
         """Returns the model with a candidate, fitted from where the linear gain puts it."""
         start = current.parameters | candidate.variant.parameters(candidate.sizes)
-        return self._fit((*current.effects, candidate.variant.effect), start, current)
+        effects = (*current.effects, candidate.variant.effect)
+        return self._fit(effects, start, current, is_trial=True)
 
     def _converged(self, trials: dict[str, Hypothesis]) -> dict[str, Hypothesis]:
         """Fits the contenders to the end; the others are too far behind for that to matter."""
@@ -249,7 +254,7 @@ class Searcher:
         for name in sorted(losses, key=lambda name: losses[name])[:CONTENDERS]:
             if losses[name] <= least + max(CONTENDS_ANYWAY, CONTENDS * abs(least)):
                 trial = trials[name]
-                longer = self._fit(trial.effects, trial.parameters, trial, **FULL)
+                longer = self._fit(trial.effects, trial.parameters, trial)
                 result[name] = longer or trial
         return result
 
@@ -259,8 +264,7 @@ class Searcher:
         start: Mapping[str, Tensor],
         current: Hypothesis,
         *,
-        max_steps: int = TRIAL["max_steps"],
-        max_rescalings: int = TRIAL["max_rescalings"],
+        is_trial: bool = False,
     ) -> Hypothesis | None:
         """Returns the model with effects, fitted; ``None`` if it cannot be simulated."""
         try:
@@ -271,8 +275,8 @@ class Searcher:
                 effects=effects,
                 start=start,
                 offsets=current.fit.offsets,
-                max_steps=max_steps,
-                max_rescalings=max_rescalings,
+                max_steps=TRIAL_STEPS if is_trial else MAX_STEPS,
+                is_rough=is_trial,
             )
         except NpdrError:
             return None
@@ -295,22 +299,13 @@ class Searcher:
         return current, removed
 
     def _alternatives(
-        self, current: Hypothesis, effect: Effect, base: Hypothesis
+        self, current: Hypothesis, effect: Effect, rounds: list[Round]
     ) -> tuple[Hypothesis, Added, dict[tuple[str, str], Hypothesis]]:
         """Asks what else could stand in an effect's place, all others being there."""
-        without = self._without(current, effect)
-        if without is None:
+        found = self._rivals(current, effect, rounds)
+        if found is None:
             return current, Added(effect, effect.name, 1.0, {effect.name: 1.0}), {}
-        candidates = tuple(e for e in self._candidates(without) if e.name != effect.name)
-        projection = Projection(without)
-        pulses = responses(without)
-        ranking = screen(projection, self._variants(projection, without, candidates, pulses))
-        trials = {effect.name: current}
-        for candidate in ranking[:SHORTLIST]:
-            found = self._fitted(without, candidate)
-            if found is not None:
-                trials[candidate.name] = found
-        trials = self._converged(trials)
+        without, trials = found
         log_prior = [_log_prior(trial) for trial in trials.values()]
         weights = weigh(list(trials.values()), log_prior, seed=0)
         alternatives = dict(zip(trials, weights, strict=True))
@@ -319,12 +314,39 @@ class Searcher:
         chosen = next(e for e in swapped.effects if e.name == best)
         self._report(f"{effect.name}: probability {alternatives[effect.name]:.2f}")
         tried = {(effect.name, name): trial for name, trial in trials.items()}
+        base = rounds[0].hypothesis
         scale = closest([base, swapped]).fit.scale
         whole, lost = (
             float((h.losses(scale) - swapped.losses(scale)).sum()) for h in (base, without)
         )
         share = max(0.0, lost) / max(whole, 1e-12)
         return swapped, Added(chosen, effect.name, share, alternatives), tried
+
+    def _rivals(
+        self, current: Hypothesis, effect: Effect, rounds: list[Round]
+    ) -> tuple[Hypothesis, dict[str, Hypothesis]] | None:
+        """Returns the model without an effect, and with each that could stand in its place.
+
+        The effect itself is among them. A round that looked at the same effects has tried them
+        already. ``None`` if the model cannot be simulated without.
+        """
+        rest = set(current.names) - {effect.name}
+        for seen in rounds:
+            if set(seen.hypothesis.names) == rest and effect.name in seen.trials:
+                return seen.hypothesis, seen.trials | {effect.name: current}
+        without = self._without(current, effect)
+        if without is None:
+            return None
+        candidates = tuple(e for e in self._candidates(without) if e.name != effect.name)
+        projection = Projection(without)
+        pulses = responses(without)
+        ranking = screen(projection, self._variants(projection, without, candidates, pulses))
+        trials = {effect.name: current}
+        for candidate in ranking[:SHORTLIST]:
+            fitted = self._fitted(without, candidate)
+            if fitted is not None:
+                trials[candidate.name] = fitted
+        return without, self._converged(trials)
 
 
 def _shown(hypothesis: Hypothesis) -> str:

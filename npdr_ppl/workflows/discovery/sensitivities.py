@@ -107,35 +107,27 @@ def sensitivities(
         if effect.name in (hints or {}):
             shapes.append({**shapes[0], **(hints or {})[effect.name]})
         sizes = SIZES if _needs_size(effect, strengths) else (SMALL,)
-        for shape, size in itertools.product(shapes, sizes):
-            values = {**probe, **shape}
-            nominal = torch.tensor([_resting(resting[n], probe[n]) for n in strengths]).double()
-            full = torch.tensor([values[n] for n in strengths], dtype=torch.float64)
-            switched = {
-                n: size * (values[n] - z) + z
-                for n, z in zip(strengths, nominal.tolist(), strict=True)
-            }
-            # One simulation per strength, the others resting.
-            batch = {
-                f"{effect.name}.{name}": torch.tensor(
-                    [
-                        (switched[name] if on == name else resting[name])
-                        if name in strengths
-                        else values[name]
-                        for on in strengths
-                    ],
-                    dtype=torch.float64,
-                )
-                for name in values
-            }
-            moved = segments.run(
-                changed,
-                {**box.parameters, **batch},
-                fit.offsets[None].expand(len(strengths), -1, -1),
-            )
-            difference = ((moved - base).double() * mask / fit.scale).flatten(-2) / size
+        cases = list(itertools.product(shapes, sizes))
+        nominal = torch.tensor([_resting(resting[n], probe[n]) for n in strengths]).double()
+        # One simulation per shape, size and strength, the other strengths resting.
+        runs = [
+            _switched_on({**probe, **shape}, size, on, nominal[k], resting, strengths)
+            for shape, size in cases
+            for k, on in enumerate(strengths)
+        ]
+        batch = {
+            f"{effect.name}.{name}": torch.tensor([run[name] for run in runs], dtype=torch.float64)
+            for name in runs[0]
+        }
+        starts = fit.offsets[None].expand(len(runs), -1, -1)
+        moved = segments.run(changed, {**box.parameters, **batch}, starts)
+        differences = ((moved - base).double() * mask / fit.scale).flatten(-2)
+        for (shape, size), part in zip(cases, differences.split(len(strengths)), strict=True):
+            difference = part / size
             if not bool(difference.isfinite().all()) or float(difference.abs().max()) == 0.0:
                 continue
+            values = {**probe, **shape}
+            full = torch.tensor([values[n] for n in strengths], dtype=torch.float64)
             lower, upper, deviation = _limits(priors, strengths, nominal, full)
             result.append(
                 Variant(
@@ -151,6 +143,20 @@ def sensitivities(
                 )
             )
     return result
+
+
+def _switched_on(
+    values: Mapping[str, float],
+    size: float,
+    on: str,
+    nominal: Tensor,
+    resting: Mapping[str, float],
+    strengths: tuple[str, ...],
+) -> dict[str, float]:
+    """Returns an effect's parameters with one strength at a size and the others resting."""
+    rest = {name: resting[name] if name in strengths else value for name, value in values.items()}
+    zero = float(nominal)
+    return rest | {on: size * (values[on] - zero) + zero}
 
 
 def _shapes(
