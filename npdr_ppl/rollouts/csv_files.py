@@ -22,6 +22,8 @@ __all__ = ["read_csv", "write_csv"]
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NUMBER_CHARACTERS = frozenset("0123456789+-.eE")
 
+_UNIT_IN_NAME = re.compile(r"\s*[\[(].*[\])]$")
+
 NOT_A_NUMBER = frozenset({"nan", "na", "n/a", "null", "none"})
 """How programs write a reading that is missing."""
 
@@ -111,8 +113,11 @@ def _checked_header(row: list[str]) -> list[str]:
     checks.check_names(header, "column")
     for required in ("rollout", "time"):
         if required not in header:
+            told = [n for n in header if _UNIT_IN_NAME.sub("", n) == required]
+            hint = f"; units are SI and no part of names, so rename {told[0]!r}" if told else ""
             raise DataError(
-                f"there is no column {required}; the header is {checks.shown(','.join(header))}."
+                f"there is no column {required}; the header is "
+                f"{checks.shown(','.join(header))}{hint}."
             )
     return header
 

@@ -22,7 +22,7 @@ from npdr_ppl.workflows.memory import sampled_memory
 from npdr_ppl.workflows.posterior import Posterior, PosteriorBase
 from npdr_ppl.workflows.predictive_scores import predictive_scores
 from npdr_ppl.workflows.progress import Reporter, reporter
-from npdr_ppl.workflows.run_folder import read_json, write_json
+from npdr_ppl.workflows.run_folder import holds_this_run, make_folder, read_json, write_json
 from npdr_ppl.workflows.stacking import StackedPosterior, Stacking, mixture_elpd, stack
 
 __all__ = ["compare"]
@@ -74,9 +74,9 @@ def compare(
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Raises:
-        BackendError: A backend or an option does not exist, the folder holds another comparison,
-            or every backend failed.
-        DataError: The data do not fit the model, or held-out data have other parameters.
+        BackendError: A backend or an option does not exist, or every backend failed.
+        DataError: The data do not fit the model, held-out data have other parameters, or the
+            folder holds another comparison.
 
     Example:
         >>> import pyro, pyro.distributions as dist, torch
@@ -299,17 +299,9 @@ def _claim(out: Path, settings: Mapping[str, Any]) -> None:
     """Notes the settings, or checks that the folder holds this very comparison already.
 
     Raises:
-        BackendError: The folder holds a comparison with other settings.
+        DataError: The folder holds a comparison with other settings.
     """
+    make_folder(out)
     file = out / "settings.json"
-    if file.exists():
-        present = read_json(file)
-        differing = [name for name, value in settings.items() if present.get(name) != value]
-        if differing:
-            raise BackendError(
-                f"{out} holds a comparison that differs in {', '.join(differing)}; choose another "
-                "folder, or remove it."
-            )
-        return
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(file, settings)
+    if not holds_this_run(file, settings):
+        write_json(file, settings)

@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from npdr_ppl.errors import DataError
 from npdr_ppl.targets.base import TargetDomain
 from npdr_ppl.workflows.control_task import ControlTask
 from npdr_ppl.workflows.run_folder import (
+    holds_this_run,
     load_tensors,
+    make_folder,
     plain,
     read_json,
     save_tensors,
@@ -67,7 +68,7 @@ class LoopFolder:
         Raises:
             DataError: The folder holds a run with another model, target or options.
         """
-        self.path.mkdir(parents=True, exist_ok=True)
+        make_folder(self.path)
         description = plain(
             {
                 "format": FORMAT,
@@ -82,16 +83,8 @@ class LoopFolder:
         # More iterations of the same run are welcome.
         iterations = description["options"].pop("iterations")
         file = self.path / "loop.json"
-        if file.exists():
-            present = read_json(file)
-            differing = [key for key, value in description.items() if present.get(key) != value]
-            if differing:
-                raise DataError(
-                    f"{self.path} holds a run that differs in {', '.join(differing)}; choose "
-                    "another folder, or remove it."
-                )
-            return
-        write_json(file, description | {"iterations": iterations, "versions": versions()})
+        if not holds_this_run(file, description):
+            write_json(file, description | {"iterations": iterations, "versions": versions()})
 
     @property
     def rollouts(self) -> Path:

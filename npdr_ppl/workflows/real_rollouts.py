@@ -24,7 +24,9 @@ class RealRollouts:
 
     Args:
         target: The target domain.
-        task: What the policy is to do; gives the reward where the target has none.
+        task: What the policy is to do; gives the reward, so that returns on the target and in
+            simulation can be compared. Rewards that a target gives count where they were recorded
+            earlier, or where no state is.
         simulator: Names the state's components, for the reward.
         folder: Where rollouts are kept; ``None`` for memory only.
 
@@ -79,7 +81,8 @@ class RealRollouts:
             rollout, commands = recovered
         else:
             rollout, commands = self._run(episode, policy, domain, seed, journal_file)
-        if rollout.rewards is None:
+        keeps_own = self.target.is_recorded or missing_states(self.simulator, rollout)
+        if rollout.rewards is None or not keeps_own:
             rollout = self._with_rewards(rollout, commands)
         if file is not None:
             rollout.to_netcdf(file)
@@ -161,7 +164,7 @@ def rewards_of(
         DataError: A component of the state was not recorded.
     """
     columns = {name: i for i, name in enumerate(rollout.channel_names)}
-    missing = [state.name for state in simulator.states if state.name not in columns]
+    missing = missing_states(simulator, rollout)
     if missing:
         raise DataError(f"The reward needs readings of {', '.join(missing)}.")
     readings = torch.tensor(rollout.readings[0][:-1])
@@ -173,3 +176,8 @@ def rewards_of(
         tuple(torch.tensor(commands[: len(readings)]).unbind(-1)),
     )
     return rewards.numpy()
+
+
+def missing_states(simulator: ClosedLoopSimulator, rollout: Rollouts) -> list[str]:
+    """Returns the components of the state that were not recorded."""
+    return [state.name for state in simulator.states if state.name not in rollout.channel_names]

@@ -28,7 +28,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from npdr_ppl.errors import BackendError, DataError
+from npdr_ppl.errors import DataError
 from npdr_ppl.inference.base import Backend, RoundInfo
 from npdr_ppl.language.handlers import ModelWithEffects
 from npdr_ppl.language.prior import Prior
@@ -40,7 +40,9 @@ from npdr_ppl.workflows.binding import BoundModel
 __all__ = [
     "RunFolder",
     "engine_settings",
+    "holds_this_run",
     "load_tensors",
+    "make_folder",
     "plain",
     "read_json",
     "save_tensors",
@@ -51,11 +53,14 @@ __all__ = [
 
 IN_WORDS = {
     "binding": "how the data are prepared",
-    "num_simulations": "the number of simulations",
     "fingerprint": "the data or what is read from them",
-    "options": "the backend's options",
+    "model": "the model's source",
+    "num_simulations": "the number of simulations",
+    "num_steps": "the number of steps",
+    "options": "options",
+    "recordings": "the recordings",
 }
-"""What the keys of ``run.json`` mean to whoever gave a command."""
+"""What the keys of descriptions mean to whoever gave a command."""
 
 FORMAT = 1
 _PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
@@ -87,9 +92,9 @@ class RunFolder:
         """Describes the run, or checks that the folder holds this very run already.
 
         Raises:
-            BackendError: The folder holds a run with other settings or data.
+            DataError: The folder holds a run with other settings or data.
         """
-        self.path.mkdir(parents=True, exist_ok=True)
+        make_folder(self.path)
         description = {
             "format": FORMAT,
             "backend": method.name,
@@ -100,15 +105,7 @@ class RunFolder:
             "fingerprint": _fingerprint(bound.observed_features()),
         }
         file = self.path / "run.json"
-        if file.exists():
-            present = read_json(file)
-            differing = [str(k) for k, v in plain(description).items() if present.get(k) != v]
-            if differing:
-                words = dict.fromkeys(IN_WORDS.get(key, key) for key in differing)
-                raise BackendError(
-                    f"{self.path} holds a run that differs in {', '.join(words)}; choose "
-                    "another folder, or remove it."
-                )
+        if holds_this_run(file, description):
             return
         for name, data in bound.data.items():
             if isinstance(data, Rollouts):
@@ -194,6 +191,48 @@ class RunFolder:
 
     def _simulations(self, index: int) -> Path:
         return self.path / f"round_{index}_simulations.safetensors"
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder for results if there is none.
+
+    Raises:
+        DataError: A file is in the way.
+    """
+    for place in (path, *path.parents):
+        if place.exists():
+            if not place.is_dir():
+                raise DataError(f"{path} cannot be a folder for results: {place} is a file.")
+            break
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
+    """Returns whether a run is described already.
+
+    The description of another run that never got as far as a result counts for nothing: whoever
+    repairs what stopped it gives the same command again.
+
+    Args:
+        file: JSON with the description, which is not written here.
+        description: What the run at hand is to be.
+
+    Raises:
+        DataError: The folder holds results of another run.
+    """
+    if not file.exists():
+        return False
+    present = read_json(file)
+    differing = [key for key, value in plain(description).items() if present.get(key) != value]
+    if not differing:
+        return True
+    inputs = {file, *file.parent.glob("data_*")}
+    if not any(entry not in inputs for entry in file.parent.iterdir()):
+        return False
+    words = ", ".join(dict.fromkeys(IN_WORDS.get(key, key) for key in differing))
+    raise DataError(
+        f"{file.parent} holds a run that differs in {words}; choose another folder, or remove it."
+    )
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -145,6 +145,11 @@ class SegmentModel:
         self.sensor_names = names = tuple(sensor.name for sensor in box.simulator.sensors)
         self.measured = tuple(s for s in box.simulator.sensors if s.name in rollouts.channel_names)
         self.channel_names = tuple(sensor.name for sensor in self.measured)
+        if not self.measured:
+            raise DataError(
+                f"None of the recording's columns {', '.join(rollouts.channel_names)} is a sensor "
+                f"of the model, {', '.join(names)}; rename them."
+            )
         self._columns = [names.index(name) for name in self.channel_names]
         self.observed = rollouts.observation(self.inputs, channels=self.channel_names)
         self._offsets = _uncertain_components(self.inputs)

@@ -47,8 +47,9 @@ def degrees(text):
 
 
 MISTAKES = {
-    "wrong names": (renamed("angle,velocity", "q,dq"), "the column angle, velocity is missing"),
+    "wrong names": (renamed("angle,velocity", "q,dq"), "is a sensor of the model, angle, velocity; rename"),
     "wrong name of time": (renamed("time", "t"), "there is no column time; the header is"),
+    "a unit behind time": (renamed("time", "time [s]"), "no part of names, so rename 'time [s]'"),
     "wrong name of an action": (renamed("torque", "tau"), "the column torque is missing"),
     "milliseconds": (column(1, lambda t: f"{1000 * float(t):.0f}"), "is it in milliseconds?"),
     "no last row": (lambda header, cells: (header, cells[:-1]), "otherwise append such a row"),
@@ -122,6 +123,32 @@ def test_a_mistake_in_a_command(monkeypatch, capsys, tmp_path, words, sentence):
     assert code == 2
     assert sentence in err
     assert err.startswith("npdr: ") and err.count("\n") == 1, err
+
+
+def test_the_same_command_works_once_the_recording_is_repaired(monkeypatch, capsys, tmp_path):
+    data, out = tmp_path / "measured.csv", tmp_path / "found"
+    words = ["discover", "pendulum", "--data", data, "--out", out, "--stage", "check"]
+    words += ["--segment-length", 10]
+    data.write_text("\n".join([HEADER.replace("angle,velocity", "q,dq"), *map(",".join, rows())]))
+    code, err = answered(monkeypatch, capsys, *words)
+    assert code == 2 and "q, dq is a sensor of the model, angle, velocity; rename them" in err
+    data.write_text("\n".join([HEADER, *map(",".join, rows())]))
+    code, err = answered(monkeypatch, capsys, *words)
+    assert code == 0, err
+    data.write_text("\n".join([HEADER, *map(",".join, rows()[:51])]))
+    code, err = answered(monkeypatch, capsys, *words)
+    assert code == 2, "results of another recording are not overwritten"
+
+
+def test_results_cannot_go_into_a_file(monkeypatch, capsys, tmp_path):
+    data = tmp_path / "measured.csv"
+    data.write_text("\n".join([HEADER, *map(",".join, rows())]))
+    for command in ("fit", "discover"):
+        code, err = answered(
+            monkeypatch, capsys, command, "pendulum", "--data", data, "--out", data / "run"
+        )
+        assert code == 2
+        assert f"cannot be a folder for results: {data} is a file." in err
 
 
 def test_an_actuator_does_not_hide_the_force_port_of_its_joint(tmp_path):

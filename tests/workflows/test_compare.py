@@ -294,7 +294,7 @@ def test_the_same_seed_gives_the_same_figures_and_a_killed_run_continues(
     # Backends may be added to a comparison, but not to another one.
     more = run(pendulum, train, test, backends | {"c": NEAR}, out=tmp_path, **arguments)
     assert set(more.rows) == {"a", "b", "c"} and len(calls) == 7
-    with pytest.raises(BackendError, match="differs in seed"):
+    with pytest.raises(DataError, match="differs in seed"):
         run(pendulum, train, test, backends, out=tmp_path, **(arguments | {"seed": 4}))
 
 

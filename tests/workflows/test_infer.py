@@ -77,7 +77,7 @@ def test_an_interrupted_run_continues_to_the_same_result(linear, quick, tmp_path
         resumed.after_round(0).sample(10)["theta"],
         npdr.infer(model, observed, **{**arguments, "rounds": 1}).sample(10)["theta"],
     )
-    with pytest.raises(BackendError, match="differs in seed"):
+    with pytest.raises(DataError, match="differs in seed"):
         npdr.infer(model, observed, checkpoint=tmp_path, **{**arguments, "seed": 9})
 
 

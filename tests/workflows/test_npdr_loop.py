@@ -85,6 +85,18 @@ def test_rewards_are_those_of_readings_and_unlimited_commands(tmp_path):
     assert result.iterations[0]["real_return"] == pytest.approx(rewards.sum())
 
 
+class PaysItself(HandmadePendulum):
+    """A target with a reward of its own, which has nothing to do with the task."""
+
+    def rollout(self, readings, actions, rewards=None):
+        return super().rollout(readings, actions, np.full(len(actions), -1000.0))
+
+
+def test_a_targets_own_reward_is_not_mistaken_for_the_tasks(tmp_path):
+    result = run(tmp_path, target=PaysItself())
+    assert result.iterations[0]["real_return"] > 0.0
+
+
 def test_an_accepted_posterior_trains_the_policy(tmp_path, monkeypatch):
     scripted(monkeypatch, Decision.ACCEPT)
     result = run(tmp_path)

@@ -14,13 +14,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.atomic import replacing
 from npdr_ppl.workflows.discovery.discovery import Investigation
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.result import Discovery, describe_candidate
-from npdr_ppl.workflows.run_folder import plain, read_json, source_text, versions, write_json
+from npdr_ppl.workflows.run_folder import (
+    holds_this_run,
+    make_folder,
+    plain,
+    read_json,
+    source_text,
+    versions,
+    write_json,
+)
 
 __all__ = ["STAGES", "DiscoveryFolder", "Stage", "findings_until"]
 
@@ -68,17 +75,9 @@ class DiscoveryFolder:
             }
         )
         file = self.path / "run.json"
-        if file.exists():
-            present = read_json(file)
-            differing = [k for k, v in description.items() if present.get(k) != v]
-            if differing:
-                raise DataError(
-                    f"{self.path} holds a run that differs in {', '.join(differing)}; choose "
-                    "another folder, or remove it."
-                )
-            return
-        self.path.mkdir(parents=True, exist_ok=True)
-        write_json(file, description | {"versions": versions()})
+        make_folder(self.path)
+        if not holds_this_run(file, description):
+            write_json(file, description | {"versions": versions()})
 
     def finished(self, stage: Stage) -> dict[str, Any] | None:
         """Returns the results up to a stage if they are here already."""
