@@ -10,6 +10,9 @@ from npdr_ppl.errors import NpdrError
 
 __all__ = ["app", "main"]
 
+# The public name of the class from which wrong options, values and commands all descend.
+_UsageError = typer.BadParameter.__bases__[0]
+
 app = typer.Typer(
     name="npdr",
     help="Probabilistic programming for robot simulators.",
@@ -39,11 +42,20 @@ def main() -> None:
     # this when torch is first imported, which is after this line.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
-        app()
+        # Without arguments the help is shown, which is no sentence.
+        sys.exit(app(standalone_mode=len(sys.argv) < 2))
+    except _UsageError as error:
+        where = error.ctx.command_path if error.ctx else "npdr"
+        _refuse(f"{_sentence(error.format_message())} See {where} --help.")
     except NpdrError as error:
         _refuse(str(error))
     except OSError as error:
         _refuse(f"{error.filename or 'A file'}: {error.strerror or error}.")
+
+
+def _sentence(message: str) -> str:
+    line = " ".join(message.split())
+    return line if line.endswith((".", "?", "!")) else f"{line}."
 
 
 def _refuse(sentence: str) -> None:

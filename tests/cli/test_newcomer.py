@@ -47,7 +47,7 @@ def degrees(text):
 
 
 MISTAKES = {
-    "wrong names": (renamed("angle,velocity", "q,dq"), "is a sensor of the model, angle, velocity; rename"),
+    "wrong names": (renamed("angle,velocity", "q,dq"), "q, dq is a sensor of the model"),
     "wrong name of time": (renamed("time", "t"), "there is no column time; the header is"),
     "a unit behind time": (renamed("time", "time [s]"), "no part of names, so rename 'time [s]'"),
     "wrong name of an action": (renamed("torque", "tau"), "the column torque is missing"),
@@ -120,6 +120,31 @@ def test_a_mistake_in_a_command(monkeypatch, capsys, tmp_path, words, sentence):
         monkeypatch, capsys, "fit", *words, "--out", "fit", "--backend", "abc", "--rounds", 1,
         "--simulations", 10, "--segment-length", 25,
     )  # fmt: skip
+    assert code == 2
+    assert sentence in err
+    assert err.startswith("npdr: ") and err.count("\n") == 1, err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["fti"], "No such command 'fti'. Did you mean 'fit'?"),
+        (["fit"], "Missing argument 'model'."),
+        (["fit", "pendulum"], "Missing option '--data'"),
+        (
+            ["fit", "pendulum", "--roundz", "3"],
+            "No such option: --roundz (Possible options: --out, --rounds).",
+        ),
+        (
+            ["fit", "pendulum", "--rounds", "many"],
+            "Invalid value for '--rounds': Input should be a valid integer",
+        ),
+        (["fit", "pendulum", "--rounds", "0"], "Invalid value for '--rounds': "),
+        (["fit", "pendulum", "--segment-length"], "requires an argument."),
+    ],
+)
+def test_a_mistake_in_an_option(monkeypatch, capsys, words, sentence):
+    code, err = answered(monkeypatch, capsys, *words)
     assert code == 2
     assert sentence in err
     assert err.startswith("npdr: ") and err.count("\n") == 1, err
