@@ -23,7 +23,7 @@ demo: $(VENV)/installed
 
 test: style
 	@echo "==> tests on $(WORKERS) workers"
-	$(TEST_ENV) $(BIN)/python -m pytest -n $(WORKERS) --durations=15
+	$(TEST_ENV) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --durations=15
 
 style: $(VENV)/installed
 	@echo "==> style and layers"

@@ -43,7 +43,7 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         # Without arguments the help is shown, which is no sentence.
-        sys.exit(app(standalone_mode=len(sys.argv) < 2))
+        sys.exit(app(standalone_mode=len(sys.argv) < 2) or 0)
     except _UsageError as error:
         where = error.ctx.command_path if error.ctx else "npdr"
         _refuse(f"{_sentence(error.format_message())} See {where} --help.")

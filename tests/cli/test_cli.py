@@ -171,7 +171,7 @@ def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path
     [
         (["fit", "pendulun", "--data", "DATA", "--out", "OUT"], "did you mean 'pendulum'"),
         (["fit", "nothing.py:f", "--data", "DATA", "--out", "OUT"], "nothing.py does not exist"),
-        (["fit", "furuta", "--data", "DATA", "--out", "OUT"], "voltage"),
+        (["fit", "furuta", "--data", "DATA", "--out", "OUT"], "arm_angle"),
         (["fit", "pendulum", "--data", "missing.csv", "--out", "OUT"], "missing.csv"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "7"], "has 2"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "x"], "3,4"),

@@ -1,5 +1,6 @@
 """What every registered backend must do, on a linear-Gaussian problem with a known posterior."""
 
+import dataclasses
 import json
 import math
 
@@ -232,6 +233,8 @@ def test_has_no_posterior_before_the_first_round(method):
 
 
 def test_stays_finite_far_from_the_simulations(method):
+    if method.name == "nuts":  # every trajectory is as long as it may be out there
+        method = dataclasses.replace(method, num_samples=100, warmup=50)
     problem = make_problem(observation=torch.tensor([1e6, -1e9, 0.0]))
     state, _ = run_round(method, problem, method.init(problem), 0, n=500)
     z = draws(method, problem, state)

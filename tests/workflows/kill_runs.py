@@ -2,11 +2,14 @@
 
     python kill_runs.py FOLDER NUM_KILLS SEED [discover]
 
-One process imports everything and forks a child for every attempt, so that a hundred take minutes.
+One process imports everything, also what a run imports on its way, and forks a child for every
+attempt, so that a hundred take minutes.
 It exits with an error if a resumed run differs from the undisturbed one, or if the target ran an
 episode that was not used.
 """
 
+import contextlib
+import importlib
 import json
 import os
 import random
@@ -30,7 +33,16 @@ from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.workflows.npdr_loop import train
 
 
-def fork(folder, seed, discovers):
+def import_what_a_run_needs(folder, seed, discovers):
+    """Imports what a run has imported in the end, so that its children need not."""
+    names = folder.with_suffix(".modules")
+    finish(fork(folder, seed, discovers, names))
+    for name in names.read_text().split():
+        with contextlib.suppress(Exception):
+            importlib.import_module(name)
+
+
+def fork(folder, seed, discovers, modules=None):
     """Starts the run, or goes on with it, in a process of its own."""
     child = os.fork()
     if child:
@@ -42,6 +54,8 @@ def fork(folder, seed, discovers):
             target, task, options = DryPendulum, swinging_task(), discovering_options()
         train(pendulum, target(folder / "episodes.log"), task, options, out=folder / "run",
               seed=seed, progress=False)  # fmt: skip
+        if modules is not None:
+            modules.write_text("\n".join(sys.modules))
         os._exit(0)
     except BaseException:
         traceback.print_exc()
@@ -74,6 +88,7 @@ def main():
     discovers = "discover" in sys.argv[4:]
     torch.set_num_threads(1)
     moments = random.Random(seed)
+    import_what_a_run_needs(root / "first", seed, discovers)
     started = time.monotonic()
     finish(fork(root / "undisturbed", seed, discovers))
     seconds = time.monotonic() - started
