@@ -2,6 +2,7 @@
 
 import os
 import sys
+from typing import Any
 
 import typer
 
@@ -11,7 +12,7 @@ from npdr_ppl.errors import NpdrError
 __all__ = ["app", "main"]
 
 # The public name of the class from which wrong options, values and commands all descend.
-_UsageError = typer.BadParameter.__bases__[0]
+_UsageError: Any = typer.BadParameter.__bases__[0]
 
 app = typer.Typer(
     name="npdr",

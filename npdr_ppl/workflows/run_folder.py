@@ -223,7 +223,7 @@ def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
     if not file.exists():
         return False
     present = read_json(file)
-    differing = [key for key, value in plain(description).items() if present.get(key) != value]
+    differing = [str(k) for k, value in plain(description).items() if present.get(k) != value]
     if not differing:
         return True
     inputs = {file, *file.parent.glob("data_*")}
