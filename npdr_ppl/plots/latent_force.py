@@ -76,7 +76,8 @@ def plot_latent_force(
                 axis.ticklabel_format(axis="y", scilimits=(-2, 3))
             limit = 1.5 * max(reach) + np.finfo(float).tiny
             row[0].set_ylim(-limit, limit)
-            row[0].set_ylabel(f"missing at {port}\n[{forces[BEFORE][port].unit}]")
+            unit = forces[BEFORE][port].unit
+            row[0].set_ylabel(f"missing at\n{port}\n[{unit}]", fontsize="small")
         for axis, name in zip(axes[-1], names, strict=True):
             unit = "s" if name == "time" else (units or {}).get(name, "")
             axis.set_xlabel(f"{name} [{unit}]" if unit else name)

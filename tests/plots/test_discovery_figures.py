@@ -44,7 +44,7 @@ def test_the_latent_force_is_the_friction_and_is_gone_afterwards(found):
     assert figure is not None
     labels = [axis.get_xlabel() for axis in figure.axes]
     assert labels == ["angle", "velocity [rad/s]", "torque", "time [s]"]
-    assert figure.axes[0].get_ylabel() == "missing at hinge\n[N m]"
+    assert figure.axes[0].get_ylabel() == "missing at\nhinge\n[N m]"
     axis = figure.axes[labels.index("velocity [rad/s]")]
     lines = {line.get_label(): line for line in axis.lines}
     for title, expected in ((BEFORE, FRICTION), (AFTER, 0.0)):
