@@ -72,7 +72,8 @@ def outcome(folder):
     return {
         "train": json.loads((folder / "run/train.json").read_text()),
         "rollouts": [
-            file.read_text() for file in sorted((folder / "run/rollouts").glob("*_[0-9]*.jsonl"))
+            file.read_text()
+            for file in sorted((folder / "run/rollouts").glob("rollout_[0-9][0-9][0-9].jsonl"))
         ],
         "episodes": (folder / "episodes.log").read_text().split(),
     }
