@@ -37,9 +37,9 @@ def recordings():
 @pytest.mark.slow
 def test_the_drivers_filter_is_found_and_helps_on_another_excitation(recordings, tmp_path, capsys):
     swing_ups, chirps = recordings
-    part = swing_ups[[0, 3, 4]]
+    part = swing_ups[[0, 1, 3, 4]]  # One to fit leaves flat directions to chance.
     story, result = reproduce_missing_effect(
-        part, chirps[[0]], tmp_path, holdout=(1, 2), options=OPTIONS, progress=False
+        part, chirps[[0]], tmp_path, holdout=(2, 3), options=OPTIONS, progress=False
     )
     (effect,) = result["effects"]
     assert (effect["port"], effect["effect"]) == (FILTER, "sensor_low_pass")
@@ -52,7 +52,7 @@ def test_the_drivers_filter_is_found_and_helps_on_another_excitation(recordings,
     for metric in ("rmse", "dtw"):
         assert after[metric]["mean"] < 0.75 * before[metric]["mean"]
         assert after[f"{metric}_chirp"]["mean"] < 0.75 * before[f"{metric}_chirp"]["mean"]
-    paths = write_missing_effect_figures(story, part[[1, 2]], chirps[[0]], tmp_path)
+    paths = write_missing_effect_figures(story, part[[2, 3]], chirps[[0]], tmp_path)
     assert {"held_out", "chirp", "residual_map", "gap"} <= {path.stem for path in paths}
     found = json.loads((tmp_path / "discovery.json").read_text())
     show.show_missing_effect(found, result, tmp_path)
@@ -60,7 +60,7 @@ def test_the_drivers_filter_is_found_and_helps_on_another_excitation(recordings,
     assert "sensor_low_pass" in text and "Another excitation" in text and "rmse, paper" in text
     # Finished, it is read, not searched again.
     again, read = reproduce_missing_effect(
-        part, chirps[[0]], tmp_path, holdout=(1, 2), options=OPTIONS, progress=False
+        part, chirps[[0]], tmp_path, holdout=(2, 3), options=OPTIONS, progress=False
     )
     assert again is None and read == json.loads((tmp_path / "missing-effect.json").read_text())
 
