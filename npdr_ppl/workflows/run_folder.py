@@ -57,8 +57,6 @@ IN_WORDS = {
     "model": "the model's source",
     "num_simulations": "the number of simulations",
     "num_steps": "the number of steps",
-    "options": "options",
-    "recordings": "the recordings",
 }
 """What the keys of descriptions mean to whoever gave a command."""
 

@@ -324,9 +324,10 @@ def _steps(
     factors = NEAR
     for _ in range(max_steps):
         now = segments.linearise(z, offsets, scale, is_rough=is_rough)
-        if not all(bool(part.isfinite().all()) for part in (now.by_parameters, now.by_starts)):
+        parts = (now.residual, now.by_parameters, now.by_starts)
+        if not all(bool(part.isfinite().all()) for part in parts):
             break
-        present = float(_objective(now.residual[None], z[None], offsets[None])[0])
+        present = sum(float(part.square().sum()) for part in (now.residual, offsets, z))
         moves = [_step(now, z, offsets, damping * f, dampings, factors) for f in factors]
         tried = torch.stack([point for point, _ in moves])
         begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
@@ -351,12 +352,6 @@ def _steps(
         else:
             factors = FAR
     return z, offsets, scale if is_rough else segments.scale_of(z, offsets)
-
-
-def _objective(residual: Tensor, z: Tensor, offsets: Tensor) -> Tensor:
-    """Returns what is minimised, ``(n,)``."""
-    sides = offsets.square().sum((-1, -2)) + z.square().sum(-1)
-    return (residual.square().sum((-1, -2)) + sides).nan_to_num(torch.inf)
 
 
 def _segment_losses(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
@@ -390,7 +385,7 @@ def _step(
         offsets: Offsets, ``(S, m)``.
         damping: Of the parameters, relative to the mean curvature.
         dampings: Of the offsets, by segment, ``(S,)``.
-        factors: Multiples of ``dampings`` to try.
+        factors: Multiples of ``dampings`` to try, among them 1.
 
     Returns:
         Parameters ``(d,)``, and offsets for each factor, ``(b, S, m)``.
@@ -403,25 +398,20 @@ def _step(
     sides = torch.cat((cross, pull[..., None]), dim=-1)
     eye = torch.eye(m, dtype=torch.float64)
 
-    def solved(factor: float) -> Tensor:
-        damped = own + (1.0 + factor * dampings)[:, None, None] * eye
-        return torch.linalg.solve(damped, sides)
-
     # Each segment's offsets are eliminated: they meet no other segment's readings.
-    middle = solved(1.0)
+    parts = {
+        f: torch.linalg.solve(own + (1.0 + f * dampings)[:, None, None] * eye, sides)
+        for f in factors
+    }
+    middle = parts[1.0]
     hessian = (by_z.mT @ by_z - cross.mT @ middle[..., :d]).sum(0)
     gradient = (by_z.mT @ now.residual[..., None] - cross.mT @ middle[..., d:]).sum(0)[:, 0] - z
     curvature = hessian.diagonal().mean().clamp_min(1.0)
     hessian = hessian + (1.0 + damping * curvature) * torch.eye(d, dtype=torch.float64)
     change = torch.linalg.solve(hessian, gradient)
     change = change * min(1.0, LARGEST_STEP / float(change.abs().max().clamp_min(1e-12)))
-    moved = z + change
-    moved = moved.clamp(-MAX_COORDINATE, MAX_COORDINATE)
-    begun = []
-    for factor in factors:
-        part = solved(factor)
-        by = part[..., d] - part[..., :d] @ (moved - z)
-        begun.append(offsets + by)
+    moved = (z + change).clamp(-MAX_COORDINATE, MAX_COORDINATE)
+    begun = [offsets + part[..., d] - part[..., :d] @ (moved - z) for part in parts.values()]
     return moved, torch.stack(begun)
 
 

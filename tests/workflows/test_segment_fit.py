@@ -1,0 +1,99 @@
+"""Steps of the fit of parameters and initial states."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.segment_fit import LEAST_GAIN, SegmentModel, fit_segments
+
+OPTIONS = BindingOptions(None, 20, "uncertain", "float64")
+START = torch.tensor([0.5, -0.5], dtype=torch.float64)
+
+
+@pytest.fixture
+def segments(noisy_pendulum, recording):
+    return SegmentModel(noisy_pendulum, recording, OPTIONS)
+
+
+def objective(segments, z, offsets, scale):
+    residual = segments.residuals(z[None], offsets[None], scale)
+    return float(residual.square().sum() + z.square().sum() + offsets.square().sum())
+
+
+def promised(segments, fit):
+    """Returns what an undamped step from the fit would gain, were the simulation linear."""
+    now = segments.linearise(fit.z, fit.offsets, fit.scale)
+    pull = (now.by_starts.mT @ now.residual[..., None])[..., 0] - fit.offsets
+    inner = now.by_starts.mT @ now.by_starts + torch.eye(segments.num_offsets)
+    own = torch.linalg.solve(inner, pull)
+    left = now.residual - (now.by_starts @ own[..., None])[..., 0]
+    gradient = (now.by_parameters.mT @ left[..., None]).sum(0)[:, 0] - fit.z
+    step = torch.linalg.solve(now.information() + torch.eye(len(fit.z)), gradient)
+    return float(gradient @ step + (pull * own).sum())
+
+
+def test_fine_steps_end_where_nothing_is_left_to_gain(segments):
+    rough = fit_segments(segments, START, is_rough=True)
+    fine = fit_segments(segments, START)
+    assert promised(segments, fine) < 2 * LEAST_GAIN < promised(segments, _at(segments, START))
+    least = objective(segments, fine.z, fine.offsets, fine.scale)
+    assert least <= objective(segments, rough.z, rough.offsets, fine.scale)
+    # Rough steps end within a thousandth of it: enough to rank hypotheses that differ plainly.
+    assert objective(segments, rough.z, rough.offsets, fine.scale) < 1.01 * least
+
+
+def test_a_segment_that_begins_far_off_is_reached_and_holds_up_no_other(segments):
+    plain = fit_segments(segments, START)
+    far = 25.0
+    segments.inputs = _shifted(segments.inputs, 3, far)
+    found = fit_segments(segments, START)
+    # What the smoother is said to be sure of holds a seventh of it back.
+    assert found.offsets[3, 0] - plain.offsets[3, 0] < -0.8 * far
+    others = torch.arange(len(found.offsets)) != 3
+    assert (found.offsets[others] - plain.offsets[others]).abs().max() < 0.5
+    assert (found.z - plain.z).abs().max() < 0.2
+    assert promised(segments, found) < 2 * LEAST_GAIN
+
+
+def test_where_the_simulation_fails_is_said(segments, monkeypatch):
+    monkeypatch.setattr(
+        segments, "simulate", lambda z, offsets: torch.nan * segments.observed[None]
+    )
+    with pytest.raises(DataError, match="simulation fails at the parameters"):
+        fit_segments(segments, START)
+
+
+def test_equal_fits_from_equal_starts(segments):
+    one, two = fit_segments(segments, START), fit_segments(segments, START)
+    assert torch.equal(one.z, two.z) and torch.equal(one.offsets, two.offsets)
+
+
+def test_a_recording_with_none_of_the_sensors(noisy_pendulum, recording):
+    renamed = Rollouts.from_arrays(
+        readings=recording.readings,
+        actions=recording.actions,
+        channel_names=("tilt", "spin"),
+        action_names=("torque",),
+        time_step=0.02,
+    )
+    with pytest.raises(DataError, match="rename them"):
+        SegmentModel(noisy_pendulum, renamed, OPTIONS)
+
+
+def _at(segments, z):
+    """Returns a fit that has not begun."""
+    fit = fit_segments(segments, z, max_steps=0)
+    assert torch.equal(fit.z, z)
+    return fit
+
+
+def _shifted(inputs: Inputs, segment: int, deviations: float) -> Inputs:
+    """Returns inputs of which one segment's first value is off by standard deviations."""
+    values, errors = inputs.initial_values.clone(), inputs.initial_value_errors
+    values[segment, 0] += deviations * errors[segment, 0]
+    return dataclasses.replace(inputs, initial_values=values)
