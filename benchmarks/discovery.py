@@ -15,7 +15,7 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ from typing import Any
 
 import torch
 from discovery_report import print_summary
+from discovery_rows import REMOVED
 from hidden_rigs import RIGS, Case, make_case, places
 from sparse_regression import sparse_choice
 
@@ -37,6 +38,9 @@ SEPARATIONS = (5.0, 10.0, 30.0)
 MEASURABLE = (25.0, 60.0)
 """Separations that stand out of the noise and are not yet too far for refitting."""
 
+STRONGEST = 30.0
+"""Multiple of a typical size beyond which no rig of this kind is."""
+
 
 @dataclass(frozen=True)
 class Task:
@@ -45,7 +49,8 @@ class Task:
     Attributes:
         rig: Name of the rig.
         condition: What is hidden, or ``"without"``: one effect, its entry taken from the
-            catalogue.
+            catalogue; or ``"beyond"``: the same, and so strong that all other entries together
+            leave the separation.
         place: Index of what is hidden among the rig's places.
         separation: Separation to set the strength by; 0 for the rig's typical size.
         seed: The case's seed.
@@ -65,10 +70,10 @@ def tasks(
     for number, seed in enumerate(seeds):
         for condition in conditions:
             for rig in rigs:
-                hidden = "one" if condition == "without" else condition
+                hidden = "one" if condition in REMOVED else condition
                 count = len(places(rig, hidden, seed))  # pyright: ignore[reportArgumentType]
                 for place in range(count):
-                    if condition in ("one", "without"):
+                    if condition in ("one", *REMOVED):
                         # One separation per place and seed, in turn.
                         wanted = separations[(place + number) % len(separations)]
                     else:
@@ -114,7 +119,7 @@ def judge(task: Task) -> dict[str, Any]:
 
 def _case(task: Task) -> tuple[Case, float, float]:
     """Returns a case, its strength and its separation."""
-    condition: Any = "one" if task.condition == "without" else task.condition
+    condition: Any = "one" if task.condition in REMOVED else task.condition
     chosen = places(task.rig, condition, task.seed)[task.place]
 
     def at(strength: float) -> Case:
@@ -122,6 +127,8 @@ def _case(task: Task) -> tuple[Case, float, float]:
 
     if not task.separation:
         return at(1.0), 1.0, float("nan")
+    if task.condition == "beyond":
+        return _beyond(task, at)
     # Where it can be measured well; below, it is proportional to the strength.
     strength, found = 1.0, separation(at(1.0))
     for _ in range(4):
@@ -139,15 +146,41 @@ def _case(task: Task) -> tuple[Case, float, float]:
     return at(wanted), wanted, task.separation
 
 
-def separation(case: Case) -> float:
+def _beyond(task: Task, at: Callable[[float], Case]) -> tuple[Case, float, float]:
+    """Returns a case of which all entries but the true one leave the wanted separation.
+
+    Raises:
+        ValueError: They leave less even of a strength that no rig of this kind has.
+    """
+    strength, found, case = 1.0, 0.0, at(1.0)
+    for _ in range(5):
+        found = separation(case, _catalogue(task, case))
+        if task.separation / 1.5 < found < task.separation * 1.5:
+            return case, strength, found
+        # What the others leave grows at least like the strength, from below the noise.
+        strength *= min(4.0, max(0.25, task.separation / max(found, 1e-9)))
+        if strength > STRONGEST:
+            break
+        case = at(strength)
+    raise ValueError(f"others imitate {case.names} up to a separation of {found:.1f}")
+
+
+def separation(case: Case, catalogue: tuple[npdr.Effect, ...] = ()) -> float:
     """Returns how far the recording is from what the refitted model explains.
 
     The square root of the misfit that goes beyond what the noise alone leaves, which the same
     case without anything hidden shows; it needs no law of the catalogue.
+
+    Args:
+        case: The case.
+        catalogue: Effects that a search may add to the model before it is judged.
     """
     quiet = make_case(case.rig, "null", (), seed=case.seed)
-    options = npdr.DiscoveryOptions()
-    hidden, null = (Searcher(c.model, c.fit, options).fit_base() for c in (case, quiet))
+    options = npdr.DiscoveryOptions(effects=catalogue)
+    searcher = Searcher(case.model, case.fit, options)
+    hidden, null = searcher.fit_base(), Searcher(quiet.model, quiet.fit, options).fit_base()
+    if catalogue:
+        hidden = searcher.run(searcher.look(hidden), max_effects=options.max_effects).final
     scale = null.fit.scale
     excess = 2.0 * float((hidden.losses(scale) - null.losses(scale)).sum())
     return max(excess, 0.0) ** 0.5
@@ -155,7 +188,7 @@ def separation(case: Case) -> float:
 
 def _catalogue(task: Task, case: Case) -> tuple[npdr.Effect, ...] | None:
     """Returns the effects to search, without the true one where it is to be missing."""
-    if task.condition != "without":
+    if task.condition not in REMOVED:
         return None
     from npdr_ppl.models.effects import candidate_effects
     from npdr_ppl.workflows.discovery.equivalents import irreducible

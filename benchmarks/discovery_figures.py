@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from discovery_rows import Row, effect_id, found_names, is_first_right
+from discovery_rows import REMOVED, Row, effect_id, found_names, is_first_right
 from discovery_table import Rate
 from matplotlib.figure import Figure
 
@@ -76,8 +76,8 @@ def confusion(rows: Iterable[Row]) -> dict[str, Counter[str]]:
         else:
             named = effect_id(names[0])
             named += " elsewhere" if named == truth else ""
-        hidden = f"{truth} ({'removed' if row['condition'] == 'without' else 'outside'})"
-        table[hidden if row["condition"] in ("without", "outside") else truth][named] += 1
+        hidden = f"{truth} ({'removed' if row['condition'] in REMOVED else 'outside'})"
+        table[hidden if row["condition"] in (*REMOVED, "outside") else truth][named] += 1
     # Those that have no name to be given come last.
     return dict(sorted(table.items(), key=lambda item: ("(" in item[0], item[0])))
 

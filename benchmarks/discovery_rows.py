@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 __all__ = [
+    "REMOVED",
     "Row",
     "effect_id",
     "estimates",
@@ -28,6 +29,9 @@ NAMED = 0.05
 
 CONFIDENT = 0.9
 """Probability from which a name is given without doubt."""
+
+REMOVED = ("without", "beyond")
+"""Conditions in which the true effect's entry is taken from the catalogue."""
 
 Row = dict[str, Any]
 

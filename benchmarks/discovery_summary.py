@@ -61,7 +61,8 @@ def summary_lines(rows: Sequence[Row]) -> list[Line]:
     for row in rows:
         of[row["condition"]].append(row)
     nulls = [row for row in rows if row["condition"].startswith("null")]
-    two, missing = of["two"], of["outside"] + of["without"]
+    two = of["two"]
+    missing = of["outside"] + of["without"] + of["beyond"]
     return [
         *_null_lines(nulls),
         *_one_lines(of["one"]),
@@ -82,9 +83,16 @@ def summary_lines(rows: Sequence[Row]) -> list[Line]:
                 ("not in the catalogue", missing),
                 ("… no catalogue has it", of["outside"]),
                 ("… its entry removed", of["without"]),
+                ("… its entry removed, d beyond all others", of["beyond"]),
             )
         ),
-        _wrong("not in the catalogue: confident impostor", missing, upper=0.05),
+        *(
+            _wrong(f"{where}: confident impostor", own, upper=0.05)
+            for where, own in (
+                ("not in the catalogue", missing),
+                ("… its entry removed, d beyond all others", of["beyond"]),
+            )
+        ),
         _rate("spoilt data: problem reported", of["bad_data"], lambda row: bool(row["problems"])),
         *_gap_lines(rows),
         *_parameter_lines([row for row in of["one"] if row["d"] >= STRONG]),

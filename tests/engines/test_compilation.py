@@ -214,6 +214,7 @@ def test_code_that_the_compiler_refuses_runs_eagerly(tmp_path):
     "ignore:The .grad attribute:UserWarning"
 )  # torch's compiler, of itself
 @needs_compiler
+@pytest.mark.usefixtures("short_kernels")
 def test_compiled_replay_agrees_with_the_eager_one_and_has_its_gradients():
     attached = (
         ActuatorLag("torque"),

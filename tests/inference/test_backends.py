@@ -34,6 +34,14 @@ def method(request):
     return backend(request.param)
 
 
+@pytest.fixture
+def brief(method):
+    """The same for tests of manners, for which a few draws of a slow sampler will do."""
+    if method.name == "nuts":
+        return dataclasses.replace(method, num_samples=50, warmup=30)
+    return method
+
+
 @pytest.fixture(
     params=[name for name in sorted(backends()) if backend_class(name).uses_simulations]
 )
@@ -137,37 +145,37 @@ def test_density_is_normalised_and_fits_its_samples(method):
         assert ((first - z.mean(0)).abs() < FALSE_ALARM * error).all()
 
 
-def test_log_prob_is_differentiable(method):
+def test_log_prob_is_differentiable(brief):
     problem = make_problem()
-    state, _ = run_round(method, problem, method.init(problem), 0, n=200)
+    state, _ = run_round(brief, problem, brief.init(problem), 0, n=200)
     z = torch.zeros(3, 2, requires_grad=True)
-    (gradient,) = torch.autograd.grad(method.densities(problem, state)[0].log_prob(z).sum(), z)
+    (gradient,) = torch.autograd.grad(brief.densities(problem, state)[0].log_prob(z).sum(), z)
     assert gradient.isfinite().all() and gradient.abs().sum() > 0
 
 
-def test_same_seed_same_result_also_after_resumption(method, tmp_path):
+def test_same_seed_same_result_also_after_resumption(brief, tmp_path):
     problem = make_problem()
-    state, _ = run_round(method, problem, method.init(problem), 0, n=400)
-    again, _ = run_round(method, problem, method.init(problem), 0, n=400)
-    assert torch.equal(draws(method, problem, state), draws(method, problem, again))
+    state, _ = run_round(brief, problem, brief.init(problem), 0, n=400)
+    again, _ = run_round(brief, problem, brief.init(problem), 0, n=400)
+    assert torch.equal(draws(brief, problem, state), draws(brief, problem, again))
 
-    tensors, values = method.tensors(state)
+    tensors, values = brief.tensors(state)
     safetensors.torch.save_file(tensors, tmp_path / "state.safetensors")
     tensors = safetensors.torch.load_file(tmp_path / "state.safetensors")
-    restored = method.restore(problem, tensors, json.loads(json.dumps(values)))
-    assert torch.equal(draws(method, problem, state), draws(method, problem, restored))
+    restored = brief.restore(problem, tensors, json.loads(json.dumps(values)))
+    assert torch.equal(draws(brief, problem, state), draws(brief, problem, restored))
 
-    state, _ = run_round(method, problem, state, 1, n=400)
-    restored, _ = run_round(method, problem, restored, 1, n=400)
+    state, _ = run_round(brief, problem, state, 1, n=400)
+    restored, _ = run_round(brief, problem, restored, 1, n=400)
     assert restored.round == 2
-    assert torch.equal(draws(method, problem, state), draws(method, problem, restored))
+    assert torch.equal(draws(brief, problem, state), draws(brief, problem, restored))
 
 
-def test_initial_state_survives_writing(method):
+def test_initial_state_survives_writing(brief):
     problem = make_problem()
-    tensors, values = method.tensors(method.init(problem))
-    restored = method.restore(problem, tensors, json.loads(json.dumps(values)))
-    state, _ = run_round(method, problem, restored, 0, n=200)
+    tensors, values = brief.tensors(brief.init(problem))
+    restored = brief.restore(problem, tensors, json.loads(json.dumps(values)))
+    state, _ = run_round(brief, problem, restored, 0, n=200)
     assert state.round == 1
 
 
@@ -232,34 +240,32 @@ def test_has_no_posterior_before_the_first_round(method):
         method.densities(problem, method.init(problem))
 
 
-def test_stays_finite_far_from_the_simulations(method):
-    if method.name == "nuts":  # every trajectory is as long as it may be out there
-        method = dataclasses.replace(method, num_samples=100, warmup=50)
+def test_stays_finite_far_from_the_simulations(brief):
     problem = make_problem(observation=torch.tensor([1e6, -1e9, 0.0]))
-    state, _ = run_round(method, problem, method.init(problem), 0, n=500)
-    z = draws(method, problem, state)
+    state, _ = run_round(brief, problem, brief.init(problem), 0, n=500)
+    z = draws(brief, problem, state)
     assert z.isfinite().all()
-    state, _ = run_round(method, problem, state, 1, n=500)
-    assert draws(method, problem, state).isfinite().all()
+    state, _ = run_round(brief, problem, state, 1, n=500)
+    assert draws(brief, problem, state).isfinite().all()
 
 
-def test_leaves_the_callers_random_stream_to_the_caller(method):
+def test_leaves_the_callers_random_stream_to_the_caller(brief):
     problem = make_problem()
-    state, _ = run_round(method, problem, method.init(problem), 0, n=200)
+    state, _ = run_round(brief, problem, brief.init(problem), 0, n=200)
     torch.manual_seed(0)
     expected = torch.rand(3)
     torch.manual_seed(0)
-    method.densities(problem, state)
+    brief.densities(problem, state)
     assert torch.equal(torch.rand(3), expected)
 
 
-def test_reports_progress(method):
+def test_reports_progress(brief):
     problem, seen = make_problem(), []
     with seeded(0):
         z = torch.randn(200, 2)
-        method.tell(
+        brief.tell(
             problem,
-            method.init(problem),
+            brief.init(problem),
             z,
             simulate(z),
             lambda done, text: seen.append((done, text)),

@@ -14,6 +14,7 @@ from npdr_ppl.models.pendulum import Pendulum
     "ignore:The .grad attribute:UserWarning"
 )  # torch's compiler, of itself
 @pytest.mark.skipif(not has_compiler("cpu"), reason="needs a C++ compiler")
+@pytest.mark.usefixtures("short_kernels")
 def test_effects_with_memory_compile():
     attached = (
         SensorDelay("velocity"),

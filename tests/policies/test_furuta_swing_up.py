@@ -189,6 +189,7 @@ def test_mistakes_are_named():
 
 @pytest.mark.slow
 @pytest.mark.skipif(not has_compiler("cpu"), reason="there is no C++ compiler")
+@pytest.mark.usefixtures("short_kernels")
 def test_compiled_loop_agrees_with_the_eager_one():
     attached = InputDelay("voltage"), CoulombFriction("arm"), CoulombFriction("pole")
     simulator = Furuta().with_effects(*attached)

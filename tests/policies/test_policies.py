@@ -111,7 +111,9 @@ def test_a_device_gets_the_same_commands(policy):
 @pytest.mark.slow
 @pytest.mark.skipif(not has_compiler("cpu"), reason="there is no C++ compiler")
 @pytest.mark.parametrize("kind", ["playback", "radial basis, random", "neural"])
-def test_compiled_loop_agrees_with_the_eager_one(kind):
+def test_compiled_loop_agrees_with_the_eager_one(kind, request):
+    if kind != "playback":  # which compiles fast, and is tested at full length
+        request.getfixturevalue("short_kernels")
     policies = some_policies(POLICIES[kind], 3, torch.float64)
     domains, states = some_domains(2, torch.float64), some_states(2, torch.float64)
     eager, fast = (
