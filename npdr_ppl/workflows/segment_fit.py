@@ -63,6 +63,9 @@ MAX_COORDINATE = 5.0
 """How far from the prior's centre a fit may lie, in standard deviations. A strength that is much
 smaller than its half-normal prior expects lies at −3 and beyond."""
 
+LEAST_SCALE = 1e-9
+"""Of a channel's residuals, in its unit: a channel may be constant."""
+
 LEAST_GAIN = 0.05
 """Reduction of the objective, in units of the readings' variance, below which steps end: far less
 than what makes a difference between two models."""
@@ -212,7 +215,7 @@ class SegmentModel:
         ones = torch.ones(len(self.channel_names), dtype=torch.float64)
         residual = self.residuals(z[None], offsets[None], ones)[0]
         square = residual.square().unflatten(-1, (-1, len(ones))).sum((0, 1))
-        return (square / self.inputs.mask.sum()).sqrt().clamp_min(1e-9)
+        return (square / self.inputs.mask.sum()).sqrt().clamp_min(LEAST_SCALE)
 
     def linearise(
         self, z: Tensor, offsets: Tensor, scale: Tensor, *, is_rough: bool = False
@@ -331,19 +334,21 @@ def _steps(
         moves = [_step(now, z, offsets, damping * f, dampings, factors) for f in factors]
         tried = torch.stack([point for point, _ in moves])
         begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
-        losses = _segment_losses(segments, tried, begun, scale)
+        squares = _squares(segments, tried, begun, scale)  # (a, b, S, C)
+        losses = (squares.sum(-1) + begun.square().sum(-1)).nan_to_num(torch.inf)
         least, chosen = losses.min(1)  # (a, S)
         outcome = least.sum(-1) + tried.square().sum(-1)
         best = int(outcome.argmin())
         gain = present - float(outcome[best])
         is_little = gain < max(LEAST_GAIN, ROUGHLY * present if is_rough else 0.0)
         if gain > 0.0:
-            place = chosen[best]
-            z, offsets = tried[best], begun[best][place, torch.arange(len(place))]
+            place, every = chosen[best], torch.arange(len(offsets))
+            z, offsets = tried[best], begun[best][place, every]
             damping = min(max(damping * factors[best], LIMITS[0]), LIMITS[1])
             dampings = (dampings * torch.tensor(factors).double()[place]).clamp(*LIMITS)
             if is_rough:
-                before, scale = scale, segments.scale_of(z, offsets)
+                left = squares[best][place, every].sum(0) / segments.inputs.mask.sum()
+                before, scale = scale, (scale * left.sqrt()).clamp_min(LEAST_SCALE)
                 is_little = is_little and bool((scale > SETTLED * before).all())
         if not is_little:
             factors = NEAR
@@ -354,8 +359,8 @@ def _steps(
     return z, offsets, scale if is_rough else segments.scale_of(z, offsets)
 
 
-def _segment_losses(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
-    """Returns the objective's part of each segment, ``(a, b, S)``.
+def _squares(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
+    """Returns the sums of squared whitened residuals, ``(a, b, S, C)``.
 
     Args:
         segments: The model and the recording.
@@ -365,8 +370,7 @@ def _segment_losses(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: T
     """
     a, b = offsets.shape[:2]
     residual = segments.residuals(z.repeat_interleave(b, 0), offsets.flatten(0, 1), scale)
-    square = residual.square().sum(-1).unflatten(0, (a, b)) + offsets.square().sum(-1)
-    return square.nan_to_num(torch.inf)
+    return residual.square().unflatten(-1, (-1, len(scale))).sum(-2).unflatten(0, (a, b))
 
 
 def _step(

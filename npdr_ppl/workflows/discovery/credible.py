@@ -13,6 +13,7 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.workflows.discovery.chance import block_sums
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
+from npdr_ppl.workflows.segment_fit import MAX_COORDINATE
 
 __all__ = ["Estimate", "estimates", "parameter_density"]
 
@@ -96,6 +97,8 @@ def estimates(
     """
     with seeded(seed, "discovery", "estimates"):
         z = parameter_density(hypothesis).sample(NUM_DRAWS).double()
+    # Fits go no further either, and beyond a prior's tail is infinity.
+    z = z.clamp(-MAX_COORDINATE, MAX_COORDINATE)
     values = hypothesis.segments.prior.to_parameters(z)
     return {
         name: Estimate(

@@ -31,7 +31,7 @@ MOST_UNEXPLAINED = 0.02
 """Share of the misfit that may stay unexplained where what was found is to be called the cause."""
 
 MINOR = 0.1
-"""Share of the findings that may be ambiguous where the rest is to be called named."""
+"""Share of the findings that may be in doubt where the rest is to be called named."""
 
 SURVIVES = 0.05
 """Probability from which an alternative has to be reckoned with."""
@@ -221,9 +221,16 @@ def _judge(
             f"What was found leaves {unexplained:.0%} of the disagreement unexplained, most of it "
             f"in {search.rounds[-1].alarm.loudest}."
         )
+    explains = sum(f.share for f in effects)
+    strained = [f for f in effects if f.at_edge and f.share > MINOR * explains]
+    if strained:
+        return "unknown", (
+            f"{strained[0].effect.name} explains it only with {strained[0].at_edge[0]} where "
+            "hardly any device has it, so the law is likely another that is alike there."
+        )
     unsure = [f for f in effects if f.probability < options.confidence]
     sure = [f for f in effects if f.probability >= options.confidence]
-    if sure and sum(f.share for f in unsure) <= MINOR * sum(f.share for f in effects):
+    if sure and sum(f.share for f in unsure) <= MINOR * explains:
         return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
     names = " or ".join(n for n, p in unsure[0].alternatives.items() if p >= SURVIVES)
     return "ambiguous", f"The recording cannot tell which it is: {names}."
@@ -249,6 +256,7 @@ def _finding(added: Added, search: Search, every: dict[str, Estimate]) -> Findin
             for site in effect.parameter_names
             if site in every
         },
+        search.final.at_edge(effect),
     )
 
 

@@ -32,6 +32,9 @@ LEAST_PENALISED = -1.0
 """Coordinate below which the prior no longer speaks against a hypothesis: that an effect is small
 is no reason to doubt it, and half-normal priors have zero strength at minus infinity."""
 
+EDGE = 3.0
+"""Coordinate beyond which a prior hardly goes: three standard deviations of a normal one."""
+
 Model = Callable[..., Any]
 
 
@@ -89,6 +92,23 @@ class Hypothesis:
         """
         residual = self.segments.residuals(self.fit.z[None], self.fit.offsets[None], scale)[0]
         return 0.5 * (residual.square().sum(-1) + self.fit.offsets.square().sum(-1))
+
+    def at_edge(self, effect: Effect) -> tuple[str, ...]:
+        """Returns the names of an effect's shapes that lie where their priors hardly go.
+
+        There a law is the limit of its own that another law may be: wind without a speed is drag.
+        Strengths may be as small or large as they are, and frequencies are looked for anywhere.
+        """
+        shapes = {p.name for p in effect.parameters} - set(effect.strength) - {effect.wave}
+        if not effect.strength:
+            return ()
+        sites = dict(zip(effect.parameter_names, (p.name for p in effect.parameters), strict=True))
+        return tuple(
+            sites[site.name]
+            for site in self.segments.prior.sites
+            if sites.get(site.name) in shapes
+            and bool((self.fit.z[site.coordinates].abs() > EDGE).any())
+        )
 
     @property
     def complexity(self) -> float:

@@ -39,6 +39,8 @@ class Finding:
         equivalent_to: Ids of causes that the recording may not tell from it.
         share: Share of the misfit that it explains.
         parameters: Its parameters' estimates by short name.
+        at_edge: Those that give it its shape and lie where their priors hardly go: its law is
+            then the limit of its own that another law may be.
     """
 
     effect: Effect
@@ -47,6 +49,7 @@ class Finding:
     equivalent_to: tuple[str, ...]
     share: float
     parameters: dict[str, Estimate]
+    at_edge: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values."""
@@ -58,6 +61,7 @@ class Finding:
             "alternatives": self.alternatives,
             "share": self.share,
             "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
+            "at_edge": list(self.at_edge),
         }
 
 

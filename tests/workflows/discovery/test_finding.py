@@ -93,6 +93,17 @@ def test_an_effect_outside_the_catalogue_is_unknown():
     assert found.remainder.fired
 
 
+def test_a_law_that_fits_only_in_a_limit_is_not_named():
+    from npdr_ppl.models.effects import CoulombFriction, Wind
+
+    others = (Wind("hinge"), CoulombFriction("hinge"))
+    _, found = discover("pendulum", "one", (("hinge", "quadratic_drag"),), effects=others)
+    (finding,) = found.effects
+    assert finding.effect.id == "wind" and finding.at_edge == ("speed",)
+    assert found.verdict == "unknown"
+    assert "explains it only with speed where hardly any device has it" in found.reason
+
+
 @pytest.mark.parametrize("kind", ["degrees", "one_in_degrees", "misaligned"])
 def test_bad_data_come_before_physics(kind):
     _, found = discover("pendulum", "bad_data", (("data", kind),))
