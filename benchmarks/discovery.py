@@ -41,6 +41,9 @@ MEASURABLE = (25.0, 60.0)
 STRONGEST = 30.0
 """Multiple of a typical size beyond which no rig of this kind is."""
 
+BEYOND_TRIES = 7
+"""Strengths tried for what the other entries leave; each takes a search."""
+
 
 @dataclass(frozen=True)
 class Task:
@@ -152,17 +155,25 @@ def _beyond(task: Task, at: Callable[[float], Case]) -> tuple[Case, float, float
     Raises:
         ValueError: They leave less even of a strength that no rig of this kind has.
     """
-    strength, found, case = 1.0, 0.0, at(1.0)
-    for _ in range(5):
+    weak, strong, strength, most = 0.0, math.inf, 1.0, 0.0
+    for _ in range(BEYOND_TRIES):
+        case = at(strength)
         found = separation(case, _catalogue(task, case))
+        most = max(most, found)
         if task.separation / 1.5 < found < task.separation * 1.5:
             return case, strength, found
-        # What the others leave grows at least like the strength, from below the noise.
-        strength *= min(4.0, max(0.25, task.separation / max(found, 1e-9)))
+        # What the others leave need not grow steadily: once it is bracketed, halve the bracket.
+        if found < task.separation:
+            weak = strength
+        else:
+            strong = strength
+        if 0.0 < weak < strong < math.inf:
+            strength = math.sqrt(weak * strong)
+        else:
+            strength *= min(4.0, max(0.25, task.separation / max(found, 1e-9)))
         if strength > STRONGEST:
             break
-        case = at(strength)
-    raise ValueError(f"others imitate {case.names} up to a separation of {found:.1f}")
+    raise ValueError(f"others imitate {case.names} up to a separation of {most:.1f}")
 
 
 def separation(case: Case, catalogue: tuple[npdr.Effect, ...] = ()) -> float:
