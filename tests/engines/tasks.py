@@ -1,6 +1,7 @@
 """Small tasks for the tests of workers; in a module of their own, because workers import it."""
 
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -25,6 +26,15 @@ class Sleep(Task):
 
     def run(self, workspace, draw):
         (Path(self.folder) / str(os.getpid())).touch()
+        time.sleep(draw.payload)
+        return np.zeros(1)
+
+
+class Orphan(Task):
+    """Kills the template that forked it, and goes on for as many seconds as the payload says."""
+
+    def run(self, workspace, draw):
+        os.kill(os.getppid(), signal.SIGKILL)
         time.sleep(draw.payload)
         return np.zeros(1)
 

@@ -23,6 +23,7 @@ from tasks import (  # noqa: E402
     FailsToLoad,
     FailsToSetUp,
     Noise,
+    Orphan,
     Parent,
     Raises,
     Refuses,
@@ -157,6 +158,13 @@ def test_an_executor_that_breaks_is_replaced():
     np.testing.assert_array_equal(np.array(outcome.values), expected(8))
     # Nothing of the killed worker is left.
     wait_for(lambda: not is_alive(template), 10.0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's prctl")
+def test_a_draw_ends_with_its_template():
+    with Pool(WorkerOptions("serial", time_limit=60.0, retries=0)) as pool:
+        outcome = pool.run(Orphan(), [10.0])
+    assert outcome.values == [None] and outcome.faults.crashed == (0,)
 
 
 @pytest.mark.parametrize("executor", ["loky", "threads", "serial"])

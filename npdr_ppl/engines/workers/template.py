@@ -9,6 +9,7 @@ Commands come from the :class:`~npdr_ppl.engines.workers.supervisor.Supervisor` 
 of a socket; when that end closes, for whatever reason, the template ends with its child.
 """
 
+import ctypes
 import os
 import pickle
 import signal
@@ -29,6 +30,9 @@ __all__ = ["IDLE_SECONDS", "main"]
 
 IDLE_SECONDS = 300.0
 """After so long without work a template ends; workers of a cluster may outlive a run by days."""
+
+PR_SET_PDEATHSIG = 1
+"""Linux's prctl option for the signal that a process gets when its parent ends."""
 
 
 def main(control_fd: int) -> None:
@@ -53,8 +57,10 @@ def main(control_fd: int) -> None:
                 control.send(reply)
             elif command == "spawn":
                 _, (fd,), _, _ = socket.recv_fds(channel, 1, 1)
+                template = os.getpid()
                 child = os.fork()
                 if child == 0:
+                    _end_with(template)
                     control.close()
                     channel.close()
                     _simulate(task, Connection(fd))
@@ -81,6 +87,18 @@ def _load(pickled: bytes, path: Sequence[str]) -> tuple[Task | None, str]:
         return pickle.loads(pickled), ""
     except Exception:
         return None, traceback.format_exc(limit=-3)
+
+
+def _end_with(parent: int) -> None:
+    """Has the kernel kill this process when its parent ends.
+
+    A template that is killed cannot end its child, which in the middle of a draw does not see that
+    nobody waits for its answer. Systems without prctl leave the child to its draw.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # already gone
+        os._exit(0)
 
 
 def _end(child: int | None) -> int:
