@@ -24,6 +24,7 @@ from npdr_ppl.models.mini_golf import MiniGolf, mini_golf, mini_golf_two_restitu
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.candidates import Candidate, requested
 from npdr_ppl.workflows.evaluation import nominal_parameters
+from npdr_ppl.workflows.mini_golf_clock import clocks_aligned
 from npdr_ppl.workflows.mini_golf_fit import (
     BALL,
     EMBEDDING,
@@ -198,16 +199,17 @@ def _column(
 def _separate_restitutions(
     label: str, candidate: Candidate, rollouts: Rollouts, budget: Budget
 ) -> dict[str, Any]:
-    """Fits the model with two restitutions to the strikes that are alike."""
+    """Fits the model with two restitutions to the strikes that are alike, their clocks aligned."""
     error = repeatability(rollouts)["rmse"]
     alike = [i for i, e in enumerate(error.tolist()) if e <= OUTLIER * float(error.median())]
-    strikes = rollouts[alike]
+    strikes, delays = clocks_aligned(rollouts[alike])
     model = mini_golf_two_restitutions
     joint = budget.fit(model, candidate, strikes, label, "two-restitutions")
     likely = most_likely_draw(joint, model, strikes, seed=budget.seed)
     return {
         **_row(score_strikes(model, strikes, likely)),
         "strikes": alike,
+        "clock_delays": [steps * strikes.time_step for steps in delays],
         "most_likely": _floats(likely),
         "angles": obstacle_angles(likely),
     }

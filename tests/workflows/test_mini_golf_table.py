@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from npdr_ppl.models.mini_golf import MiniGolf, mini_golf
 from npdr_ppl.models.mini_golf.course import OBSTACLES
 from npdr_ppl.plots.mini_golf import measured_shifts, write_mini_golf_figures
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.mini_golf_clock import clocks_aligned
 from npdr_ppl.workflows.mini_golf_fit import score_strikes
 from npdr_ppl.workflows.mini_golf_posterior import obstacle_angles
 from npdr_ppl.workflows.mini_golf_table import (
@@ -54,6 +56,30 @@ def strikes():
     inputs = rollouts([resting]).inputs(initial_state="recorded")
     struck = MiniGolf().simulate({"ball_restitution": torch.tensor([0.5, 0.7])}, inputs)
     return rollouts([np.vstack([resting[:1], one[0].numpy()]) for one in struck])
+
+
+def test_clocks_of_ball_and_arm_are_aligned(strikes):
+    straight = strikes[[0]]  # nominal restitution, so that the simulation's clock is its own
+    columns = [strikes.channel_names.index(name) for name in ("ball_x", "ball_y")]
+    original = straight.readings[0]
+
+    def shifted(steps):
+        readings = np.array(original)
+        rows = np.clip(np.arange(len(readings)) - steps, 0, len(readings) - 1)
+        readings[:, columns] = original[rows][:, columns]
+        return replace(straight, readings=(readings,))
+
+    aligned, delays = clocks_aligned(straight)
+    assert delays == [0] and aligned == straight
+    for steps in (6, -4):
+        aligned, delays = clocks_aligned(shifted(steps))
+        assert delays == [-steps]
+        inner = slice(10, -10)
+        np.testing.assert_array_equal(aligned.readings[0][inner], original[inner])
+    resting = np.array(original)
+    resting[:, columns] = resting[0, columns]
+    with pytest.raises(DataError, match="never struck"):
+        clocks_aligned(replace(straight, readings=(resting,)))
 
 
 def test_the_table_has_every_row_and_what_figure_4_shows(strikes, tmp_path):
