@@ -11,7 +11,7 @@ from npdr_ppl.models.furuta import Furuta, initial_states
 from npdr_ppl.models.furuta_mujoco import FurutaRig
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.targets.base import Controller, TargetDomain
+from npdr_ppl.targets.base import Controller, TargetDomain, end_episode
 
 __all__ = ["FurutaTarget", "furuta_target"]
 
@@ -45,6 +45,7 @@ class FurutaTarget(TargetDomain):
         generator = torch.Generator().manual_seed(derived_seed(seed, "initial state"))
         initial_state = initial_states(1, generator)[0].double().numpy()
         recording = self._rig.run(controller, num_steps, initial_state=initial_state)
+        end_episode(controller, recording.readings[-1])
         return self.rollout(recording.readings, recording.voltage[:, None])
 
 

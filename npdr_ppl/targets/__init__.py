@@ -1,6 +1,12 @@
 """Target domains: the devices, other engines and recordings that policies are run on."""
 
-from npdr_ppl.targets.base import Controller, TargetDomain, TargetError, partial_rollout
+from npdr_ppl.targets.base import (
+    Controller,
+    TargetDomain,
+    TargetError,
+    end_episode,
+    partial_rollout,
+)
 from npdr_ppl.targets.gymnasium import GymnasiumTarget
 from npdr_ppl.targets.hardware import HardwareReport, HardwareTarget
 from npdr_ppl.targets.recorded import RecordedTarget
@@ -13,5 +19,6 @@ __all__ = [
     "RecordedTarget",
     "TargetDomain",
     "TargetError",
+    "end_episode",
     "partial_rollout",
 ]

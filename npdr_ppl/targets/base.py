@@ -11,7 +11,7 @@ from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.checks import MAX_MAGNITUDE
 
-__all__ = ["Array", "Controller", "TargetDomain", "TargetError", "partial_rollout"]
+__all__ = ["Array", "Controller", "TargetDomain", "TargetError", "end_episode", "partial_rollout"]
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,8 @@ class TargetDomain(ABC):
     ) -> Rollouts:
         """Runs one episode from the target's own distribution of initial states.
 
-        The controller may carry memory, so it serves one episode. An exception that ends the
+        The controller may carry memory, so it serves one episode. What takes time after the last
+        reading (homing, disconnecting) follows :func:`end_episode`. An exception that ends the
         episode carries what was recorded until then where that is worth keeping; see
         :func:`partial_rollout`.
 
@@ -126,6 +127,20 @@ class TargetDomain(ABC):
             for channels in (self.sensors, self.actions)
         )
         return f"{self.name}: {sensors}; {actions}; every {self.time_step:g} s"
+
+
+def end_episode(controller: Controller, readings: ArrayLike) -> None:
+    """Hands the last readings of an episode to a controller that keeps a record of it.
+
+    A process killed from then on has the whole episode on disk, and does not repeat it.
+
+    Args:
+        controller: What commanded the target; one without a method ``end`` is left alone.
+        readings: The readings after the last step, ``(sensors,)``.
+    """
+    end = getattr(controller, "end", None)
+    if end is not None:
+        end(np.array(readings, dtype=np.float64))
 
 
 def partial_rollout(error: BaseException) -> Rollouts | None:

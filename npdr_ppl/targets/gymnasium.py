@@ -15,7 +15,7 @@ from npdr_ppl.language.environments import (
 )
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.targets.base import Array, Controller, TargetDomain
+from npdr_ppl.targets.base import Array, Controller, TargetDomain, end_episode
 
 __all__ = ["GymnasiumTarget"]
 
@@ -116,6 +116,7 @@ class GymnasiumTarget(TargetDomain):
             rewards.append(float(reward))
             if is_terminated or is_truncated:
                 break
+        end_episode(controller, readings[-1])
         return self.rollout(readings, actions, rewards)
 
     def close(self) -> None:

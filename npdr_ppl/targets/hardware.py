@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from npdr_ppl.errors import ModelError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.checks import MAX_MAGNITUDE, MAX_STEP_JITTER
-from npdr_ppl.targets.base import Array, Controller, TargetDomain, TargetError
+from npdr_ppl.targets.base import Array, Controller, TargetDomain, TargetError, end_episode
 from npdr_ppl.targets.watchdog import Watchdog
 
 __all__ = ["HardwareReport", "HardwareTarget"]
@@ -195,6 +195,7 @@ class HardwareTarget(TargetDomain):
                 f"{self.name} starts outside its limits: {self._violation(record.readings[0])}."
             )
         due = self._clock()
+        ending = "All steps were made."
         for step in range(num_steps):
             self._check_stops(watchdog)
             watchdog.feed()
@@ -206,9 +207,12 @@ class HardwareTarget(TargetDomain):
             record.readings.append(self._checked_reading())
             violation = self._violation(record.readings[-1])
             if violation:
-                return f"{violation}."
-        self._check_stops(watchdog)
-        return "All steps were made."
+                ending = f"{violation}."
+                break
+        else:
+            self._check_stops(watchdog)
+        end_episode(controller, record.readings[-1])
+        return ending
 
     def _wait_until(self, due: float) -> float:
         """Waits for a tick and returns when it was due, or when it came if that was too late."""

@@ -18,33 +18,34 @@ __all__ = ["Journal", "read_journal"]
 
 
 class Journal:
-    """Writes the journal of one episode.
+    """A controller that notes every step of its episode before the command leaves.
 
     Args:
+        controller: What decides on the commands.
         path: The file; ``None`` keeps the commands in memory only.
 
     Attributes:
         commands: Commands so far, before any limit, ``(actions,)`` each.
     """
 
-    def __init__(self, path: Path | None) -> None:
+    def __init__(self, controller: Controller, path: Path | None) -> None:
         self.commands: list[Array] = []
+        self._controller = controller
+        self._is_complete = False
         self._file = None if path is None else path.open("w", buffering=1)
 
-    def controller(self, controller: Controller) -> Controller:
-        """Returns a controller that notes every step before its command leaves."""
+    def __call__(self, readings: Array, time: float) -> Array:
+        """Returns the commands, ``(actions,)``, for readings ``(sensors,)`` at a time in s."""
+        commands = np.array(self._controller(readings, time), dtype=np.float64, ndmin=1)
+        self.commands.append(commands)
+        self._write({"readings": readings.tolist(), "commands": commands.tolist()})
+        return commands
 
-        def command(readings: Array, time: float) -> Array:
-            chosen = np.array(controller(readings, time), dtype=np.float64, ndmin=1)
-            self.commands.append(chosen)
-            self._write({"readings": readings.tolist(), "commands": chosen.tolist()})
-            return chosen
-
-        return command
-
-    def end(self, rollout: Rollouts) -> None:
-        """Notes that the episode is complete."""
-        self._write({"end": rollout.readings[0][-1].tolist()})
+    def end(self, readings: Array) -> None:
+        """Notes that the episode is complete, with its last readings ``(sensors,)``, once."""
+        if not self._is_complete:
+            self._write({"end": readings.tolist()})
+        self._is_complete = True
 
     def close(self) -> None:
         """Closes the file."""

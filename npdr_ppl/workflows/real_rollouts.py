@@ -96,11 +96,10 @@ class RealRollouts:
         seed: int,
         journal_file: Path | None,
     ) -> tuple[Rollouts, Array]:
-        journal = Journal(journal_file)
-        controller = journal.controller(self._controller(policy, domain))
+        journal = Journal(self._controller(policy, domain), journal_file)
         try:
-            rollout = self.target.run(controller, self.task.num_steps, episode=episode, seed=seed)
-            journal.end(rollout)
+            rollout = self.target.run(journal, self.task.num_steps, episode=episode, seed=seed)
+            journal.end(rollout.readings[0][-1])
         except BaseException as error:
             partial = partial_rollout(error)
             if partial is not None and journal_file is not None:

@@ -110,6 +110,21 @@ def test_leaving_the_limits_ends_the_episode():
     assert cart.is_at_rest()
 
 
+def test_the_end_is_noted_before_the_device_is_brought_to_rest():
+    class Notes:
+        def __call__(self, readings, time):
+            return np.array([1.0])
+
+        def end(self, readings):
+            self.ending = readings.tolist(), list(cart.calls)
+
+    cart, notes = Cart(), Notes()
+    recorded = cart.run(notes, 10, seed=0)
+    readings, calls = notes.ending
+    assert readings == recorded.readings[0][-1].tolist()
+    assert "disconnect" not in calls
+
+
 @pytest.mark.parametrize("is_event", [True, False], ids=["event", "function"])
 def test_the_emergency_stop_lets_no_further_command_through(is_event):
     pressed = threading.Event()

@@ -5,7 +5,8 @@
 One process imports everything, also what a run imports on its way, and forks a child for every
 attempt, so that a hundred take minutes.
 It exits with an error if a resumed run differs from the undisturbed one, or if the target ran an
-episode that was not used.
+episode again that had finished. The target writes an episode down after it has finished, so a kill
+right between the two leaves an episode that is not written down, but never one that is twice.
 """
 
 import contextlib
@@ -75,8 +76,13 @@ def outcome(folder):
             file.read_text()
             for file in sorted((folder / "run/rollouts").glob("rollout_[0-9][0-9][0-9].jsonl"))
         ],
-        "episodes": (folder / "episodes.log").read_text().split(),
     }
+
+
+def episodes(folder):
+    """The numbers of the episodes that the target has finished, in order."""
+    log = folder / "episodes.log"
+    return [int(number) for number in log.read_text().split()] if log.exists() else []
 
 
 def written(folder):
@@ -94,7 +100,10 @@ def main():
     finish(fork(root / "undisturbed", seed, discovers))
     seconds = time.monotonic() - started
     expected = outcome(root / "undisturbed")
-    kills = runs = 0
+    planned = episodes(root / "undisturbed")
+    if planned != list(range(len(expected["rollouts"]))):
+        raise SystemExit(f"the undisturbed run made episodes {planned}")
+    kills = runs = unwritten = 0
     stages = set()
     while kills < num_kills:
         folder = root / f"run_{runs}"
@@ -121,7 +130,12 @@ def main():
         for name, value in expected.items():
             if found[name] != value:
                 raise SystemExit(f"{folder}: {name} differ from those of the undisturbed run")
-    print(json.dumps({"kills": kills, "runs": runs, "stages": len(stages), "seconds": seconds}))
+        made = episodes(folder)
+        if len(made) > len(set(made)) or not set(made) <= set(planned):
+            raise SystemExit(f"{folder}: episodes {made} were made instead of {planned}")
+        unwritten += len(planned) - len(made)
+    summary = {"kills": kills, "runs": runs, "stages": len(stages), "unwritten": unwritten}
+    print(json.dumps({**summary, "seconds": seconds}))
 
 
 if __name__ == "__main__":

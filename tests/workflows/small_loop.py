@@ -1,11 +1,12 @@
 """A loop small enough to run in seconds: hold a pendulum still against its weight.
 
 The target is not made by the package: it integrates the pendulum's equation itself, with other
-parameters, and writes a line for every episode that it has finished.
+parameters, and writes a line for every episode after it has finished.
 """
 
 import math
 import os
+import time
 
 import numpy as np
 import torch
@@ -15,13 +16,16 @@ from npdr_ppl.models.effects import CoulombFriction, InputDelay, SensorLowPass
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.linear import Linear
 from npdr_ppl.policies.search_registry import policy_search
-from npdr_ppl.targets.base import TargetDomain
+from npdr_ppl.targets.base import TargetDomain, end_episode
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.control_task import ControlTask
 from npdr_ppl.workflows.discovery import DiscoveryOptions
 from npdr_ppl.workflows.loop_options import LoopOptions
 
 NUM_STEPS = 40
+
+TIME_TO_REST = 0.02
+"""Seconds that the device takes after an episode, in which a run can be killed too."""
 
 
 class HandmadePendulum(TargetDomain):
@@ -45,13 +49,19 @@ class HandmadePendulum(TargetDomain):
                 state = _heun(state, torque[0], self.time_step / 10)
             readings.append(state)
             actions.append(torque)
-        rollout = self.rollout(readings, actions)
-        if self.log is not None:
-            with open(self.log, "a") as file:
-                file.write(f"{episode}\n")
-                file.flush()
-                os.fsync(file.fileno())
-        return rollout
+        end_episode(controller, readings[-1])
+        self.note(episode)
+        return self.rollout(readings, actions)
+
+    def note(self, episode):
+        """Writes down that an episode is over, and takes its time."""
+        if self.log is None:
+            return
+        with open(self.log, "a") as file:
+            file.write(f"{episode}\n")
+            file.flush()
+            os.fsync(file.fileno())
+        time.sleep(TIME_TO_REST)
 
 
 def _heun(state, torque, h):
@@ -79,11 +89,8 @@ class DryPendulum(HandmadePendulum):
                 state = _heun(state, torque[0] - friction, self.time_step / 20)
             readings.append(_read(state, rng))
             actions.append(torque)
-        if self.log is not None:
-            with open(self.log, "a") as file:
-                file.write(f"{episode}\n")
-                file.flush()
-                os.fsync(file.fileno())
+        end_episode(controller, readings[-1])
+        self.note(episode)
         return self.rollout(readings, actions)
 
 

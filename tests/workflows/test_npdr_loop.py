@@ -306,5 +306,6 @@ def test_no_rollout_is_lost_or_repeated_when_a_run_is_killed_a_hundred_times(tmp
     summary = json.loads(found.stdout.splitlines()[-1])
     assert summary["kills"] == 100
     assert summary["stages"] >= 5, "the kills all met the run at the same few places"
+    assert summary["unwritten"] <= 2, "the target hardly ever wrote its episodes down"
     undisturbed = Rollouts.from_netcdf(tmp_path / "undisturbed/run/rollouts/rollout_000.nc")
     assert len(undisturbed) == 1
