@@ -24,6 +24,7 @@ __all__ = [
     "NOISE",
     "OPTIONS",
     "Budget",
+    "likeliest_draws",
     "most_likely_draw",
     "score_each",
     "score_strikes",
@@ -48,6 +49,10 @@ OPTIONS = BindingOptions(EMBEDDING, None, "recorded")
 
 NUM_DRAWS = 1_000
 """Posterior draws among which the most likely is sought, less than one round's simulations."""
+
+NUM_LIKELIEST = 20
+"""Draws whose mean says where the obstacles are: the likeliest one of a wide posterior is off by
+degrees by chance."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +105,15 @@ class Budget:
 def most_likely_draw(
     posterior: Posterior, model: Model, rollouts: Rollouts, *, seed: int = 0
 ) -> dict[str, Tensor]:
-    """Returns the posterior draw that makes the fitted strikes most likely.
+    """Returns the first of :func:`likeliest_draws`."""
+    likeliest = likeliest_draws(posterior, model, rollouts, seed=seed)
+    return {name: values[0] for name, values in likeliest.items()}
+
+
+def likeliest_draws(
+    posterior: Posterior, model: Model, rollouts: Rollouts, *, seed: int = 0
+) -> dict[str, Tensor]:
+    """Returns the :data:`NUM_LIKELIEST` draws that make the strikes most likely, best first.
 
     The simulator is deterministic, so that under the noise of :data:`NOISE` every draw that is
     simulated once more has a likelihood, and no network has to be asked for it. The density of a
@@ -120,7 +133,7 @@ def most_likely_draw(
     # Replayed joints are the measured ones, whatever the draw.
     ball = [replayed.channel_names.index(name) for name in BALL]
     error = ((replayed.trajectory - measured) / scale)[..., ball].square()
-    best = int(error.flatten(1).sum(-1).nan_to_num(torch.inf).argmin())
+    best = error.flatten(1).sum(-1).nan_to_num(torch.inf).argsort()[:NUM_LIKELIEST]
     return {name: values[best] for name, values in draws.items()}
 
 

@@ -47,15 +47,17 @@ def obstacle_angles(parameters: dict[str, Tensor]) -> dict[str, dict[str, float]
     """Returns both obstacles' angles beside those of motion capture, in degrees.
 
     Args:
-        parameters: Values by site, e.g. the most likely ones.
+        parameters: Values by site, e.g. the most likely ones, or several of each, ``(n,)``.
 
     Returns:
-        ``angle``, ``measured`` and ``error`` by side; a box is the same after half a turn.
+        ``angle``, ``measured`` and ``error`` by side, the mean of several; a box is the same after
+        half a turn, so that it is the mean direction of axes (Mardia & Jupp 2000, §9.2).
     """
     result = {}
     for side, box, measured in zip(SIDES, OBSTACLES, MEASURED_OBSTACLES, strict=True):
-        angle = _half_turn(math.degrees(box.angle + float(parameters[f"{side}_turn"])))
-        seen = measured[2]
+        doubled = 2.0 * (box.angle + parameters[f"{side}_turn"].double())
+        mean = 0.5 * math.atan2(float(doubled.sin().mean()), float(doubled.cos().mean()))
+        angle, seen = _half_turn(math.degrees(mean)), measured[2]
         result[side] = {"angle": angle, "measured": seen, "error": _half_turn(angle - seen)}
     return result
 

@@ -29,6 +29,7 @@ from npdr_ppl.workflows.mini_golf_fit import (
     BALL,
     EMBEDDING,
     Budget,
+    likeliest_draws,
     most_likely_draw,
     score_each,
     score_strikes,
@@ -205,13 +206,14 @@ def _separate_restitutions(
     strikes, delays = clocks_aligned(rollouts[alike])
     model = mini_golf_two_restitutions
     joint = budget.fit(model, candidate, strikes, label, "two-restitutions")
-    likely = most_likely_draw(joint, model, strikes, seed=budget.seed)
+    likeliest = likeliest_draws(joint, model, strikes, seed=budget.seed)
+    likely = {name: values[0] for name, values in likeliest.items()}
     return {
         **_row(score_strikes(model, strikes, likely)),
         "strikes": alike,
         "clock_delays": [steps * strikes.time_step for steps in delays],
         "most_likely": _floats(likely),
-        "angles": obstacle_angles(likely),
+        "angles": obstacle_angles(likeliest),
     }
 
 

@@ -121,6 +121,10 @@ def test_half_a_turn_makes_no_other_obstacle():
     turned = measured_shifts()
     there = obstacle_angles({k: torch.tensor(v) for k, v in turned.items()})
     assert all(abs(side["error"]) < 1e-4 for side in there.values())
+    # Of several, the mean of axes: 1 and 3 degrees, the latter turned round.
+    turns = torch.deg2rad(torch.tensor([1.0, 183.0]))
+    two = obstacle_angles({f"{side}_turn": turns for side in ("left", "right")})
+    assert two["left"]["error"] == pytest.approx(4.7, abs=1e-3)
 
 
 def test_one_strike_is_not_enough(strikes, tmp_path):

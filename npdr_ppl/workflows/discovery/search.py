@@ -46,6 +46,11 @@ LEAST_SHARE = 1e-4
 """Share of what was explained below which what is left is not looked into: where a large effect
 was missing, integrators and the laws' own details differ by as much."""
 
+STRAIN = 0.02
+"""Share of what it explains by which a law that fits only in a limit of its shape must be ahead of
+one that needs none: there it is likely the other law, and what differs is how an engine solves it,
+as dry friction whose bristles hardly bend."""
+
 PRIOR_OF_ANY = 0.5
 """Prior probability that anything of the catalogue is missing."""
 
@@ -306,7 +311,10 @@ class Searcher:
         if found is None:
             return current, Added(effect, effect.name, 1.0, {effect.name: 1.0}), {}
         without, trials = found
-        log_prior = [_log_prior(trial) for trial in trials.values()]
+        log_prior = [
+            _log_prior(trial) - strain
+            for trial, strain in zip(trials.values(), _strains(trials, without), strict=True)
+        ]
         weights = weigh(list(trials.values()), log_prior, seed=0)
         alternatives = dict(zip(trials, weights, strict=True))
         best = max(alternatives, key=lambda name: alternatives[name])
@@ -368,3 +376,21 @@ def _log_prior(hypothesis: Hypothesis) -> float:
     """Returns what the search over frequencies costs, as so many hypotheses share one's prior."""
     waves = sum(bool(effect.wave) for effect in hypothesis.effects)
     return -waves * math.log(FREQUENCIES)
+
+
+def _strains(trials: Mapping[str, Hypothesis], without: Hypothesis) -> list[float]:
+    """Returns by how much evidence each candidate must be ahead of laws that fit without strain.
+
+    Args:
+        trials: The model with each candidate, by the candidate's name.
+        without: The model without any.
+    """
+    best = closest(list(trials.values()))
+    before = float(without.losses(best.fit.scale).sum())
+    result = []
+    for name, trial in trials.items():
+        effect = next(effect for effect in trial.effects if effect.name == name)
+        explains = before - float(trial.losses(best.fit.scale).sum())
+        share = STRAIN if trial.at_edge(effect) else 0.0
+        result.append(share * best.share * max(0.0, explains))
+    return result
