@@ -38,6 +38,7 @@ __all__ = [
     "simulate",
     "train",
     "with_likelihood",
+    "with_finer_steps",
     "with_noise",
     "workers",
 ]
@@ -49,7 +50,12 @@ if TYPE_CHECKING:
     from npdr_ppl.errors import NpdrError
     from npdr_ppl.language.channels import Channel, Parameter, Port
     from npdr_ppl.language.effects import Effect
-    from npdr_ppl.language.handlers import add_effect, remove_effect, with_noise
+    from npdr_ppl.language.handlers import (
+        add_effect,
+        remove_effect,
+        with_finer_steps,
+        with_noise,
+    )
     from npdr_ppl.language.inputs import Inputs
     from npdr_ppl.language.simulator import Simulator
     from npdr_ppl.language.sites import simulate
@@ -93,6 +99,7 @@ _HOMES = {
     "simulate": "language.sites",
     "train": "workflows.npdr_loop",
     "with_likelihood": "workflows.learned_likelihood",
+    "with_finer_steps": "language.handlers",
     "with_noise": "language.handlers",
     "workers": "engines.workers",
 }

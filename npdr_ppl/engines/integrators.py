@@ -31,11 +31,14 @@ class Integrator:
             returns the next q and v. The acceleration at the start is an argument because dry
             friction has computed it already.
         order: The global error is O(h^order).
+        rate_lag: Part of a step between a velocity and the position's derivative, in whichever
+            direction: staggered methods know velocities between the positions.
     """
 
     name: str
     step: StepFn
     order: int
+    rate_lag: float = 0.0
 
 
 def _advance(x: Components, rate: Components, time: float) -> Components:
@@ -85,7 +88,7 @@ INTEGRATORS: dict[str, Integrator] = {
     method.name: method
     for method in (
         Integrator("constant-acceleration", _constant_acceleration, order=1),
-        Integrator("semi-implicit-euler", _semi_implicit_euler, order=1),
+        Integrator("semi-implicit-euler", _semi_implicit_euler, order=1, rate_lag=0.5),
         Integrator("rk4", _rk4, order=4),
     )
 }

@@ -1,8 +1,9 @@
 """Batched simulation of mechanical systems whose accelerations are written in torch."""
 
+import copy
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -23,6 +24,9 @@ __all__ = ["Forces", "ODESimulator"]
 
 Forces = tuple[Tensor | float, ...]
 """Generalised forces to add, one per joint; 0.0 where no effect acts."""
+
+FINEST = "rk4"
+"""Integrator of :meth:`ODESimulator.with_finer_steps`."""
 
 
 class ODESimulator(ClosedLoopSimulator):
@@ -109,6 +113,20 @@ class ODESimulator(ClosedLoopSimulator):
         """Returns the true value of every sensor channel; by default the states of that name."""
         values = dict(zip((s.name for s in self.states), (*positions, *velocities), strict=True))
         return tuple(values[sensor.name] for sensor in self.sensors)
+
+    @property
+    def rate_lag(self) -> float:
+        """Part of a time step between the state's rates and the derivatives of its positions."""
+        return self.integrator.rate_lag / self.substeps
+
+    def with_finer_steps(self) -> Self | None:
+        """Returns a copy with Runge–Kutta steps; ``None`` if it makes them already."""
+        finest = integrator(FINEST)
+        if self.integrator.order >= finest.order:
+            return None
+        changed = copy.copy(self)
+        changed.integrator = finest
+        return changed
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
         """Replays the inputs' actions; see :meth:`Simulator.simulate`."""

@@ -14,12 +14,15 @@ from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox, SiteLikelihood
 
 __all__ = [
     "EffectMessenger",
+    "FinerStepsMessenger",
     "LikelihoodMessenger",
     "ModelWithEffects",
+    "ModelWithFinerSteps",
     "NoiseMessenger",
     "SkipSimulation",
     "add_effect",
     "remove_effect",
+    "with_finer_steps",
     "with_noise",
 ]
 
@@ -139,6 +142,49 @@ def _parts(model: Model) -> tuple[Model, tuple[tuple[Effect, str | None], ...]]:
     if isinstance(model, ModelWithEffects):
         return model.base, model.effects
     return model, ()
+
+
+class FinerStepsMessenger(Messenger):
+    """Lets the simulators of a program integrate more accurately while it runs, where they can."""
+
+    def _pyro_sample(self, msg: Any) -> None:
+        box = msg["fn"]
+        if isinstance(box, SimulatorBlackBox):
+            finer = box.simulator.with_finer_steps()
+            if finer is not None:
+                msg["fn"] = box.with_simulator(finer)
+
+
+class ModelWithFinerSteps:
+    """A Pyro model whose simulators integrate more accurately than the model asks for.
+
+    Attributes:
+        base: The model.
+    """
+
+    def __init__(self, base: Model) -> None:
+        self.base = base
+        self.__name__ = getattr(base, "__name__", type(base).__name__)
+        self.__doc__ = base.__doc__
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Runs the model with finer steps."""
+        return FinerStepsMessenger()(self.base)(*args, **kwargs)
+
+    def __repr__(self) -> str:
+        return f"{self.__name__} in finer steps"
+
+
+def with_finer_steps(model: Model) -> Model:
+    """Returns the model with simulators that integrate more accurately, where they can.
+
+    One step per sample is enough to learn a policy in; set against measurements, the error of such
+    steps looks like a delay.
+    """
+    base, effects = _parts(model)
+    if not isinstance(base, ModelWithFinerSteps):
+        base = ModelWithFinerSteps(base)
+    return ModelWithEffects(base, effects) if effects else base
 
 
 class NoiseMessenger(Messenger):

@@ -100,6 +100,15 @@ class Simulator(ABC):
         return changed
 
     @property
+    def rate_lag(self) -> float:
+        """Part of a time step between the state's rates and the derivatives of its positions."""
+        return 0.0
+
+    def with_finer_steps(self) -> Self | None:
+        """Returns a copy whose integration errs less; ``None`` where there is none to offer."""
+        return None
+
+    @property
     def is_rate(self) -> tuple[bool, ...]:
         """Whether each state is the rate of another; the others are positions."""
         return tuple(state.rate_of is not None for state in self.states)

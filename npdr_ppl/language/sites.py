@@ -287,6 +287,12 @@ class SimulatorBlackBox(BlackBox):
         changed.likelihood = self.likelihood
         return changed
 
+    def with_simulator(self, simulator: Simulator) -> "SimulatorBlackBox":
+        """Returns the same site with another simulator that has the same channels."""
+        changed = self.expand(self.batch_shape)
+        changed.simulator = simulator
+        return changed
+
     def _run(self, batch_shape: torch.Size) -> Tensor:
         device = self.inputs.actions.device
         parameters = {name: value.to(device) for name, value in self.parameters.items()}

@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,6 +29,7 @@ from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.states import estimate_states
 from npdr_ppl.workflows.binding import BindingOptions
 
 __all__ = ["Linearisation", "SegmentFit", "SegmentModel", "fit_segments"]
@@ -35,6 +37,9 @@ __all__ = ["Linearisation", "SegmentFit", "SegmentModel", "fit_segments"]
 PARAMETER_STEP = 1e-2
 """Half the width of finite differences, in standard deviations of the prior: more than what
 single precision and dry friction blur."""
+
+RATE_SAMPLES = 200
+"""Steps of each rollout at which the change of a rate is looked at."""
 
 START_STEP = 0.1
 """The same for initial states, in standard deviations of the smoother's error."""
@@ -155,6 +160,7 @@ class SegmentModel:
             )
         self._columns = [names.index(name) for name in self.channel_names]
         self.observed = rollouts.observation(self.inputs, channels=self.channel_names)
+        self.inputs = _with_lagging_rates(self.inputs, rollouts, box.simulator.rate_lag)
         self._offsets = _uncertain_components(self.inputs)
 
     @property
@@ -417,6 +423,30 @@ def _step(
     moved = (z + change).clamp(-MAX_COORDINATE, MAX_COORDINATE)
     begun = [offsets + part[..., d] - part[..., :d] @ (moved - z) for part in parts.values()]
     return moved, torch.stack(begun)
+
+
+def _with_lagging_rates(inputs: Inputs, rollouts: Rollouts, lag: float) -> Inputs:
+    """Returns inputs whose initial rates may be off by as much as they change during a lag.
+
+    Rates are estimated as derivatives; a simulator may have its own between the steps.
+
+    Args:
+        inputs: The segments.
+        rollouts: What they were made of.
+        lag: Part of a time step.
+    """
+    if lag == 0.0 or inputs.initial_rate_errors is None:
+        return inputs
+    changes = []
+    for readings in rollouts.readings:
+        steps = np.linspace(0, len(readings) - 2, RATE_SAMPLES).astype(np.int64)
+        now, then = (
+            estimate_states(readings, at, rollouts.time_step).rates for at in (steps, steps + 1)
+        )
+        changes.append(np.square(then - now))
+    change = np.sqrt(np.concatenate(changes).mean(0))
+    errors = inputs.initial_rate_errors
+    return replace(inputs, initial_rate_errors=errors.hypot(errors.new_tensor(lag * change)))
 
 
 def _uncertain_components(inputs: Inputs) -> list[tuple[str, int, Tensor]]:

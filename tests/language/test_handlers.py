@@ -129,3 +129,22 @@ def test_noise_can_be_exchanged(inputs):
     # The standard error of a standard deviation over 80 readings; 4 of them.
     assert abs(difference.std() / 0.1 - 1) < 4 / (2 * difference.numel()) ** 0.5
     assert torch.equal(npdr.with_noise(noisy, None)(inputs), clean(inputs))
+
+
+def test_finer_steps_are_taken_where_there_are_some(inputs):
+    fixed = {"mass": torch.tensor(0.8), "length": torch.tensor(1.1)}
+
+    def reading(model):
+        return pyro.condition(model, data=fixed)(inputs)
+
+    finer = npdr.with_finer_steps(pendulum)
+    expected = Pendulum(integrator="rk4").simulate(fixed, inputs)
+    assert torch.equal(reading(finer), expected)
+    assert not torch.equal(reading(pendulum), expected)
+    # Nothing is finer than that, and effects stay attached, and come off.
+    assert Pendulum(integrator="rk4").with_finer_steps() is None
+    assert torch.equal(reading(npdr.with_finer_steps(finer)), expected)
+    revised = npdr.with_finer_steps(npdr.add_effect(pendulum, Bias("hinge")))
+    assert sites(revised, inputs) == ["mass", "length", "hinge.bias.offset", "trajectory"]
+    bare = npdr.remove_effect(revised, "hinge.bias")
+    assert torch.equal(reading(bare), expected)

@@ -36,6 +36,11 @@ MINOR = 0.1
 SURVIVES = 0.05
 """Probability from which an alternative has to be reckoned with."""
 
+COARSE = (
+    "The model's integration steps are too coarse for this recording; the revised model takes "
+    "finer ones."
+)
+
 LEADING = 10
 """Candidates in the separation matrix."""
 
@@ -81,10 +86,10 @@ class Investigation:
 
     @cached_property
     def start(self) -> Hypothesis:
-        """The model as it is, fitted."""
+        """The model as it is, fitted; in finer steps where its own are too coarse."""
         with _timed(self.seconds, "fit"):
             try:
-                fitted = self._searcher.fit_base()
+                fitted = self._searcher.with_finer_steps(self._searcher.fit_base())
             except DataError as error:
                 measured = SegmentModel(self.model, self.rollouts, self._binding).measured
                 problems = recording_problems(measured, self.rollouts)
@@ -147,6 +152,8 @@ class Investigation:
         every = estimates(final, _units(final), seed=self.options.seed)
         effects = [_finding(added, search, every) for added in search.added]
         verdict, reason = _judge(search, effects, self.problems, unexplained, self.options)
+        if self._searcher.are_steps_coarse:
+            reason = f"{reason} {COARSE}"
         gap = self.gap
         with _timed(self.seconds, "next experiment"):
             advice = None
@@ -166,7 +173,7 @@ class Investigation:
             separation_names=tuple(c.name for c in self.first.ranking[:LEADING]),
             gap=gap,
             next_experiment=advice,
-            model=self.model,
+            model=search.rounds[0].hypothesis.model,
             revised=final.model,
             parameters=every,
             search=search,

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.handlers import with_finer_steps
 from npdr_ppl.models.effects import candidate_effects
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
@@ -126,6 +127,10 @@ class Searcher:
         rollouts: The recording.
         options: How to search.
         report: Called with a sentence at each step.
+
+    Attributes:
+        model: The model in question, in finer steps once its own have turned out too coarse.
+        are_steps_coarse: Whether they have.
     """
 
     def __init__(
@@ -139,6 +144,7 @@ class Searcher:
         self.rollouts = rollouts
         self.options = options
         self.binding: BindingOptions = options.binding(rollouts)
+        self.are_steps_coarse = False
         self._report = report
 
     def fit_base(self) -> Hypothesis:
@@ -146,12 +152,36 @@ class Searcher:
         self._report("fitting the model as it is")
         return fit_hypothesis(self.model, self.rollouts, self.binding)
 
+    def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
+        """Returns the hypothesis in finer steps, where that explains more; else as it is.
+
+        The error of coarse steps would be found as a delay. A recording that was itself made in
+        coarse steps is left to them. All later hypotheses are in the steps of what is returned.
+
+        Args:
+            current: A fitted hypothesis.
+        """
+        if current.simulator.with_finer_steps() is None:
+            return current
+        coarse, self.model = self.model, with_finer_steps(self.model)
+        finer = self._fit(current.effects, current.parameters, current)
+        if finer is not None:
+            if weigh([current, finer], [0.0, 0.0], seed=0)[1] > self.options.confidence:
+                self._report("the model's steps are too coarse for this recording: finer ones")
+                self.are_steps_coarse = True
+                return finer
+        self.model = coarse
+        return current
+
     def run(self, first: Round, *, max_effects: int) -> Search:
         """Adds effects until no alarm fires, nothing helps, or there are enough.
 
         Args:
             first: What was seen at the model as it is.
             max_effects: How many are enough.
+
+        Returns:
+            What came of it; its first round is in finer steps if those turned out to be needed.
         """
         current, now = first.hypothesis, first
         rounds = [first]
@@ -167,6 +197,12 @@ class Searcher:
                 break
             current, needless = self._pruned(tried[best])
             removed += needless
+            if self.with_finer_steps(current) is not current:
+                # What was missing had hidden how coarse they are: begin anew.
+                current = self.fit_base()
+                first = now = self.look(current)
+                rounds, removed = [first], []
+                continue
             if any(set(current.names) == set(r.hypothesis.names) for r in rounds):
                 break
             now = self.look(current)

@@ -4,10 +4,13 @@ The true laws, equations and integrators are those of benchmarks/hidden_rigs, wh
 with the package; the held-out rollouts have another excitation.
 """
 
+import mujoco
+import numpy as np
 import pytest
 from hidden_rigs import make_case
 
 import npdr_ppl as npdr
+from npdr_ppl.models.pendulum import Pendulum, pendulum
 
 SEED = 2000
 """No seed of the benchmark's, neither of its tuning nor of its reporting."""
@@ -102,6 +105,84 @@ def test_a_law_that_fits_only_in_a_limit_is_not_named():
     assert finding.effect.id == "wind" and finding.at_edge == ("speed",)
     assert found.verdict == "unknown"
     assert "explains it only with speed where hardly any device has it" in found.reason
+
+
+ROD = """
+<mujoco>
+  <option timestep="0.001" integrator="RK4"/>
+  <worldbody>
+    <body>
+      <joint name="hinge" axis="0 1 0" frictionloss="{friction}"/>
+      <inertial pos="0 0 -0.45" mass="1.1" diaginertia="0.07425 0.07425 0.001"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="hinge"/></actuator>
+</mujoco>
+"""
+
+
+def swing(friction, *, num_rollouts, seed):
+    """A rod of 0.9 m and 1.1 kg in MuJoCo, whose friction yields as it does by default."""
+    model = mujoco.MjModel.from_xml_string(ROD.format(friction=friction))
+    rng = np.random.default_rng(seed)
+    readings, actions = [], []
+    for _ in range(num_rollouts):
+        data = mujoco.MjData(model)
+        data.qpos[0] = rng.uniform(-0.5, 0.5)
+        torque = _torque(rng)
+        states = [[data.qpos[0], data.qvel[0]]]
+        for value in torque:
+            data.ctrl[0] = value
+            mujoco.mj_step(model, data, nstep=20)
+            states.append([data.qpos[0], data.qvel[0]])
+        readings.append(np.array(states) + rng.normal(0.0, [1e-3, 1e-2], (301, 2)))
+        actions.append(torque[:, None])
+    return _rollouts(readings, actions)
+
+
+def _torque(rng):
+    frequency, phase = rng.uniform(0.2, 1.5, (3, 1)), rng.uniform(0.0, 2.0 * np.pi, (3, 1))
+    times = Pendulum.time_step * np.arange(300)
+    return np.sin(2.0 * np.pi * frequency * times + phase).sum(0)
+
+
+def _rollouts(readings, actions):
+    return npdr.Rollouts.from_arrays(
+        readings=readings, actions=actions, channel_names=["angle", "velocity"],
+        action_names=["torque"], time_step=Pendulum.time_step,
+    )  # fmt: skip
+
+
+def test_coarse_steps_are_no_discovery_and_hide_none():
+    # One Euler step per sample is off by half a sample: a delay of 10 ms, if one believed it.
+    still = npdr.discover(pendulum, swing(0.0, num_rollouts=3, seed=SEED))
+    assert (still.verdict, still.effects) == ("none", []), still.reason
+    assert "the revised model takes finer ones" in still.reason
+    recording = swing(0.3, num_rollouts=4, seed=SEED)
+    found = npdr.discover(pendulum, recording[[0, 1, 2]], holdout=recording[[3]])
+    assert [f.effect.name for f in found.effects] == ["hinge.coulomb_friction"], found.reason
+    assert found.verdict == "named"
+    assert found.effects[0].parameters["magnitude"].mean == pytest.approx(0.3, rel=0.03)
+    assert found.gap["rmse"].closed > 0.9
+    assert "with_finer_steps(revised_model)" in found.source()
+
+
+def test_a_recording_made_in_coarse_steps_is_left_to_them():
+    rng = np.random.default_rng(SEED)
+    h, readings, actions = Pendulum.time_step, [], []
+    for _ in range(3):
+        torque = _torque(rng)
+        states = [rng.uniform(-0.5, 0.5, 2)]
+        for value in torque:
+            angle, velocity = states[-1]
+            weight = 1.1 * 9.81 * 0.45 * np.sin(angle)
+            velocity = velocity + h * (value - weight) / (1.1 * 0.9**2 / 3.0)
+            states.append(np.array([angle + h * velocity, velocity]))
+        readings.append(np.array(states) + rng.normal(0.0, [1e-3, 1e-2], (301, 2)))
+        actions.append(torque[:, None])
+    found = npdr.discover(pendulum, _rollouts(readings, actions))
+    assert (found.verdict, found.effects) == ("none", []), found.reason
+    assert found.search.final.model is pendulum
 
 
 @pytest.mark.parametrize("kind", ["degrees", "one_in_degrees", "misaligned"])
