@@ -62,7 +62,7 @@ class Investigation:
         seconds: Time spent, by stage.
 
     Raises:
-        DataError: The held-out rollouts have other channels.
+        DataError: The held-out rollouts have other channels, or are none.
     """
 
     def __init__(
@@ -74,6 +74,10 @@ class Investigation:
         options: DiscoveryOptions | None = None,
         report: Callable[[str], None] = lambda _: None,
     ) -> None:
+        if holdout is not None and not isinstance(holdout, Rollouts):
+            raise DataError(
+                f"holdout takes rollouts, e.g. rollouts[[3]], but was given {holdout!r}."
+            )
         if holdout is not None and holdout.channel_names != rollouts.channel_names:
             raise DataError("The held-out rollouts have other channels than those to fit.")
         self.model = model

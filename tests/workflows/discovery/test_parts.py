@@ -170,6 +170,12 @@ def test_the_same_seed_finds_the_same():
     assert first.alarm == second.alarm
 
 
+def test_numbers_of_rollouts_are_no_rollouts():
+    case = make_case("pendulum", "null", (), seed=2001)
+    with pytest.raises(DataError, match=r"takes rollouts, e.g. rollouts\[\[3\]\]"):
+        npdr.discover(case.model, case.fit, holdout=(3,))
+
+
 def test_too_short_a_recording_is_refused():
     case = make_case("pendulum", "null", (), seed=2001)
     with pytest.raises(DataError, match="too few"):
