@@ -24,6 +24,7 @@ import torch
 from small_loop import (
     DryPendulum,
     HandmadePendulum,
+    accurate_pendulum,
     discovering_options,
     small_options,
     small_task,
@@ -50,10 +51,11 @@ def fork(folder, seed, discovers, modules=None):
         return child
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        target, task, options = HandmadePendulum, small_task(), small_options()
+        model, target, task, options = pendulum, HandmadePendulum, small_task(), small_options()
         if discovers:
-            target, task, options = DryPendulum, swinging_task(), discovering_options()
-        train(pendulum, target(folder / "episodes.log"), task, options, out=folder / "run",
+            model, target = accurate_pendulum, DryPendulum
+            task, options = swinging_task(), discovering_options()
+        train(model, target(folder / "episodes.log"), task, options, out=folder / "run",
               seed=seed, progress=False)  # fmt: skip
         if modules is not None:
             modules.write_text("\n".join(sys.modules))

@@ -9,8 +9,11 @@ import os
 import time
 
 import numpy as np
+import pyro
+import pyro.distributions as dist
 import torch
 
+import npdr_ppl as npdr
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.models.effects import CoulombFriction, InputDelay, SensorLowPass
 from npdr_ppl.models.pendulum import Pendulum
@@ -110,6 +113,16 @@ def reward(positions, velocities, commands):
 def small_task(excitation=None):
     policy = Linear(("angle", "velocity"), ("torque",), max_gain=20.0)
     return ControlTask("hold", policy, reward, initial_states, NUM_STEPS, 30.0, excitation)
+
+
+def accurate_pendulum(inputs, *, noise=None):
+    """The zoo's pendulum in Runge-Kutta steps, which discovery has no reason to refine."""
+    parameters = {
+        "mass": pyro.sample("mass", dist.Uniform(0.3, 1.7)),
+        "length": pyro.sample("length", dist.Uniform(0.3, 1.7)),
+    }
+    simulator = Pendulum(integrator="rk4")
+    return npdr.simulate("trajectory", simulator, parameters, inputs, noise=noise)
 
 
 def swinging_task():
