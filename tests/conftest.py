@@ -9,6 +9,9 @@ from npdr_ppl.engines import closed_loop, compilation, open_loop
 # A worker per core: torch's own threads would only get in each other's way.
 torch.set_num_threads(int(os.environ.get("NPDR_NUM_THREADS", "1")))
 
+# Nor would processes that a command starts on its own, one per core.
+os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
+
 # The same examples every time, so that a run says something about the change under test;
 # NPDR_EXPLORE=1 looks for new ones.
 settings.register_profile("repeatable", derandomize=True)

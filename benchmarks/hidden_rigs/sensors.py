@@ -1,6 +1,5 @@
 """What sensors make of the true motion, before noise: timing, filters, scale and offset."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -34,8 +33,7 @@ def sensed(
     """Returns what noise-free sensors report, ``(R, num_steps + 1, channels)``.
 
     Delays and skewed clocks look the motion up at other times, between substeps along a line. A
-    filter runs on the samples that the device takes, as drivers do it, and has run before the
-    recording began.
+    filter runs on the substeps, and has run before the recording began.
 
     Args:
         motion: True positions and velocities at all substeps, ``(N, channels, R)``, some of it
@@ -47,8 +45,7 @@ def sensed(
         hidden: What is hidden.
         layout: Names of the channels.
     """
-    before = begin // num_substeps
-    samples = np.arange(-before, num_steps + 1, dtype=np.float64)
+    samples = np.arange(num_steps + 1, dtype=np.float64)
     result = []
     for column, channel in enumerate(layout.sensors):
         mine = [
@@ -63,10 +60,14 @@ def sensed(
                 at = at - h.parameters["delay"] / substep
             elif h.effect_id == "clock_skew":
                 at = at * (1.0 + h.parameters["skew"])
-        values = _looked_up(motion[:, column], at + begin)
+        values = motion[:, column]
         for h in mine:
-            values = _changed(values, h, num_substeps * substep)
-        result.append(values[before:])
+            if h.effect_id == "sensor_low_pass":
+                values = _filtered(values, h.parameters["time_constant"], substep)
+        values = _looked_up(values, at + begin)
+        for h in mine:
+            values = _changed(values, h)
+        result.append(values)
     return np.stack(result, axis=-1).swapaxes(0, 1)
 
 
@@ -78,15 +79,19 @@ def _looked_up(table: Array, at: Array) -> Array:
     return (1.0 - share) * table[low] + share * table[low + 1]
 
 
-def _changed(values: Array, hidden: Hidden, time_step: float) -> Array:
-    """Returns samples ``(K, R)`` after a filter, a scale or an offset."""
+def _filtered(values: Array, time_constant: float, substep: float) -> Array:
+    """Returns values at substeps ``(N, R)`` after a low-pass, by the trapezoidal rule."""
+    ratio = 0.5 * substep / time_constant
+    filtered = values.copy()
+    for k in range(1, len(values)):
+        drive = ratio * (values[k - 1] + values[k] - filtered[k - 1])
+        filtered[k] = (filtered[k - 1] + drive) / (1.0 + ratio)
+    return filtered
+
+
+def _changed(values: Array, hidden: Hidden) -> Array:
+    """Returns samples ``(K, R)`` after a scale or an offset."""
     p = hidden.parameters
-    if hidden.effect_id == "sensor_low_pass":
-        step = -math.expm1(-time_step / p["time_constant"])
-        filtered = values.copy()
-        for k in range(1, len(values)):
-            filtered[k] = filtered[k - 1] + step * (values[k] - filtered[k - 1])
-        return filtered
     if hidden.effect_id == "encoder_scale":
         return values + p["error"] * values
     if hidden.effect_id == "encoder_bias":

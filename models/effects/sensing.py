@@ -21,8 +21,9 @@ __all__ = ["EncoderBias", "EncoderScale", "Quantisation", "SensorLowPass"]
 class SensorLowPass(SensorEffect):
     """ẏ = (x − y)/T: a filtered reading, e.g. a velocity derived from an encoder.
 
-    Discretised as drivers do it: y_k = x_k + exp(−h/T) (y_{k−1} − x_k). The filter's output at a
-    segment's start is what was read there. Attach it to a group of channels,
+    Exact for values that change along a line between samples, so that the reading trails by T at
+    any sampling rate, as that of a driver does which filters the encoder's differences. The
+    filter's output at a segment's start is what was read there. Attach it to a group of channels,
     ``"arm_velocity,pole_velocity"``, where one driver filters them all.
     """
 
@@ -38,16 +39,26 @@ class SensorLowPass(SensorEffect):
         """Uniform up to 30 ms."""
         return {"time_constant": dist.Uniform(0.0, 0.03)}
 
-    def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> Tensor:
-        """Returns the reading."""
-        return reading
+    def initial_memory(
+        self, value: Tensor, reading: Tensor, start: Start
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the filter's output and the true value."""
+        return reading, value
 
     def read(
-        self, value: Tensor, parameters: Mapping[str, Tensor], memory: Tensor, time_step: float
-    ) -> tuple[Tensor, Tensor]:
-        """Returns the filter's output, which is its memory too."""
-        output = value + remaining(parameters["time_constant"], time_step) * (memory - value)
-        return output, output
+        self,
+        value: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: tuple[Tensor, Tensor],
+        time_step: float,
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """Returns the filter's output, and with the true value its memory."""
+        output, last = memory
+        time_constant = parameters["time_constant"]
+        decay = remaining(time_constant, time_step)
+        trailing = time_constant / time_step * (1.0 - decay)
+        output = value + trailing * (last - value) + decay * (output - last)
+        return output, (output, value)
 
 
 class EncoderBias(SensorEffect):

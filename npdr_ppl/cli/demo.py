@@ -27,6 +27,7 @@ def demo(
     from rich.console import Console
 
     from npdr_ppl.cli.show import show_demo
+    from npdr_ppl.engines.workers import workers
     from npdr_ppl.plots.training_figures import write_training_figures
     from npdr_ppl.reports import write_report
     from npdr_ppl.workflows.demo import run_demo
@@ -36,6 +37,7 @@ def demo(
     console.print("A Furuta pendulum in MuJoCo is the rig; the model has the paper's equations …")
     with (
         resumable(f"the same command again continues the run in {out}."),
+        workers(),
         reporter(False if quiet else None) as report,
     ):
         told = run_demo(out, seed=seed, progress=report)

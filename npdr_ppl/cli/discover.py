@@ -60,7 +60,7 @@ def discover(
             autocompletion=complete_effect,
         ),
     ] = "",
-    max_effects: Annotated[int, typer.Option(min=0, help="Greatest number to add.")] = 4,
+    max_effects: Annotated[int, typer.Option(min=0, help="Greatest number to add.")] = 5,
     false_alarm_rate: Annotated[
         float, typer.Option(help="Probability of an alarm although nothing is missing.")
     ] = 0.01,

@@ -134,6 +134,7 @@ def _reproduce_missing_effect(
     data: Path | None, out: Path, seed: int, as_json: bool, quiet: bool
 ) -> None:
     from npdr_ppl.cli.show import show_missing_effect
+    from npdr_ppl.engines.workers import workers
     from npdr_ppl.errors import DataError
     from npdr_ppl.plots.missing_effect_figures import write_missing_effect_figures
     from npdr_ppl.workflows.discovery import DiscoveryOptions
@@ -143,7 +144,7 @@ def _reproduce_missing_effect(
     if data is None:
         raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")
     swing_ups, chirps = load_recordings(data)
-    with resumable(f"the same command again begins the search in {out} anew."):
+    with resumable(f"the same command again begins the search in {out} anew."), workers():
         story, result = reproduce_missing_effect(
             swing_ups,
             chirps,

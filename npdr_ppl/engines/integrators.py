@@ -62,6 +62,15 @@ def _semi_implicit_euler(
     return _advance(q, velocities, h), velocities
 
 
+def _midpoint(
+    acceleration: Acceleration, q: Components, v: Components, a: Components, h: float
+) -> tuple[Components, Components]:
+    """Advances by the rates at the middle of the step, which half an Euler step leads to."""
+    middle = _advance(v, a, 0.5 * h)
+    rates = acceleration(_advance(q, v, 0.5 * h), middle)
+    return _advance(q, middle, h), _advance(v, rates, h)
+
+
 def _rk4(
     acceleration: Acceleration, q: Components, v: Components, a: Components, h: float
 ) -> tuple[Components, Components]:
@@ -89,6 +98,7 @@ INTEGRATORS: dict[str, Integrator] = {
     for method in (
         Integrator("constant-acceleration", _constant_acceleration, order=1),
         Integrator("semi-implicit-euler", _semi_implicit_euler, order=1, rate_lag=0.5),
+        Integrator("midpoint", _midpoint, order=2),
         Integrator("rk4", _rk4, order=4),
     )
 }

@@ -25,8 +25,9 @@ __all__ = ["Forces", "ODESimulator"]
 Forces = tuple[Tensor | float, ...]
 """Generalised forces to add, one per joint; 0.0 where no effect acts."""
 
-FINEST = "rk4"
-"""Integrator of :meth:`ODESimulator.with_finer_steps`."""
+FINER = "midpoint"
+"""Integrator of :meth:`ODESimulator.with_finer_steps`. At the zoo's steps it errs by a hundredth
+of what one Euler step does, less than encoders resolve, at half the price of Runge–Kutta steps."""
 
 
 class ODESimulator(ClosedLoopSimulator):
@@ -120,12 +121,12 @@ class ODESimulator(ClosedLoopSimulator):
         return self.integrator.rate_lag / self.substeps
 
     def with_finer_steps(self) -> Self | None:
-        """Returns a copy with Runge–Kutta steps; ``None`` if it makes them already."""
-        finest = integrator(FINEST)
-        if self.integrator.order >= finest.order:
+        """Returns a copy with midpoint steps; ``None`` if its own are of their order or higher."""
+        finer = integrator(FINER)
+        if self.integrator.order >= finer.order:
             return None
         changed = copy.copy(self)
-        changed.integrator = finest
+        changed.integrator = finer
         return changed
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:

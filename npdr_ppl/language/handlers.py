@@ -21,6 +21,7 @@ __all__ = [
     "NoiseMessenger",
     "SkipSimulation",
     "add_effect",
+    "has_finer_steps",
     "remove_effect",
     "with_finer_steps",
     "with_noise",
@@ -185,6 +186,11 @@ def with_finer_steps(model: Model) -> Model:
     if not isinstance(base, ModelWithFinerSteps):
         base = ModelWithFinerSteps(base)
     return ModelWithEffects(base, effects) if effects else base
+
+
+def has_finer_steps(model: Model) -> bool:
+    """Returns whether a model's simulators take finer steps than it asks for."""
+    return isinstance(_parts(model)[0], ModelWithFinerSteps)
 
 
 class NoiseMessenger(Messenger):

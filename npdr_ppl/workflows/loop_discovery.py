@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from npdr_ppl.errors import DataError, NpdrError
-from npdr_ppl.language.handlers import ModelWithEffects, add_effect
+from npdr_ppl.language.handlers import ModelWithEffects, add_effect, with_finer_steps
 from npdr_ppl.models.effects.registry import effect_class
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.discovery import DiscoveryOptions, discover
@@ -34,7 +34,7 @@ class Revision:
     """What looking for a missing effect came to.
 
     Attributes:
-        model: The revised model; ``None`` where nothing was found.
+        model: The revised model; ``None`` where nothing is to be revised.
         reason: The finding in a sentence.
     """
 
@@ -82,11 +82,11 @@ class LoopDiscovery:
     def _read(self, result: Mapping[str, Any]) -> Revision:
         """Returns the revision that a saved discovery stands for."""
         own = {effect.name: effect for effect in self.options.effects or ()}
-        model = self.model
+        model = with_finer_steps(self.model) if result.get("finer_steps") else self.model
         for row in result["effects"]:
             name = f"{row['port']}.{row['effect']}"
             model = add_effect(model, own.get(name) or effect_class(row["effect"])(row["port"]))
-        return Revision(model if result["effects"] else None, _sentence(result))
+        return Revision(None if model is self.model else model, _sentence(result))
 
 
 def effect_names(model: Model) -> list[str]:

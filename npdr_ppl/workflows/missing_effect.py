@@ -25,7 +25,7 @@ from npdr_ppl.rollouts.segments import InitialState
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery import Discovery, DiscoveryOptions, Investigation
 from npdr_ppl.workflows.discovery.folder import DiscoveryFolder, findings_until
-from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, fit_hypothesis
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
 from npdr_ppl.workflows.discovery.progress import sentences
 from npdr_ppl.workflows.evaluation import nominal_parameters, score
 from npdr_ppl.workflows.run_folder import read_json, write_json
@@ -120,8 +120,8 @@ def reproduce_missing_effect(
     nominal = nominal_parameters(furuta, train.inputs(SEGMENT_LENGTH))
     story = Story(
         discovery,
-        _refitted(investigation.start, train),
-        _refitted(discovery.search.final, train),
+        _refitted(furuta, investigation.given, train),
+        _refitted(discovery.model, discovery.search.final, train),
     )
     fits = {"refitted": story.refitted, "revised": story.revised}
     result = {
@@ -141,10 +141,16 @@ def reproduce_missing_effect(
     return story, result
 
 
-def _refitted(found: Hypothesis, rollouts: Rollouts) -> Hypothesis:
-    """Fits a model of the discovery to Table 2's segments, from where the discovery left it."""
+def _refitted(model: Model, found: Hypothesis, rollouts: Rollouts) -> Hypothesis:
+    """Fits a model of the discovery to Table 2's segments, from where the discovery left it.
+
+    Args:
+        model: The hypothesis's model without its effects.
+        found: The hypothesis.
+        rollouts: What to fit.
+    """
     options = BindingOptions(None, SEGMENT_LENGTH, "estimated", "float64")
-    return fit_hypothesis(furuta, rollouts, options, effects=found.effects, start=found.parameters)
+    return fit_hypothesis(model, rollouts, options, effects=found.effects, start=found.parameters)
 
 
 def _row(model: Any, parameters: Any, held_out: Rollouts, chirps: Rollouts | None) -> Row:

@@ -2,8 +2,10 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.signal import lsim
 
 from npdr_ppl.language.effect_context import Joint
 from npdr_ppl.models.cart_pole import CartPole
@@ -24,6 +26,7 @@ from npdr_ppl.models.effects import (
     QuadraticDrag,
     Quantisation,
     Saturation,
+    SensorLowPass,
     ViscousFriction,
     Wind,
 )
@@ -333,3 +336,16 @@ def test_a_bias_is_what_asymmetric_friction_has_over_coulomb_friction():
         rtol=1e-3,
         atol=1e-3,
     )
+
+
+@pytest.mark.parametrize("time_step", [0.002, 0.01])
+def test_a_filtered_reading_is_the_continuous_filter_of_the_line_between_samples(time_step):
+    law, time_constant = SensorLowPass("velocity"), torch.tensor(0.012, dtype=torch.float64)
+    times = time_step * np.arange(60)
+    true = np.interp(times, [0.0, 0.05, 0.2, 1.0], [0.0, 3.0, -1.0, 5.0])
+    expected = lsim(([1.0], [float(time_constant), 1.0]), true, times, X0=[0.0])[1]
+    values = torch.tensor(true)
+    memory = law.initial_memory(values[0], torch.tensor(0.0).double(), None)
+    for value, reading in zip(values[1:], expected[1:], strict=True):
+        output, memory = law.read(value, {"time_constant": time_constant}, memory, time_step)
+        assert output.item() == pytest.approx(reading, abs=1e-12)

@@ -9,7 +9,14 @@ from npdr_ppl.engines.workers.options import Executor, WorkerOptions
 from npdr_ppl.engines.workers.pool import Outcome, Pool, Progress
 from npdr_ppl.engines.workers.task import Task
 
-__all__ = ["Workers", "collect_faults", "report_progress", "run_on_workers", "workers"]
+__all__ = [
+    "Workers",
+    "collect_faults",
+    "num_local_processes",
+    "report_progress",
+    "run_on_workers",
+    "workers",
+]
 
 
 class Workers:
@@ -59,7 +66,8 @@ def workers(
 ) -> Iterator[Workers]:
     """Chooses the workers of simulations inside the block, and ends them with it.
 
-    Only engines that run one simulation at a time use workers; batched ones need none. See
+    Engines that run one simulation at a time use them for every batch. Batched ones need none, but
+    discovery fits its candidates side by side in the processes of ``"loky"``. See
     :class:`~npdr_ppl.engines.workers.options.WorkerOptions` for the arguments.
 
     Raises:
@@ -105,6 +113,17 @@ def report_progress(progress: Progress) -> Iterator[None]:
         yield
     finally:
         _PROGRESS.reset(token)
+
+
+def num_local_processes() -> int:
+    """Returns how many processes of this machine the block has for work of any kind; else one."""
+    chosen = _WORKERS.get()
+    if chosen is None or chosen.pool.options.executor != "loky":
+        return 1
+    from joblib import effective_n_jobs
+
+    chosen.is_used = True
+    return max(1, effective_n_jobs(chosen.pool.options.num_workers or -1))
 
 
 def run_on_workers(task: Task, payloads: list, seed: int) -> Outcome:

@@ -89,11 +89,11 @@ class Investigation:
         self._searcher = Searcher(model, rollouts, self.options, report)
 
     @cached_property
-    def start(self) -> Hypothesis:
-        """The model as it is, fitted; in finer steps where its own are too coarse."""
+    def given(self) -> Hypothesis:
+        """The model as it is, fitted."""
         with _timed(self.seconds, "fit"):
             try:
-                fitted = self._searcher.with_finer_steps(self._searcher.fit_base())
+                fitted = self._searcher.fit_base()
             except DataError as error:
                 measured = SegmentModel(self.model, self.rollouts, self._binding).measured
                 problems = recording_problems(measured, self.rollouts)
@@ -104,6 +104,13 @@ class Investigation:
             # Screening leaves out what the simulator cannot have; who asks by name is told.
             fitted.simulator.with_effects(effect)
         return fitted
+
+    @cached_property
+    def start(self) -> Hypothesis:
+        """The same in finer steps, where the model's own are too coarse."""
+        given = self.given
+        with _timed(self.seconds, "choose steps"):
+            return self._searcher.with_finer_steps(given)
 
     @cached_property
     def problems(self) -> tuple[str, ...]:
@@ -143,10 +150,10 @@ class Investigation:
         """Metrics on the held-out recording; empty without one."""
         if self.holdout is None:
             return {}
-        start, final = self.start, self.search.final
+        given, final = self.given, self.search.final
         with _timed(self.seconds, "prove"):
             binding = _like(self._binding, self.rollouts, self.holdout)
-            return prove(start, final, self.holdout, binding, seed=self.options.seed)
+            return prove(given, final, self.holdout, binding, seed=self.options.seed)
 
     def conclude(self) -> Discovery:
         """Returns what all stages came to."""

@@ -37,7 +37,7 @@ class DiscoveryOptions:
 
     segment_length: int | None = None
     effects: tuple[Effect, ...] | None = None
-    max_effects: int = 4
+    max_effects: int = 5
     false_alarm_rate: float = 0.01
     confidence: float = 0.9
     precision: Literal["float64", "float32"] = "float64"

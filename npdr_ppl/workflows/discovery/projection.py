@@ -15,15 +15,17 @@ independent from segment to segment; what is inside one is not, so the variance 
 taken from how the segments' terms scatter (Liang & Zeger 1986), never from their number.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from npdr_ppl.language.effects import Effect
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 
-__all__ = ["Projection", "Scores"]
+__all__ = ["Projection", "Scores", "loss_without"]
 
 
 @dataclass(frozen=True)
@@ -56,22 +58,23 @@ class Projection:
 
     Args:
         hypothesis: The hypothesis.
+        keep: Coordinates of the parameters that are refitted, a mask ``(d,)``; all by default.
     """
 
-    def __init__(self, hypothesis: Hypothesis) -> None:
+    def __init__(self, hypothesis: Hypothesis, keep: Tensor | None = None) -> None:
         now = hypothesis.linearisation
+        by_z = now.by_parameters if keep is None else now.by_parameters[..., keep]
         self._starts = now.by_starts
         eye = torch.eye(now.by_starts.shape[-1], dtype=torch.float64)
         self._inner = eye + now.by_starts.mT @ now.by_starts
         #: Residuals as they were with the initial states at the smoother's estimate, (S, N).
         self.residual = now.residual + (now.by_starts @ hypothesis.fit.offsets[..., None])[..., 0]
-        self._by_z = now.by_parameters
-        self._weights = self.solve(now.by_parameters)
+        self._by_z = by_z
+        self._weights = self.solve(by_z)
         self._weighted = self.solve(self.residual[..., None])[..., 0]
-        d = now.by_parameters.shape[-1]
-        self._information = (now.by_parameters.mT @ self._weights).sum(0)
-        self._information = self._information + torch.eye(d, dtype=torch.float64)
-        self._score = (now.by_parameters.mT @ self._weighted[..., None])[..., 0]  # (S, d)
+        eye = torch.eye(by_z.shape[-1], dtype=torch.float64)
+        self._information = (by_z.mT @ self._weights).sum(0) + eye
+        self._score = (by_z.mT @ self._weighted[..., None])[..., 0]  # (S, d)
 
     @property
     def weighted_residual(self) -> Tensor:
@@ -120,3 +123,35 @@ class Projection:
         own = (columns.mT @ weighted).sum(0)
         by_segment = (columns.mT @ self._weighted[..., None])[..., 0] - self._score @ refit
         return Scores(by_segment, own - cross.mT @ refit, own.diagonal())
+
+
+def loss_without(hypothesis: Hypothesis, effect: Effect) -> float:
+    """Returns by how much the evidence falls without one of a hypothesis's effects.
+
+    To first order in what the other parameters and the initial states make up for.
+
+    Args:
+        hypothesis: The hypothesis.
+        effect: One of its effects.
+    """
+    segments, fit = hypothesis.segments, hypothesis.fit
+    strengths = effect.strength or tuple(p.name for p in effect.parameters)
+    resting = {
+        f"{effect.name}.{p.name}": torch.tensor([p.nominal], dtype=torch.float64)
+        for p in effect.parameters
+        if p.name in strengths
+    }
+    box = segments.black_box(fit.z[None])
+    starts = fit.offsets[None]
+    present = segments.run(box.simulator, box.parameters, starts)[0]
+    absent = segments.run(box.simulator, {**box.parameters, **resting}, starts)[0]
+    mask = segments.inputs.mask[..., None]
+    change = ((present - absent).double() * mask / fit.scale).flatten(-2)
+    if not bool(change.isfinite().all()):
+        return math.nan
+    keep = torch.ones(len(fit.z), dtype=torch.bool)
+    for site in segments.prior.sites:
+        if site.name in effect.parameter_names:
+            keep[site.coordinates] = False
+    information = Projection(hypothesis, keep).scores(change[..., None]).information
+    return 0.5 * hypothesis.share * float(information)

@@ -1,14 +1,16 @@
 """The search: add the effect that explains most, look again, take back what became needless."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from torch import Tensor
 
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
-from npdr_ppl.language.handlers import with_finer_steps
+from npdr_ppl.language.handlers import add_effect, with_finer_steps
+from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.models.effects import candidate_effects
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
@@ -19,9 +21,11 @@ from npdr_ppl.workflows.discovery.generic_laws import FREQUENCIES, strongest_fre
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
 from npdr_ppl.workflows.discovery.latent_force import Responses, responses
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
-from npdr_ppl.workflows.discovery.projection import Projection
+from npdr_ppl.workflows.discovery.projection import Projection, loss_without
 from npdr_ppl.workflows.discovery.screening import Screened, screen
 from npdr_ppl.workflows.discovery.sensitivities import Variant, sensitivities
+from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_side
+from npdr_ppl.workflows.segment_fit import SegmentModel
 
 __all__ = ["Added", "Round", "Search", "Searcher", "explained"]
 
@@ -51,6 +55,14 @@ STRAIN = 0.02
 """Share of what it explains by which a law that fits only in a limit of its shape must be ahead of
 one that needs none: there it is likely the other law, and what differs is how an engine solves it,
 as dry friction whose bristles hardly bend."""
+
+PLAINLY = 30.0
+"""Evidence, estimated to first order, from which an effect is kept without fitting the model that
+lacks it."""
+
+NOTICEABLE = 0.05
+"""Error of integration, relative to what a fit leaves of a channel, from which finer steps are
+taken unless the recording speaks against them: effects would be found that make up for it."""
 
 PRIOR_OF_ANY = 0.5
 """Prior probability that anything of the catalogue is missing."""
@@ -119,6 +131,23 @@ class Search:
     trials: dict[tuple[str, str], Hypothesis]
 
 
+@dataclass(frozen=True)
+class _Fit:
+    """A fit to be made.
+
+    Attributes:
+        effects: The effects that the model is to have.
+        start: Parameters to begin with, by site.
+        offsets: Offsets of the initial states to begin with, ``(S, m)``.
+        is_trial: Whether rough steps will do.
+    """
+
+    effects: tuple[Effect, ...]
+    start: Mapping[str, Tensor]
+    offsets: Tensor
+    is_trial: bool = False
+
+
 class Searcher:
     """Searches a recording for missing effects.
 
@@ -153,7 +182,7 @@ class Searcher:
         return fit_hypothesis(self.model, self.rollouts, self.binding)
 
     def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
-        """Returns the hypothesis in finer steps, where that explains more; else as it is.
+        """Returns the hypothesis in finer steps, where its own err noticeably; else as it is.
 
         The error of coarse steps would be found as a delay. A recording that was itself made in
         coarse steps is left to them. All later hypotheses are in the steps of what is returned.
@@ -164,14 +193,30 @@ class Searcher:
         if current.simulator.with_finer_steps() is None:
             return current
         coarse, self.model = self.model, with_finer_steps(self.model)
-        finer = self._fit(current.effects, current.parameters, current)
-        if finer is not None:
-            if weigh([current, finer], [0.0, 0.0], seed=0)[1] > self.options.confidence:
-                self._report("the model's steps are too coarse for this recording: finer ones")
-                self.are_steps_coarse = True
-                return finer
+        if self._step_error(current) > NOTICEABLE:
+            finer = self._fit(current.effects, current.parameters, current)
+            if finer is not None:
+                if weigh([current, finer], [0.0, 0.0], seed=0)[0] < self.options.confidence:
+                    self._report("the model's steps are too coarse for this recording: finer ones")
+                    self.are_steps_coarse = True
+                    return finer
         self.model = coarse
         return current
+
+    def _step_error(self, current: Hypothesis) -> float:
+        """Returns what the model's steps change, relative to what a hypothesis in others leaves.
+
+        The root mean square over the recording, of the channel where it is greatest.
+        """
+        fit, model = current.fit, self.model
+        for effect in current.effects:
+            model = add_effect(model, effect)
+        finer = SegmentModel(model, self.rollouts, self.binding)
+        here = fit.z[None], fit.offsets[None]
+        difference = (finer.simulate(*here) - current.segments.simulate(*here))[0].double()
+        mask = finer.inputs.mask[..., None]
+        square = (difference.square() * mask).sum((0, 1)) / mask.sum()
+        return float((square.sqrt() / fit.scale).nan_to_num(math.inf).max())
 
     def run(self, first: Round, *, max_effects: int) -> Search:
         """Adds effects until no alarm fires, nothing helps, or there are enough.
@@ -243,7 +288,15 @@ class Searcher:
             for effect in candidates
             if effect.wave and effect.port in found.by_port
         }
-        return sensitivities(hypothesis, candidates, hints)
+        # Dealt out in turn, so that each process gets effects of every kind.
+        number = num_processes(hypothesis.simulator)
+        parts = [candidates[k::number] for k in range(number)]
+        function = partial(sensitivities, hypothesis, hints=hints)
+        variants: list[Variant] = []
+        for part in side_by_side(function, parts, number):
+            variants += part
+        order = {effect.name: place for place, effect in enumerate(candidates)}
+        return sorted(variants, key=lambda variant: order[variant.effect.name])
 
     def _candidates(self, hypothesis: Hypothesis) -> tuple[Effect, ...]:
         """Returns the effects that may be added."""
@@ -260,12 +313,7 @@ class Searcher:
         against the model without it is strong.
         """
         ranking = now.ranking
-        trials: dict[str, Hypothesis] = {}
-        for candidate in ranking[:SHORTLIST]:
-            found = self._fitted(current, candidate)
-            if found is not None:
-                trials[candidate.name] = found
-                self._report(f"tried {candidate.name}: {_shown(found)}")
+        trials = self._tried(current, ranking, report=self._report)
         if not trials:
             return None, {}, {}
         trials = self._converged(trials)
@@ -280,23 +328,55 @@ class Searcher:
         self._report(f"adding {best}")
         return best, weights, trials
 
-    def _fitted(self, current: Hypothesis, candidate: Screened) -> Hypothesis | None:
-        """Returns the model with a candidate, fitted from where the linear gain puts it."""
-        start = current.parameters | candidate.variant.parameters(candidate.sizes)
-        effects = (*current.effects, candidate.variant.effect)
-        return self._fit(effects, start, current, is_trial=True)
+    def _tried(
+        self,
+        current: Hypothesis,
+        ranking: list[Screened],
+        report: Callable[[str], None] = lambda _: None,
+    ) -> dict[str, Hypothesis]:
+        """Returns the model with each of the shortlist, fitted from where its linear gain is."""
+        shortlist = ranking[:SHORTLIST]
+        asked = [
+            _Fit(
+                (*current.effects, candidate.variant.effect),
+                current.parameters | candidate.variant.parameters(candidate.sizes),
+                current.fit.offsets,
+                is_trial=True,
+            )
+            for candidate in shortlist
+        ]
+        trials = {}
+        for candidate, found in zip(shortlist, self._fits(asked, current.simulator), strict=True):
+            if found is not None:
+                trials[candidate.name] = found
+                report(f"tried {candidate.name}: {_shown(found)}")
+        return trials
 
-    def _converged(self, trials: dict[str, Hypothesis]) -> dict[str, Hypothesis]:
-        """Fits the contenders to the end; the others are too far behind for that to matter."""
+    def _converged(
+        self, trials: dict[str, Hypothesis], *, done: str | None = None
+    ) -> dict[str, Hypothesis]:
+        """Fits the contenders to the end; the others are too far behind for that to matter.
+
+        Args:
+            trials: The model with each of several effects.
+            done: The one that is at its end already.
+        """
         scale = closest(list(trials.values())).fit.scale
         losses = {name: float(trial.losses(scale).sum()) for name, trial in trials.items()}
         least = min(losses.values())
+        contenders = [
+            name
+            for name in sorted(losses, key=lambda name: losses[name])[:CONTENDERS]
+            if name != done and losses[name] <= least + max(CONTENDS_ANYWAY, CONTENDS * abs(least))
+        ]
+        asked = [
+            _Fit(trial.effects, trial.parameters, trial.fit.offsets)
+            for trial in (trials[name] for name in contenders)
+        ]
         result = dict(trials)
-        for name in sorted(losses, key=lambda name: losses[name])[:CONTENDERS]:
-            if losses[name] <= least + max(CONTENDS_ANYWAY, CONTENDS * abs(least)):
-                trial = trials[name]
-                longer = self._fit(trial.effects, trial.parameters, trial)
-                result[name] = longer or trial
+        fits = self._fits(asked, next(iter(trials.values())).simulator)
+        for name, longer in zip(contenders, fits, strict=True):
+            result[name] = longer or trials[name]
         return result
 
     def _fit(
@@ -304,23 +384,15 @@ class Searcher:
         effects: tuple[Effect, ...],
         start: Mapping[str, Tensor],
         current: Hypothesis,
-        *,
-        is_trial: bool = False,
     ) -> Hypothesis | None:
         """Returns the model with effects, fitted; ``None`` if it cannot be simulated."""
-        try:
-            return fit_hypothesis(
-                self.model,
-                self.rollouts,
-                self.binding,
-                effects=effects,
-                start=start,
-                offsets=current.fit.offsets,
-                max_steps=TRIAL_STEPS if is_trial else MAX_STEPS,
-                is_rough=is_trial,
-            )
-        except NpdrError:
-            return None
+        (found,) = self._fits([_Fit(effects, start, current.fit.offsets)], current.simulator)
+        return found
+
+    def _fits(self, asked: Sequence[_Fit], simulator: Simulator) -> Iterator[Hypothesis | None]:
+        """Yields the model with the effects of each fit, ``None`` where it cannot be simulated."""
+        function = partial(_fitted, self.model, self.rollouts, self.binding)
+        return side_by_side(function, asked, num_processes(simulator))
 
     def _without(self, current: Hypothesis, effect: Effect) -> Hypothesis | None:
         rest = tuple(e for e in current.effects if e.name != effect.name)
@@ -331,6 +403,8 @@ class Searcher:
         """Takes back effects that the last addition made needless."""
         removed: list[str] = []
         for effect in current.effects[:-1]:
+            if loss_without(current, effect) > PLAINLY:
+                continue
             without = self._without(current, effect)
             if without is None:
                 continue
@@ -385,12 +459,27 @@ class Searcher:
         projection = Projection(without)
         pulses = responses(without)
         ranking = screen(projection, self._variants(projection, without, candidates, pulses))
-        trials = {effect.name: current}
-        for candidate in ranking[:SHORTLIST]:
-            fitted = self._fitted(without, candidate)
-            if fitted is not None:
-                trials[candidate.name] = fitted
-        return without, self._converged(trials)
+        trials = {effect.name: current} | self._tried(without, ranking)
+        return without, self._converged(trials, done=effect.name)
+
+
+def _fitted(
+    model: Model, rollouts: Rollouts, binding: BindingOptions, asked: _Fit
+) -> Hypothesis | None:
+    """Returns a fitted model; ``None`` if it cannot be simulated."""
+    try:
+        return fit_hypothesis(
+            model,
+            rollouts,
+            binding,
+            effects=asked.effects,
+            start=asked.start,
+            offsets=asked.offsets,
+            max_steps=TRIAL_STEPS if asked.is_trial else MAX_STEPS,
+            is_rough=asked.is_trial,
+        )
+    except NpdrError:
+        return None
 
 
 def _shown(hypothesis: Hypothesis) -> str:

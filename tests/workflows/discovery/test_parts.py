@@ -3,6 +3,7 @@
 import json
 import math
 import runpy
+import threading
 
 import pytest
 import torch
@@ -25,9 +26,10 @@ from npdr_ppl.workflows.discovery.equivalents import equivalents, irreducible
 from npdr_ppl.workflows.discovery.evidence import weigh
 from npdr_ppl.workflows.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.workflows.discovery.latent_force import latent_force, responses
-from npdr_ppl.workflows.discovery.projection import Projection
+from npdr_ppl.workflows.discovery.projection import Projection, loss_without
 from npdr_ppl.workflows.discovery.revised_model import revised_source
 from npdr_ppl.workflows.discovery.sensitivities import sensitivities
+from npdr_ppl.workflows.discovery.side_by_side import side_by_side
 
 
 @pytest.fixture(scope="module")
@@ -186,3 +188,36 @@ def test_too_short_a_recording_is_refused():
 def test_options_that_make_no_sense_are_refused(wrong):
     with pytest.raises(DataError):
         npdr.DiscoveryOptions(**wrong)
+
+
+def test_what_is_lost_without_an_effect_is_known_without_a_fit(dragged):
+    case, without = dragged
+    drag = QuadraticDrag("hinge")
+    binding = npdr.DiscoveryOptions().binding(case.fit)
+    fitted = fit_hypothesis(case.model, case.fit, binding, effects=(drag,))
+    scale = fitted.fit.scale
+    lost = fitted.share * float((without.losses(scale) - fitted.losses(scale)).sum())
+    assert loss_without(fitted, drag) == pytest.approx(lost, rel=0.1)
+
+
+def test_two_processes_find_what_one_finds(dragged):
+    case, _ = dragged
+    effects = (QuadraticDrag("hinge"), CoulombFriction("hinge"), InputDelay("torque"))
+    options = npdr.DiscoveryOptions(effects=effects, max_effects=1)
+    alone = npdr.discover(case.model, case.fit, options=options)
+    with npdr.workers("loky", 2) as used:
+        together = npdr.discover(case.model, case.fit, options=options)
+    assert used.is_used
+    kinds = [{k: v for k, v in d.to_dict().items() if k != "seconds"} for d in (alone, together)]
+    assert kinds[0] == kinds[1]
+    assert kinds[0]["effects"][0]["effect"] == "quadratic_drag"
+
+
+def test_what_cannot_travel_is_done_here():
+    lock = threading.Lock()
+
+    def doubled(x):
+        with lock:
+            return 2 * x
+
+    assert list(side_by_side(doubled, [1, 2, 3], 2)) == [2, 4, 6]

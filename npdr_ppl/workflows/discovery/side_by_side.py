@@ -1,0 +1,51 @@
+"""Independent pieces of a search, in as many processes as there are workers."""
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar, cast
+
+from npdr_ppl.engines.pooled import PooledSimulator
+from npdr_ppl.engines.workers.session import num_local_processes
+from npdr_ppl.language.simulator import Simulator
+
+__all__ = ["num_processes", "side_by_side"]
+
+_LOGGER = logging.getLogger(__name__)
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def num_processes(simulator: Simulator) -> int:
+    """Returns how many processes simulate side by side: those of the enclosing ``workers`` block.
+
+    One where there is no such block, and where the simulator itself uses the workers.
+    """
+    return 1 if isinstance(simulator, PooledSimulator) else num_local_processes()
+
+
+def side_by_side(
+    function: Callable[[Item], Result], items: Sequence[Item], number: int
+) -> Iterator[Result]:
+    """Yields the function of every item, in their order.
+
+    Args:
+        function: What to do; it travels to the processes, with what it refers to.
+        items: What to do it to.
+        number: Processes.
+    """
+    done = 0
+    if number > 1 and len(items) > 1:
+        # Not at the top: joblib takes a quarter of a second to import.
+        from joblib import Parallel, delayed
+
+        parallel = Parallel(number, backend="loky", return_as="generator", max_nbytes=None)
+        try:
+            for result in parallel(delayed(function)(item) for item in items):
+                yield cast(Result, result)
+                done += 1
+        except Exception as error:
+            # A process was killed, or something cannot travel, such as a handle of an engine.
+            _LOGGER.warning("The search goes on in one process: %s", error)
+    for item in items[done:]:
+        yield function(item)
