@@ -8,6 +8,7 @@ It needs the paper's recordings and a finished search in them::
 
 import json
 import re
+import runpy
 import sys
 from pathlib import Path
 
@@ -15,9 +16,7 @@ import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from npdr_ppl import add_effect
 from npdr_ppl.displays.theme import theme
-from npdr_ppl.models.effects import effects
 from npdr_ppl.models.furuta import Furuta, furuta
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.evaluation import replay
@@ -37,9 +36,7 @@ def main(data, search, out):
     result = json.loads((Path(search) / "missing-effect.json").read_text())
     swing_ups, _ = load_recordings(Path(data))
     rollout = swing_ups[[result["held_out"][0]]]
-    revised = furuta
-    for found in result["effects"]:
-        revised = add_effect(revised, effects()[found["effect"]](found["port"]))
+    revised = runpy.run_path(str(Path(search) / "revised_model.py"))["revised_model"]
     replays = {
         name: simulated(model, rollout, result["closest_fit"][name])
         for name, model in (("refitted", furuta), ("revised", revised))
