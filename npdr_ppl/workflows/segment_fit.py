@@ -213,15 +213,21 @@ class SegmentModel:
             offsets: Offsets of the initial states, ``(n, S, m)``.
             scale: Standard deviation of each channel's residuals, ``(C,)``.
         """
-        difference = (self.observed - self.simulate(z, offsets)).double()
-        return (difference * self.inputs.mask[..., None] / scale).flatten(-2)
+        return self.whitened(self.observed - self.simulate(z, offsets), scale)
+
+    def whitened(self, difference: Tensor, scale: Tensor) -> Tensor:
+        """Returns a difference of readings ``(…, S, K, C)`` in scales, as :meth:`residuals`."""
+        return (difference.double() * self.inputs.mask[..., None] / scale).flatten(-2)
+
+    def root_mean_square(self, difference: Tensor) -> Tensor:
+        """Returns the size of a difference of readings ``(S, K, C)`` per channel, ``(C,)``."""
+        square = difference.double().square() * self.inputs.mask[..., None]
+        return (square.sum((0, 1)) / self.inputs.mask.sum()).sqrt()
 
     def scale_of(self, z: Tensor, offsets: Tensor) -> Tensor:
         """Returns the root-mean-square residual per channel, ``(C,)``, at ``(d,)``, ``(S, m)``."""
-        ones = torch.ones(len(self.channel_names), dtype=torch.float64)
-        residual = self.residuals(z[None], offsets[None], ones)[0]
-        square = residual.square().unflatten(-1, (-1, len(ones))).sum((0, 1))
-        return (square / self.inputs.mask.sum()).sqrt().clamp_min(LEAST_SCALE)
+        residual = self.observed - self.simulate(z[None], offsets[None])[0]
+        return self.root_mean_square(residual).clamp_min(LEAST_SCALE)
 
     def linearise(
         self, z: Tensor, offsets: Tensor, scale: Tensor, *, is_rough: bool = False

@@ -1,5 +1,6 @@
 """`npdr discover`: what it writes, where it stops, what it refuses, and that others accept it."""
 
+import inspect
 import json
 import sys
 from io import StringIO
@@ -8,10 +9,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from npdr_ppl.cli import discover, show
 from npdr_ppl.cli import main as cli
-from npdr_ppl.cli import show
 from npdr_ppl.cli.resolve import resolve_holdout, resolve_model
-from npdr_ppl.workflows.discovery import Investigation
+from npdr_ppl.workflows.discovery import DiscoveryOptions, Investigation
 from tests.cli.discovery_recording import CANDIDATES, FRICTION, MISSING, pendulum_recording
 
 NAMES = {
@@ -203,3 +204,9 @@ def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, t
     assert "ambiguous: It cannot tell." in shown
     assert "slow ramp with torque up to 4, which sets the survivors 12 standard" in shown
     assert "a change of load" in shown and "5.00%" in shown
+
+
+def test_the_command_has_the_defaults_of_the_options():
+    declared = inspect.signature(discover.discover).parameters
+    for name in ("max_effects", "false_alarm_rate", "seed"):
+        assert declared[name].default == getattr(DiscoveryOptions(), name)

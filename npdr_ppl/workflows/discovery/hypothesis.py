@@ -1,7 +1,7 @@
 """A hypothesis: the model with some effects, fitted to the recording."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,7 +22,7 @@ from npdr_ppl.workflows.segment_fit import (
     fit_segments,
 )
 
-__all__ = ["Hypothesis", "fit_hypothesis"]
+__all__ = ["Hypothesis", "fit_hypothesis", "with_effects"]
 
 START_LIMIT = 4.5
 """How far from the prior's centre a fit may begin, in standard deviations: at the ends of a range
@@ -123,6 +123,13 @@ class Hypothesis:
         return 0.5 * float(z.square().sum()) + 0.5 * num * math.log(len(self.fit.offsets))
 
 
+def with_effects(model: Model, effects: Sequence[Effect]) -> Model:
+    """Returns the model with effects attached."""
+    for effect in effects:
+        model = add_effect(model, effect)
+    return model
+
+
 def fit_hypothesis(
     model: Model,
     rollouts: Rollouts,
@@ -149,8 +156,7 @@ def fit_hypothesis(
     Raises:
         DataError: The simulation fails at the start, or the data do not fit the model.
     """
-    for effect in effects:
-        model = add_effect(model, effect)
+    model = with_effects(model, effects)
     segments = SegmentModel(model, rollouts, options)
     z = torch.zeros(segments.prior.num_parameters, dtype=torch.float64)
     if start:

@@ -110,7 +110,6 @@ def responses(hypothesis: Hypothesis) -> Responses:
     seconds = edges.double() * inputs.time_step
     box = segments.black_box(fit.z[None])
     base = segments.run(simulator, box.parameters, fit.offsets[None])[0]
-    mask = inputs.mask[..., None]
     by_port, units, rated = {}, {}, {}
     for port in simulator.ports:
         if port.kind != "force":
@@ -124,7 +123,7 @@ def responses(hypothesis: Hypothesis) -> Responses:
         }
         starts = fit.offsets[None].expand(len(edges) - 1, -1, -1)
         moved = segments.run(simulator.with_effects(pulse), {**box.parameters, **batch}, starts)
-        change = ((moved - base).double() * mask / fit.scale).flatten(-2) / height
+        change = segments.whitened(moved - base, fit.scale) / height
         if bool(change.isfinite().all()):
             by_port[port.name] = change.permute(1, 2, 0)
             units[port.name], rated[port.name] = port.unit, port.rated

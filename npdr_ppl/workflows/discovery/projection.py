@@ -72,8 +72,8 @@ class Projection:
         self._by_z = by_z
         self._weights = self.solve(by_z)
         self._weighted = self.solve(self.residual[..., None])[..., 0]
-        eye = torch.eye(by_z.shape[-1], dtype=torch.float64)
-        self._information = (by_z.mT @ self._weights).sum(0) + eye
+        prior = torch.eye(by_z.shape[-1], dtype=torch.float64)
+        self._information = (by_z.mT @ self._weights).sum(0) + prior
         self._score = (by_z.mT @ self._weighted[..., None])[..., 0]  # (S, d)
 
     @property
@@ -145,8 +145,7 @@ def loss_without(hypothesis: Hypothesis, effect: Effect) -> float:
     starts = fit.offsets[None]
     present = segments.run(box.simulator, box.parameters, starts)[0]
     absent = segments.run(box.simulator, {**box.parameters, **resting}, starts)[0]
-    mask = segments.inputs.mask[..., None]
-    change = ((present - absent).double() * mask / fit.scale).flatten(-2)
+    change = segments.whitened(present - absent, fit.scale)
     if not bool(change.isfinite().all()):
         return math.nan
     keep = torch.ones(len(fit.z), dtype=torch.bool)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
-from npdr_ppl.language.handlers import add_effect, with_finer_steps
+from npdr_ppl.language.handlers import with_finer_steps
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.models.effects import candidate_effects
 from npdr_ppl.rollouts import Rollouts
@@ -18,7 +18,7 @@ from npdr_ppl.workflows.discovery.alarm import Alarm, sound_alarm
 from npdr_ppl.workflows.discovery.equivalents import irreducible
 from npdr_ppl.workflows.discovery.evidence import closest, weigh
 from npdr_ppl.workflows.discovery.generic_laws import FREQUENCIES, strongest_frequency
-from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis, with_effects
 from npdr_ppl.workflows.discovery.latent_force import Responses, responses
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.projection import Projection, loss_without
@@ -208,15 +208,12 @@ class Searcher:
 
         The root mean square over the recording, of the channel where it is greatest.
         """
-        fit, model = current.fit, self.model
-        for effect in current.effects:
-            model = add_effect(model, effect)
+        fit, model = current.fit, with_effects(self.model, current.effects)
         finer = SegmentModel(model, self.rollouts, self.binding)
         here = fit.z[None], fit.offsets[None]
-        difference = (finer.simulate(*here) - current.segments.simulate(*here))[0].double()
-        mask = finer.inputs.mask[..., None]
-        square = (difference.square() * mask).sum((0, 1)) / mask.sum()
-        return float((square.sqrt() / fit.scale).nan_to_num(math.inf).max())
+        difference = finer.simulate(*here) - current.segments.simulate(*here)
+        error = finer.root_mean_square(difference[0]) / fit.scale
+        return float(error.nan_to_num(math.inf).max())
 
     def run(self, first: Round, *, max_effects: int) -> Search:
         """Adds effects until no alarm fires, nothing helps, or there are enough.

@@ -89,7 +89,6 @@ def sensitivities(
     segments, fit = hypothesis.segments, hypothesis.fit
     box = segments.black_box(fit.z[None])
     base = segments.run(box.simulator, box.parameters, fit.offsets[None])[0]
-    mask = segments.inputs.mask[..., None]
     result = []
     for effect in effects:
         port = box.simulator.port(effect.port)
@@ -121,7 +120,7 @@ def sensitivities(
         }
         starts = fit.offsets[None].expand(len(runs), -1, -1)
         moved = segments.run(changed, {**box.parameters, **batch}, starts)
-        differences = ((moved - base).double() * mask / fit.scale).flatten(-2)
+        differences = segments.whitened(moved - base, fit.scale)
         for (shape, size), part in zip(cases, differences.split(len(strengths)), strict=True):
             difference = part / size
             if not bool(difference.isfinite().all()) or float(difference.abs().max()) == 0.0:

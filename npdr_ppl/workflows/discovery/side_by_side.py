@@ -6,6 +6,7 @@ from typing import TypeVar, cast
 
 from npdr_ppl.engines.pooled import PooledSimulator
 from npdr_ppl.engines.workers.session import num_local_processes
+from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["num_processes", "side_by_side"]
@@ -44,6 +45,8 @@ def side_by_side(
             for result in parallel(delayed(function)(item) for item in items):
                 yield cast(Result, result)
                 done += 1
+        except NpdrError:
+            raise
         except Exception as error:
             # A process was killed, or something cannot travel, such as a handle of an engine.
             _LOGGER.warning("The search goes on in one process: %s", error)
