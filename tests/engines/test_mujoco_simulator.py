@@ -23,6 +23,7 @@ from npdr_ppl.models.effects import (
     Bias,
     CoulombFriction,
     InputDelay,
+    ViscousFriction,
 )
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -307,6 +308,28 @@ def test_substeps_divide_the_control_step():
         }
     )
     assert torch.equal(coarse.simulate({}, inputs), fine.simulate({}, repeated)[:, 4::5])
+
+
+@pytest.mark.parametrize(("integrator", "most"), [("Euler", 0.3), ("RK4", 0.55)])
+def test_finer_steps_err_less(integrator, most):
+    # The engine's order helps the equations, not forces of effects, which it holds for a step.
+    drag = ViscousFriction("shoulder_torque")
+    strength = {"shoulder_torque.viscous_friction.damping": value(0.3)}
+    inputs = random_inputs(arm(), num_segments=1, num_steps=100)
+
+    def readings(simulator):
+        return simulator.with_effects(drag).simulate(strength, inputs)
+
+    coarse = arm(integrator=integrator)
+    finer = coarse.with_finer_steps()
+    exact = readings(arm(integrator="RK4", substeps=64))
+    assert (readings(finer) - exact).norm() < most * (readings(coarse) - exact).norm()
+    assert (finer.num_substeps(0.002), coarse.num_substeps(0.002)) == (2, 1)
+    # Without effects only the order is left.
+    inputs = random_inputs(coarse, num_segments=1, num_steps=100)
+    exact = arm(integrator="RK4", substeps=64).simulate({}, inputs)
+    torch.testing.assert_close(finer.simulate({}, inputs), exact, rtol=1e-6, atol=1e-8)
+    assert finer.with_finer_steps() is None
 
 
 @pytest.mark.parametrize("substeps", [1, 3])

@@ -6,10 +6,21 @@ with the package; the held-out rollouts have another excitation.
 
 import mujoco
 import numpy as np
+import pyro
+import pyro.distributions as dist
 import pytest
 from hidden_rigs import make_case
 
 import npdr_ppl as npdr
+from npdr_ppl.engines.mujoco import MujocoSimulator
+from npdr_ppl.models.effects import (
+    CoulombFriction,
+    InputDelay,
+    Payload,
+    Spring,
+    ViscousFriction,
+    Wind,
+)
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 
 SEED = 2000
@@ -50,8 +61,6 @@ def test_one_effect_at_each_kind_of_port(place, parameter, strength):
 
 
 def test_an_effect_of_the_environment_in_an_mjcf():
-    from npdr_ppl.models.effects import CoulombFriction, InputDelay, Payload, Spring
-
     few = (
         Payload("payload"),
         CoulombFriction("shoulder"),
@@ -97,8 +106,6 @@ def test_an_effect_outside_the_catalogue_is_unknown():
 
 
 def test_a_law_that_fits_only_in_a_limit_is_not_named():
-    from npdr_ppl.models.effects import CoulombFriction, Wind
-
     others = (Wind("hinge"), CoulombFriction("hinge"))
     _, found = discover("pendulum", "one", (("hinge", "quadratic_drag"),), effects=others)
     (finding,) = found.effects
@@ -109,21 +116,22 @@ def test_a_law_that_fits_only_in_a_limit_is_not_named():
 
 ROD = """
 <mujoco>
-  <option timestep="0.001" integrator="RK4"/>
+  <option timestep="{step}" integrator="{integrator}"/>
   <worldbody>
-    <body>
+    <body name="rod">
       <joint name="hinge" axis="0 1 0" frictionloss="{friction}"/>
       <inertial pos="0 0 -0.45" mass="1.1" diaginertia="0.07425 0.07425 0.001"/>
     </body>
   </worldbody>
-  <actuator><motor joint="hinge"/></actuator>
+  <actuator><motor name="torque" joint="hinge"/></actuator>
 </mujoco>
 """
 
 
 def swing(friction, *, num_rollouts, seed):
     """A rod of 0.9 m and 1.1 kg in MuJoCo, whose friction yields as it does by default."""
-    model = mujoco.MjModel.from_xml_string(ROD.format(friction=friction))
+    text = ROD.format(friction=friction, step=0.001, integrator="RK4")
+    model = mujoco.MjModel.from_xml_string(text)
     rng = np.random.default_rng(seed)
     readings, actions = [], []
     for _ in range(num_rollouts):
@@ -165,6 +173,25 @@ def test_coarse_steps_are_no_discovery_and_hide_none():
     assert found.effects[0].parameters["magnitude"].mean == pytest.approx(0.3, rel=0.03)
     assert found.gap["rmse"].closed > 0.9
     assert "with_finer_steps(revised_model)" in found.source()
+
+
+def test_coarse_steps_of_an_engine_are_no_discovery():
+    text = ROD.format(friction=0.0, step=Pendulum.time_step, integrator="Euler")
+    simulator = MujocoSimulator(
+        mujoco.MjModel.from_xml_string(text),
+        {"mass": "body rod mass"},
+        states={"angle": "hinge", "velocity": "hinge_velocity"},
+    )
+
+    def rod(inputs):
+        mass = pyro.sample("mass", dist.Uniform(0.9, 1.3))
+        return npdr.simulate("trajectory", simulator, {"mass": mass}, inputs)
+
+    few = (InputDelay("torque"), CoulombFriction("hinge"), ViscousFriction("hinge"))
+    recording = swing(0.0, num_rollouts=3, seed=SEED)
+    found = npdr.discover(rod, recording, options=npdr.DiscoveryOptions(effects=few))
+    assert (found.verdict, found.effects) == ("none", []), found.reason
+    assert "the revised model takes finer ones" in found.reason
 
 
 def test_a_recording_made_in_coarse_steps_is_left_to_them():
