@@ -87,8 +87,9 @@ class SensorDelay(SensorEffect):
 class ClockSkew(SensorEffect):
     """y(t) = x(t (1 + κ)): readings stamped by a clock that runs apart from that of the commands.
 
-    κ t is small, so that a parabola through the last three values gives the reading. Both clocks
-    agree when a rollout begins; readings at a segment's start are κ t ahead.
+    κ t is small, so that a position follows from the parabola through its last three values, and a
+    velocity, which is kinked where commands change, from the line through two. Both clocks agree
+    when a rollout begins; readings at a segment's start are κ t ahead.
     """
 
     id = "clock_skew"
@@ -116,8 +117,9 @@ class ClockSkew(SensorEffect):
         return rate / (1.0 + parameters["skew"])
 
     def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> tuple[Tensor, ...]:
-        """Returns the time, the present value and the one before it."""
-        return start.time, value, _past(value, start)[0]
+        """Returns the time, the share of curvature, the present value and the one before it."""
+        smooth = torch.full_like(value, 0.0 if start.is_rate else 1.0)
+        return start.time, smooth, value, _past(value, start)[0]
 
     def read(
         self,
@@ -127,9 +129,9 @@ class ClockSkew(SensorEffect):
         time_step: float,
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
         """Returns the value κ t ahead."""
-        before, last, previous = memory
+        before, smooth, last, previous = memory
         time = before + time_step
         lead = parameters["skew"] * time / time_step
-        rate = 1.5 * value - 2.0 * last + 0.5 * previous
-        curvature = value - 2.0 * last + previous
-        return value + lead * (rate + 0.5 * lead * curvature), (time, value, last)
+        curvature = smooth * (value - 2.0 * last + previous)
+        ahead = lead * (value - last + 0.5 * (1.0 + lead) * curvature)
+        return value + ahead, (time, smooth, value, last)

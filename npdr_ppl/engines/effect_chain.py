@@ -226,12 +226,21 @@ class EffectChain(ABC):
             accelerations = self.accelerations(positions, velocities, latest, tables)
             rates = sensor_rates(self.simulator, velocities, accelerations)
         lengths = self.histories[len(self.action_effects) :]
+        simulator = self.simulator
+        states = zip(simulator.states, simulator.is_rate, strict=True)
+        of_rates = {state.name for state, is_rate in states if is_rate}
+        is_rate = [sensor.name in of_rates for sensor in simulator.sensors]
+
+        def start(place: int, length: int, column: int) -> Start:
+            own, known = tables.effects[place], rates.get(column, ())
+            return Start(time, self.time_step, own, length, known, is_rate[column])
+
         return tuple(
             tuple(
                 effect.initial_memory(
                     true[c],
                     true[c] if (reported := readings[c]) is None else reported,
-                    Start(time, self.time_step, tables.effects[place], length, rates.get(c, ())),
+                    start(place, length, c),
                 )
                 for c in columns
             )

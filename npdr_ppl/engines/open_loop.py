@@ -197,7 +197,8 @@ def _start(
         )
     past = inputs.past_actions.shape[-2]
     latest = tuple(record.at(-1 if past else 0) for record in records)
-    components = true_start(stepper, tables, recorded, latest)
+    upcoming = tuple(record.at(0) for record in records)
+    components = true_start(stepper, tables, recorded, latest, upcoming)
     state = stepper.start(
         components[:num_joints],
         components[num_joints:],

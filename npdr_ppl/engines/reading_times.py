@@ -1,12 +1,11 @@
 """Readings that are late or early: the state behind them at the start of a segment.
 
 A segment starts from what was read there. If the sensors lag by d, that is the state d ago, and
-the segment starts from the state extrapolated over d with the simulator's own accelerations. That
-is exact to second order in d for positions and to first order for velocities, under the command
-that was given last.
+the segment starts from the state extrapolated over d with the simulator's own accelerations
+halfway there. That is exact to second order in d while the command stays the same.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -67,7 +66,7 @@ def sensor_leads(
 def catch_up(
     simulator: Simulator,
     states: Components,
-    accelerations: Components,
+    accelerations: Callable[[Components], Components],
     leads: tuple[Tensor | None, ...],
 ) -> Components:
     """Returns the state now behind one that was read too early or too late.
@@ -77,19 +76,31 @@ def catch_up(
     Args:
         simulator: The system, whose effects are left out.
         states: Positions as read, then velocities as read or derived from positions, ``(N,)``.
-        accelerations: Rates of the velocities, ``(N,)`` each.
+        accelerations: Returns the rates of the velocities in a state, ``(N,)`` each.
         leads: By how many seconds each state's reading is ahead.
     """
+    halfway = tuple(None if lead is None else 0.5 * lead for lead in leads)
+    middle = _earlier(simulator, states, accelerations(states), halfway)
+    return _earlier(simulator, states, accelerations(middle), leads)
+
+
+def _earlier(
+    simulator: Simulator,
+    states: Components,
+    accelerations: Components,
+    times: tuple[Tensor | None, ...],
+) -> Components:
+    """Returns the states so many seconds earlier, under constant accelerations."""
     result = list(states)
     num_positions = len(states) - len(accelerations)
     places = {state.name: i for i, state in enumerate(simulator.states)}
     for j, acceleration in enumerate(accelerations, start=num_positions):
-        rate_lead = leads[j]
-        if rate_lead is not None:
-            result[j] = states[j] - rate_lead * acceleration
+        rate_time = times[j]
+        if rate_time is not None:
+            result[j] = states[j] - rate_time * acceleration
         i = places.get(simulator.states[j].rate_of or "")
-        lead = None if i is None else leads[i]
-        if i is not None and lead is not None:
-            # Back from the velocity now, which has just been found.
-            result[i] = states[i] - lead * result[j] - 0.5 * lead * lead * acceleration
+        time = None if i is None else times[i]
+        if i is not None and time is not None:
+            # Back from the velocity then, which has just been found.
+            result[i] = states[i] - time * result[j] - 0.5 * time * time * acceleration
     return tuple(result)

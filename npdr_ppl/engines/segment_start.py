@@ -66,7 +66,11 @@ def recorded_start(simulator: Simulator, inputs: Inputs, shape: torch.Size) -> R
 
 
 def true_start(
-    chain: EffectChain, tables: Tables, recorded: RecordedStart, latest: Components
+    chain: EffectChain,
+    tables: Tables,
+    recorded: RecordedStart,
+    latest: Components,
+    upcoming: Components,
 ) -> Components:
     """Returns the true state behind what was recorded through the sensor effects.
 
@@ -78,6 +82,7 @@ def true_start(
         tables: The effects' parameters.
         recorded: What is known of the start.
         latest: What each action channel saw last, ``(N,)`` each.
+        upcoming: What it sees next.
     """
     if not chain.sensor_effects:
         return recorded.states
@@ -103,9 +108,17 @@ def true_start(
         sensors.get((state.rate_of or "") if is_derived else state.name)
         for state, is_derived in zip(states, recorded.is_derived, strict=True)
     )
-    split = chain.num_positions
-    accelerations = chain.accelerations(tuple(true[:split]), tuple(true[split:]), latest, tables)
     late = tuple(None if source is None else leads.get(source) for source in sources)
+    # What was read too early is behind the next command, not the last.
+    ahead = sum(leads.values()) > 0.0
+    commands = tuple(
+        torch.where(ahead, after, before) for before, after in zip(latest, upcoming, strict=True)
+    )
+    split = chain.num_positions
+
+    def accelerations(states: Components) -> Components:
+        return chain.accelerations(states[:split], states[split:], commands, tables)
+
     return catch_up(chain.simulator, tuple(true), accelerations, late)
 
 

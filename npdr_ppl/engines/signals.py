@@ -77,7 +77,7 @@ class Signals:
         An offset or a wrong scale of a sensor is taken out of what was read there.
         """
         tables = Tables(None, self._sensor_parameters)
-        components = true_start(self._sensor_chain, tables, self._recorded, ())
+        components = true_start(self._sensor_chain, tables, self._recorded, (), ())
         if not components:
             return torch.zeros(len(self.start_times), 0, dtype=torch.float64)
         return torch.stack(components, dim=-1)

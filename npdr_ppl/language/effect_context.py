@@ -56,6 +56,8 @@ class Start(NamedTuple):
         history: Past values that the effect asked to keep, rounded up.
         rates: First and second time derivative of a sensor channel's true value, as the
             simulator predicts them without its effects; empty for what is no sensor.
+        is_rate: Whether the value is a sensor's of a velocity. Under commands that are held for a
+            step, velocities are kinked where steps meet, and positions smooth.
     """
 
     time: Tensor
@@ -63,6 +65,7 @@ class Start(NamedTuple):
     parameters: Mapping[str, Tensor]
     history: int = 0
     rates: tuple[Tensor, ...] = ()
+    is_rate: bool = False
 
 
 class Joint(NamedTuple):

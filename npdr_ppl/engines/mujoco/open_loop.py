@@ -122,7 +122,8 @@ class _Replay:
             chain = MujocoStepper(self.simulator, batch, step, self.histories)
             records = self._records(chain, first, last)
             latest = tuple(record.at(-1 if self.past else 0) for record in records)
-            components = true_start(chain, tables, recorded, latest)
+            upcoming = tuple(record.at(0) for record in records)
+            components = true_start(chain, tables, recorded, latest, upcoming)
             chain.place(components)
             chain.begin()
             state = chain.start(
