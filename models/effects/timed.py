@@ -12,11 +12,14 @@ __all__ = ["TimedForceEffect"]
 
 
 class TimedForceEffect(ForceEffect):
-    """A force effect whose memory is the time in s since the rollout began."""
+    """A force effect whose memory is the time in s since the rollout began.
+
+    It is that of the middle of the step for which the force is constant.
+    """
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:
-        """Returns the time."""
-        return start.time
+        """Returns the time half a step later."""
+        return start.time + 0.5 * start.time_step
 
     def next_memory(
         self,

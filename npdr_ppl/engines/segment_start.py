@@ -110,7 +110,7 @@ def true_start(
     )
     late = tuple(None if source is None else leads.get(source) for source in sources)
     # What was read too early is behind the next command, not the last.
-    ahead = sum(leads.values()) > 0.0
+    ahead = torch.stack(torch.broadcast_tensors(*leads.values())).sum(0) > 0.0
     commands = tuple(
         torch.where(ahead, after, before) for before, after in zip(latest, upcoming, strict=True)
     )

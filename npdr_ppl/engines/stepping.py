@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.drive import drive_forces, inverse_inertia
-from npdr_ppl.engines.dry_friction import solve_dry_friction
+from npdr_ppl.engines.dry_friction import DryFriction, dry_friction_over_step
 from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.language.effect_context import Joint
@@ -72,25 +72,35 @@ class Stepper(EffectChain):
             return simulator.accelerations(positions, velocities, actions, forces, constants)
 
         first = acceleration(*start)
-        bounds = self.dry_friction_bounds(state, tables)
-        has_dry_friction = any(bound is not None for bound in bounds)
-        if has_dry_friction:
+
+        def bounds_at(velocities: Components) -> tuple[Tensor | None, ...]:
+            return self.dry_friction_bounds(state._replace(velocities=velocities), tables)
+
+        friction: DryFriction | None = None
+        if any(bound is not None for bound in bounds_at(state.velocities)):
             forces = self._forces(*start, state, tables, dry)
             inertia = inverse_inertia(simulator, *start, actions, forces, constants, first)
-            dry = solve_dry_friction(bounds, state.velocities, first, inertia, self._substep)
+            friction = dry_friction_over_step(
+                bounds_at, state.velocities, first, inertia, self._substep
+            )
+            dry = tuple(0.0 if force is None else force for force in friction.forces)
             # Accelerations are affine in the forces, so the first evaluation is not repeated.
             first = tuple(
-                a + sum(w * f for w, f, b in zip(row, dry, bounds, strict=True) if b is not None)
+                a + sum(w * f for w, f in zip(row, friction.forces, strict=True) if f is not None)
                 for a, row in zip(first, inertia, strict=True)
             )
         q, v = simulator.integrator.step(acceleration, *start, first, self._substep)
-        if has_dry_friction:
-            # Friction within its bound has stopped the joint; rounding must not leave a velocity
-            # whose sign then means something to a policy.
+        if friction is not None:
+            # Rounding must not leave a velocity whose sign then means something to a policy.
             v = tuple(
-                vi if b is None else torch.where(f.abs() < b, 0.0, vi)
-                for vi, f, b in zip(v, dry, bounds, strict=True)
+                vi if held is None else torch.where(held, 0.0, vi)
+                for vi, held in zip(v, friction.is_held, strict=True)
             )
+            if not simulator.integrator.rate_lag:
+                q = tuple(
+                    qi if shortfall is None else qi + shortfall
+                    for qi, shortfall in zip(q, friction.shortfalls, strict=True)
+                )
         memory = self.next_force_memory(state, tables)
         return state._replace(positions=q, velocities=v, force_memory=memory)
 
