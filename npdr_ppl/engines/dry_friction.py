@@ -7,11 +7,12 @@ rest by the end of the step, or for ±F_i against the motion if it cannot:
     f minimises  ½ h fᵀ W f + (v + h a₀)ᵀ f   subject to |f_i| ≤ F_i.
 
 At rest this is stiction; in motion it is ∓F_i; there is no chatter, and the solution is a
-composition of clips, so gradients exist almost everywhere. F = 0 gives f = 0 exactly.
+composition of clips, so gradients exist almost everywhere. F = 0 gives f = 0 exactly. That is good
+to first order, which does for integrators of that order.
 
-A joint that comes to rest does so within the step and not at its end. Friction is against its
-motion until then; afterwards it holds the joint, or the joint breaks away under what exceeds F_i.
-The mean over the step, and the way that the joint is short of what that mean would make it go, are
+In truth a joint that comes to rest does so within the step and not at its end. Friction is against
+its motion until then; afterwards it holds the joint, or it breaks away under what exceeds F_i. The
+mean over the step, and the way that the joint is short of what that mean would make it go, are
 exact under constant accelerations, so that a reversal costs no accuracy. Bounds that depend on
 velocity are taken halfway through each of both phases.
 """
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from npdr_ppl.engines.integrators import Components
 
-__all__ = ["DryFriction", "dry_friction_over_step", "solve_dry_friction"]
+__all__ = ["DryFriction", "dry_friction_over_step", "solve_dry_friction", "stopping_friction"]
 
 # Projected Gauss–Seidel for more than two joints. The strongest coupling of the zoo, the Furuta
 # pendulum's, contracts errors by 0.56 per sweep, so 20 sweeps leave 1e-5 of them.
@@ -45,6 +46,27 @@ class DryFriction(NamedTuple):
     shortfalls: tuple[Tensor | None, ...]
 
 
+def stopping_friction(
+    bounds: tuple[Tensor | None, ...],
+    velocities: Components,
+    accelerations: Components,
+    inverse_inertia: tuple[Components, ...],
+    step: float,
+) -> DryFriction:
+    """Returns dry friction that is constant over a step and stops joints at its end.
+
+    Good to first order, at less than half the price of :func:`dry_friction_over_step`. For the
+    arguments see :func:`solve_dry_friction`.
+    """
+    solved = solve_dry_friction(bounds, velocities, accelerations, inverse_inertia, step)
+    forces: list[Tensor | None] = [None] * len(bounds)
+    is_held = list(forces)
+    for i, (bound, force) in enumerate(zip(bounds, solved, strict=True)):
+        if bound is not None and isinstance(force, Tensor):
+            forces[i], is_held[i] = force, force.abs() < bound
+    return DryFriction(tuple(forces), tuple(is_held), (None,) * len(bounds))
+
+
 def dry_friction_over_step(
     bounds_at: Callable[[Components], tuple[Tensor | None, ...]],
     velocities: Components,
@@ -63,62 +85,82 @@ def dry_friction_over_step(
         step: Length h of the step, in seconds.
     """
 
-    def bounds(changed: Mapping[int, Tensor]) -> dict[int, Tensor]:
-        at = tuple(changed.get(i, v) for i, v in enumerate(velocities))
-        return {i: bound for i, bound in enumerate(bounds_at(at)) if bound is not None}
+    def bounds(at: Mapping[int, Tensor]) -> dict[int, Tensor]:
+        moving = tuple(at.get(i, v) for i, v in enumerate(velocities))
+        return {i: bound for i, bound in enumerate(bounds_at(moving)) if bound is not None}
 
     first = bounds({})
-    limits = tuple(first.get(i) for i in range(len(velocities)))
-    stopping = solve_dry_friction(limits, velocities, accelerations, inverse_inertia, step)
-    w = {i: inverse_inertia[i][i] for i in first}
-    free: dict[int, Tensor] = {}  # accelerations without the joint's own friction
-    for i in first:
-        others = (inverse_inertia[i][j] * stopping[j] for j in first if j != i)
-        free[i] = sum(others, start=accelerations[i])
-
-    def braked(i: int, bound: Tensor) -> Tensor:
-        return free[i] - w[i] * bound * velocities[i].sign()
-
-    # Until it stops, or to the step's end.
-    middle: dict[int, Tensor] = {}
-    for i, bound in first.items():
-        v, a = velocities[i], braked(i, bound)
-        middle[i] = torch.where(_stops(v, a, step), 0.5 * v, v + 0.5 * step * a)
-    sliding = bounds(middle)
-    time = {i: _time_to_rest(velocities[i], braked(i, sliding[i]), step) for i in first}
-    # From then on.
     resting = bounds({i: torch.zeros_like(velocities[i]) for i in first})
-    onwards: dict[int, Tensor] = {}
-    for i, bound in resting.items():
-        excess = free[i] + w[i] * _clip(-free[i] / w[i], bound)
-        onwards[i] = 0.5 * (step - time[i]) * excess
-    going_on = bounds(onwards)
+    # What is the same tensor at rest does not depend on the velocity.
+    varies = any(resting[i] is not first[i] for i in first)
+    w = {i: inverse_inertia[i][i] for i in first}
+    free = _free_accelerations(first, velocities, accelerations, inverse_inertia, step)
+    sliding = going_on = first
+    if varies:
+        middle: dict[int, Tensor] = {}
+        for i, bound in first.items():
+            v, a = velocities[i], free[i] - w[i] * bound * velocities[i].sign()
+            stops = _time_to_rest(v, a, bound, step) < step
+            middle[i] = torch.where(stops, 0.5 * v, v + 0.5 * step * a)
+        sliding = bounds(middle)
+    against = {i: sliding[i] * velocities[i].sign() for i in first}
+    time = {
+        i: _time_to_rest(velocities[i], free[i] - w[i] * against[i], sliding[i], step)
+        for i in first
+    }
+    if varies:
+        excess = {i: free[i] + w[i] * _clip(-free[i] / w[i], resting[i]) for i in first}
+        going_on = bounds({i: 0.5 * (step - time[i]) * excess[i] for i in first})
 
     forces: list[Tensor | None] = [None] * len(velocities)
     is_held, shortfalls = list(forces), list(forces)
     for i in first:
-        v, left = velocities[i], step - time[i]
-        has_stopped = (left > 0.0) & (first[i] > 0.0)
-        holds = free[i].abs() <= w[i] * torch.maximum(resting[i], going_on[i])
-        is_held[i] = has_stopped & holds
-        last = torch.where(holds, -free[i] / w[i], _clip(-free[i] / w[i], going_on[i]))
-        last = torch.where(has_stopped, last, 0.0)
-        forces[i] = (last * left - sliding[i] * v.sign() * time[i]) / step
+        left = step - time[i]
+        last = _clip(-free[i] / w[i], going_on[i])
+        holds = free[i].abs() <= w[i] * going_on[i]
+        if varies:
+            holds = holds | (free[i].abs() <= w[i] * resting[i])
+            last = torch.where(holds, -free[i] / w[i], last)
+        forces[i] = (last * left - against[i] * time[i]) / step
+        is_held[i] = holds & (left > 0.0)
         end = torch.where(holds, 0.0, (free[i] + w[i] * last) * left)
-        shortfalls[i] = torch.where(has_stopped, -0.5 * (v * left + end * time[i]), 0.0)
+        shortfalls[i] = -0.5 * (velocities[i] * left + end * time[i])
     return DryFriction(tuple(forces), tuple(is_held), tuple(shortfalls))
 
 
-def _stops(velocity: Tensor, acceleration: Tensor, step: float) -> Tensor:
-    """Returns whether a moving joint comes to rest within the step."""
-    return velocity * (velocity + step * acceleration) < 0.0
+def _free_accelerations(
+    bounds: Mapping[int, Tensor],
+    velocities: Components,
+    accelerations: Components,
+    inverse_inertia: tuple[Components, ...],
+    step: float,
+) -> dict[int, Tensor]:
+    """Returns the accelerations without a joint's own friction, with that of the others.
+
+    Theirs is as if it stopped them at the step's end: that they stop in the same step is rare.
+    """
+    if len(bounds) == 1:
+        return {i: accelerations[i] for i in bounds}
+    limits = tuple(bounds.get(i) for i in range(len(velocities)))
+    stopping = solve_dry_friction(limits, velocities, accelerations, inverse_inertia, step)
+    return {
+        i: accelerations[i] + sum(inverse_inertia[i][j] * stopping[j] for j in bounds if j != i)
+        for i in bounds
+    }
 
 
-def _time_to_rest(velocity: Tensor, acceleration: Tensor, step: float) -> Tensor:
-    """Returns when a joint is at rest, or the whole step if it does not come to rest in it."""
-    stops = _stops(velocity, acceleration, step)
-    time = torch.where(stops, -velocity / torch.where(stops, acceleration, 1.0), step)
-    return torch.where(velocity == 0.0, 0.0, time)
+def _time_to_rest(velocity: Tensor, acceleration: Tensor, bound: Tensor, step: float) -> Tensor:
+    """Returns when friction has a joint at rest; the whole step if not in it, or if there is none.
+
+    Args:
+        velocity: Velocity at the step's start.
+        acceleration: Acceleration under the friction of sliding.
+        bound: Greatest magnitude of that friction.
+        step: Length of the step.
+    """
+    time = -velocity / torch.where(acceleration == 0.0, 1.0, acceleration)
+    stops = (time >= 0.0) & (time < step) & (bound > 0.0)
+    return torch.where(stops, time, step)
 
 
 def solve_dry_friction(

@@ -7,7 +7,11 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.drive import drive_forces, inverse_inertia
-from npdr_ppl.engines.dry_friction import DryFriction, dry_friction_over_step
+from npdr_ppl.engines.dry_friction import (
+    DryFriction,
+    dry_friction_over_step,
+    stopping_friction,
+)
 from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.language.effect_context import Joint
@@ -76,13 +80,16 @@ class Stepper(EffectChain):
         def bounds_at(velocities: Components) -> tuple[Tensor | None, ...]:
             return self.dry_friction_bounds(state._replace(velocities=velocities), tables)
 
+        bounds = bounds_at(state.velocities)
         friction: DryFriction | None = None
-        if any(bound is not None for bound in bounds_at(state.velocities)):
+        if any(bound is not None for bound in bounds):
             forces = self._forces(*start, state, tables, dry)
             inertia = inverse_inertia(simulator, *start, actions, forces, constants, first)
-            friction = dry_friction_over_step(
-                bounds_at, state.velocities, first, inertia, self._substep
-            )
+            given = state.velocities, first, inertia, self._substep
+            if simulator.integrator.order == 1:
+                friction = stopping_friction(bounds, *given)
+            else:
+                friction = dry_friction_over_step(bounds_at, *given)
             dry = tuple(0.0 if force is None else force for force in friction.forces)
             # Accelerations are affine in the forces, so the first evaluation is not repeated.
             first = tuple(
@@ -96,11 +103,10 @@ class Stepper(EffectChain):
                 vi if held is None else torch.where(held, 0.0, vi)
                 for vi, held in zip(v, friction.is_held, strict=True)
             )
-            if not simulator.integrator.rate_lag:
-                q = tuple(
-                    qi if shortfall is None else qi + shortfall
-                    for qi, shortfall in zip(q, friction.shortfalls, strict=True)
-                )
+            q = tuple(
+                qi if shortfall is None else qi + shortfall
+                for qi, shortfall in zip(q, friction.shortfalls, strict=True)
+            )
         memory = self.next_force_memory(state, tables)
         return state._replace(positions=q, velocities=v, force_memory=memory)
 
