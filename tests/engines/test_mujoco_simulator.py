@@ -326,7 +326,6 @@ def test_finer_steps_err_less(integrator, most):
     assert (readings(finer) - exact).norm() < most * (readings(coarse) - exact).norm()
     assert (finer.num_substeps(0.002), coarse.num_substeps(0.002)) == (2, 1)
     # Without effects only the order is left.
-    inputs = random_inputs(coarse, num_segments=1, num_steps=100)
     exact = arm(integrator="RK4", substeps=64).simulate({}, inputs)
     torch.testing.assert_close(finer.simulate({}, inputs), exact, rtol=1e-6, atol=1e-8)
     assert finer.with_finer_steps() is None

@@ -3,10 +3,18 @@
 import pytest
 import torch
 
+from npdr_ppl.language.effect_context import Start
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import ClockSkew, EncoderScale, InputDelay, SensorDelay
+from npdr_ppl.models.effects import (
+    ClockSkew,
+    EncoderScale,
+    InputDelay,
+    PeriodicDisturbance,
+    SensorDelay,
+)
 from npdr_ppl.models.emps import Emps
 from npdr_ppl.models.furuta import Furuta
+from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.linear import Linear
 from tests.models.effect_replay import FREE, replay
 
@@ -119,3 +127,39 @@ def test_a_skewed_clock_reads_the_parabola_of_a_falling_body_early_or_late(skew)
         step,
     )
     torch.testing.assert_close(out, truth[1:], rtol=0.0, atol=1e-10)
+
+
+def test_a_wave_in_time_is_that_of_the_middle_of_a_step():
+    # A force of the step's start would be late by 10 ms, which is 0.13 rad of this wave's phase.
+    wave = PeriodicDisturbance("hinge")
+    names = "sine", "cosine", "frequency"
+    strength = {
+        f"{wave.name}.{name}": torch.tensor(value, dtype=torch.float64)
+        for name, value in zip(names, (0.5, 0.3, 2.0), strict=True)
+    }
+    still = Inputs.single(
+        torch.zeros(100, 1, dtype=torch.float64),
+        torch.zeros(2, dtype=torch.float64),
+        action_names=("torque",),
+        state_names=("angle", "velocity"),
+        time_step=0.02,
+    )
+    coarse, fine = (
+        Pendulum(integrator="rk4", substeps=n).with_effects(wave).simulate(strength, still)
+        for n in (1, 32)
+    )
+    assert (coarse - fine).norm() < 0.02 * fine.norm()
+
+
+def test_a_clock_ahead_reads_velocities_along_a_line_and_positions_along_a_parabola():
+    clock, h = ClockSkew("clock"), 0.02
+    skew = {"skew": torch.tensor(1e-3, dtype=torch.float64)}
+    ahead = 5.0 * 1e-3 / h  # in steps, at 5 s
+    parabola = [torch.tensor(x, dtype=torch.float64) for x in (0.0, 1.0, 4.0)]
+    for is_rate, expected in ((True, 4.0 + 3.0 * ahead), (False, (2.0 + ahead) ** 2)):
+        zero = torch.zeros((), dtype=torch.float64)
+        start = Start(zero + 5.0 - 2 * h, h, skew, 2, (zero, zero), is_rate)
+        memory = clock.initial_memory(parabola[0], parabola[0], start)
+        for value in parabola[1:]:
+            reading, memory = clock.read(value, skew, memory, h)
+        assert float(reading) == pytest.approx(expected, rel=1e-9)
