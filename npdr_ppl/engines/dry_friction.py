@@ -68,6 +68,7 @@ def stopping_friction(
 
 
 def dry_friction_over_step(
+    limits: tuple[Tensor | None, ...],
     bounds_at: Callable[[Components], tuple[Tensor | None, ...]],
     velocities: Components,
     accelerations: Components,
@@ -77,8 +78,9 @@ def dry_friction_over_step(
     """Returns the dry friction at each joint over a step, reversals included.
 
     Args:
-        bounds_at: Returns the greatest magnitude F_i per joint, in its force unit, at velocities;
-            ``None`` without friction.
+        limits: Greatest magnitude F_i per joint at the step's start, in its force unit; ``None``
+            without friction.
+        bounds_at: Returns the same at other velocities.
         velocities: Velocities v at the step's start.
         accelerations: Accelerations a₀ without dry friction at the step's start.
         inverse_inertia: Rows of W, the acceleration of joint i per unit force at joint j.
@@ -89,7 +91,7 @@ def dry_friction_over_step(
         moving = tuple(at.get(i, v) for i, v in enumerate(velocities))
         return {i: bound for i, bound in enumerate(bounds_at(moving)) if bound is not None}
 
-    first = bounds({})
+    first = {i: bound for i, bound in enumerate(limits) if bound is not None}
     resting = bounds({i: torch.zeros_like(velocities[i]) for i in first})
     # What is the same tensor at rest does not depend on the velocity.
     varies = any(resting[i] is not first[i] for i in first)

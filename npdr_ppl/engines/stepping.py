@@ -80,7 +80,7 @@ class Stepper(EffectChain):
         def bounds_at(velocities: Components) -> tuple[Tensor | None, ...]:
             return self.dry_friction_bounds(state._replace(velocities=velocities), tables)
 
-        bounds = bounds_at(state.velocities)
+        bounds = self.dry_friction_bounds(state, tables)
         friction: DryFriction | None = None
         if any(bound is not None for bound in bounds):
             forces = self._forces(*start, state, tables, dry)
@@ -89,7 +89,7 @@ class Stepper(EffectChain):
             if simulator.integrator.order == 1:
                 friction = stopping_friction(bounds, *given)
             else:
-                friction = dry_friction_over_step(bounds_at, *given)
+                friction = dry_friction_over_step(bounds, bounds_at, *given)
             dry = tuple(0.0 if force is None else force for force in friction.forces)
             # Accelerations are affine in the forces, so the first evaluation is not repeated.
             first = tuple(
