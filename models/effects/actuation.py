@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Start
-from npdr_ppl.language.effects import ActionEffect, Commands
+from npdr_ppl.language.effects import ActionEffect, Commands, Uneven
 from npdr_ppl.models.effects.equivalence import (
     COMMAND_LIMIT,
     FIRST_ORDER_LAG,
@@ -28,7 +28,7 @@ class InputDelay(ActionEffect):
     """u(t − d) with a delay d that need not be a whole number of steps.
 
     Commands are held for a step, so with d = (n + f) h a step of length h sees u_{k−n−1} for the
-    fraction f and u_{k−n} for the rest; their mean acts: (1 − f) u_{k−n} + f u_{k−n−1}.
+    fraction f and u_{k−n} for the rest.
     """
 
     id = "input_delay"
@@ -47,15 +47,20 @@ class InputDelay(ActionEffect):
         """Returns the steps that the longest delay reaches back."""
         return math.floor(float(parameters["delay"].detach().max()) / time_step) + 1
 
+    def initial_memory(self, command: Tensor, start: Start) -> tuple[Tensor, Tensor]:
+        """Returns n and f."""
+        steps = start.parameters["delay"] / start.time_step
+        whole = torch.floor(steps.detach())
+        return whole.long().expand(command.shape), (steps - whole).expand(command.shape)
+
     def act(
         self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
-    ) -> tuple[Tensor, Any]:
-        """Returns the mean command of the delayed step."""
-        steps = parameters["delay"] / time_step
-        whole = torch.floor(steps.detach())
-        fraction = steps - whole
-        later, earlier = commands.delayed(whole), commands.delayed(whole + 1.0)
-        return (1.0 - fraction) * later + fraction * earlier, memory
+    ) -> tuple[Uneven, Any]:
+        """Returns the command of the delayed step."""
+        whole, fraction = memory
+        later = commands.delayed(whole)
+        rise = fraction * (later - commands.delayed(whole + 1))
+        return Uneven(later - rise, (0.5 * time_step**2) * (1.0 - fraction) * rise), memory
 
 
 class ActuatorLag(ActionEffect):
@@ -72,23 +77,27 @@ class ActuatorLag(ActionEffect):
         """Uniform up to 50 ms."""
         return {"time_constant": dist.Uniform(0.0, 0.05)}
 
-    def initial_memory(self, command: Tensor, start: Start) -> Tensor:
-        """Returns the settled output."""
-        return command
+    def initial_memory(self, command: Tensor, start: Start) -> Any:
+        """Returns the settled output, and what is missing of the command in the next step.
+
+        As shares of what is missing at its start: at its end, in its mean, in its moment.
+        """
+        time_constant, half = start.parameters["time_constant"], 0.5 * start.time_step
+        decay = remaining(time_constant, start.time_step)
+        mean = time_constant / start.time_step * (1.0 - decay)
+        moment = time_constant * ((time_constant - half) - (time_constant + half) * decay)
+        return command, tuple(share.expand(command.shape) for share in (decay, mean, moment))
 
     def act(
-        self,
-        commands: Commands,
-        parameters: Mapping[str, Tensor],
-        memory: Tensor,
-        time_step: float,
-    ) -> tuple[Tensor, Tensor]:
-        """Returns the mean output during the step, and the output at its end."""
-        command, time_constant = commands.now(), parameters["time_constant"]
-        decay = remaining(time_constant, time_step)
-        missing = memory - command
-        mean = command + missing * (time_constant / time_step * (1.0 - decay))
-        return mean, command + missing * decay
+        self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Uneven, Any]:
+        """Returns the output during the step, and that at its end."""
+        output, shares = memory
+        command = commands.now()
+        missing = output - command
+        decay, mean, moment = shares
+        reached = Uneven(torch.addcmul(command, missing, mean), missing * moment)
+        return reached, (torch.addcmul(command, missing, decay), shares)
 
 
 class ActuatorGain(ActionEffect):

@@ -21,10 +21,11 @@ __all__ = ["EncoderBias", "EncoderScale", "Quantisation", "SensorLowPass"]
 class SensorLowPass(SensorEffect):
     """ẏ = (x − y)/T: a filtered reading, e.g. a velocity derived from an encoder.
 
-    Exact for values that change along a line between samples, so that the reading trails by T at
-    any sampling rate, as that of a driver does which filters the encoder's differences. The
-    filter's output at a segment's start is what was read there. Attach it to a group of channels,
-    ``"arm_velocity,pole_velocity"``, where one driver filters them all.
+    Exact for velocities that change along a line between samples and for positions that do along a
+    parabola, so that the reading trails by T at any sampling rate, as that of a driver does which
+    filters the encoder's differences. The filter's output at a segment's start is what was read
+    there. Attach it to a group of channels, ``"arm_velocity,pole_velocity"``, where one driver
+    filters them all.
     """
 
     id = "sensor_low_pass"
@@ -39,26 +40,36 @@ class SensorLowPass(SensorEffect):
         """Uniform up to 30 ms."""
         return {"time_constant": dist.Uniform(0.0, 0.03)}
 
-    def initial_memory(
-        self, value: Tensor, reading: Tensor, start: Start
-    ) -> tuple[Tensor, Tensor]:
-        """Returns the filter's output and the true value."""
-        return reading, value
+    def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> Any:
+        """Returns the shares of what the next reading is made of, the filter's output and value.
+
+        Those of the true value, of the one before it and of the output. For a position there are
+        the share of the curvature in the next reading, none as the value before is not known, that
+        in later ones, and the value before.
+        """
+        time_constant = start.parameters["time_constant"]
+        decay = remaining(time_constant, start.time_step)
+        steps = time_constant / start.time_step
+        trailing = steps * (1.0 - decay)
+        shares = 1.0 - trailing, trailing - decay, decay
+        bends = () if start.is_rate else (0.0 * steps, (steps + 0.5) * trailing - steps)
+        shares, bends = (
+            tuple(share.expand(value.shape) for share in group) for group in (shares, bends)
+        )
+        return shares, bends, (reading, value, value)
 
     def read(
-        self,
-        value: Tensor,
-        parameters: Mapping[str, Tensor],
-        memory: tuple[Tensor, Tensor],
-        time_step: float,
-    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
         """Returns the filter's output, and with the true value its memory."""
-        output, last = memory
-        time_constant = parameters["time_constant"]
-        decay = remaining(time_constant, time_step)
-        trailing = time_constant / time_step * (1.0 - decay)
-        output = value + trailing * (last - value) + decay * (output - last)
-        return output, (output, value)
+        shares, bends, (output, last, previous) = memory
+        reading = torch.addcmul(shares[0] * value, shares[1], last)
+        reading = torch.addcmul(reading, shares[2], output)
+        if bends:
+            bend, bends = bends[0], (bends[1], bends[1])
+            curvature = torch.add(value, last, alpha=-2.0) + previous
+            reading = torch.addcmul(reading, bend, curvature)
+        return reading, (shares, bends, (reading, value, last))
 
 
 class EncoderBias(SensorEffect):

@@ -17,17 +17,23 @@ from npdr_ppl.models.effects.references import LJUNG_1999
 __all__ = ["ClockSkew", "SensorDelay"]
 
 
-def _past(value: Tensor, start: Start) -> tuple[Tensor, ...]:
-    """Returns what came before the start, latest first: continued by the rates backwards."""
-    rate, curvature = start.rates
-    steps = (j * start.time_step for j in range(1, start.history + 1))
-    return tuple(value - h * rate + 0.5 * h * h * curvature for h in steps)
+def _on_line(age: Tensor) -> Tensor:
+    """Returns the share that a value has in that of so many steps before it, on a line."""
+    return (1.0 - age.abs()).clamp_min(0.0)
+
+
+def _on_parabola(age: Tensor) -> Tensor:
+    """Returns the same on the parabola through the two values around and the one before them."""
+    share = torch.where(age >= 0.0, (1.0 - age) * (1.0 - 0.5 * age), (1.0 + age) * (1.0 - age))
+    share = torch.where(age >= -1.0, share, 0.5 * (2.0 + age) * (1.0 + age))
+    return torch.where((age > -2.0) & (age < 1.0), share, 0.0)
 
 
 class SensorDelay(SensorEffect):
     """y(t) = x(t − d) with a delay d that need not be a whole number of steps.
 
-    Between steps of length h, x is taken as linear: y_k = Σ_j max(0, 1 − |d/h − j|) x_{k−j}.
+    Between steps of length h, a velocity, which is kinked where commands change, is on the line
+    through its neighbours, and a position on the parabola through two of them and the one before.
     Attach it to the channels that are late together.
 
     What was read at a segment's start is the state d earlier, so the segment starts from the state
@@ -51,8 +57,8 @@ class SensorDelay(SensorEffect):
         return {"delay": dist.Uniform(0.0, 0.03)}
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
-        """Returns the steps that the longest delay reaches back."""
-        return math.floor(float(parameters["delay"].detach().max()) / time_step) + 1
+        """Returns the steps that the longest delay reaches back, and one for the curvature."""
+        return math.floor(float(parameters["delay"].detach().max()) / time_step) + 2
 
     def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor:
         """Returns −d."""
@@ -63,11 +69,9 @@ class SensorDelay(SensorEffect):
     ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
         """Returns the weights of x_k, x_{k−1}, …, and the past values, latest first."""
         steps = start.parameters["delay"] / start.time_step
-        weights = tuple(
-            (1.0 - (steps - j).abs()).clamp_min(0.0).expand(value.shape)
-            for j in range(start.history + 1)
-        )
-        return weights, (value, *_past(value, start)[:-1])
+        weight = _on_line if start.is_rate else _on_parabola
+        weights = tuple(weight(steps - j).expand(value.shape) for j in range(start.history + 1))
+        return weights, (value, *start.past(value)[:-1])
 
     def read(
         self,
@@ -119,7 +123,7 @@ class ClockSkew(SensorEffect):
     def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> tuple[Tensor, ...]:
         """Returns the time, the share of curvature, the present value and the one before it."""
         smooth = torch.full_like(value, 0.0 if start.is_rate else 1.0)
-        return start.time, smooth, value, _past(value, start)[0]
+        return start.time, smooth, value, start.past(value)[0]
 
     def read(
         self,

@@ -91,8 +91,7 @@ class LoopBody:
             reward = self.reward(state.positions, state.velocities, commands)
             total = torch.where(loop.is_running, total + reward, total)
         length = torch.where(loop.is_running, loop.length + 1.0, loop.length)
-        state, actions = stepper.act(state, limited, tables)
-        state = stepper.move(state, actions, tables)
+        state = stepper.advance(state, limited, tables)
         state, readings = stepper.read(state, tables)
         is_running = loop.is_running
         for value, (lower, upper) in zip(

@@ -101,33 +101,37 @@ def dry_friction_over_step(
     if varies:
         middle: dict[int, Tensor] = {}
         for i, bound in first.items():
-            v, a = velocities[i], free[i] - w[i] * bound * velocities[i].sign()
+            v = velocities[i]
+            a = _under(free[i], w[i], bound * v.sign())
             stops = _time_to_rest(v, a, bound, step) < step
             middle[i] = torch.where(stops, 0.5 * v, v + 0.5 * step * a)
         sliding = bounds(middle)
     against = {i: sliding[i] * velocities[i].sign() for i in first}
     time = {
-        i: _time_to_rest(velocities[i], free[i] - w[i] * against[i], sliding[i], step)
+        i: _time_to_rest(velocities[i], _under(free[i], w[i], against[i]), sliding[i], step)
         for i in first
     }
     if varies:
-        excess = {i: free[i] + w[i] * _clip(-free[i] / w[i], resting[i]) for i in first}
+        excess = {i: _under(free[i], w[i], _clip(free[i] / w[i], resting[i])) for i in first}
         going_on = bounds({i: 0.5 * (step - time[i]) * excess[i] for i in first})
 
     forces: list[Tensor | None] = [None] * len(velocities)
     is_held, shortfalls = list(forces), list(forces)
     for i in first:
-        left = step - time[i]
-        last = _clip(-free[i] / w[i], going_on[i])
-        holds = free[i].abs() <= w[i] * going_on[i]
+        left, needed = step - time[i], free[i] / w[i]
+        last = _clip(needed, going_on[i])
         if varies:
-            holds = holds | (free[i].abs() <= w[i] * resting[i])
-            last = torch.where(holds, -free[i] / w[i], last)
-        forces[i] = (last * left - against[i] * time[i]) / step
-        is_held[i] = holds & (left > 0.0)
-        end = torch.where(holds, 0.0, (free[i] + w[i] * last) * left)
-        shortfalls[i] = -0.5 * (velocities[i] * left + end * time[i])
+            last = torch.where(needed.abs() <= resting[i], needed, last)
+        forces[i] = torch.addcmul(last * left, against[i], time[i]) * (-1.0 / step)
+        is_held[i] = (last == needed) & (left > 0.0)
+        end = torch.addcmul(velocities[i], _under(free[i], w[i], last), time[i])
+        shortfalls[i] = -0.5 * (end * left)
     return DryFriction(tuple(forces), tuple(is_held), tuple(shortfalls))
+
+
+def _under(acceleration: Tensor, inverse_inertia: Tensor, friction: Tensor) -> Tensor:
+    """Returns an acceleration under friction against it."""
+    return torch.addcmul(acceleration, inverse_inertia, friction, value=-1.0)
 
 
 def _free_accelerations(
@@ -160,9 +164,11 @@ def _time_to_rest(velocity: Tensor, acceleration: Tensor, bound: Tensor, step: f
         bound: Greatest magnitude of that friction.
         step: Length of the step.
     """
-    time = -velocity / torch.where(acceleration == 0.0, 1.0, acceleration)
-    stops = (time >= 0.0) & (time < step) & (bound > 0.0)
-    return torch.where(stops, time, step)
+    if acceleration.requires_grad:
+        # Infinity times no gradient is none.
+        acceleration = torch.where(acceleration == 0.0, 1.0, acceleration)
+    time = -velocity / acceleration
+    return torch.where((time >= 0.0) & (bound > 0.0), time, step).clamp_max(step)
 
 
 def solve_dry_friction(

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from npdr_ppl.engines.commands import RecentCommands
@@ -17,13 +18,18 @@ from npdr_ppl.language.effects import (
     Effect,
     ForceEffect,
     SensorEffect,
+    Uneven,
 )
 from npdr_ppl.language.simulator import Simulator
 
-__all__ = ["EffectChain", "State", "Tables", "needed_histories"]
+__all__ = ["EffectChain", "Moments", "State", "Tables", "needed_histories"]
 
 # Histories come in multiples of this many steps, so that draws of a delay share a compiled kernel.
 _HISTORY_GRAIN = 4
+
+
+Moments = tuple[Tensor | None, ...]
+"""First moment of each action about a step's middle; ``None`` for one that is constant."""
 
 
 class State(NamedTuple):
@@ -139,8 +145,18 @@ class EffectChain(ABC):
         """
 
     @abstractmethod
-    def move(self, state: State, actions: Components, tables: Tables) -> State:
-        """Advances the dynamics by one time step under constant actions."""
+    def move(
+        self, state: State, actions: Components, tables: Tables, moments: Moments = ()
+    ) -> State:
+        """Advances the dynamics by one time step.
+
+        Args:
+            state: State at the step's start.
+            actions: Mean of each action over the step, ``(N,)`` each.
+            tables: Constants of the simulation.
+            moments: First moment of each about the step's middle; none if all are constant. An
+                engine that holds its actions for a step leaves them out.
+        """
 
     def at_joints(
         self, positions: Components, velocities: Components
@@ -266,9 +282,64 @@ class EffectChain(ABC):
         Returns:
             The state with the action effects' memory advanced, and what reaches the dynamics.
         """
+        state, actions, _ = self.through(state, commands, tables, records)
+        return state, actions
+
+    def advance(
+        self,
+        state: State,
+        commands: Components,
+        tables: Tables,
+        records: tuple[Commands, ...] | None = None,
+    ) -> State:
+        """Advances the state by one time step under commands; see :meth:`act`."""
+        state, actions, moments = self.through(state, commands, tables, records)
+        return self.move(state, actions, tables, moments)
+
+    def by_substep(
+        self, actions: Components, moments: Moments, substeps: int
+    ) -> tuple[list[Components], Moments]:
+        """Divides actions that change within a step among its substeps.
+
+        Each gets its part of a line that has the mean and the moment of the whole.
+
+        Args:
+            actions: Mean of each action, see :meth:`move`.
+            moments: Their moments.
+            substeps: Number of substeps.
+
+        Returns:
+            The mean of each action in each substep, and what is left of its moment in each.
+        """
+        own = tuple(None if m is None else m / substeps**3 for m in moments)
+        if all(moment is None for moment in own):
+            return [actions] * substeps, own
+        rise = 12.0 * (substeps / self.time_step) ** 2
+        means = [
+            tuple(
+                a if m is None else torch.add(a, m, alpha=rise * (k - 0.5 * (substeps - 1)))
+                for a, m in zip(actions, own, strict=True)
+            )
+            for k in range(substeps)
+        ]
+        return means, own
+
+    def through(
+        self,
+        state: State,
+        commands: Components,
+        tables: Tables,
+        records: tuple[Commands, ...] | None,
+    ) -> tuple[State, Components, Moments]:
+        """Passes commands through the action effects; see :meth:`act`.
+
+        Returns:
+            State and actions, and their moments; see :meth:`move`.
+        """
         if not self.action_effects:
-            return state, commands
+            return state, commands, ()
         present = list(commands)
+        moments: list[Tensor | None] = [None] * len(commands)
         memory, past = list(state.action_memory), list(state.past_commands)
         is_raw = [True] * len(present)
         for k, (place, effect, channel) in enumerate(self.action_effects):
@@ -279,14 +350,17 @@ class EffectChain(ABC):
                 seen = records[channel]
             else:
                 seen = RecentCommands(command, past[k])
-            present[channel], memory[k] = effect.act(
-                seen, tables.effects[place], memory[k], self.time_step
-            )
+            reached, memory[k] = effect.act(seen, tables.effects[place], memory[k], self.time_step)
+            if isinstance(reached, Uneven):
+                reached, moment = reached
+                known = moments[channel]
+                moments[channel] = moment if known is None else known + moment
+            present[channel] = reached
             if self.histories[k]:
                 past[k] = (command, *past[k][:-1])
             is_raw[channel] = False
         changed = state._replace(action_memory=tuple(memory), past_commands=tuple(past))
-        return changed, tuple(present)
+        return changed, tuple(present), tuple(moments)
 
     def read(self, state: State, tables: Tables) -> tuple[State, Components]:
         """Returns the state with the sensor effects' memory advanced, and the readings."""

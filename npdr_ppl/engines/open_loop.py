@@ -109,22 +109,15 @@ class _Body:
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
 
-    def act(
-        self, state: State, tables: Tables, commands: Components, views: tuple[_View, ...]
-    ) -> tuple[State, Components]:
-        """Passes the recorded commands of a step through the action effects."""
-        records = tuple(
-            RecordedCommands(command, *view)
-            for command, view in zip(commands, views, strict=bool(views))
-        )
-        return self.stepper.act(state, commands, tables, records)
-
     def step(
         self, state: State, tables: Tables, commands: Components, views: tuple[_View, ...]
     ) -> tuple[State, Components]:
         """Advances the state by one step and reads the sensors."""
-        state, actions = self.act(state, tables, commands, views)
-        state = self.stepper.move(state, actions, tables)
+        records = tuple(
+            RecordedCommands(command, *view)
+            for command, view in zip(commands, views, strict=bool(views))
+        )
+        state = self.stepper.advance(state, commands, tables, records)
         return self.stepper.read(state, tables)
 
     def run(

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.closed_loop import LoopBody, begin
-from npdr_ppl.engines.effect_chain import EffectChain, State, Tables, needed_histories
+from npdr_ppl.engines.effect_chain import EffectChain, Moments, State, Tables, needed_histories
 from npdr_ppl.engines.episodes import EpisodeRequest, Episodes
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.pooled import Segment
@@ -176,7 +176,9 @@ class _OneStepper(EffectChain):
         """Is the engine's own matter; effects that need it are not attached."""
         raise NotImplementedError
 
-    def move(self, state: State, actions: Components, tables: Tables) -> State:
+    def move(
+        self, state: State, actions: Components, tables: Tables, moments: Moments = ()
+    ) -> State:
         """Advances the simulation by one step."""
         self._segment.actions[self._step] = [float(action) for action in actions]
         self._simulation.advance(self._step)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.commands import CommandRecord
-from npdr_ppl.engines.effect_chain import EffectChain, State, Tables, needed_histories
+from npdr_ppl.engines.effect_chain import EffectChain, Moments, State, Tables, needed_histories
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.segment_start import recorded_start, true_start, with_past_commands
 from npdr_ppl.engines.stepping import flatten
@@ -143,6 +143,8 @@ class _SignalChain(EffectChain):
         """Is the engine's own matter; effects that need it are not attached."""
         raise NotImplementedError
 
-    def move(self, state: State, actions: Components, tables: Tables) -> State:
+    def move(
+        self, state: State, actions: Components, tables: Tables, moments: Moments = ()
+    ) -> State:
         """Is the engine's own matter."""
         raise NotImplementedError

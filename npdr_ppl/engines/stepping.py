@@ -12,7 +12,7 @@ from npdr_ppl.engines.dry_friction import (
     dry_friction_over_step,
     stopping_friction,
 )
-from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
+from npdr_ppl.engines.effect_chain import EffectChain, Moments, State, Tables
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.language.effect_context import Joint
 
@@ -57,13 +57,18 @@ class Stepper(EffectChain):
         none = (0.0,) * len(positions)
         return self.simulator.accelerations(positions, velocities, actions, none, tables.constants)
 
-    def move(self, state: State, actions: Components, tables: Tables) -> State:
-        """Advances the dynamics by one time step under constant actions."""
-        for _ in range(self.simulator.substeps):
-            state = self._move_once(state, actions, tables)
+    def move(
+        self, state: State, actions: Components, tables: Tables, moments: Moments = ()
+    ) -> State:
+        """Advances the dynamics by one time step; see :meth:`EffectChain.move`."""
+        means, left = self.by_substep(actions, moments, self.simulator.substeps)
+        for present in means:
+            state = self._move_once(state, present, left, tables)
         return state
 
-    def _move_once(self, state: State, actions: Components, tables: Tables) -> State:
+    def _move_once(
+        self, state: State, actions: Components, moments: Moments, tables: Tables
+    ) -> State:
         """Advances the dynamics by one substep."""
         if self.needs_joints:
             state = self.begin_step(state, self._joints(state, actions, tables), tables)
@@ -75,7 +80,15 @@ class Stepper(EffectChain):
             forces = self._forces(positions, velocities, state, tables, dry)
             return simulator.accelerations(positions, velocities, actions, forces, constants)
 
-        first = acceleration(*start)
+        first = undisturbed = acceleration(*start)
+        late: Components | None = None
+        if simulator.integrator.order > 1 and any(moment is not None for moment in moments):
+            # Positions move by ∫ (h − t) a dt, of which the integrator sees ½ h² times the mean.
+            shifted = tuple(
+                a if m is None else a + m for a, m in zip(actions, moments, strict=True)
+            )
+            forces = self._forces(*start, state, tables, dry)
+            late = simulator.accelerations(*start, shifted, forces, constants)
 
         def bounds_at(velocities: Components) -> tuple[Tensor | None, ...]:
             return self.dry_friction_bounds(state._replace(velocities=velocities), tables)
@@ -92,11 +105,15 @@ class Stepper(EffectChain):
                 friction = dry_friction_over_step(bounds, bounds_at, *given)
             dry = tuple(0.0 if force is None else force for force in friction.forces)
             # Accelerations are affine in the forces, so the first evaluation is not repeated.
-            first = tuple(
-                a + sum(w * f for w, f in zip(row, friction.forces, strict=True) if f is not None)
-                for a, row in zip(first, inertia, strict=True)
-            )
+            for joint, force in enumerate(friction.forces):
+                if force is not None:
+                    # Not fused, lest what friction holds creep by what that would round otherwise.
+                    first = tuple(
+                        a + row[joint] * force for a, row in zip(first, inertia, strict=True)
+                    )
         q, v = simulator.integrator.step(acceleration, *start, first, self._substep)
+        if late is not None:
+            q = tuple(qi - (b - a) for qi, a, b in zip(q, undisturbed, late, strict=True))
         if friction is not None:
             # Rounding must not leave a velocity whose sign then means something to a policy.
             v = tuple(

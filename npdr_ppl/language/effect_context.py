@@ -67,6 +67,18 @@ class Start(NamedTuple):
     rates: tuple[Tensor, ...] = ()
     is_rate: bool = False
 
+    def past(self, value: Tensor) -> tuple[Tensor, ...]:
+        """Returns a sensor channel's true values before the start, latest first.
+
+        As many as :attr:`history`, continued backwards by the rates.
+
+        Args:
+            value: The true value at the start.
+        """
+        rate, curvature = self.rates
+        times = (j * self.time_step for j in range(1, self.history + 1))
+        return tuple(value - h * rate + 0.5 * h * h * curvature for h in times)
+
 
 class Joint(NamedTuple):
     """A joint at the start of a step; tensors of the batch's shape.

@@ -6,7 +6,7 @@ dimensions, so any engine that can hand over velocities, commands or readings ca
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,6 +31,7 @@ __all__ = [
     "LinearForceEffect",
     "ParameterEffect",
     "SensorEffect",
+    "Uneven",
 ]
 
 
@@ -241,6 +242,22 @@ class Commands(ABC):
         """Returns the command of ``steps`` (whole numbers, ≥ 0) steps ago, batch-wise."""
 
 
+class Uneven(NamedTuple):
+    """A command that changes within a step.
+
+    Velocities move as far as under its mean, and positions lag as its moment says. Engines that
+    hold a command for a step make do with the mean.
+
+    Attributes:
+        mean: Its mean, in its unit.
+        moment: Its first moment ∫ (t − h/2) u dt about the middle of a step of length h, in its
+            unit times s².
+    """
+
+    mean: Tensor
+    moment: Tensor
+
+
 class ActionEffect(Effect):
     """An effect on a command on its way to the dynamics."""
 
@@ -260,7 +277,7 @@ class ActionEffect(Effect):
     @abstractmethod
     def act(
         self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
-    ) -> tuple[Tensor, Any]:
+    ) -> "tuple[Tensor | Uneven, Any]":
         """Returns what reaches the dynamics during this step, and the next memory."""
 
 

@@ -10,7 +10,7 @@ from npdr_ppl.language.inputs import Inputs
 FREE = {"mass": 1.0, "viscous_friction": 0.0, "drive_gain": 1.0}
 
 
-def replay(simulator, parameters, actions, start=None, step=0, past_actions=None):
+def replay(simulator, parameters, actions, start=None, step=0, past_actions=None, time_step=None):
     """Readings of one segment, (steps, sensors), from a state at a step of its rollout."""
     actions = torch.as_tensor(actions, dtype=torch.float64)
     names = tuple(state.name for state in simulator.states)
@@ -19,7 +19,7 @@ def replay(simulator, parameters, actions, start=None, step=0, past_actions=None
         torch.tensor(start or [0.0] * len(names), dtype=torch.float64),
         action_names=tuple(action.name for action in simulator.actions),
         state_names=names,
-        time_step=simulator.time_step,
+        time_step=time_step or simulator.time_step,
     )
     inputs = replace(inputs, start=torch.tensor([step]))
     if past_actions is not None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.signal import lsim
 
-from npdr_ppl.language.effect_context import Joint
+from npdr_ppl.language.effect_context import Joint, Start
 from npdr_ppl.models.cart_pole import CartPole
 from npdr_ppl.models.effects import (
     AsymmetricCoulombFriction,
@@ -344,8 +344,20 @@ def test_a_filtered_reading_is_the_continuous_filter_of_the_line_between_samples
     times = time_step * np.arange(60)
     true = np.interp(times, [0.0, 0.05, 0.2, 1.0], [0.0, 3.0, -1.0, 5.0])
     expected = lsim(([1.0], [float(time_constant), 1.0]), true, times, X0=[0.0])[1]
-    values = torch.tensor(true)
-    memory = law.initial_memory(values[0], torch.tensor(0.0).double(), None)
+    values, own = torch.tensor(true), {"time_constant": time_constant}
+    start = Start(torch.zeros(()), time_step, own, is_rate=True)
+    memory = law.initial_memory(values[0], torch.tensor(0.0).double(), start)
     for value, reading in zip(values[1:], expected[1:], strict=True):
-        output, memory = law.read(value, {"time_constant": time_constant}, memory, time_step)
+        output, memory = law.read(value, own, memory, time_step)
         assert output.item() == pytest.approx(reading, abs=1e-12)
+
+
+def test_a_filtered_position_trails_a_parabola_as_the_continuous_filter_does():
+    law, own = SensorLowPass("angle"), {"time_constant": torch.tensor(0.012).double()}
+    step, (a, b) = 0.02, (0.3, -4.0)  # x = a t + ½ b t², whose filtered value is known
+    memory = law.initial_memory(*torch.zeros(2).double(), Start(torch.zeros(()), step, own))
+    for k in range(1, 80):
+        t, lag = k * step, 0.012
+        output, memory = law.read(torch.tensor(a * t + 0.5 * b * t * t), own, memory, step)
+    # After the transient: x(t) − T ẋ(t) + T² ẍ.
+    assert output.item() == pytest.approx(a * t + 0.5 * b * t * t - lag * (a + b * t) + lag**2 * b)

@@ -1,11 +1,14 @@
 """Late sensors and skewed clocks against motions whose readings have closed forms."""
 
+import math
+
 import pytest
 import torch
 
 from npdr_ppl.language.effect_context import Start
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import (
+    ActuatorLag,
     ClockSkew,
     EncoderScale,
     InputDelay,
@@ -51,6 +54,59 @@ def test_delays_of_all_sensors_and_of_the_input_are_one_class():
     effect = (run() - run(voltage)).abs().amax(0)
     difference = (run(sensors) - run(voltage)).abs().amax(0)
     assert (difference < 0.15 * effect).all()
+
+
+def reached(effect_id, value, commands, parts):
+    """The commands that reach the dynamics in each of many parts of a step of 20 ms."""
+    part = 0.02 / parts
+    middle = part * (torch.arange(len(commands) * parts) + 0.5)
+    if effect_id == "input_delay":
+        return commands[((middle - value) / 0.02).floor().long().clamp_min(0)]
+    output, result = commands[0], []
+    for command in commands.repeat_interleave(parts):
+        before, output = output, command + (output - command) * math.exp(-part / value)
+        result.append(command + (before - output) * value / part)
+    return torch.stack(result)
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+@pytest.mark.parametrize(
+    ("effect", "value"),
+    [
+        (InputDelay("torque"), 0.007),
+        (InputDelay("torque"), 0.031),
+        (ActuatorLag("torque"), 0.002),
+        (ActuatorLag("torque"), 0.02),
+    ],
+    ids=lambda value: getattr(value, "id", value),
+)
+def test_commands_that_change_within_a_step_move_positions_when_they_do(effect, value, substeps):
+    """A step's mean command moves velocities as far, but positions by half a step too early."""
+    time = 0.02 * torch.arange(40, dtype=torch.float64)
+    commands = 2.0 * torch.sin(8.0 * time) + torch.sign(torch.sin(13.0 * time))
+
+    def swing(simulator, commands, parameters, time_step):
+        return replay(simulator, parameters, commands, start=[0.3, 0.0], time_step=time_step)
+
+    name = f"{effect.name}.{effect.parameters[0].name}"
+    simulator = Pendulum(integrator="rk4", substeps=substeps)
+    found = swing(simulator.with_effects(effect), commands, {name: value}, 0.02)
+    fine = reached(effect.id, value, commands, 100)
+    expected = swing(Pendulum(integrator="rk4"), fine, {}, 0.02 / 100)[99::100]
+    assert (found - expected)[:, 0].abs().max() < 4e-5  # 7e-4 with the means alone
+
+
+def test_late_positions_are_read_along_a_parabola_and_velocities_along_a_line():
+    """Of a constant acceleration; before the delay has passed they are continued backwards."""
+    simulator = Emps(integrator="rk4").with_effects(SensorDelay("position,velocity"))
+    free = FREE | {"position,velocity.sensor_delay.delay": 0.0027}
+    push = replay(Emps(integrator="rk4"), FREE, [1.0] * 30)
+    acceleration = push[-1, 1] / (30 * Emps.time_step)
+    out = replay(simulator, free, [1.0] * 30, past_actions=torch.ones(1, 8, 1).double())
+    late = Emps.time_step * torch.arange(1, 31, dtype=torch.float64)
+    # What was read at the start is the state of then; the motion began by the delay earlier.
+    expected = torch.stack((0.5 * acceleration * late**2, acceleration * late), dim=-1)
+    torch.testing.assert_close(out, expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -24,15 +24,17 @@ def run_all_steps(
 
     Args:
         batch: A ``mujoco.batch.Batch`` of n simulations, in their initial states.
-        controls: What reaches the actuators, ``(n, steps, actuators)``.
+        controls: What reaches the actuators in each engine step of a control step, or in all of
+            them, ``(n, steps, substeps or 1, actuators)``.
         substeps: Engine steps per control step.
         sensors: What to report.
     """
     mujoco: Any = importlib.import_module("mujoco")
     module: Any = importlib.import_module("mujoco.batch")
     model, num_steps = batch.model, controls.shape[1]
-    if substeps > 1:
-        controls = np.repeat(controls, substeps, axis=1)
+    num, num_actuators = len(controls), controls.shape[-1]
+    controls = np.broadcast_to(controls, (num, num_steps, substeps, num_actuators))
+    controls = controls.reshape(num, num_steps * substeps, num_actuators)
     # Sensors of position and velocity describe the state before an engine step, so that theirs
     # after the last step takes another.
     if any(isinstance(s, Reading) and s.stage < ACCELERATION_STAGE for s in sensors):

@@ -180,17 +180,23 @@ class _Replay:
         first: int,
         last: int,
     ) -> NDArray[np.float64]:
-        """Returns what reaches the dynamics in every step, ``(n, steps, actions)``."""
-        controls = self.commands[self.rows[first:last]]
+        """Returns what reaches the dynamics, ``(n, steps, engine steps per step, actions)``.
+
+        One engine step stands for all of a step under constant actions.
+        """
+        controls = self.commands[self.rows[first:last], :, None]
         if not chain.action_effects:
             return controls
+        controls = np.repeat(controls, chain.substeps, axis=2)
         state = with_past_commands(chain, state, tables, records, self.past)
         for k in range(self.inputs.num_steps):
             commands = tuple(record.at(k) for record in records)
             views = tuple(record.view(k) for record in records)
-            state, actions = chain.act(state, commands, tables, views)
-            for channel, action in enumerate(actions):
-                controls[:, k, channel] = action.numpy()
+            state, actions, moments = chain.through(state, commands, tables, views)
+            means, _ = chain.by_substep(actions, moments, chain.substeps)
+            for part, present in enumerate(means):
+                for channel, action in enumerate(present):
+                    controls[:, k, part, channel] = action.numpy()
         return controls
 
     def _step_by_step(
@@ -203,8 +209,8 @@ class _Replay:
         """Runs one step after the other."""
         steps = []
         for k in range(self.inputs.num_steps):
-            actions = torch.from_numpy(controls[:, k]).unbind(-1)
-            state = chain.move(state, actions, tables)
+            actions = [part.unbind(-1) for part in torch.from_numpy(controls[:, k]).unbind(1)]
+            state = chain.follow(state, actions, tables)
             state, readings = chain.read(state, tables)
             steps.append(torch.stack(readings, dim=-1))
         return torch.stack(steps, dim=1)

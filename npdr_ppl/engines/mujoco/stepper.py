@@ -1,13 +1,14 @@
 """A batch of MuJoCo simulations, one control step at a time, with effects."""
 
 import importlib
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
+from npdr_ppl.engines.effect_chain import EffectChain, Moments, State, Tables
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.mujoco.batches import state_view
 from npdr_ppl.engines.mujoco.channels import Component, Reading
@@ -139,20 +140,38 @@ class MujocoStepper(EffectChain):
             tuple(self._read(c) for c in components if c.is_velocity),
         )
 
-    def move(self, state: State, actions: Components, tables: Tables) -> State:
-        """Advances all simulations by one control step under constant actions."""
-        self._command(actions)
-        if self.force_effects:
-            for k in range(self.substeps):
-                is_last = k == self.substeps - 1
-                state = self._move_once(state, tables, self._stage if is_last else 0)
-        else:
+    def move(
+        self, state: State, actions: Components, tables: Tables, moments: Moments = ()
+    ) -> State:
+        """Advances all simulations by one control step; see :meth:`EffectChain.move`."""
+        if not any(moment is not None for moment in moments):
+            return self.follow(state, [actions], tables)
+        return self.follow(state, self.by_substep(actions, moments, self.substeps)[0], tables)
+
+    def follow(self, state: State, actions: Sequence[Components], tables: Tables) -> State:
+        """Advances all simulations by one control step.
+
+        Args:
+            state: State at its start.
+            actions: What reaches the dynamics in each engine step, or in all of them.
+            tables: Constants of the simulation.
+        """
+        if len(actions) == 1 and not self.force_effects:
+            self._command(actions[0])
             self._guarded(self._batch.step, nstep=self.substeps, stage=self._stage)
+        else:
+            for k in range(self.substeps):
+                self._command(actions[k % len(actions)])
+                stage = self._stage if k == self.substeps - 1 else 0
+                state = self._move_once(state, tables, stage)
         positions, velocities = self.state()
         return state._replace(positions=positions, velocities=velocities)
 
     def _move_once(self, state: State, tables: Tables, stage: int) -> State:
         """Advances all simulations by one engine step under the force effects."""
+        if not self.force_effects:
+            self._guarded(self._batch.step, stage=stage)
+            return state
         positions, velocities = self.at_joints((), ())
         state = state._replace(positions=positions, velocities=velocities)
         if self._joints is not None:
