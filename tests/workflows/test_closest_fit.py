@@ -33,8 +33,7 @@ def model(inputs):
     )
 
 
-@pytest.fixture(scope="module")
-def rollouts():
+def record(noise):
     """Angles of a pendulum that passes its unstable equilibrium, by an adaptive integrator."""
     rng = np.random.default_rng(0)
     torque = 4.5 * np.sin(2 * math.pi * 0.013 * np.arange(400) + np.array([[0.0], [1.0]]))
@@ -50,7 +49,7 @@ def rollouts():
         for u in commands:
             state = solve_ivp(rate, (0, 0.02), state, args=(u,), rtol=1e-9, atol=1e-9).y[:, -1]
             angles.append(state[0])
-        readings.append(np.array(angles)[:, None] + NOISE * rng.standard_normal((401, 1)))
+        readings.append(np.array(angles)[:, None] + noise * rng.standard_normal((401, 1)))
     return Rollouts.from_arrays(
         readings=readings,
         actions=[commands[:, None] for commands in torque],
@@ -58,6 +57,11 @@ def rollouts():
         action_names=("torque",),
         time_step=0.02,
     )
+
+
+@pytest.fixture(scope="module")
+def rollouts():
+    return record(NOISE)
 
 
 def test_initial_states_that_are_fitted_leave_only_noise(rollouts):
@@ -88,8 +92,13 @@ def test_simulations_start_within_the_error(rollouts):
     assert not torch.equal(first, second)
 
 
-def test_the_score_is_as_sharp_as_fisher_information_allows(rollouts):
-    """In simulations at the fit its standard deviation is that of the score, and it is centred."""
+def test_the_score_is_as_sharp_as_fisher_information_allows():
+    """In simulations at the fit its standard deviation is that of the score, and it is centred.
+
+    With so little noise initial states two and three standard errors off are still where the
+    expansion is linear; with four times as much the standard deviation is 1.4.
+    """
+    rollouts = record(NOISE / 4)
     found = closest_fit(model, rollouts, UNCERTAIN)
     embedding = score_embedding(found)
     prepared = prepare(model, rollouts, UNCERTAIN)
@@ -97,9 +106,8 @@ def test_the_score_is_as_sharp_as_fisher_information_allows(rollouts):
     torch.manual_seed(1)
     features = bound.features(bound.prior.execute(found.fit.z.expand(400, -1)))
     score = torch.sinh(features)
-    # The standard error of a standard deviation is 3.5 %; initial states two and three standard
-    # errors off are no longer where the expansion is linear.
-    assert ((score.std(0) - 1).abs() < 0.35).all()
+    # The standard error of a standard deviation is 3.5 %.
+    assert ((score.std(0) - 1).abs() < 0.2).all()
     assert bound.observed_features().abs().max() < 0.5
 
 
