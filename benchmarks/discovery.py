@@ -28,7 +28,11 @@ from hidden_rigs import RIGS, Case, make_case, places
 from sparse_regression import sparse_choice
 
 import npdr_ppl as npdr
+from npdr_ppl.models.effects import candidate_effects
+from npdr_ppl.workflows.discovery.equivalents import irreducible
+from npdr_ppl.workflows.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
+from npdr_ppl.workflows.discovery.proof import prove
 from npdr_ppl.workflows.discovery.search import Searcher
 
 SEEDS = {"tune": range(100), "test": range(1000, 1100)}
@@ -113,6 +117,7 @@ def judge(task: Task) -> dict[str, Any]:
             "bic": bic_choice(found),
             "sparse": sparse_choice(found.search.rounds[0].hypothesis, case.fit).to_dict(),
             "gap": {name: gap.to_dict() for name, gap in found.gap.items()},
+            "true_model": true_model_errors(case, found),
             "seconds": found.seconds,
         }
     except Exception as error:  # a failure is a row with its message
@@ -201,14 +206,36 @@ def _catalogue(task: Task, case: Case) -> tuple[npdr.Effect, ...] | None:
     """Returns the effects to search, without the true one where it is to be missing."""
     if task.condition not in REMOVED:
         return None
-    from npdr_ppl.models.effects import candidate_effects
-    from npdr_ppl.workflows.discovery.equivalents import irreducible
-
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions())
     every = irreducible(candidate_effects(searcher.fit_base().simulator))
     gone = {name for names in (case.names, *case.alternatives) for name in names}
     ids = {name.rsplit(".", 1)[1] for name in case.names}
     return tuple(e for e in every if e.name not in gone and e.id not in ids)
+
+
+def true_model_errors(case: Case, found: npdr.Discovery) -> dict[str, float] | None:
+    """Returns the metrics of the true model on the held-out recording.
+
+    The model under test with the true effects and parameters: what a gap can close to. ``None``
+    where the catalogue has no such effect.
+    """
+    given = found.search.rounds[0].hypothesis
+    known = {effect.name: effect for effect in candidate_effects(given.simulator)}
+    if case.condition == "bad_data" or not known.keys() >= set(case.names):
+        return None
+    truth = {f"{h.name}.{n}": torch.tensor(v) for h in case.truth for n, v in h.parameters.items()}
+    truth |= {name: torch.tensor(value) for name, value in case.parameters.items()}
+    options = npdr.DiscoveryOptions()
+    true = fit_hypothesis(
+        given.model,
+        case.fit,
+        options.binding(case.fit),
+        effects=tuple(known[name] for name in case.names),
+        start={name: value.double() for name, value in truth.items()},
+        max_steps=0,
+    )
+    gap = prove(given, true, case.holdout, options.binding(case.holdout), seed=options.seed)
+    return {name: part.after for name, part in gap.items()}
 
 
 def bic_choice(found: npdr.Discovery) -> str | None:

@@ -47,8 +47,8 @@ NULLS = {
 
 NO_BASELINES = Baselines()
 
-VISIBLE_GAP = 1.2
-"""Held-out error in that of a perfect model from which a gap can be seen to close."""
+VISIBLE_GAP = 1.05
+"""Held-out error in that of the true model from which a gap can be seen to close."""
 
 
 def summary_lines(rows: Sequence[Row]) -> list[Line]:
@@ -197,11 +197,11 @@ def _gap_lines(rows: Sequence[Row]) -> list[Line]:
             )
         )
     own = [row for row in rows if _has_visible_gap(row)]
-    after = [_ratio(row, "after", "noise_floor") for row in own]
-    before = [_ratio(row, "before", "noise_floor") for row in own]
+    after = [row["gap"]["rmse"]["after"] / _true_error(row) for row in own]
+    before = [row["gap"]["rmse"]["before"] / _true_error(row) for row in own]
     lines.append(
         Line(
-            "held-out error in that of a perfect model, median",
+            "held-out error in that of the true model, median",
             len(own),
             float(np.median(after)) if own else math.nan,
             bootstrap(after, 50.0),
@@ -213,15 +213,29 @@ def _gap_lines(rows: Sequence[Row]) -> list[Line]:
 
 
 def gap_closed(rows: Iterable[Row]) -> list[float]:
-    """Returns the shares of the held-out gaps that were closed, of gaps that can be seen."""
-    return [row["gap"]["rmse"]["closed"] for row in rows if _has_visible_gap(row)]
+    """Returns the shares of the held-out gaps that were closed, of gaps that can be seen.
+
+    A gap is what the given model's error is above that of the true model, with the true effects
+    and parameters: what is left of the latter is due to the readings and the initial states.
+    """
+    return [
+        (row["gap"]["rmse"]["before"] - row["gap"]["rmse"]["after"])
+        / (row["gap"]["rmse"]["before"] - _true_error(row))
+        for row in rows
+        if _has_visible_gap(row)
+    ]
 
 
 def _has_visible_gap(row: Row) -> bool:
     if row["condition"] not in ("one", "two") or not row["d"] >= STRONG or not row.get("gap"):
         return False
-    gap = row["gap"]["rmse"]
-    return gap["closed"] is not None and gap["before"] > VISIBLE_GAP * gap["noise_floor"]
+    if row.get("true_model") is None:
+        return False
+    return row["gap"]["rmse"]["before"] > VISIBLE_GAP * _true_error(row)
+
+
+def _true_error(row: Row) -> float:
+    return row["true_model"]["rmse"]
 
 
 def _ratio(row: Row, one: str, other: str) -> float:

@@ -39,6 +39,7 @@ def row(condition="one", truth=("hinge.bias",), found=(), verdict="none", d=10.0
         "bic": None,
         "sparse": {"first": None, "terms": {}, "left_out": ""},
         "gap": {"rmse": rmse},
+        "true_model": {"rmse": 1.0},
         "d": d,
         "cpu": 10.0,
         "seconds": {"fit": 1.0, "check data": 2.0, "screen": 3.0, "search": 4.0},
@@ -137,22 +138,23 @@ def test_what_has_no_name_is_unknown_or_has_an_impostor():
 
 
 def test_gaps_within_the_noise_and_weak_effects_do_not_count():
-    def gap(closed, before=3.0):
-        rmse = {"before": before, "after": 1.2, "noise_floor": 1.0, "closed": closed}
-        return {"rmse": rmse}
+    def gap(after, before=3.0):
+        # What a model without error would have counts for nothing: the true model's has been seen.
+        return {"rmse": {"before": before, "after": after, "noise_floor": 0.5, "closed": 0.5}}
 
-    rows = [row(gap=gap(k / 10)) for k in range(11)]
+    rows = [row(gap=gap(3.0 - k / 5)) for k in range(11)]
     rows += [
-        row(gap=gap(-5.0, before=1.1)),
-        row(gap=gap(-5.0), d=5.0),
+        row(gap=gap(9.0, before=1.04)),
+        row(gap=gap(9.0), d=5.0),
+        row(gap=gap(9.0), true_model=None),
         row("null", (), d=math.nan),
     ]
-    assert gap_closed(rows) == [k / 10 for k in range(11)]
+    assert gap_closed(rows) == pytest.approx([k / 10 for k in range(11)])
     table = lines(rows)
     assert table["held-out gap closed, d ≥ 10: median"].value == pytest.approx(0.5)
     assert table["held-out gap closed, d ≥ 10: 10th percentile"].value == pytest.approx(0.1)
-    error = table["held-out error in that of a perfect model, median"]
-    assert (error.value, error.baselines.refit) == (pytest.approx(1.2), "3")
+    error = table["held-out error in that of the true model, median"]
+    assert (error.value, error.baselines.refit) == (pytest.approx(2.0), "3")
 
 
 def test_parameters_are_judged_by_90_percent_intervals():
