@@ -332,11 +332,19 @@ def _steps(
     must not hold up the others: of the offsets tried at the same parameters every segment keeps
     its best.
 
+    Args:
+        segments: The model and the recording.
+        z: Where to begin, ``(d,)``.
+        offsets: Offsets of the initial states to begin with, ``(S, m)``.
+        scale: Scale of what is left there, ``(C,)``.
+        max_steps: Greatest number of steps.
+        is_rough: Whether steps are rough.
+
     Returns:
         Parameters, offsets and the scale of what is left.
     """
     damping, dampings = FIRST_DAMPING, torch.full((len(offsets),), FIRST_DAMPING).double()
-    factors = NEAR
+    factors, present_scale = NEAR, scale
     for _ in range(max_steps):
         now = segments.linearise(z, offsets, scale, is_rough=is_rough)
         parts = (now.residual, now.by_parameters, now.by_starts)
@@ -358,9 +366,10 @@ def _steps(
             z, offsets = tried[best], begun[best][place, every]
             damping = min(max(damping * factors[best], LIMITS[0]), LIMITS[1])
             dampings = (dampings * torch.tensor(factors).double()[place]).clamp(*LIMITS)
+            left = squares[best][place, every].sum(0) / segments.inputs.mask.sum()
+            present_scale = (scale * left.sqrt()).clamp_min(LEAST_SCALE)
             if is_rough:
-                left = squares[best][place, every].sum(0) / segments.inputs.mask.sum()
-                before, scale = scale, (scale * left.sqrt()).clamp_min(LEAST_SCALE)
+                before, scale = scale, present_scale
                 is_little = is_little and bool((scale > SETTLED * before).all())
         if not is_little:
             factors = NEAR
@@ -368,7 +377,7 @@ def _steps(
             break
         else:
             factors = FAR
-    return z, offsets, scale if is_rough else segments.scale_of(z, offsets)
+    return z, offsets, present_scale
 
 
 def _squares(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:

@@ -52,17 +52,28 @@ class LargestStatistic:
         self._projection = projection
         residual = projection.weighted_residual
         num = len(residual)
-        self._width = 2 if num >= 2 * FEWEST_BLOCKS else 1
-        self._num = num - num % self._width
-        square = residual[: self._num].square().mean(-1)
-        self._spread = (0.5 * (square + square.mean())).sqrt().clamp_min(1e-30)
-        self._standard = residual[: self._num] / self._spread[:, None]
-        blocks = self._num // self._width
+        width = 2 if num >= 2 * FEWEST_BLOCKS else 1
+        num_used = num - num % width
+        square = residual[:num_used].square().mean(-1)
+        spread = (0.5 * (square + square.mean())).sqrt().clamp_min(1e-30)
+        standard = residual[:num_used] / spread[:, None]
+        blocks = num_used // width
         generator = torch.Generator().manual_seed(seed)
         order = torch.rand(draws, blocks, generator=generator).argsort(-1)
         signs = torch.randint(0, 2, (draws, blocks), generator=generator).double() * 2.0 - 1.0
         order[0], signs[0] = torch.arange(blocks), 1.0
-        self._order, self._signs = order, signs
+        # The entry of every block and what it is dealt, (draws, blocks · blocks).
+        entries = torch.arange(blocks) * blocks + order
+        places = torch.stack((torch.arange(draws).repeat_interleave(blocks), entries.flatten()))
+        shape = draws, blocks * blocks
+        self._deals = torch.sparse_coo_tensor(
+            places, signs.flatten(), shape, check_invariants=True
+        ).coalesce()
+        self._dealt: list[tuple[slice, Tensor, Tensor]] = []
+        for k in range(width):
+            own = slice(k, num_used, width)
+            dealt = (spread[own, None, None] * standard[own].mT, own)
+            self._dealt.append((own, projection.solve(*dealt), projection.explained(*dealt)))
 
     def p_values(self, groups: Sequence[Tensor]) -> list[float]:
         """Returns each candidate's p-value among all of them.
@@ -71,7 +82,7 @@ class LargestStatistic:
             groups: Changes of each candidate, ``(S, N, k)``.
         """
         rows: list[Tensor] = []
-        limit = max(1, MOST_NUMBERS // (self._num * self._num))
+        limit = max(1, MOST_NUMBERS // self._deals.shape[1])
         waiting: list[Tensor] = []
         for group in groups:
             if waiting and sum(g.shape[-1] for g in waiting) + group.shape[-1] > limit:
@@ -87,28 +98,21 @@ class LargestStatistic:
 
     def _statistics(self, groups: list[Tensor]) -> list[Tensor]:
         """Returns minus the log tail of each candidate's statistic in every deal, ``(draws,)``."""
-        weights = self._projection.weights_of(torch.cat(groups, dim=-1))[: self._num]
-        weights = weights * self._spread[:, None, None]
-        blocks = self._num // self._width
-        # What block b would score with the residuals of block b', (blocks, blocks, P).
-        table = torch.zeros(blocks, blocks, weights.shape[-1], dtype=torch.float64)
-        for k in range(self._width):
-            own, dealt = weights[k :: self._width], self._standard[k :: self._width]
-            table += (own.mT @ dealt.mT).transpose(-1, -2)
-        flat = table.flatten(0, 1)
-        rows = torch.arange(blocks) * blocks
-        sums = torch.stack(
-            [
-                (flat[rows + order] * sign[:, None]).sum(0)
-                for order, sign in zip(self._order, self._signs, strict=True)
-            ]
+        columns = torch.cat(groups, dim=-1)
+        refit = self._projection.refit(columns)
+        # What block b would score with the residuals of block b', (blocks, blocks', P).
+        table = sum(
+            weighted.mT @ columns[own] - explained.mT @ refit
+            for own, weighted, explained in self._dealt
         )
+        assert isinstance(table, Tensor)
+        sums = torch.sparse.mm(self._deals, table.flatten(0, 1))
         result, start = [], 0
         for group in groups:
             own = slice(start, start + group.shape[-1])
             start = own.stop
             terms = table[..., own].flatten(0, 1)
-            covariance = terms.mT @ terms / blocks
+            covariance = terms.mT @ terms / len(table)
             scale = covariance.diagonal().clamp_min(1e-300).sqrt()
             inverse = torch.linalg.pinv(covariance / scale / scale[:, None], hermitian=True)
             unit = sums[:, own] / scale

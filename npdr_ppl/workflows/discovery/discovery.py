@@ -21,7 +21,8 @@ from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.proof import Gap, prove
 from npdr_ppl.workflows.discovery.residual_map import Spot, worst_windows
 from npdr_ppl.workflows.discovery.result import Discovery, Finding, Verdict
-from npdr_ppl.workflows.discovery.search import Added, Round, Search, Searcher, explained
+from npdr_ppl.workflows.discovery.rivals import Added
+from npdr_ppl.workflows.discovery.search import Round, Search, Searcher, explained
 from npdr_ppl.workflows.discovery.separation import separation_matrix
 from npdr_ppl.workflows.segment_fit import SegmentModel
 

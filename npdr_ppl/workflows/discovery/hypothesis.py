@@ -65,6 +65,12 @@ class Hypothesis:
         return self.segments.simulator
 
     @cached_property
+    def difference(self) -> Tensor:
+        """What was measured less what is simulated at the fit, ``(S, K, C)``."""
+        simulated = self.segments.simulate(self.fit.z[None], self.fit.offsets[None])[0]
+        return self.segments.observed - simulated
+
+    @cached_property
     def linearisation(self) -> Linearisation:
         """Residuals and derivatives at the fit, whitened by its own scale."""
         return self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
@@ -78,7 +84,7 @@ class Hypothesis:
     @cached_property
     def share(self) -> float:
         """Share of the readings that are worth an independent one."""
-        residual = self.linearisation.residual
+        residual = self.segments.whitened(self.difference, self.fit.scale)
         mask = self.segments.inputs.mask
         return float(
             effective_share(residual.unflatten(-1, (-1, len(self.fit.scale))), mask).mean()
@@ -90,7 +96,7 @@ class Hypothesis:
         Args:
             scale: Standard deviation of the readings per channel, ``(C,)``.
         """
-        residual = self.segments.residuals(self.fit.z[None], self.fit.offsets[None], scale)[0]
+        residual = self.segments.whitened(self.difference, scale)
         return 0.5 * (residual.square().sum(-1) + self.fit.offsets.square().sum(-1))
 
     def at_edge(self, effect: Effect) -> tuple[str, ...]:

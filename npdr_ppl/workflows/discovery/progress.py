@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
-from npdr_ppl.workflows.discovery.search import SHORTLIST
+from npdr_ppl.workflows.discovery.trials import SHORTLIST
 from npdr_ppl.workflows.progress import Reporter, reporter
 
 __all__ = ["sentences"]

@@ -64,6 +64,7 @@ class Projection:
     def __init__(self, hypothesis: Hypothesis, keep: Tensor | None = None) -> None:
         now = hypothesis.linearisation
         by_z = now.by_parameters if keep is None else now.by_parameters[..., keep]
+        self.hypothesis = hypothesis
         self._starts = now.by_starts
         eye = torch.eye(now.by_starts.shape[-1], dtype=torch.float64)
         self._inner = eye + now.by_starts.mT @ now.by_starts
@@ -81,14 +82,18 @@ class Projection:
         """C⁻¹ r: the residuals with every initial state at its best, ``(S, N)``."""
         return self._weighted
 
-    def weights_of(self, columns: Tensor) -> Tensor:
-        """Returns what residuals are multiplied by for the scores of columns, ``(S, N, P)``.
+    def refit(self, columns: Tensor) -> Tensor:
+        """Returns how the parameters answer to columns ``(S, N, P)``, ``(d, P)``."""
+        return torch.linalg.solve(self._information, self.explained(columns).sum(0))
 
-        C⁻¹ x with the parameters' span taken out.
+    def explained(self, columns: Tensor, segments: slice = slice(None)) -> Tensor:
+        """Returns the parameters' scores with columns for residuals, ``(S, d, P)``.
+
+        Args:
+            columns: The columns, ``(S, N, P)``.
+            segments: Of which segments they are.
         """
-        cross = (self._weights.mT @ columns).sum(0)
-        refit = torch.linalg.solve(self._information, cross)
-        return self.solve(columns) - self._weights @ refit
+        return self._weights[segments].mT @ columns
 
     @property
     def parameter_scores(self) -> Tensor:
@@ -105,10 +110,15 @@ class Projection:
         """Information of the parameters with their prior, ``(d, d)``."""
         return self._information
 
-    def solve(self, columns: Tensor) -> Tensor:
-        """Returns C⁻¹ x, ``(S, N, P)``."""
-        inner = torch.linalg.solve(self._inner, self._starts.mT @ columns)
-        return columns - self._starts @ inner
+    def solve(self, columns: Tensor, segments: slice = slice(None)) -> Tensor:
+        """Returns C⁻¹ x, ``(S, N, P)``.
+
+        Args:
+            columns: The columns x, ``(S, N, P)``.
+            segments: Of which segments they are.
+        """
+        starts = self._starts[segments]
+        return columns - starts @ torch.linalg.solve(self._inner[segments], starts.mT @ columns)
 
     @cached_property
     def misfit(self) -> float:
@@ -118,7 +128,7 @@ class Projection:
     def scores(self, columns: Tensor) -> Scores:
         """Returns the scores of columns, ``(S, N, P)``."""
         weighted = self.solve(columns)
-        cross = (self._weights.mT @ columns).sum(0)  # (d, P)
+        cross = self.explained(columns).sum(0)  # (d, P)
         refit = torch.linalg.solve(self._information, cross)
         own = (columns.mT @ weighted).sum(0)
         by_segment = (columns.mT @ self._weighted[..., None])[..., 0] - self._score @ refit

@@ -8,16 +8,18 @@ values, and effects that are not smooth in their strength at several sizes.
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from npdr_ppl.engines.pooled import PooledSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 
 __all__ = ["Variant", "sensitivities"]
@@ -36,6 +38,10 @@ SHAPE_QUANTILES = (0.5, 0.15, 0.85)
 
 MOST_SHAPES = 7
 """Shapes tried of one effect."""
+
+
+MOST_TOGETHER = 10_000
+"""Segments simulated together: beyond, their states outgrow a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -89,58 +95,139 @@ def sensitivities(
     segments, fit = hypothesis.segments, hypothesis.fit
     box = segments.black_box(fit.z[None])
     base = segments.run(box.simulator, box.parameters, fit.offsets[None])[0]
-    result = []
+    probes = []
     for effect in effects:
-        port = box.simulator.port(effect.port)
-        priors = effect.priors(port)
-        probe = effect.probe(port)
-        strengths = effect.strength or tuple(p.name for p in effect.parameters)
-        resting = {p.name: p.nominal for p in effect.parameters}
-        if effect.port in segments.inputs.action_names:
-            probe = _within_reach(effect, probe, segments.inputs)
         try:
-            changed = box.simulator.with_effects(effect)
+            box.simulator.with_effects(effect)
         except ModelError:
             continue
-        shapes = _shapes(effect, priors, strengths)
-        if effect.name in (hints or {}):
-            shapes.append({**shapes[0], **(hints or {})[effect.name]})
-        sizes = SIZES if _needs_size(effect, strengths) else (SMALL,)
-        cases = list(itertools.product(shapes, sizes))
-        nominal = torch.tensor([_resting(resting[n], probe[n]) for n in strengths]).double()
-        # One simulation per shape, size and strength, the other strengths resting.
-        runs = [
-            _switched_on({**probe, **shape}, size, on, nominal[k], resting, strengths)
-            for shape, size in cases
-            for k, on in enumerate(strengths)
-        ]
-        batch = {
-            f"{effect.name}.{name}": torch.tensor([run[name] for run in runs], dtype=torch.float64)
-            for name in runs[0]
-        }
-        starts = fit.offsets[None].expand(len(runs), -1, -1)
-        moved = segments.run(changed, {**box.parameters, **batch}, starts)
+        probes.append(
+            _probe(effect, segments.inputs, box.simulator, (hints or {}).get(effect.name))
+        )
+    result = []
+    for group in _groups(probes, box.simulator, segments.inputs.num_segments):
+        changed = box.simulator.with_effects(*(probe.effect for probe in group))
+        starts = fit.offsets[None].expand(sum(len(probe.runs) for probe in group), -1, -1)
+        moved = segments.run(changed, {**box.parameters, **_side_by_side(group)}, starts)
         differences = segments.whitened(moved - base, fit.scale)
-        for (shape, size), part in zip(cases, differences.split(len(strengths)), strict=True):
-            difference = part / size
-            if not bool(difference.isfinite().all()) or float(difference.abs().max()) == 0.0:
-                continue
-            values = {**probe, **shape}
-            full = torch.tensor([values[n] for n in strengths], dtype=torch.float64)
-            lower, upper, deviation = _limits(priors, strengths, nominal, full)
-            result.append(
-                Variant(
-                    effect,
-                    values,
-                    strengths,
-                    nominal,
-                    lower,
-                    upper,
-                    deviation,
-                    difference.permute(1, 2, 0),
-                    effect.name in (hints or {}) and shape is shapes[-1],
-                )
+        for probe, rows in zip(
+            group, differences.split([len(probe.runs) for probe in group]), strict=True
+        ):
+            result += _variants(probe, rows)
+    return result
+
+
+@dataclass(frozen=True)
+class _Probe:
+    """An effect to be switched on, in several shapes and sizes.
+
+    Attributes:
+        effect: The effect.
+        priors: Its priors, by parameter.
+        cases: Values of its parameters at size one, whether they are hinted, and the size.
+        strengths: Names of the parameters that scale it.
+        nominal: Their values at zero strength, or where a limit rests.
+        runs: Parameters of each simulation: one per case and strength, the others resting.
+    """
+
+    effect: Effect
+    priors: Mapping[str, Distribution]
+    cases: list[tuple[dict[str, float], bool, float]]
+    strengths: tuple[str, ...]
+    nominal: Tensor
+    runs: list[dict[str, float]]
+
+
+def _probe(
+    effect: Effect, inputs: Inputs, simulator: Simulator, hint: Mapping[str, float] | None
+) -> _Probe:
+    port = simulator.port(effect.port)
+    priors = effect.priors(port)
+    probe = effect.probe(port)
+    strengths = effect.strength or tuple(p.name for p in effect.parameters)
+    resting = {p.name: p.nominal for p in effect.parameters}
+    if effect.port in inputs.action_names:
+        probe = _within_reach(effect, probe, inputs)
+    shapes = [(shape, False) for shape in _shapes(effect, priors, strengths)]
+    if hint:
+        shapes.append(({**shapes[0][0], **hint}, True))
+    sizes = SIZES if _needs_size(effect, strengths) else (SMALL,)
+    cases = [
+        ({**probe, **shape}, is_hinted, size)
+        for (shape, is_hinted), size in itertools.product(shapes, sizes)
+    ]
+    nominal = torch.tensor([_resting(resting[n], probe[n]) for n in strengths]).double()
+    runs = [
+        _switched_on(values, size, on, nominal[k], resting, strengths)
+        for values, _, size in cases
+        for k, on in enumerate(strengths)
+    ]
+    return _Probe(effect, priors, cases, strengths, nominal, runs)
+
+
+def _groups(
+    probes: list[_Probe], simulator: Simulator, num_segments: int
+) -> Iterator[list[_Probe]]:
+    """Yields effects of one kind that are simulated together, each alone in rows of its own.
+
+    An effect at zero strength changes nothing, and a step of many simulations costs little more
+    than one of a few. Where each simulation is a call of an engine, effects stay apart.
+    """
+    together = 1 if isinstance(simulator, PooledSimulator) else MOST_TOGETHER
+    kinds: dict[object, list[_Probe]] = {}
+    for probe in probes:
+        effect = probe.effect
+        kind = (simulator.port(effect.port).kind, getattr(effect, "needs_joint", False))
+        kinds.setdefault(kind, []).append(probe)
+    for members in kinds.values():
+        group: list[_Probe] = []
+        for probe in members:
+            size = num_segments * sum(len(p.runs) for p in (*group, probe))
+            if group and size > together:
+                yield group
+                group = []
+            group.append(probe)
+        yield group
+
+
+def _side_by_side(group: list[_Probe]) -> dict[str, Tensor]:
+    """Returns the parameters of all effects of a group in the rows of each."""
+    result = {}
+    for probe in group:
+        resting = {p.name: p.nominal for p in probe.effect.parameters}
+        rows = [run if p is probe else resting for p in group for run in p.runs]
+        result |= {
+            f"{probe.effect.name}.{name}": torch.tensor([row[name] for row in rows]).double()
+            for name in resting
+        }
+    return result
+
+
+def _variants(probe: _Probe, rows: Tensor) -> list[Variant]:
+    """Returns what an effect changes, of what its runs changed in the whitened readings."""
+    strengths, nominal = probe.strengths, probe.nominal
+    result = []
+    parts = rows.split(len(strengths))
+    for (values, is_hinted, size), part in zip(probe.cases, parts, strict=True):
+        difference = part / size
+        if not bool(difference.isfinite().all()) or float(difference.abs().max()) == 0.0:
+            continue
+        full = torch.tensor([values[n] for n in strengths], dtype=torch.float64)
+        lower, upper, deviation = _limits(probe.priors, strengths, nominal, full)
+        change = difference.permute(1, 2, 0)
+        result.append(
+            Variant(
+                probe.effect,
+                values,
+                strengths,
+                nominal,
+                lower,
+                upper,
+                deviation,
+                change,
+                is_hinted,
             )
+        )
     return result
 
 

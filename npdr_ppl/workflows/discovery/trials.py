@@ -1,0 +1,207 @@
+"""Trials: the model in question with one set of effects or another, fitted to the recording."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from torch import Tensor
+
+from npdr_ppl.errors import NpdrError
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.simulator import Simulator
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.discovery.evidence import closest
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
+from npdr_ppl.workflows.discovery.screening import Screened
+from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_side
+
+__all__ = ["PLAINLY", "SHORTLIST", "Trials"]
+
+SHORTLIST = 6
+"""Candidates fitted in full in each round."""
+
+MAX_STEPS = 12
+"""Steps of a fit."""
+
+TRIAL_STEPS = 6
+"""Steps of a fit that shows whether a candidate is worth a longer one."""
+
+CONTENDERS = 3
+"""Candidates that are fitted to the end."""
+
+CONTENDS = 0.3
+"""A candidate contends whose loss is at most this much above the least, relatively …"""
+
+CONTENDS_ANYWAY = 20.0
+"""… or this much, absolutely."""
+
+
+TOGETHER = 2
+"""Candidates that are tried before it is asked whether others are worth it."""
+
+GROWTH = 4.0
+"""How much more a candidate may explain than its linear gain says, beside that of the best: on
+rigs for tuning 3.4 at most where it explains a tenth or more."""
+
+PLAINLY = 30.0
+"""Evidence that settles which of two it is."""
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A fit to be made.
+
+    Attributes:
+        effects: The effects that the model is to have.
+        start: Parameters to begin with, by site.
+        offsets: Offsets of the initial states to begin with, ``(S, m)``.
+        is_trial: Whether rough steps will do.
+    """
+
+    effects: tuple[Effect, ...]
+    start: Mapping[str, Tensor]
+    offsets: Tensor
+    is_trial: bool = False
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Fits a model with effects.
+
+    Attributes:
+        model: The model in question.
+        rollouts: The recording.
+        binding: Its segments.
+    """
+
+    model: Model
+    rollouts: Rollouts
+    binding: BindingOptions
+
+    def extended(
+        self,
+        current: Hypothesis,
+        ranking: Sequence[Screened],
+        report: Callable[[str], None] = lambda _: None,
+    ) -> dict[str, Hypothesis]:
+        """Returns a hypothesis with each of the shortlist, fitted from where its linear gain is.
+
+        In turn, and not those that by their linear gain are too far behind what has been found.
+        Candidates that cannot be simulated are left out.
+
+        Args:
+            current: The hypothesis.
+            ranking: The candidates, the best first.
+            report: Called with a sentence about each.
+        """
+        trials: dict[str, Hypothesis] = {}
+        waiting = list(ranking[:SHORTLIST])
+        while waiting:
+            tried, waiting = waiting[:TOGETHER], waiting[TOGETHER:]
+            asked = [
+                _Fit(
+                    (*current.effects, candidate.variant.effect),
+                    current.parameters | candidate.variant.parameters(candidate.sizes),
+                    current.fit.offsets,
+                    is_trial=True,
+                )
+                for candidate in tried
+            ]
+            for candidate, found in zip(tried, self._fits(asked, current.simulator), strict=True):
+                if found is not None:
+                    trials[candidate.name] = found
+                    report(f"tried {candidate.name}: {_shown(found)}")
+            if trials:
+                far = _far_behind(current, closest(list(trials.values())))
+                waiting = [c for c in waiting if c.gain * GROWTH > far * ranking[0].gain]
+        return trials
+
+    def converged(
+        self, trials: dict[str, Hypothesis], *, done: str | None = None
+    ) -> dict[str, Hypothesis]:
+        """Fits the contenders to the end; the others are too far behind for that to matter.
+
+        Args:
+            trials: The model with each of several effects.
+            done: The one that is at its end already.
+        """
+        scale = closest(list(trials.values())).fit.scale
+        losses = {name: float(trial.losses(scale).sum()) for name, trial in trials.items()}
+        least = min(losses.values())
+        contenders = [
+            name
+            for name in sorted(losses, key=lambda name: losses[name])[:CONTENDERS]
+            if name != done and losses[name] <= least + max(CONTENDS_ANYWAY, CONTENDS * abs(least))
+        ]
+        asked = [
+            _Fit(trial.effects, trial.parameters, trial.fit.offsets)
+            for trial in (trials[name] for name in contenders)
+        ]
+        result = dict(trials)
+        fits = self._fits(asked, next(iter(trials.values())).simulator)
+        for name, longer in zip(contenders, fits, strict=True):
+            result[name] = longer or trials[name]
+        return result
+
+    def refitted(
+        self, current: Hypothesis, effects: tuple[Effect, ...] | None = None
+    ) -> Hypothesis | None:
+        """Returns the model with effects, fitted from where a hypothesis is.
+
+        Args:
+            current: The hypothesis.
+            effects: The effects, its own by default.
+
+        Returns:
+            ``None`` if the model cannot be simulated with them.
+        """
+        chosen = current.effects if effects is None else effects
+        kept = {name for effect in chosen for name in effect.parameter_names}
+        gone = {name for effect in current.effects for name in effect.parameter_names} - kept
+        start = {name: value for name, value in current.parameters.items() if name not in gone}
+        (found,) = self._fits([_Fit(chosen, start, current.fit.offsets)], current.simulator)
+        return found
+
+    def without(self, current: Hypothesis, effect: Effect) -> Hypothesis | None:
+        """Returns a hypothesis without one of its effects, see :meth:`refitted`."""
+        return self.refitted(current, tuple(e for e in current.effects if e.name != effect.name))
+
+    def _fits(self, asked: Sequence[_Fit], simulator: Simulator) -> Iterator[Hypothesis | None]:
+        """Yields the model with the effects of each fit, ``None`` where it cannot be simulated."""
+        return side_by_side(partial(_fitted, self), asked, num_processes(simulator))
+
+
+def _fitted(trials: Trials, asked: _Fit) -> Hypothesis | None:
+    """Returns a fitted model; ``None`` if it cannot be simulated."""
+    try:
+        found = fit_hypothesis(
+            trials.model,
+            trials.rollouts,
+            trials.binding,
+            effects=asked.effects,
+            start=asked.start,
+            offsets=asked.offsets,
+            max_steps=TRIAL_STEPS if asked.is_trial else MAX_STEPS,
+            is_rough=asked.is_trial,
+        )
+    except NpdrError:
+        return None
+    _ = found.difference  # travels with it, computed side by side
+    return found
+
+
+def _far_behind(current: Hypothesis, best: Hypothesis) -> float:
+    """Returns the share of what the best trial explains below which no other is a match for it."""
+    scale = best.fit.scale
+    explained = best.share * float((current.losses(scale) - best.losses(scale)).sum())
+    return 1.0 - PLAINLY / max(explained, PLAINLY)
+
+
+def _shown(hypothesis: Hypothesis) -> str:
+    return ", ".join(
+        f"{name} {scale:.3g}"
+        for name, scale in zip(
+            hypothesis.segments.channel_names, hypothesis.fit.scale.tolist(), strict=True
+        )
+    )
