@@ -52,11 +52,11 @@ class Rivals:
 
     Attributes:
         without: The model without the effect.
-        trials: The model with each that could stand there, the effect among them, by name.
+        others: The model with each other that could stand there, by name.
     """
 
     without: Hypothesis
-    trials: dict[str, Hypothesis]
+    others: dict[str, Hypothesis]
 
 
 def find_rivals(
@@ -83,7 +83,8 @@ def find_rivals(
     projection = Projection(without)
     ranking = screen(projection, variants_of(candidates, projection, responses(without)))
     tried = {effect.name: current} | trials.extended(without, ranking)
-    return Rivals(without, trials.converged(tried, done=effect.name))
+    tried = trials.converged(tried, done=effect.name)
+    return Rivals(without, {name: h for name, h in tried.items() if name != effect.name})
 
 
 def tried_before(
@@ -101,7 +102,8 @@ def tried_before(
     rest = set(current.names) - {effect.name}
     for hypothesis, tried in seen:
         if set(hypothesis.names) == rest and effect.name in tried:
-            return Rivals(hypothesis, {**tried, effect.name: current})
+            others = {name: trial for name, trial in tried.items() if name != effect.name}
+            return Rivals(hypothesis, others)
     return None
 
 
@@ -121,7 +123,7 @@ def weigh_rivals(
     """
     if rivals is None:
         return current, Added(effect, effect.name, 1.0, {effect.name: 1.0})
-    without, trials = rivals.without, rivals.trials
+    without, trials = rivals.without, {effect.name: current} | rivals.others
     prior = [
         log_prior(trial) - strain
         for trial, strain in zip(trials.values(), _strains(trials, without), strict=True)

@@ -261,7 +261,7 @@ class Searcher:
                 probability = found.alternatives[effect.name]
                 self._report(f"{effect.name}: probability {probability:.2f}")
                 added.append(found)
-                tried = {} if rivals is None else rivals.trials
+                tried = {effect.name: asked} | ({} if rivals is None else rivals.others)
                 trials |= {(effect.name, name): trial for name, trial in tried.items()}
                 if current is not asked:
                     break  # the rivals of the others are to be found beside what was swapped in

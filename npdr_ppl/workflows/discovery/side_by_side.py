@@ -1,7 +1,8 @@
 """Independent pieces of a search, in as many processes as there are workers."""
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import TypeVar, cast
 
 from npdr_ppl.engines.pooled import PooledSimulator
@@ -41,11 +42,19 @@ def side_by_side(
         from joblib import Parallel, delayed
 
         parallel = Parallel(number, backend="loky", return_as="generator", max_nbytes=None)
+        results = cast(
+            Generator[Result, None, None], parallel(delayed(function)(item) for item in items)
+        )
         try:
-            for result in parallel(delayed(function)(item) for item in items):
-                yield cast(Result, result)
+            for result in results:
+                yield result
                 done += 1
         except NpdrError:
+            raise
+        except GeneratorExit:
+            # Who has seen enough knows that the rest is given up.
+            with warnings.catch_warnings(action="ignore", category=UserWarning):
+                results.close()
             raise
         except Exception as error:
             # A process was killed, or something cannot travel, such as a handle of an engine.
