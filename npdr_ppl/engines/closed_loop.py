@@ -12,6 +12,7 @@ from npdr_ppl.engines.compilation import (
     is_worthwhile,
     mark_sizes_dynamic,
     signature,
+    steps_per_call,
     with_fallback,
 )
 from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
@@ -23,10 +24,6 @@ if TYPE_CHECKING:
     from npdr_ppl.engines.ode import ODESimulator
 
 __all__ = ["LoopBody", "begin", "roll_out", "run_eagerly"]
-
-# Steps per call of a compiled kernel: the call's overhead is spread over them, while compilation
-# time grows with them.
-_STEPS_PER_CALL = 10
 
 # Simulations that a compiled kernel advances through the whole episode before the next block, so
 # that memory stays bounded. Measured: larger is faster up to here, because calls cost 50 µs each.
@@ -48,13 +45,24 @@ class _Loop(NamedTuple):
 
 
 class LoopBody:
-    """The loop's body; everything in it is fixed before the first step."""
+    """The loop's body; everything in it is fixed before the first step.
+
+    Args:
+        stepper: Advances the state.
+        policy: What acts.
+        reward: Reward of a step, if any.
+        steps_per_call: Steps of :meth:`run`.
+    """
 
     def __init__(
-        self, stepper: EffectChain, policy: FeedbackPolicy, reward: Reward | None
+        self,
+        stepper: EffectChain,
+        policy: FeedbackPolicy,
+        reward: Reward | None,
+        steps_per_call: int = 1,
     ) -> None:
         simulator = stepper.simulator
-        self.stepper = stepper
+        self.stepper, self.steps_per_call = stepper, steps_per_call
         # Without its parameters and their defaults, so that a compiled body cannot hold on to some
         # by mistake.
         self.policy = copy.copy(policy)
@@ -70,7 +78,8 @@ class LoopBody:
     @property
     def signature(self) -> Any:
         """Equal for bodies that compile to the same code."""
-        return "roll_out", self.stepper.signature, signature(self.policy), signature(self.reward)
+        parts = signature(self.policy), signature(self.reward), self.steps_per_call
+        return "roll_out", self.stepper.signature, *parts
 
     def step(
         self, loop: _Loop, tables: Tables, policy_constants: Any, time: Tensor | float
@@ -105,8 +114,8 @@ class LoopBody:
         return _Loop(state, readings, memory, is_running, total, length), commands
 
     def run(self, loop: _Loop, tables: Tables, policy_constants: Any, start: Tensor) -> _Loop:
-        """Advances the loop by a fixed number of steps from a time in seconds."""
-        for step in range(_STEPS_PER_CALL):
+        """Advances the loop by ``steps_per_call`` steps from a time in seconds."""
+        for step in range(self.steps_per_call):
             time = start + step * self.stepper.time_step
             loop, _ = self.step(loop, tables, policy_constants, time)
         return self.without_repetition(loop)
@@ -130,20 +139,20 @@ def roll_out(simulator: "ODESimulator", request: EpisodeRequest) -> Episodes:
     device = initial_states.device
     policy, domain, shape = request.batch(simulator, dtype, device)
     mode = request.compile or simulator.compile
-    is_compiled = not request.record and is_worthwhile(
-        mode,
-        device,
-        num_steps=num_steps,
-        batch_size=shape.numel(),
-        expected_calls=request.expected_calls,
-    )
+    size = {
+        "num_steps": num_steps,
+        "batch_size": shape.numel(),
+        "expected_calls": request.expected_calls,
+    }
+    is_compiled = not request.record and is_worthwhile(mode, device, **size)
 
     def run(is_compiled: bool) -> Episodes:
         middle = torch.tensor(0.5 * num_steps * step, dtype=dtype, device=device)
         present = simulator.changed(domain, middle)
         tables, histories = simulator.tables(present, shape, step, expand=is_compiled)
         constants = flatten(policy.constants(domain), shape, expand=is_compiled)
-        body = LoopBody(Stepper(simulator, step, histories), policy, reward)
+        stepper = Stepper(simulator, step, histories)
+        body = LoopBody(stepper, policy, reward, steps_per_call(**size))
         states = flatten(initial_states.to(dtype).unbind(-1), shape, expand=True)
         loop = begin(body, states, tables)
         if not is_compiled:
@@ -195,14 +204,14 @@ def _run_compiled(
 ) -> _Loop:
     """Runs all steps block by block, and the few that do not fill a kernel call eagerly."""
     key = body.signature, loop.total.dtype, loop.total.device.type
-    run = compiled(key, body.run)
+    run, at_once = compiled(key, body.run), body.steps_per_call
     num_simulations = loop.total.shape[0]
     num_blocks = -(-num_simulations // _BLOCK)
     edges = [i * num_simulations // num_blocks for i in range(num_blocks + 1)]
-    num_calls = num_steps // _STEPS_PER_CALL
+    num_calls = num_steps // at_once
     time_step = body.stepper.time_step
     starts = torch.arange(num_calls, dtype=loop.total.dtype, device=loop.total.device)
-    starts = (starts * (_STEPS_PER_CALL * time_step)).unbind()
+    starts = (starts * (at_once * time_step)).unbind()
     done = []
     for first, last in zip(edges, edges[1:], strict=False):
 
@@ -215,7 +224,7 @@ def _run_compiled(
         mark_sizes_dynamic((part, block_tables, block_constants))
         for start in starts:
             part = run(part, block_tables, block_constants, start)
-        for k in range(num_calls * _STEPS_PER_CALL, num_steps):
+        for k in range(num_calls * at_once, num_steps):
             part, _ = body.step(part, block_tables, block_constants, k * time_step)
         done.append(part)
     if len(done) == 1:

@@ -28,6 +28,7 @@ __all__ = [
     "is_worthwhile",
     "mark_sizes_dynamic",
     "signature",
+    "steps_per_call",
     "with_fallback",
 ]
 
@@ -45,6 +46,12 @@ _LOGGER = logging.getLogger(__name__)
 _EAGER_SECONDS_PER_TIME_STEP = 150e-6
 _EAGER_SECONDS_PER_SIMULATION_STEP = 20e-9
 _COMPILE_SECONDS = 10.0
+
+# Steps that one call of a compiled kernel takes. A call costs a quarter of a millisecond, and
+# compiling some ten seconds more for each step of a system with friction: few steps serve a search
+# for a policy, many one that would run for minutes uncompiled.
+_FEW_STEPS, _MANY_STEPS = 2, 10
+_MANY_STEPS_SECONDS = 100.0
 
 # Shapes, types and devices that one kernel may specialise to. Beyond the limit torch raises,
 # because kernels are compiled with fullgraph=True; it would silently run eagerly otherwise.
@@ -85,8 +92,7 @@ def is_worthwhile(
     Raises:
         DependencyError: Compilation is demanded, but there is no compiler.
     """
-    per_time_step = _EAGER_SECONDS_PER_TIME_STEP + batch_size * _EAGER_SECONDS_PER_SIMULATION_STEP
-    eager_seconds = expected_calls * num_steps * per_time_step
+    eager_seconds = _eager_seconds(num_steps, batch_size, expected_calls)
     if mode == "never" or (mode == "auto" and eager_seconds < _COMPILE_SECONDS):
         return False
     if has_compiler(device.type):
@@ -98,6 +104,23 @@ def is_worthwhile(
         )
     _log_once("There is no compiler, so time loops run eagerly, about ten times slower.")
     return False
+
+
+def steps_per_call(*, num_steps: int, batch_size: int, expected_calls: int = 1) -> int:
+    """Returns how many time steps a compiled kernel had better take at a time.
+
+    Args:
+        num_steps: Time steps of one simulation.
+        batch_size: Simulations that advance together.
+        expected_calls: How many simulations of this size are to come.
+    """
+    is_long = _eager_seconds(num_steps, batch_size, expected_calls) > _MANY_STEPS_SECONDS
+    return _MANY_STEPS if is_long else _FEW_STEPS
+
+
+def _eager_seconds(num_steps: int, batch_size: int, expected_calls: int) -> float:
+    per_time_step = _EAGER_SECONDS_PER_TIME_STEP + batch_size * _EAGER_SECONDS_PER_SIMULATION_STEP
+    return expected_calls * num_steps * per_time_step
 
 
 def with_fallback(mode: CompileMode, is_compiled: bool, run: Callable[[bool], _T]) -> _T:

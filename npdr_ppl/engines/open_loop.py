@@ -12,6 +12,7 @@ from npdr_ppl.engines.compilation import (
     compiled,
     is_worthwhile,
     mark_sizes_dynamic,
+    steps_per_call,
     with_fallback,
 )
 from npdr_ppl.engines.effect_chain import State, Tables
@@ -25,9 +26,6 @@ if TYPE_CHECKING:
     from npdr_ppl.engines.ode import ODESimulator
 
 __all__ = ["replay"]
-
-# Steps per call of a compiled kernel; see closed_loop.
-_STEPS_PER_CALL = 10
 
 
 def replay(simulator: "ODESimulator", parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
@@ -87,14 +85,15 @@ def _replay(
 
     first, last = 0, 0
     if is_compiled:
+        at_once = steps_per_call(num_steps=inputs.num_steps, batch_size=shape.numel())
         # The first state carries no gradient where later ones do, and would need its own kernel.
         has_gradient = any(
             isinstance(leaf, Tensor) and leaf.requires_grad for leaf in pytree.tree_leaves(tables)
         )
-        first = min(_STEPS_PER_CALL, inputs.num_steps) if has_gradient else 0
-        last = inputs.num_steps - (inputs.num_steps - first) % _STEPS_PER_CALL
+        first = min(at_once, inputs.num_steps) if has_gradient else 0
+        last = inputs.num_steps - (inputs.num_steps - first) % at_once
         state = run_eagerly(state, 0, first)
-        state = _run_compiled(body, state, tables, records, range(first, last), readings)
+        state = _run_compiled(body, state, tables, records, range(first, last, at_once), readings)
     run_eagerly(state, last, inputs.num_steps)
     return torch.stack(readings, dim=-1).reshape(*shape, inputs.num_steps, len(simulator.sensors))
 
@@ -148,16 +147,16 @@ def _run_compiled(
     steps: range,
     readings: list[Tensor],
 ) -> State:
-    """Runs steps with the compiled body and appends their readings."""
+    """Runs steps with the compiled body, ``steps.step`` at a time, and appends their readings."""
     position = state.positions[0]
     key = "replay", body.stepper.signature, position.dtype, position.device.type
     run = compiled(key, body.run)
     state = flatten(state, position.shape, expand=True)
 
-    for step in steps[::_STEPS_PER_CALL]:
+    for step in steps:
         commands = tuple(
             tuple(record.at(k).contiguous() for record in records)
-            for k in range(step, step + _STEPS_PER_CALL)
+            for k in range(step, step + steps.step)
         )
         # As tensors, because numbers would be compiled in. Without action effects nobody looks.
         views = tuple(
