@@ -22,8 +22,7 @@ settings.load_profile("explore" if os.environ.get("NPDR_EXPLORE") else "repeatab
 @pytest.fixture
 def short_kernels(monkeypatch):
     """Compiles loops of three time steps, however long they are to run."""
-    for name in ("_FEW_STEPS", "_MANY_STEPS"):
-        monkeypatch.setattr(compilation, name, 3)
+    monkeypatch.setattr(compilation, "_STEPS_PER_CALL", (3,))
     compilation._compile.cache_clear()
     yield
     compilation._compile.cache_clear()

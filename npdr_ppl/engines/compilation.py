@@ -9,6 +9,7 @@ import functools
 import importlib
 import importlib.util
 import logging
+import math
 import os
 import shutil
 import warnings
@@ -47,11 +48,13 @@ _EAGER_SECONDS_PER_TIME_STEP = 150e-6
 _EAGER_SECONDS_PER_SIMULATION_STEP = 20e-9
 _COMPILE_SECONDS = 10.0
 
-# Steps that one call of a compiled kernel takes. A call costs a quarter of a millisecond, and
-# compiling some ten seconds more for each step of a system with friction: few steps serve a search
-# for a policy, many one that would run for minutes uncompiled.
-_FEW_STEPS, _MANY_STEPS = 2, 10
-_MANY_STEPS_SECONDS = 100.0
+# Steps that one call of a compiled kernel may take; what a call costs, and on top of that per
+# simulation for its state's way to memory and back; what a step more costs to compile, 3 s for the
+# paper's equations and 12 s with friction. Measured as above.
+_STEPS_PER_CALL = (2, 5, 10)
+_CALL_SECONDS = 250e-6
+_CALL_SECONDS_PER_SIMULATION = 40e-9
+_COMPILE_SECONDS_PER_STEP = 4.0
 
 # Shapes, types and devices that one kernel may specialise to. Beyond the limit torch raises,
 # because kernels are compiled with fullgraph=True; it would silently run eagerly otherwise.
@@ -92,7 +95,8 @@ def is_worthwhile(
     Raises:
         DependencyError: Compilation is demanded, but there is no compiler.
     """
-    eager_seconds = _eager_seconds(num_steps, batch_size, expected_calls)
+    per_time_step = _EAGER_SECONDS_PER_TIME_STEP + batch_size * _EAGER_SECONDS_PER_SIMULATION_STEP
+    eager_seconds = expected_calls * num_steps * per_time_step
     if mode == "never" or (mode == "auto" and eager_seconds < _COMPILE_SECONDS):
         return False
     if has_compiler(device.type):
@@ -114,13 +118,11 @@ def steps_per_call(*, num_steps: int, batch_size: int, expected_calls: int = 1) 
         batch_size: Simulations that advance together.
         expected_calls: How many simulations of this size are to come.
     """
-    is_long = _eager_seconds(num_steps, batch_size, expected_calls) > _MANY_STEPS_SECONDS
-    return _MANY_STEPS if is_long else _FEW_STEPS
-
-
-def _eager_seconds(num_steps: int, batch_size: int, expected_calls: int) -> float:
-    per_time_step = _EAGER_SECONDS_PER_TIME_STEP + batch_size * _EAGER_SECONDS_PER_SIMULATION_STEP
-    return expected_calls * num_steps * per_time_step
+    per_call = _CALL_SECONDS + batch_size * _CALL_SECONDS_PER_SIMULATION
+    calls = expected_calls * num_steps * per_call / _COMPILE_SECONDS_PER_STEP
+    # Calls and compilation together are least at the square root, and flat about it.
+    wanted = math.sqrt(2.0 * calls)
+    return max((n for n in _STEPS_PER_CALL if n <= wanted), default=_STEPS_PER_CALL[0])
 
 
 def with_fallback(mode: CompileMode, is_compiled: bool, run: Callable[[bool], _T]) -> _T:

@@ -9,7 +9,12 @@ import pytest
 import torch
 
 from npdr_ppl.engines import compilation
-from npdr_ppl.engines.compilation import has_compiler, is_worthwhile, signature
+from npdr_ppl.engines.compilation import (
+    has_compiler,
+    is_worthwhile,
+    signature,
+    steps_per_call,
+)
 from npdr_ppl.errors import CompilationError, DependencyError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import ActuatorLag, CoulombFriction, InputDelay, SensorLowPass
@@ -69,6 +74,13 @@ def test_many_time_steps_many_simulations_and_many_calls_each_make_a_computation
     assert is_worthwhile("auto", CPU, num_steps=100, batch_size=10**8)
     assert is_worthwhile("auto", CPU, num_steps=1_000, batch_size=1_000, expected_calls=10**3)
     assert is_worthwhile("always", CPU, num_steps=1, batch_size=1)
+
+
+def test_a_call_takes_as_many_steps_as_its_use_is_long():
+    sizes = {"num_steps": 2_500, "batch_size": 600}
+    taken = [steps_per_call(**sizes, expected_calls=n) for n in (1, 10**2, 10**3, 10**5)]
+    assert taken == sorted(taken)
+    assert (taken[0], taken[-1]) == (2, 10)
 
 
 @pytest.fixture
