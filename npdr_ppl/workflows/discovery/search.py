@@ -188,7 +188,7 @@ class Searcher:
                 break
             now = self.look(current)
             rounds.append(now)
-        current, added, trials = self._with_rivals(current, rounds)
+        current, added, trials = self.with_rivals(current, rounds)
         if set(current.names) != set(rounds[-1].hypothesis.names):
             rounds.append(self.look(current))  # something was swapped: what is left is another
         return Search(rounds, current, added, removed, trials)
@@ -246,17 +246,25 @@ class Searcher:
                 current, removed = without, [*removed, effect.name]
         return current, removed
 
-    def _with_rivals(
+    def with_rivals(
         self, current: Hypothesis, rounds: list[Round]
     ) -> tuple[Hypothesis, list[Added], dict[tuple[str, str], Hypothesis]]:
-        """Asks of each effect what else could stand in its place, and swaps what is likelier."""
+        """Asks of each effect what else could stand in its place, and swaps what is likelier.
+
+        Args:
+            current: The model with all effects, fitted.
+            rounds: What was seen on the way to it.
+
+        Returns:
+            The model at last, its effects, and the models with each rival; see :class:`Search`.
+        """
         added: list[Added] = []
         trials: dict[tuple[str, str], Hypothesis] = {}
-        effects = list(current.effects)
-        while effects:
+        waiting = current.effects
+        while waiting:
             asked = current
-            for rivals in self._rivals(asked, effects, rounds):
-                effect = effects.pop(0)
+            for effect, rivals in zip(waiting, self._rivals(asked, waiting, rounds), strict=True):
+                waiting = waiting[1:]
                 current, found = weigh_rivals(rounds[0].hypothesis, asked, effect, rivals)
                 probability = found.alternatives[effect.name]
                 self._report(f"{effect.name}: probability {probability:.2f}")

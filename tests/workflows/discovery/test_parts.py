@@ -4,6 +4,7 @@ import json
 import math
 import runpy
 import threading
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import (
     AsymmetricCoulombFriction,
     Bias,
+    Cogging,
     CoulombFriction,
     InputDelay,
     QuadraticDrag,
@@ -28,6 +30,7 @@ from npdr_ppl.workflows.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.workflows.discovery.latent_force import latent_force, responses
 from npdr_ppl.workflows.discovery.projection import Projection, loss_without
 from npdr_ppl.workflows.discovery.revised_model import revised_source
+from npdr_ppl.workflows.discovery.search import Searcher
 from npdr_ppl.workflows.discovery.sensitivities import sensitivities
 from npdr_ppl.workflows.discovery.side_by_side import side_by_side
 
@@ -198,6 +201,27 @@ def test_what_is_lost_without_an_effect_is_known_without_a_fit(dragged):
     scale = fitted.fit.scale
     lost = fitted.share * float((without.losses(scale) - fitted.losses(scale)).sum())
     assert loss_without(fitted, drag) == pytest.approx(lost, rel=0.1)
+
+
+def test_every_effect_gets_its_own_rivals(dragged):
+    case, _ = dragged
+    three = QuadraticDrag("hinge"), CoulombFriction("hinge"), Bias("hinge")
+    options = npdr.DiscoveryOptions(effects=(*three, Cogging("hinge")))
+    searcher = Searcher(case.model, case.fit, options)
+    two, all_three, ripple = (
+        fit_hypothesis(case.model, case.fit, searcher.binding, effects=effects)
+        for effects in (three[:2], three, (*three[:2], Cogging("hinge")))
+    )
+    # The last one's were tried when it was added.
+    tried = {"hinge.bias": all_three, "hinge.cogging": ripple}
+    rounds = [searcher.look(searcher.fit_base()), replace(searcher.look(two), trials=tried)]
+    _, added, trials = searcher.with_rivals(all_three, rounds)
+    assert [each.place for each in added] == [effect.name for effect in three]
+    for effect in three:
+        others = {other.name for other in three} - {effect.name}
+        assert set(trials[effect.name, "hinge.cogging"].names) == others | {"hinge.cogging"}
+    # The drag is there and the others are not, so that all is lost without it.
+    assert added[0].share > 0.5 > added[2].share
 
 
 def test_two_processes_find_what_one_finds(dragged):
