@@ -263,28 +263,6 @@ class EffectChain(ABC):
             for (place, effect, columns), length in zip(self.sensor_effects, lengths, strict=True)
         )
 
-    def act(
-        self,
-        state: State,
-        commands: Components,
-        tables: Tables,
-        records: tuple[Commands, ...] | None = None,
-    ) -> tuple[State, Components]:
-        """Passes the commands of one step through the action effects.
-
-        Args:
-            state: State at the step's start.
-            commands: One per action channel, within the channel's limits already: a limit sits
-                where the command enters the device, and recordings hold limited commands.
-            tables: Constants of the simulation.
-            records: Where the whole past of each channel is on record, a view of it.
-
-        Returns:
-            The state with the action effects' memory advanced, and what reaches the dynamics.
-        """
-        state, actions, _ = self.through(state, commands, tables, records)
-        return state, actions
-
     def advance(
         self,
         state: State,
@@ -293,7 +271,7 @@ class EffectChain(ABC):
         records: tuple[Commands, ...] | None = None,
     ) -> State:
         """Advances the state by one time step under commands; see :meth:`act`."""
-        state, actions, moments = self.through(state, commands, tables, records)
+        state, actions, moments = self.act(state, commands, tables, records)
         return self.move(state, actions, tables, moments)
 
     def by_substep(
@@ -324,17 +302,25 @@ class EffectChain(ABC):
         ]
         return means, own
 
-    def through(
+    def act(
         self,
         state: State,
         commands: Components,
         tables: Tables,
-        records: tuple[Commands, ...] | None,
+        records: tuple[Commands, ...] | None = None,
     ) -> tuple[State, Components, Moments]:
-        """Passes commands through the action effects; see :meth:`act`.
+        """Passes the commands of one step through the action effects.
+
+        Args:
+            state: State at the step's start.
+            commands: One per action channel, within the channel's limits already: a limit sits
+                where the command enters the device, and recordings hold limited commands.
+            tables: Constants of the simulation.
+            records: Where the whole past of each channel is on record, a view of it.
 
         Returns:
-            State and actions, and their moments; see :meth:`move`.
+            The state with the action effects' memory advanced, what reaches the dynamics, and its
+            moments; see :meth:`move`.
         """
         if not self.action_effects:
             return state, commands, ()

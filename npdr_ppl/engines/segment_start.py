@@ -142,5 +142,5 @@ def with_past_commands(
         for step in range(-num_steps, 0):
             commands = tuple(record.at(step) for record in records)
             views = tuple(record.view(step) for record in records)
-            state, _ = chain.act(state, commands, tables, views)
+            state, _, _ = chain.act(state, commands, tables, views)
     return state

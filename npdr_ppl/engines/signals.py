@@ -93,7 +93,7 @@ class Signals:
         for step in range(self._inputs.num_steps):
             commands = tuple(record.at(step) for record in self._records)
             views = tuple(record.view(step) for record in self._records)
-            state, reached = chain.act(state, commands, tables, views)
+            state, reached, _ = chain.act(state, commands, tables, views)
             steps.append(torch.stack([x.expand_as(commands[0]) for x in reached], dim=-1))
         return torch.stack(steps, dim=-2)
 

@@ -192,7 +192,7 @@ class _Replay:
         for k in range(self.inputs.num_steps):
             commands = tuple(record.at(k) for record in records)
             views = tuple(record.view(k) for record in records)
-            state, actions, moments = chain.through(state, commands, tables, views)
+            state, actions, moments = chain.act(state, commands, tables, views)
             means, _ = chain.by_substep(actions, moments, chain.substeps)
             for part, present in enumerate(means):
                 for channel, action in enumerate(present):
