@@ -54,7 +54,7 @@ _COMPILE_SECONDS = 10.0
 _STEPS_PER_CALL = (2, 5, 10)
 _CALL_SECONDS = 250e-6
 _CALL_SECONDS_PER_SIMULATION = 40e-9
-_COMPILE_SECONDS_PER_STEP = 4.0
+_COMPILE_SECONDS_PER_STEP = 8.0
 
 # Shapes, types and devices that one kernel may specialise to. Beyond the limit torch raises,
 # because kernels are compiled with fullgraph=True; it would silently run eagerly otherwise.
