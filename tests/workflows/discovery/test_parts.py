@@ -19,6 +19,8 @@ from npdr_ppl.models.effects import (
     CoulombFriction,
     InputDelay,
     QuadraticDrag,
+    SupplySag,
+    ViscousFriction,
     candidate_effects,
 )
 from npdr_ppl.models.pendulum import Pendulum, pendulum
@@ -33,6 +35,7 @@ from npdr_ppl.workflows.discovery.revised_model import revised_source
 from npdr_ppl.workflows.discovery.search import Searcher
 from npdr_ppl.workflows.discovery.sensitivities import sensitivities
 from npdr_ppl.workflows.discovery.side_by_side import side_by_side
+from npdr_ppl.workflows.discovery.trials import Trials
 
 
 @pytest.fixture(scope="module")
@@ -201,6 +204,40 @@ def test_what_is_lost_without_an_effect_is_known_without_a_fit(dragged):
     scale = fitted.fit.scale
     lost = fitted.share * float((without.losses(scale) - fitted.losses(scale)).sum())
     assert loss_without(fitted, drag) == pytest.approx(lost, rel=0.1)
+
+
+def test_effects_that_are_simulated_together_do_what_each_does_alone(quiet, monkeypatch):
+    effects = candidate_effects(quiet.simulator)
+    together = sensitivities(quiet, effects)
+    monkeypatch.setattr("npdr_ppl.workflows.discovery.sensitivities.MOST_TOGETHER", 0)
+    alone = sensitivities(quiet, effects)
+    by_name = {variant.effect.name: [] for variant in alone}
+    for variant in alone:
+        by_name[variant.effect.name].append(variant.change)
+    assert len(together) == len(alone)
+    for variant in together:
+        assert torch.equal(variant.change, by_name[variant.effect.name].pop(0))
+
+
+def test_candidates_far_behind_what_was_found_are_not_tried(dragged):
+    case, base = dragged
+    effects = (
+        *(
+            law("hinge")
+            for law in (QuadraticDrag, ViscousFriction, CoulombFriction, Bias, Cogging)
+        ),
+        SupplySag("torque"),
+    )
+    searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=effects))
+    ranking = searcher.look(base).ranking
+    gains = {candidate.name: candidate.gain for candidate in ranking}
+    tried = Trials(case.model, case.fit, searcher.binding).extended(base, ranking)
+    assert list(tried)[:2] == [candidate.name for candidate in ranking[:2]]
+    assert next(iter(tried)) == "hinge.quadratic_drag"
+    missed = gains.keys() - tried.keys()
+    assert missed
+    # Even four times their linear gain would leave them 30 units of evidence behind.
+    assert all(4.0 * gains[name] < gains["hinge.quadratic_drag"] for name in missed)
 
 
 def test_every_effect_gets_its_own_rivals(dragged):
