@@ -77,17 +77,17 @@ class Stepper(EffectChain):
         dry: tuple[Any, ...] = (0.0,) * len(state.positions)
 
         def acceleration(positions: Components, velocities: Components) -> Components:
-            forces = self._forces(positions, velocities, state, tables, dry)
-            return simulator.accelerations(positions, velocities, actions, forces, constants)
+            smooth = self._forces(positions, velocities, state, tables, dry)
+            return simulator.accelerations(positions, velocities, actions, smooth, constants)
 
-        first = undisturbed = acceleration(*start)
+        forces = self._forces(*start, state, tables, dry)
+        first = even = simulator.accelerations(*start, actions, forces, constants)
         late: Components | None = None
         if simulator.integrator.order > 1 and any(moment is not None for moment in moments):
             # Positions move by ∫ (h − t) a dt, of which the integrator sees ½ h² times the mean.
             shifted = tuple(
                 a if m is None else a + m for a, m in zip(actions, moments, strict=True)
             )
-            forces = self._forces(*start, state, tables, dry)
             late = simulator.accelerations(*start, shifted, forces, constants)
 
         def bounds_at(velocities: Components) -> tuple[Tensor | None, ...]:
@@ -96,7 +96,6 @@ class Stepper(EffectChain):
         bounds = self.dry_friction_bounds(state, tables)
         friction: DryFriction | None = None
         if any(bound is not None for bound in bounds):
-            forces = self._forces(*start, state, tables, dry)
             inertia = inverse_inertia(simulator, *start, actions, forces, constants, first)
             given = state.velocities, first, inertia, self._substep
             if simulator.integrator.order == 1:
@@ -113,7 +112,7 @@ class Stepper(EffectChain):
                     )
         q, v = simulator.integrator.step(acceleration, *start, first, self._substep)
         if late is not None:
-            q = tuple(qi - (b - a) for qi, a, b in zip(q, undisturbed, late, strict=True))
+            q = tuple(qi - (b - a) for qi, a, b in zip(q, even, late, strict=True))
         if friction is not None:
             # Rounding must not leave a velocity whose sign then means something to a policy.
             v = tuple(

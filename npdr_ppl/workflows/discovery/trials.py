@@ -36,7 +36,6 @@ CONTENDS = 0.3
 CONTENDS_ANYWAY = 20.0
 """… or this much, absolutely."""
 
-
 TOGETHER = 2
 """Candidates that are tried before it is asked whether others are worth it."""
 
