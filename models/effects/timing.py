@@ -36,16 +36,15 @@ class SensorDelay(SensorEffect):
     through its neighbours, and a position on the parabola through two of them and the one before.
     Attach it to the channels that are late together.
 
-    What was read at a segment's start is the state d earlier, so the segment starts from the state
-    extrapolated by d, and what the sensor reports until d has passed is the extrapolation back.
-    Both use the simulator's accelerations without effects under the last command; good while
-    these change little within d.
+    What was read at a segment's start is the state d earlier, so the segment starts from where the
+    simulator without its effects gets from there under the commands of that time. What the sensor
+    reports until d has passed is found the same way, backwards.
     """
 
     id = "sensor_delay"
     parameters = (Parameter("delay", "s", 0.0, "delay d"),)
     is_smooth = False
-    needs_rates = True
+    needs_past = True
     spans = ("joint", "rates", "all")
     law = "y(t − d)"
     equivalence = (LATENCY,)
@@ -99,7 +98,7 @@ class ClockSkew(SensorEffect):
     id = "clock_skew"
     port_kinds = ("clock",)
     parameters = (Parameter("skew", "1", 0.0, "relative skew κ"),)
-    needs_rates = True
+    needs_past = True
     law = "t (1 + κ)"
     excitation = "long_run"
     reference = LJUNG_1999

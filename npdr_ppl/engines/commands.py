@@ -1,6 +1,7 @@
 """Commands given so far, as action effects see them: recorded ones and those of a live loop."""
 
 import copy
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -8,7 +9,7 @@ from torch import Tensor
 from npdr_ppl.language.effects import Commands
 from npdr_ppl.language.inputs import Inputs
 
-__all__ = ["CommandRecord", "RecentCommands", "RecordedCommands"]
+__all__ = ["CommandRecord", "RecentCommands", "RecordedCommands", "commands_at"]
 
 
 class CommandRecord:
@@ -56,7 +57,7 @@ class CommandRecord:
 
     def at(self, step: int) -> Tensor:
         """Returns the command of each simulation at a step, ``(N,)``; steps before 0 are past."""
-        present = self._table[self.first + step]
+        present = self._table[max(0, self.first + step)]
         if self._batch_shape is None:
             return present.reshape(-1)[self.rows]
         return present.expand(self._batch_shape).reshape(-1)
@@ -73,6 +74,11 @@ class CommandRecord:
         part.rows = self.rows[first:last]
         part._batch_shape = None
         return part
+
+
+def commands_at(records: Sequence[CommandRecord], step: int) -> tuple[Tensor, ...]:
+    """Returns the command of each action channel at a step; see :meth:`CommandRecord.at`."""
+    return tuple(record.at(step) for record in records)
 
 
 class RecordedCommands(Commands):

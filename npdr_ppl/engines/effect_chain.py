@@ -1,7 +1,7 @@
 """Effects on their way through a step, whatever engine moves the state in between."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 from npdr_ppl.engines.commands import RecentCommands
 from npdr_ppl.engines.compilation import signature
 from npdr_ppl.engines.integrators import Components
-from npdr_ppl.engines.reading_times import sensor_rates
+from npdr_ppl.engines.reading_times import earlier_changes
 from npdr_ppl.language.effect_context import Joint, Start
 from npdr_ppl.language.effects import (
     ActionEffect,
@@ -173,7 +173,7 @@ class EffectChain(ABC):
         readings: tuple[Tensor | None, ...],
         time: Tensor,
         *,
-        latest: Components | None = None,
+        commands_before: Callable[[int], Components] | None = None,
         num_past: int = 0,
     ) -> State:
         """Returns the state at the start of an episode or segment.
@@ -187,7 +187,8 @@ class EffectChain(ABC):
             readings: What each sensor reported at the start, ``(N,)`` each; ``None`` for the
                 true value.
             time: Seconds since the rollout began, ``(N,)``.
-            latest: What each action channel saw last; ``None`` for ``commands``.
+            commands_before: What each action channel saw at a step before 0; ``None`` for
+                ``commands``.
             num_past: Steps before the start that the action effects are to be taken through.
         """
         step, split = self.time_step, len(self.action_effects)
@@ -220,7 +221,14 @@ class EffectChain(ABC):
                     self.action_effects, self.histories[:split], strict=True
                 )
             ),
-            self._sensor_memory(positions, velocities, tables, latest or commands, readings, time),
+            self._sensor_memory(
+                positions,
+                velocities,
+                tables,
+                commands_before or (lambda _: commands),
+                readings,
+                time,
+            ),
         )
 
     def _sensor_memory(
@@ -228,7 +236,7 @@ class EffectChain(ABC):
         positions: Components,
         velocities: Components,
         tables: Tables,
-        latest: Components,
+        commands_before: Callable[[int], Components],
         readings: tuple[Tensor | None, ...],
         time: Tensor,
     ) -> tuple[tuple[Any, ...], ...]:
@@ -237,18 +245,30 @@ class EffectChain(ABC):
         if not self.sensor_effects:
             return ()
         true = self.true_readings(positions, velocities, tables)
-        rates: dict[int, tuple[Tensor, ...]] = {}
-        if any(effect.needs_rates for _, effect, _ in self.sensor_effects):
-            accelerations = self.accelerations(positions, velocities, latest, tables)
-            rates = sensor_rates(self.simulator, velocities, accelerations)
         lengths = self.histories[len(self.action_effects) :]
+        num_before = max(
+            length if effect.needs_past else 0
+            for (_, effect, _), length in zip(self.sensor_effects, lengths, strict=True)
+        )
+        changes: dict[int, tuple[Tensor, ...]] = {}
+        if num_before:
+
+            def accelerations(states: Components, step: int) -> Components:
+                split = self.num_positions
+                commands = commands_before(step)
+                return self.accelerations(states[:split], states[split:], commands, tables)
+
+            states = (*positions, *velocities)
+            changes = earlier_changes(
+                self.simulator, states, accelerations, self.time_step, num_before
+            )
         simulator = self.simulator
         states = zip(simulator.states, simulator.is_rate, strict=True)
         of_rates = {state.name for state, is_rate in states if is_rate}
         is_rate = [sensor.name in of_rates for sensor in simulator.sensors]
 
         def start(place: int, length: int, column: int) -> Start:
-            own, known = tables.effects[place], rates.get(column, ())
+            own, known = tables.effects[place], changes.get(column, ())[:length]
             return Start(time, self.time_step, own, length, known, is_rate[column])
 
         return tuple(

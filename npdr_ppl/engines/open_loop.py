@@ -1,13 +1,14 @@
 """Open loop: recorded commands replayed from the segments' initial states."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from npdr_ppl.engines.commands import CommandRecord, RecordedCommands
+from npdr_ppl.engines.commands import CommandRecord, RecordedCommands, commands_at
 from npdr_ppl.engines.compilation import (
     compiled,
     is_worthwhile,
@@ -78,7 +79,7 @@ def _replay(
 
     def run_eagerly(state: State, first: int, last: int) -> State:
         for step in range(first, last):
-            commands = tuple(record.at(step) for record in records)
+            commands = commands_at(records, step)
             state, values = body.step(state, tables, commands, _views(records, step))
             readings.extend(values)
         return state
@@ -188,17 +189,15 @@ def _start(
             f"states, got {len(recorded.states)}."
         )
     past = inputs.past_actions.shape[-2]
-    latest = tuple(record.at(-1 if past else 0) for record in records)
-    upcoming = tuple(record.at(0) for record in records)
-    components = true_start(stepper, tables, recorded, latest, upcoming)
+    components = true_start(stepper, tables, recorded, records)
     state = stepper.start(
         components[:num_joints],
         components[num_joints:],
         tables,
-        tuple(record.at(-1 - past) for record in records),
+        commands_at(records, -1 - past),
         recorded.readings,
         recorded.time,
-        latest=latest,
+        commands_before=partial(commands_at, records),
         num_past=past if stepper.action_effects else 0,
     )
     return with_past_commands(stepper, state, tables, records, past)

@@ -1,46 +1,24 @@
-"""Readings that are late or early: the state behind them at the start of a segment.
+"""Readings that are late or early: the states behind them and before them.
 
 A segment starts from what was read there. If the sensors lag by d, that is the state d ago, and
-the segment starts from the state extrapolated over d with the simulator's own accelerations
-halfway there. That is exact to second order in d while the command stays the same.
+the segment starts from where the recorded commands have led since. For as long as d a late sensor
+also reports what was true before the segment. States are moved in time with the simulator's own
+accelerations in the middle of each span, without effects.
 """
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 
-import torch
 from torch import Tensor
 
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.language.effects import SensorEffect
 from npdr_ppl.language.simulator import Simulator
 
-__all__ = ["catch_up", "sensor_leads", "sensor_rates"]
+__all__ = ["Accelerations", "catch_up", "earlier_changes", "sensor_leads"]
 
-
-def sensor_rates(
-    simulator: Simulator, velocities: Components, accelerations: Components
-) -> dict[int, tuple[Tensor, ...]]:
-    """Returns first and second derivative of the sensor channels, zero unless they read states.
-
-    A position's first derivative is the velocity that is declared as its rate.
-
-    Args:
-        simulator: The system, whose effects are left out.
-        velocities: Velocities among its states, ``(N,)`` each.
-        accelerations: Their rates.
-    """
-    num_positions = len(simulator.states) - len(velocities)
-    by_name: dict[str, tuple[Tensor, ...]] = {}
-    for state, velocity, acceleration in zip(
-        simulator.states[num_positions:], velocities, accelerations, strict=True
-    ):
-        by_name[state.name] = acceleration, torch.zeros_like(velocity)
-        if state.rate_of is not None:
-            by_name[state.rate_of] = velocity, acceleration
-    none = tuple(torch.zeros_like(v) for v in (*velocities, *velocities)[:2])
-    return {
-        column: by_name.get(sensor.name, none) for column, sensor in enumerate(simulator.sensors)
-    }
+Accelerations = Callable[[Components, int], Components]
+"""Rates of a state's velocities under the commands of a step; steps before 0 are past."""
 
 
 def sensor_leads(
@@ -66,8 +44,9 @@ def sensor_leads(
 def catch_up(
     simulator: Simulator,
     states: Components,
-    accelerations: Callable[[Components], Components],
-    leads: tuple[Tensor | None, ...],
+    accelerations: Accelerations,
+    leads: Sequence[Tensor | None],
+    time_step: float,
 ) -> Components:
     """Returns the state now behind one that was read too early or too late.
 
@@ -76,31 +55,102 @@ def catch_up(
     Args:
         simulator: The system, whose effects are left out.
         states: Positions as read, then velocities as read or derived from positions, ``(N,)``.
-        accelerations: Returns the rates of the velocities in a state, ``(N,)`` each.
+        accelerations: See :data:`Accelerations`.
         leads: By how many seconds each state's reading is ahead.
+        time_step: Seconds per step.
     """
-    halfway = tuple(None if lead is None else 0.5 * lead for lead in leads)
-    middle = _earlier(simulator, states, accelerations(states), halfway)
-    return _earlier(simulator, states, accelerations(middle), leads)
+    ages = [None if lead is None else -lead for lead in leads]
+    known = [age.detach() for age in ages if age is not None]
+    oldest = max(float(age.max()) for age in known)
+    for step in range(-math.ceil(oldest / time_step), 0):
+        spans = [
+            None if age is None else (age + (step + 1) * time_step).clamp(0.0, time_step)
+            for age in ages
+        ]
+        states = _moved(simulator, states, accelerations, step, ages, spans)
+        ages = [_difference(age, span) for age, span in zip(ages, spans, strict=True)]
+    if min(float(age.min()) for age in known) < 0.0:
+        states = _moved(simulator, states, accelerations, 0, ages, ages)
+    return states
 
 
-def _earlier(
+def earlier_changes(
+    simulator: Simulator,
+    states: Components,
+    accelerations: Accelerations,
+    time_step: float,
+    num_steps: int,
+) -> dict[int, tuple[Tensor, ...]]:
+    """Returns how the sensor channels differed before the start, latest first; 0 if no states.
+
+    Args:
+        simulator: The system, whose effects are left out.
+        states: Positions, then velocities at the start, ``(N,)``.
+        accelerations: See :data:`Accelerations`.
+        time_step: Seconds per step.
+        num_steps: How many steps to go back.
+    """
+    names = [state.name for state in simulator.states]
+    found: dict[int, list[Tensor]] = {column: [] for column in range(len(simulator.sensors))}
+    now, none = states, [states[0].new_zeros(()) for _ in states]
+    back = [value - time_step for value in none]
+    for step in range(1, num_steps + 1):
+        now = _moved(simulator, now, accelerations, -step, none, back)
+        for column, sensor in enumerate(simulator.sensors):
+            i = names.index(sensor.name) if sensor.name in names else None
+            change = states[0].new_zeros(states[0].shape) if i is None else now[i] - states[i]
+            found[column].append(change)
+    return {column: tuple(changes) for column, changes in found.items()}
+
+
+def _moved(
+    simulator: Simulator,
+    states: Components,
+    accelerations: Accelerations,
+    step: int,
+    ages: Sequence[Tensor | None],
+    spans: Sequence[Tensor | None],
+) -> Components:
+    """Returns the states so many seconds later, under the commands of one step.
+
+    Args:
+        simulator: The system.
+        states: The states, each of its own time.
+        accelerations: See :data:`Accelerations`.
+        step: The step.
+        ages: How many seconds ago each was true; ``None`` for now.
+        spans: By how many seconds to move each; ``None`` to leave it.
+    """
+    halves = [None if span is None else 0.5 * span for span in spans]
+    middle = _under(simulator, states, accelerations(states, step), ages, halves)
+    return _under(simulator, states, accelerations(middle, step), ages, spans)
+
+
+def _under(
     simulator: Simulator,
     states: Components,
     accelerations: Components,
-    times: tuple[Tensor | None, ...],
+    ages: Sequence[Tensor | None],
+    spans: Sequence[Tensor | None],
 ) -> Components:
-    """Returns the states so many seconds earlier, under constant accelerations."""
+    """Returns the states so many seconds later, under constant accelerations; see _moved."""
     result = list(states)
-    num_positions = len(states) - len(accelerations)
     places = {state.name: i for i, state in enumerate(simulator.states)}
-    for j, acceleration in enumerate(accelerations, start=num_positions):
-        rate_time = times[j]
-        if rate_time is not None:
-            result[j] = states[j] - rate_time * acceleration
+    for j, acceleration in enumerate(accelerations, start=len(states) - len(accelerations)):
+        if (span := spans[j]) is not None:
+            result[j] = states[j] + span * acceleration
         i = places.get(simulator.states[j].rate_of or "")
-        time = None if i is None else times[i]
-        if i is not None and time is not None:
-            # Back from the velocity then, which has just been found.
-            result[i] = states[i] - time * result[j] - 0.5 * time * time * acceleration
+        if i is None or (span := spans[i]) is None:
+            continue
+        # From the velocity at the span's end, which may be known of another time.
+        velocity, position_age = result[j], _difference(ages[i], span)
+        velocity_age = _difference(ages[j], spans[j])
+        if position_age is not None:
+            apart = position_age if velocity_age is None else position_age - velocity_age
+            velocity = velocity - apart * acceleration
+        result[i] = states[i] + span * velocity - 0.5 * span * span * acceleration
     return tuple(result)
+
+
+def _difference(age: Tensor | None, span: Tensor | None) -> Tensor | None:
+    return age if age is None or span is None else age - span

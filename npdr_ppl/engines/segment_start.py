@@ -1,11 +1,12 @@
 """How segments start: from what was recorded, back through the sensor effects to the truth."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.commands import CommandRecord
+from npdr_ppl.engines.commands import CommandRecord, commands_at
 from npdr_ppl.engines.effect_chain import EffectChain, State, Tables
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.reading_times import catch_up, sensor_leads
@@ -69,8 +70,7 @@ def true_start(
     chain: EffectChain,
     tables: Tables,
     recorded: RecordedStart,
-    latest: Components,
-    upcoming: Components,
+    records: Sequence[CommandRecord],
 ) -> Components:
     """Returns the true state behind what was recorded through the sensor effects.
 
@@ -81,8 +81,7 @@ def true_start(
         chain: The effects.
         tables: The effects' parameters.
         recorded: What is known of the start.
-        latest: What each action channel saw last, ``(N,)`` each.
-        upcoming: What it sees next.
+        records: Commands of each action channel.
     """
     if not chain.sensor_effects:
         return recorded.states
@@ -109,17 +108,13 @@ def true_start(
         for state, is_derived in zip(states, recorded.is_derived, strict=True)
     )
     late = tuple(None if source is None else leads.get(source) for source in sources)
-    # What was read too early is behind the next command, not the last.
-    ahead = torch.stack(torch.broadcast_tensors(*leads.values())).sum(0) > 0.0
-    commands = tuple(
-        torch.where(ahead, after, before) for before, after in zip(latest, upcoming, strict=True)
-    )
     split = chain.num_positions
 
-    def accelerations(states: Components) -> Components:
+    def accelerations(states: Components, step: int) -> Components:
+        commands = commands_at(records, step)
         return chain.accelerations(states[:split], states[split:], commands, tables)
 
-    return catch_up(chain.simulator, tuple(true), accelerations, late)
+    return catch_up(chain.simulator, tuple(true), accelerations, late, chain.time_step)
 
 
 def with_past_commands(
@@ -140,7 +135,6 @@ def with_past_commands(
     """
     if chain.action_effects:
         for step in range(-num_steps, 0):
-            commands = tuple(record.at(step) for record in records)
             views = tuple(record.view(step) for record in records)
-            state, _, _ = chain.act(state, commands, tables, views)
+            state, _, _ = chain.act(state, commands_at(records, step), tables, views)
     return state

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.commands import CommandRecord
+from npdr_ppl.engines.commands import CommandRecord, commands_at
 from npdr_ppl.engines.effect_chain import EffectChain, Moments, State, Tables, needed_histories
 from npdr_ppl.engines.integrators import Components
 from npdr_ppl.engines.segment_start import recorded_start, true_start, with_past_commands
@@ -24,8 +24,8 @@ __all__ = ["Signals", "needs_accelerations"]
 
 
 def needs_accelerations(effect: SensorEffect) -> bool:
-    """Returns whether an effect starts from rates of the state, which such engines do not give."""
-    return effect.needs_rates or type(effect).lead is not SensorEffect.lead
+    """Returns whether an effect needs states at other times, which take the engine's rates."""
+    return effect.needs_past or type(effect).lead is not SensorEffect.lead
 
 
 class Signals:
@@ -77,7 +77,7 @@ class Signals:
         An offset or a wrong scale of a sensor is taken out of what was read there.
         """
         tables = Tables(None, self._sensor_parameters)
-        components = true_start(self._sensor_chain, tables, self._recorded, (), ())
+        components = true_start(self._sensor_chain, tables, self._recorded, ())
         if not components:
             return torch.zeros(len(self.start_times), 0, dtype=torch.float64)
         return torch.stack(components, dim=-1)
@@ -86,12 +86,12 @@ class Signals:
         """Returns what reaches the engine, ``(N, steps, actions)``."""
         chain, tables = self._action_chain, Tables(None, self._action_parameters)
         past = self._inputs.past_actions.shape[-2]
-        settled = tuple(record.at(-1 - past) for record in self._records)
+        settled = commands_at(self._records, -1 - past)
         state = chain.start((), (), tables, settled, (), self.start_times, num_past=past)
         state = with_past_commands(chain, state, tables, self._records, past)
         steps = []
         for step in range(self._inputs.num_steps):
-            commands = tuple(record.at(step) for record in self._records)
+            commands = commands_at(self._records, step)
             views = tuple(record.view(step) for record in self._records)
             state, reached, _ = chain.act(state, commands, tables, views)
             steps.append(torch.stack([x.expand_as(commands[0]) for x in reached], dim=-1))

@@ -54,8 +54,9 @@ class Start(NamedTuple):
         time_step: Seconds between two calls of the effect.
         parameters: The effect's parameters by short name.
         history: Past values that the effect asked to keep, rounded up.
-        rates: First and second time derivative of a sensor channel's true value, as the
-            simulator predicts them without its effects; empty for what is no sensor.
+        changes: By how much a sensor channel's true value differed one step before the start, two
+            steps and so on, as the simulator without its effects predicts; empty for what is no
+            sensor, or does not ask.
         is_rate: Whether the value is a sensor's of a velocity. Under commands that are held for a
             step, velocities are kinked where steps meet, and positions smooth.
     """
@@ -64,20 +65,18 @@ class Start(NamedTuple):
     time_step: float
     parameters: Mapping[str, Tensor]
     history: int = 0
-    rates: tuple[Tensor, ...] = ()
+    changes: tuple[Tensor, ...] = ()
     is_rate: bool = False
 
     def past(self, value: Tensor) -> tuple[Tensor, ...]:
         """Returns a sensor channel's true values before the start, latest first.
 
-        As many as :attr:`history`, continued backwards by the rates.
+        As many as :attr:`history`.
 
         Args:
             value: The true value at the start.
         """
-        rate, curvature = self.rates
-        times = (j * self.time_step for j in range(1, self.history + 1))
-        return tuple(value - h * rate + 0.5 * h * h * curvature for h in times)
+        return tuple(value + change for change in self.changes)
 
 
 class Joint(NamedTuple):

@@ -285,12 +285,12 @@ class SensorEffect(Effect):
     """An effect between the true value of a channel and its reading.
 
     Attributes:
-        needs_rates: Whether its memory starts from :attr:`Start.rates`.
+        needs_past: Whether its memory starts from :attr:`Start.changes`.
         spans: The channels that one device may have it on, with the same parameters.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
-    needs_rates: ClassVar[bool] = False
+    needs_past: ClassVar[bool] = False
     spans: ClassVar[tuple[SensorSpan, ...]] = ("position", "rate", "positions", "rates")
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
@@ -326,8 +326,8 @@ class SensorEffect(Effect):
     def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor | None:
         """Returns by how many seconds readings are ahead of the truth; ``None`` for not at all.
 
-        Negative for a delay. A segment whose state was read too late starts from the state
-        extrapolated by as much.
+        Negative for a delay. A segment whose state was read too late starts from where it has come
+        to since.
 
         Args:
             parameters: The effect's parameters by short name.

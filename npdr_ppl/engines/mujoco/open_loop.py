@@ -8,6 +8,7 @@ forces of effects have to be evaluated between engine steps.
 import logging
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.engines.commands import CommandRecord
+from npdr_ppl.engines.commands import CommandRecord, commands_at
 from npdr_ppl.engines.effect_chain import State, Tables
 from npdr_ppl.engines.mujoco.batches import quiet
 from npdr_ppl.engines.mujoco.native import run_all_steps
@@ -121,19 +122,17 @@ class _Replay:
             batch, tables = self.simulator.make_batch(given, last - first, step, middle)
             chain = MujocoStepper(self.simulator, batch, step, self.histories)
             records = self._records(chain, first, last)
-            latest = tuple(record.at(-1 if self.past else 0) for record in records)
-            upcoming = tuple(record.at(0) for record in records)
-            components = true_start(chain, tables, recorded, latest, upcoming)
+            components = true_start(chain, tables, recorded, records)
             chain.place(components)
             chain.begin()
             state = chain.start(
                 components[: chain.num_positions],
                 components[chain.num_positions :],
                 tables,
-                tuple(record.at(-1 - self.past) for record in records),
+                commands_at(records, -1 - self.past),
                 recorded.readings,
                 recorded.time,
-                latest=latest,
+                commands_before=partial(commands_at, records),
                 num_past=self.past if chain.action_effects else 0,
             )
             controls = self._controls(chain, state, tables, records, first, last)
@@ -190,7 +189,7 @@ class _Replay:
         controls = np.repeat(controls, chain.substeps, axis=2)
         state = with_past_commands(chain, state, tables, records, self.past)
         for k in range(self.inputs.num_steps):
-            commands = tuple(record.at(k) for record in records)
+            commands = commands_at(records, k)
             views = tuple(record.view(k) for record in records)
             state, actions, moments = chain.act(state, commands, tables, views)
             means, _ = chain.by_substep(actions, moments, chain.substeps)

@@ -93,16 +93,19 @@ class MujocoStepper(EffectChain):
     def accelerations(
         self, positions: Components, velocities: Components, actions: Components, tables: Tables
     ) -> Components:
-        """Returns the rate of each velocity among the states, without any effect.
-
-        Leaves the simulations in the state that is asked about.
-        """
+        """Returns the rate of each velocity among the states, without any effect."""
+        views = self._qpos, self._qvel, self._ctrl
+        kept = [view.copy() for view in views]
         self.place((*positions, *velocities))
         self._command(actions)
         result = self._batch.bind("qacc")
         self._look(ACCELERATION_STAGE)
         columns = [c.address for c in self.simulator.components if c.is_velocity]
-        return tuple(_column(result, column) for column in columns)
+        rates = tuple(_column(result, column) for column in columns)
+        for view, values in zip(views, kept, strict=True):
+            view[:] = values
+        self.begin()
+        return rates
 
     def _look(self, stage: int) -> None:
         """Computes forward stages in the present state, which stays as it is."""
