@@ -9,11 +9,18 @@ candidates' statistics is noted (a permutation test with Westfall and Young's ma
 Residuals are scaled by each segment's own spread before they are dealt, since fast segments have
 larger ones, and neighbours go together as long as there are enough, since coloured noise and the
 smoother's windows reach across a boundary.
+
+Where something is missing, it is among what is dealt, and would hide behind its own size. So no
+segment keeps its own residuals, and the variance of each deal's score is that of what the
+candidate, fitted to the deal, leaves.
 """
 
+import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+from scipy import special
 from torch import Tensor
 
 from npdr_ppl.workflows.discovery.projection import Projection
@@ -50,30 +57,28 @@ class LargestStatistic:
 
     def __init__(self, projection: Projection, *, seed: int, draws: int = DRAWS) -> None:
         self._projection = projection
-        residual = projection.weighted_residual
-        num = len(residual)
-        width = 2 if num >= 2 * FEWEST_BLOCKS else 1
-        num_used = num - num % width
-        square = residual[:num_used].square().mean(-1)
+        residual = projection.whitened(projection.residual[..., None])[..., 0]
+        width = 2 if len(residual) >= 2 * FEWEST_BLOCKS else 1
+        self._blocks = len(residual) // width
+        self._num_used = self._blocks * width
+        used = residual[: self._num_used]
+        square = used.square().mean(-1)
         spread = (0.5 * (square + square.mean())).sqrt().clamp_min(1e-30)
-        standard = residual[:num_used] / spread[:, None]
-        blocks = num_used // width
+        self._spread = spread[:, None, None]
+        self._standard = self._joined(used[..., None] / self._spread)[..., 0]
         generator = torch.Generator().manual_seed(seed)
-        order = torch.rand(draws, blocks, generator=generator).argsort(-1)
-        signs = torch.randint(0, 2, (draws, blocks), generator=generator).double() * 2.0 - 1.0
-        order[0], signs[0] = torch.arange(blocks), 1.0
+        order = _derangements(draws, self._blocks, generator)
+        signs = torch.randint(0, 2, order.shape, generator=generator).double() * 2.0 - 1.0
+        order[0], signs[0] = torch.arange(self._blocks), 1.0
         # The entry of every block and what it is dealt, (draws, blocks · blocks).
-        entries = torch.arange(blocks) * blocks + order
-        places = torch.stack((torch.arange(draws).repeat_interleave(blocks), entries.flatten()))
-        shape = draws, blocks * blocks
+        entries = torch.arange(self._blocks) * self._blocks + order
+        rows = torch.arange(draws).repeat_interleave(self._blocks)
         self._deals = torch.sparse_coo_tensor(
-            places, signs.flatten(), shape, check_invariants=True
+            torch.stack((rows, entries.flatten())),
+            signs.flatten(),
+            (draws, self._blocks**2),
+            check_invariants=True,
         ).coalesce()
-        self._dealt: list[tuple[slice, Tensor, Tensor]] = []
-        for k in range(width):
-            own = slice(k, num_used, width)
-            dealt = (spread[own, None, None] * standard[own].mT, own)
-            self._dealt.append((own, projection.solve(*dealt), projection.explained(*dealt)))
 
     def p_values(self, groups: Sequence[Tensor]) -> list[float]:
         """Returns each candidate's p-value among all of them.
@@ -81,45 +86,82 @@ class LargestStatistic:
         Args:
             groups: Changes of each candidate, ``(S, N, k)``.
         """
-        rows: list[Tensor] = []
-        limit = max(1, MOST_NUMBERS // self._deals.shape[1])
-        waiting: list[Tensor] = []
-        for group in groups:
-            if waiting and sum(g.shape[-1] for g in waiting) + group.shape[-1] > limit:
-                rows += self._statistics(waiting)
-                waiting = []
-            waiting.append(group)
-        if waiting:
-            rows += self._statistics(waiting)
-        if not rows:
+        if not groups:
             return []
-        largest = torch.stack(rows).amax(0)
-        return [float((largest >= row[0] - 1e-12).double().mean()) for row in rows]
+        rows: list[Tensor | None] = [None] * len(groups)
+        for size in {group.shape[-1] for group in groups}:
+            alike = [i for i, group in enumerate(groups) if group.shape[-1] == size]
+            together = max(1, MOST_NUMBERS // (self._deals.shape[1] * size * size))
+            for first in range(0, len(alike), together):
+                chosen = alike[first : first + together]
+                found = self._tails(torch.stack([groups[i] for i in chosen], dim=-2))
+                for i, row in zip(chosen, found, strict=True):
+                    rows[i] = row
+        tails = torch.stack([row for row in rows if row is not None])
+        largest = tails.amax(0)
+        return (largest >= tails[:, :1] - 1e-12).double().mean(1).tolist()
 
-    def _statistics(self, groups: list[Tensor]) -> list[Tensor]:
-        """Returns minus the log tail of each candidate's statistic in every deal, ``(draws,)``."""
-        columns = torch.cat(groups, dim=-1)
-        refit = self._projection.refit(columns)
-        # What block b would score with the residuals of block b', (blocks, blocks', P).
-        table = sum(
-            weighted.mT @ columns[own] - explained.mT @ refit
-            for own, weighted, explained in self._dealt
+    def _tails(self, columns: Tensor) -> Tensor:
+        """Returns minus the log tail of each candidate's statistic in every deal, ``(P, draws)``.
+
+        Args:
+            columns: Changes of P candidates of k strengths, ``(S, N, P, k)``.
+        """
+        _, _, num, size = columns.shape
+        changes = self._projection.projected(columns.flatten(-2))[: self._num_used]
+        weights, signals = (
+            self._joined(by_segment).unflatten(-1, (num, size))
+            for by_segment in (changes * self._spread, changes / self._spread)
         )
-        assert isinstance(table, Tensor)
-        sums = torch.sparse.mm(self._deals, table.flatten(0, 1))
-        result, start = [], 0
-        for group in groups:
-            own = slice(start, start + group.shape[-1])
-            start = own.stop
-            terms = table[..., own].flatten(0, 1)
-            covariance = terms.mT @ terms / len(table)
-            scale = covariance.diagonal().clamp_min(1e-300).sqrt()
-            inverse = torch.linalg.pinv(covariance / scale / scale[:, None], hermitian=True)
-            unit = sums[:, own] / scale
-            statistic = ((unit @ inverse) * unit).sum(-1)
-            half = torch.tensor(0.5 * group.shape[-1], dtype=torch.float64)
-            tail = torch.special.gammaincc(half, 0.5 * statistic.clamp_min(0.0))
-            # Beyond what the function resolves, its leading term goes on.
-            far = 0.5 * statistic
-            result.append(torch.where(tail > 1e-290, -tail.clamp_min(1e-300).log(), far))
-        return result
+        # What block b would score with the residuals of block c, (P, b, c, k), standardised.
+        scores = torch.einsum("bnpk,cn->pbck", weights, self._standard)
+        scale = (scores.square().sum((1, 2)) / self._blocks).clamp_min(1e-300).sqrt()
+        scores, weights = scores / scale[:, None, None], weights / scale
+        # ... and with what each strength changes in block c, (P, b, c, k, strength).
+        signals = signals / signals.square().sum((0, 1)).clamp_min(1e-300).sqrt()
+        expected = torch.einsum("bnpk,cnpl->pbckl", weights, signals)
+        covariance = torch.einsum("pbci,pbcj->pij", scores, scores) / self._blocks
+        towards = torch.einsum("pbckl,pbek->pcel", expected, scores)
+        dealt = self._dealt(torch.cat((scores, towards), dim=-1))
+        total, aligned = dealt[..., :size], dealt[..., size:]
+        inverse = torch.linalg.pinv(covariance, hermitian=True)
+        direction = total @ inverse  # (P, draws, k)
+        statistic = (direction * total).sum(-1)
+        # Strengths by least squares over all pairs of blocks, and what they take of the variance
+        # along the direction in which the score lies.
+        pairs = torch.einsum("pbckl,pbckm->plm", expected, expected)
+        strengths = aligned @ torch.linalg.pinv(pairs, hermitian=True)
+        both = torch.einsum("pdk,pdl->pdkl", direction, strengths).flatten(-2)
+        gram = expected.flatten(-2).flatten(1, 2)
+        taken = ((both @ (gram.mT @ gram)) * both).sum(-1) / self._blocks
+        left = (1.0 - taken / statistic.clamp_min(1e-300)).clamp_min(1e-6)
+        return _log_tail(statistic / left, size, self._blocks - size)
+
+    def _dealt(self, table: Tensor) -> Tensor:
+        """Returns a table's sums in every deal, ``(P, b, c, Q)`` to ``(P, draws, Q)``."""
+        rows = table.permute(1, 2, 0, 3).flatten(0, 1).flatten(1)
+        return torch.sparse.mm(self._deals, rows).unflatten(1, table.shape[::3]).transpose(0, 1)
+
+    def _joined(self, by_segment: Tensor) -> Tensor:
+        """Joins neighbouring segments, ``(S, N, P)`` to ``(blocks, N', P)``."""
+        return by_segment.unflatten(0, (self._blocks, -1)).flatten(1, 2)
+
+
+def _derangements(draws: int, size: int, generator: torch.Generator) -> Tensor:
+    """Returns random orders in which nothing keeps its place, ``(draws, size)``."""
+    found: list[Tensor] = []
+    while sum(map(len, found)) < draws:
+        # One in e has no fixed point.
+        order = torch.rand(3 * draws, size, generator=generator).argsort(-1)
+        found.append(order[(order != torch.arange(size)).all(-1)])
+    return torch.cat(found)[:draws]
+
+
+def _log_tail(statistic: Tensor, size: int, freedom: int) -> Tensor:
+    """Returns minus the log probability that Hotelling's statistic is greater."""
+    halves = 0.5 * freedom, 0.5 * size
+    share = freedom / (freedom + statistic.clamp_min(0.0).numpy())
+    tail = special.betainc(*halves, share)
+    # Beyond what the function resolves, its leading term goes on.
+    far = halves[0] * np.log(share) - math.log(halves[0]) - special.betaln(*halves)
+    return torch.from_numpy(-np.where(tail > 1e-290, np.log(tail.clip(1e-300)), far))

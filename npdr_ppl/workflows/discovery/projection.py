@@ -77,23 +77,35 @@ class Projection:
         self._information = (by_z.mT @ self._weights).sum(0) + prior
         self._score = (by_z.mT @ self._weighted[..., None])[..., 0]  # (S, d)
 
-    @property
-    def weighted_residual(self) -> Tensor:
-        """C⁻¹ r: the residuals with every initial state at its best, ``(S, N)``."""
-        return self._weighted
+    def projected(self, columns: Tensor) -> Tensor:
+        """Returns C^-½ x less what refitted parameters explain of it.
 
-    def refit(self, columns: Tensor) -> Tensor:
-        """Returns how the parameters answer to columns ``(S, N, P)``, ``(d, P)``."""
-        return torch.linalg.solve(self._information, self.explained(columns).sum(0))
-
-    def explained(self, columns: Tensor, segments: slice = slice(None)) -> Tensor:
-        """Returns the parameters' scores with columns for residuals, ``(S, d, P)``.
+        Its products with the whitened residuals are scores, those with itself information.
 
         Args:
-            columns: The columns, ``(S, N, P)``.
-            segments: Of which segments they are.
+            columns: The columns x, ``(S, N, P)``.
         """
-        return self._weights[segments].mT @ columns
+        refit = torch.linalg.solve(self._information, self._explained(columns))
+        return self.whitened(columns - self._by_z @ refit)
+
+    def whitened(self, columns: Tensor) -> Tensor:
+        """Returns C^-½ x: with independent components of unit variance where x is a residual.
+
+        Args:
+            columns: The columns x, ``(S, N, P)``.
+        """
+        directions, sizes, _ = self._starts_by_size
+        shrunk = 1.0 - (1.0 + sizes.square()).rsqrt()
+        return columns - directions @ (shrunk[..., None] * (directions.mT @ columns))
+
+    @cached_property
+    def _starts_by_size(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Singular value decomposition of the starts' derivatives."""
+        return torch.linalg.svd(self._starts, full_matrices=False)
+
+    def _explained(self, columns: Tensor) -> Tensor:
+        """Returns the parameters' scores with columns for residuals, ``(d, P)``."""
+        return (self._weights.mT @ columns).sum(0)
 
     @property
     def parameter_scores(self) -> Tensor:
@@ -110,15 +122,10 @@ class Projection:
         """Information of the parameters with their prior, ``(d, d)``."""
         return self._information
 
-    def solve(self, columns: Tensor, segments: slice = slice(None)) -> Tensor:
-        """Returns C⁻¹ x, ``(S, N, P)``.
-
-        Args:
-            columns: The columns x, ``(S, N, P)``.
-            segments: Of which segments they are.
-        """
-        starts = self._starts[segments]
-        return columns - starts @ torch.linalg.solve(self._inner[segments], starts.mT @ columns)
+    def solve(self, columns: Tensor) -> Tensor:
+        """Returns C⁻¹ x, ``(S, N, P)``."""
+        inner = torch.linalg.solve(self._inner, self._starts.mT @ columns)
+        return columns - self._starts @ inner
 
     @cached_property
     def misfit(self) -> float:
@@ -128,7 +135,7 @@ class Projection:
     def scores(self, columns: Tensor) -> Scores:
         """Returns the scores of columns, ``(S, N, P)``."""
         weighted = self.solve(columns)
-        cross = self.explained(columns).sum(0)  # (d, P)
+        cross = self._explained(columns)
         refit = torch.linalg.solve(self._information, cross)
         own = (columns.mT @ weighted).sum(0)
         by_segment = (columns.mT @ self._weighted[..., None])[..., 0] - self._score @ refit
