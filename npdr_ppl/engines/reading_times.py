@@ -61,7 +61,7 @@ def catch_up(
     """
     ages = [None if lead is None else -lead for lead in leads]
     known = [age.detach() for age in ages if age is not None]
-    oldest = max(float(age.max()) for age in known)
+    oldest = max((float(age.max()) for age in known), default=0.0)
     for step in range(-math.ceil(oldest / time_step), 0):
         spans = [
             None if age is None else (age + (step + 1) * time_step).clamp(0.0, time_step)
@@ -69,7 +69,7 @@ def catch_up(
         ]
         states = _moved(simulator, states, accelerations, step, ages, spans)
         ages = [_difference(age, span) for age, span in zip(ages, spans, strict=True)]
-    if min(float(age.min()) for age in known) < 0.0:
+    if any(float(age.min()) < 0.0 for age in known):
         states = _moved(simulator, states, accelerations, 0, ages, ages)
     return states
 

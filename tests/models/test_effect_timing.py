@@ -115,7 +115,8 @@ def test_segments_of_late_sensors_start_from_where_the_commands_since_have_led(d
         past_actions=commands[None, :begin, None],
         time_step=step,
     )
-    assert (out - late[1:])[:, 0].abs().max() < 2e-4
+    # Where it is kinked a parabola misses the motion by as much.
+    assert (out - late[1:])[:, 0].abs().max() < 3e-4
 
 
 def test_late_positions_are_read_along_a_parabola_and_velocities_along_a_line():
