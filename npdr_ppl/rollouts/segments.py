@@ -16,7 +16,15 @@ from npdr_ppl.rollouts.states import StateEstimate, estimate_states
 if TYPE_CHECKING:
     from npdr_ppl.rollouts.container import Rollouts
 
-__all__ = ["DEFAULT_HISTORY", "InitialState", "columns_of", "inputs", "observation", "stitch"]
+__all__ = [
+    "DEFAULT_HISTORY",
+    "InitialState",
+    "columns_of",
+    "cut",
+    "inputs",
+    "observation",
+    "stitch",
+]
 
 InitialState = Literal["estimated", "recorded", "uncertain"]
 """How the state at a segment's start is found: the readings are smoothed and differentiated, or
@@ -59,6 +67,26 @@ def inputs(
     if history < 0:
         raise DataError(f"a history cannot be negative, but {history=}.")
     layout = _layout(rollouts.lengths, segment_length)
+    return cut(rollouts, layout, initial_state=initial_state, history=history, dtype=dtype)
+
+
+def cut(
+    rollouts: "Rollouts",
+    layout: Sequence[tuple[int, int, int]],
+    *,
+    initial_state: InitialState,
+    history: int,
+    dtype: torch.dtype,
+) -> Inputs:
+    """Returns chosen segments of rollouts; see :meth:`Rollouts.inputs`.
+
+    Args:
+        rollouts: The rollouts.
+        layout: Rollout, first step and end of each segment, in the order of the rollouts.
+        initial_state: How the state at a segment's start is found.
+        history: Steps of past commands to hand over.
+        dtype: Floating-point type of the tensors.
+    """
     num_steps = max(stop - start for _, start, stop in layout)
     num_actions = len(rollouts.action_names)
     actions = np.zeros((len(layout), num_steps, num_actions))

@@ -1,12 +1,13 @@
 """Estimates values and time derivatives from readings, robust to quantisation and noise."""
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["StateEstimate", "estimate_states"]
+__all__ = ["StateEstimate", "estimate_departures", "estimate_states"]
 
 Array = NDArray[np.float64]
 
@@ -69,10 +70,66 @@ def estimate_states(readings: Array, steps: NDArray[np.int64], time_step: float)
         regression, 1997; V. Katkovnik, A new method for varying adaptive bandwidth selection,
         1999 (the rule).
     """
+    value, rate, value_error, rate_error, _ = _adaptive(
+        readings, steps, _noises(readings), _num_changes(readings)
+    )
+    value_error, rate_error = ERROR_RATIOS[0] * value_error, ERROR_RATIOS[1] * rate_error
+    return StateEstimate(value, rate / time_step, value_error, rate_error / time_step)
+
+
+def estimate_departures(
+    readings: Array,
+    predicted: Sequence[Array],
+    first: NDArray[np.int64],
+    steps: NDArray[np.int64],
+    time_step: float,
+) -> StateEstimate:
+    """Estimates by how much readings and their rates depart from a prediction at chosen steps.
+
+    What a model leaves of the readings is smoother than they are: where commands change, their
+    rates are kinked, which a polynomial takes for a bias and answers with a small window. Where
+    nothing but the prediction's end stops a window, errors are the standard errors.
+
+    Args:
+        readings: ``(T + 1, C)``, constant sampling, in the channels' units.
+        predicted: The same channels predicted around each of P steps, ``(W, C)`` each.
+        first: Index of the row that each prediction begins with, ``(P,)``.
+        steps: Indices of the rows wanted, ``(P,)``.
+        time_step: Seconds between rows.
+    """
+    noises, num_changes = _noises(readings), _num_changes(readings)
+    num_channels = readings.shape[1]
+    result = np.empty((4, len(steps), num_channels))
+    shapes = [
+        (int(step - row), len(window))
+        for step, row, window in zip(steps, first, predicted, strict=True)
+    ]
+    # Windows of one shape are smoothed at once, as channels of one recording.
+    for shape in sorted(set(shapes)):
+        place, size = shape
+        which = [i for i, other in enumerate(shapes) if other == shape]
+        rows = first[which, None] + np.arange(size)
+        departures = readings[rows] - np.stack([predicted[i] for i in which])
+        columns = departures.transpose(1, 0, 2).reshape(size, -1)
+        changes = num_changes[rows].transpose(1, 0, 2).reshape(size, -1)
+        *found, is_stopped = _adaptive(
+            columns, np.array([place]), np.tile(noises, len(which)), changes
+        )
+        for k, ratio in zip((2, 3), ERROR_RATIOS, strict=True):
+            found[k] = np.where(is_stopped[k - 2], ratio, 1.0) * found[k]
+        result[:, which] = np.stack(found).reshape(4, len(which), num_channels)
+    value, rate, value_error, rate_error = result
+    return StateEstimate(value, rate / time_step, value_error, rate_error / time_step)
+
+
+def _adaptive(
+    readings: Array, steps: NDArray[np.int64], noises: Array, num_changes: NDArray[np.int64]
+) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
+    """Returns values, rates per row, their standard errors, and what bias stopped; ``(P, C)``.
+
+    The last is ``(2, P, C)``: whether a window of values or of rates could have grown on.
+    """
     num_rows = len(readings)
-    noise = np.array([_noise(channel) for channel in readings.T])
-    is_change = np.diff(readings, axis=0, prepend=readings[:1]) != 0
-    num_changes = np.cumsum(is_change, axis=0)
     widths = [w for w in HALF_WIDTHS if w < num_rows] or [HALF_WIDTHS[0]]
     around = np.clip(steps[:, None] + np.array(NEIGHBOURS), 0, num_rows - 1)
     where, which = np.unique(around, return_inverse=True)
@@ -81,15 +138,24 @@ def estimate_states(readings: Array, steps: NDArray[np.int64], time_step: float)
     errors = np.empty_like(fits)
     for index, width in enumerate(widths):
         fits[index], errors[index] = _fit(readings, where, width, num_changes)
-    spread = CONFIDENCE * errors * noise
+    spread = CONFIDENCE * errors * noises
     meets = np.maximum.accumulate(fits - spread) <= np.minimum.accumulate(fits + spread)
     largest = np.logical_and.accumulate(meets).sum(axis=0) - 1
     chosen = np.median(largest[:, which.reshape(around.shape)], axis=2).astype(int)
     at = np.searchsorted(where, steps)
     value, rate = np.take_along_axis(fits[:, :, at], chosen[None], axis=0)[0]
-    error = np.take_along_axis(errors[:, :, at], chosen[None], axis=0)[0]
-    value_error, rate_error = noise * error * np.array(ERROR_RATIOS)[:, None, None]
-    return StateEstimate(value, rate / time_step, value_error, rate_error / time_step)
+    error = noises * np.take_along_axis(errors[:, :, at], chosen[None], axis=0)[0]
+    return value, rate, error[0], error[1], chosen < len(widths) - 1
+
+
+def _noises(readings: Array) -> Array:
+    return np.array([_noise(channel) for channel in readings.T])
+
+
+def _num_changes(readings: Array) -> NDArray[np.int64]:
+    """Returns how often each channel's reading has changed up to each row, ``(T + 1, C)``."""
+    is_change = np.diff(readings, axis=0, prepend=readings[:1]) != 0
+    return np.cumsum(is_change, axis=0)
 
 
 def _fit(

@@ -14,6 +14,7 @@ for all parameters, all segments and all components of their initial states: the
 black box.
 """
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -31,6 +32,12 @@ from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.states import estimate_states
 from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.segment_starts import (
+    Starts,
+    error_factors,
+    estimate_starts,
+    uncertain_components,
+)
 
 __all__ = ["Linearisation", "SegmentFit", "SegmentModel", "fit_segments"]
 
@@ -129,6 +136,7 @@ class SegmentModel:
         rollouts: The recording.
         options: Segments, initial states and precision; where initial states are ``"uncertain"``
             they can be shifted, otherwise m is zero.
+        starts: What the segments start from, if better known than by the smoother.
 
     Attributes:
         prior: The model's prior.
@@ -137,10 +145,15 @@ class SegmentModel:
         measured: The C of them that were measured, as the simulator declares them.
         channel_names: Their names.
         observed: What was measured, ``(S, K, C)``.
+        starts: What the segments start from, where that was given.
     """
 
     def __init__(
-        self, model: Callable[..., Any], rollouts: Rollouts, options: BindingOptions
+        self,
+        model: Callable[..., Any],
+        rollouts: Rollouts,
+        options: BindingOptions,
+        starts: Starts | None = None,
     ) -> None:
         self.inputs = options.inputs(rollouts)
         self.prior = Prior(with_noise(model, None), (self.inputs,))
@@ -160,8 +173,33 @@ class SegmentModel:
             )
         self._columns = [names.index(name) for name in self.channel_names]
         self.observed = rollouts.observation(self.inputs, channels=self.channel_names)
-        self.inputs = _with_lagging_rates(self.inputs, rollouts, box.simulator.rate_lag)
-        self._offsets = _uncertain_components(self.inputs)
+        self._smoothed = _with_lagging_rates(self.inputs, rollouts, box.simulator.rate_lag)
+        self._start_from(starts)
+
+    def estimated_starts(self, z: Tensor, scale: Tensor, rollouts: Rollouts) -> Starts | None:
+        """Estimates what the segments start from along a fitted motion, and how well.
+
+        Args:
+            z: Parameters, ``(d,)``.
+            scale: Standard deviation of each channel's residuals, ``(C,)``.
+            rollouts: The recording.
+
+        Returns:
+            ``None`` if what the segments start from is certain.
+        """
+        starts = estimate_starts(self.black_box(z[None]), self._smoothed, rollouts)
+        if starts is None:
+            return None
+        segments = copy.copy(self)
+        segments._start_from(starts)
+        unmoved = torch.zeros(self.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
+        now = segments.linearise(z, unmoved, scale, is_rough=True)
+        return starts.scaled(segments.inputs, error_factors(now.residual, now.by_starts))
+
+    def _start_from(self, starts: Starts | None) -> None:
+        self.starts = starts
+        self.inputs = self._smoothed if starts is None else starts.put_into(self._smoothed)
+        self._offsets = uncertain_components(self.inputs)
 
     @property
     def num_offsets(self) -> int:
@@ -462,18 +500,3 @@ def _with_lagging_rates(inputs: Inputs, rollouts: Rollouts, lag: float) -> Input
     change = np.sqrt(np.concatenate(changes).mean(0))
     errors = inputs.initial_rate_errors
     return replace(inputs, initial_rate_errors=errors.hypot(errors.new_tensor(lag * change)))
-
-
-def _uncertain_components(inputs: Inputs) -> list[tuple[str, int, Tensor]]:
-    """Returns field, channel and standard deviations ``(S,)`` of what may be off at a start."""
-    found = []
-    for name, errors in (
-        ("initial_values", inputs.initial_value_errors),
-        ("initial_rates", inputs.initial_rate_errors),
-    ):
-        if errors is not None:
-            for column in range(errors.shape[-1]):
-                error = errors[..., column].double()
-                if bool((error > 0).any()):
-                    found.append((name, column, error))
-    return found

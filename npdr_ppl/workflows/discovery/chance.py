@@ -33,8 +33,9 @@ DRAWS = 2000
 FEWEST_BLOCKS = 24
 """Neighbouring segments are joined in pairs as long as this many pairs remain."""
 
-MOST_NUMBERS = 20_000_000
-"""Numbers held at a time."""
+MOST_NUMBERS = 1_000_000
+"""Numbers of candidates' changes looked at together, which with their tables fit a processor's
+caches."""
 
 
 def block_sums(by_segment: Tensor) -> Tensor:
@@ -91,7 +92,7 @@ class LargestStatistic:
         rows: list[Tensor | None] = [None] * len(groups)
         for size in {group.shape[-1] for group in groups}:
             alike = [i for i, group in enumerate(groups) if group.shape[-1] == size]
-            together = max(1, MOST_NUMBERS // (self._deals.shape[1] * size * size))
+            together = max(1, MOST_NUMBERS // groups[alike[0]].numel())
             for first in range(0, len(alike), together):
                 chosen = alike[first : first + together]
                 found = self._tails(torch.stack([groups[i] for i in chosen], dim=-2))

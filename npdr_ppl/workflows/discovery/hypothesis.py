@@ -21,6 +21,7 @@ from npdr_ppl.workflows.segment_fit import (
     SegmentModel,
     fit_segments,
 )
+from npdr_ppl.workflows.segment_starts import Starts
 
 __all__ = ["Hypothesis", "fit_hypothesis", "with_effects"]
 
@@ -74,6 +75,10 @@ class Hypothesis:
     def linearisation(self) -> Linearisation:
         """Residuals and derivatives at the fit, whitened by its own scale."""
         return self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
+
+    def estimated_starts(self, rollouts: Rollouts) -> Starts | None:
+        """Estimates what the segments start from along the fitted motion, and how well."""
+        return self.segments.estimated_starts(self.fit.z, self.fit.scale, rollouts)
 
     @cached_property
     def parameters(self) -> dict[str, Tensor]:
@@ -144,6 +149,7 @@ def fit_hypothesis(
     effects: tuple[Effect, ...] = (),
     start: Mapping[str, Tensor] | None = None,
     offsets: Tensor | None = None,
+    starts: Starts | None = None,
     max_steps: int = 12,
     is_rough: bool = False,
 ) -> Hypothesis:
@@ -156,6 +162,7 @@ def fit_hypothesis(
         effects: Effects to add.
         start: Parameters to begin with by site; the others begin in the middle of their priors.
         offsets: Offsets of the initial states to begin with, ``(S, m)``.
+        starts: What the segments start from, if better known than by the smoother.
         max_steps: Greatest number of steps.
         is_rough: Whether to leave it at rough steps.
 
@@ -163,7 +170,7 @@ def fit_hypothesis(
         DataError: The simulation fails at the start, or the data do not fit the model.
     """
     model = with_effects(model, effects)
-    segments = SegmentModel(model, rollouts, options)
+    segments = SegmentModel(model, rollouts, options, starts)
     z = torch.zeros(segments.prior.num_parameters, dtype=torch.float64)
     if start:
         middle = segments.prior.to_parameters(z[None])

@@ -52,10 +52,13 @@ class Rivals:
 
     Attributes:
         without: The model without the effect.
+        with_it: The model with the effect, as it was when the others were tried: with the same
+            states to start from.
         others: The model with each other that could stand there, by name.
     """
 
     without: Hypothesis
+    with_it: Hypothesis
     others: dict[str, Hypothesis]
 
 
@@ -84,7 +87,8 @@ def find_rivals(
     ranking = screen(projection, variants_of(candidates, projection, responses(without)))
     tried = {effect.name: current} | trials.extended(without, ranking)
     tried = trials.converged(tried, done=effect.name)
-    return Rivals(without, {name: h for name, h in tried.items() if name != effect.name})
+    others = {name: h for name, h in tried.items() if name != effect.name}
+    return Rivals(without, current, others)
 
 
 def tried_before(
@@ -103,7 +107,7 @@ def tried_before(
     for hypothesis, tried in seen:
         if set(hypothesis.names) == rest and effect.name in tried:
             others = {name: trial for name, trial in tried.items() if name != effect.name}
-            return Rivals(hypothesis, others)
+            return Rivals(hypothesis, tried[effect.name], others)
     return None
 
 
@@ -123,7 +127,7 @@ def weigh_rivals(
     """
     if rivals is None:
         return current, Added(effect, effect.name, 1.0, {effect.name: 1.0})
-    without, trials = rivals.without, {effect.name: current} | rivals.others
+    without, trials = rivals.without, {effect.name: rivals.with_it} | rivals.others
     prior = [
         log_prior(trial) - strain
         for trial, strain in zip(trials.values(), _strains(trials, without), strict=True)
@@ -136,6 +140,7 @@ def weigh_rivals(
     scale = closest([base, swapped]).fit.scale
     whole, lost = (float((h.losses(scale) - swapped.losses(scale)).sum()) for h in (base, without))
     share = max(0.0, lost) / max(whole, 1e-12)
+    swapped = current if best == effect.name else swapped
     return swapped, Added(chosen, effect.name, share, alternatives)
 
 

@@ -118,7 +118,8 @@ class Searcher:
     def fit_base(self) -> Hypothesis:
         """Fits the model as it is."""
         self._report("fitting the model as it is")
-        return fit_hypothesis(self.model, self.rollouts, self.binding)
+        fitted = fit_hypothesis(self.model, self.rollouts, self.binding)
+        return self._trials.with_own_starts(fitted)
 
     def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
         """Returns the hypothesis in finer steps, where its own err noticeably; else as it is.
@@ -138,7 +139,7 @@ class Searcher:
                 if weigh([current, finer], [0.0, 0.0], seed=0)[0] < self.options.confidence:
                     self._report("the model's steps are too coarse for this recording: finer ones")
                     self.are_steps_coarse = True
-                    return finer
+                    return self._trials.with_own_starts(finer)
         self.model = coarse
         return current
 
@@ -148,7 +149,7 @@ class Searcher:
         The root mean square over the recording, of the channel where it is greatest.
         """
         fit, model = current.fit, with_effects(self.model, current.effects)
-        finer = SegmentModel(model, self.rollouts, self.binding)
+        finer = SegmentModel(model, self.rollouts, self.binding, current.segments.starts)
         here = fit.z[None], fit.offsets[None]
         difference = finer.simulate(*here) - current.segments.simulate(*here)
         error = finer.root_mean_square(difference[0]) / fit.scale
@@ -177,6 +178,7 @@ class Searcher:
             if best is None:
                 break
             current, needless = self._pruned(tried[best])
+            current = self._trials.with_own_starts(current)
             removed += needless
             if self.with_finer_steps(current) is not current:
                 # What was missing had hidden how coarse they are: begin anew.
@@ -272,6 +274,7 @@ class Searcher:
                 tried = {effect.name: asked} | ({} if rivals is None else rivals.others)
                 trials |= {(effect.name, name): trial for name, trial in tried.items()}
                 if current is not asked:
+                    current = self._trials.with_own_starts(current)
                     break  # the rivals of the others are to be found beside what was swapped in
         return current, added, trials
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import torch
 from torch import Tensor
 
 from npdr_ppl.errors import NpdrError
@@ -15,6 +16,7 @@ from npdr_ppl.workflows.discovery.evidence import closest
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
 from npdr_ppl.workflows.discovery.screening import Screened
 from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_side
+from npdr_ppl.workflows.segment_starts import Starts
 
 __all__ = ["PLAINLY", "SHORTLIST", "Trials"]
 
@@ -55,12 +57,14 @@ class _Fit:
         effects: The effects that the model is to have.
         start: Parameters to begin with, by site.
         offsets: Offsets of the initial states to begin with, ``(S, m)``.
+        starts: What the segments start from.
         is_trial: Whether rough steps will do.
     """
 
     effects: tuple[Effect, ...]
     start: Mapping[str, Tensor]
     offsets: Tensor
+    starts: Starts | None
     is_trial: bool = False
 
 
@@ -103,6 +107,7 @@ class Trials:
                     (*current.effects, candidate.variant.effect),
                     current.parameters | candidate.variant.parameters(candidate.sizes),
                     current.fit.offsets,
+                    current.segments.starts,
                     is_trial=True,
                 )
                 for candidate in tried
@@ -134,7 +139,7 @@ class Trials:
             if name != done and losses[name] <= least + max(CONTENDS_ANYWAY, CONTENDS * abs(least))
         ]
         asked = [
-            _Fit(trial.effects, trial.parameters, trial.fit.offsets)
+            _Fit(trial.effects, trial.parameters, trial.fit.offsets, trial.segments.starts)
             for trial in (trials[name] for name in contenders)
         ]
         result = dict(trials)
@@ -159,8 +164,27 @@ class Trials:
         kept = {name for effect in chosen for name in effect.parameter_names}
         gone = {name for effect in current.effects for name in effect.parameter_names} - kept
         start = {name: value for name, value in current.parameters.items() if name not in gone}
-        (found,) = self._fits([_Fit(chosen, start, current.fit.offsets)], current.simulator)
+        asked = _Fit(chosen, start, current.fit.offsets, current.segments.starts)
+        (found,) = self._fits([asked], current.simulator)
         return found
+
+    def with_own_starts(self, current: Hypothesis) -> Hypothesis:
+        """Returns a hypothesis whose segments start from where it leads itself.
+
+        What its model leaves of the readings tells their states better than the readings alone,
+        and how large its offsets come out tells how well.
+
+        Args:
+            current: The hypothesis.
+        """
+        starts = current.estimated_starts(self.rollouts)
+        if starts is None:
+            return current
+        unmoved = torch.zeros_like(current.fit.offsets)
+        (found,) = self._fits(
+            [_Fit(current.effects, current.parameters, unmoved, starts)], current.simulator
+        )
+        return found or current
 
     def without(self, current: Hypothesis, effect: Effect) -> Hypothesis | None:
         """Returns a hypothesis without one of its effects, see :meth:`refitted`."""
@@ -181,6 +205,7 @@ def _fitted(trials: Trials, asked: _Fit) -> Hypothesis | None:
             effects=asked.effects,
             start=asked.start,
             offsets=asked.offsets,
+            starts=asked.starts,
             max_steps=TRIAL_STEPS if asked.is_trial else MAX_STEPS,
             is_rough=asked.is_trial,
         )

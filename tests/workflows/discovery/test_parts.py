@@ -282,3 +282,32 @@ def test_what_cannot_travel_is_done_here():
             return 2 * x
 
     assert list(side_by_side(doubled, [1, 2, 3], 2)) == [2, 4, 6]
+
+
+class WhiteNoise:
+    """Stands for a fitted hypothesis whose residuals are white, with nothing to refit."""
+
+    def __init__(self, residual):
+        self.residual = residual
+
+    def whitened(self, columns):
+        return columns
+
+    projected = whitened
+
+
+def test_what_shows_in_one_segment_only_is_heard():
+    """Dealing every segment its own residuals now and then would take it for chance."""
+    generator = torch.Generator().manual_seed(0)
+    residual = torch.randn(30, 20, generator=generator).double()
+    columns = torch.zeros(30, 20, 1).double()
+    columns[7] = torch.randn(20, 1, generator=generator).double()
+    columns[7] /= columns[7].norm()
+    others = [torch.randn(30, 20, 1, generator=generator).double() for _ in range(40)]
+
+    def p_value(size):
+        changed = WhiteNoise(residual + size * columns[..., 0])
+        return LargestStatistic(changed, seed=0).p_values([columns, *others])[0]
+
+    assert p_value(0.0) > 0.05
+    assert p_value(6.0) < 0.01  # at least 1 / 60 if it kept its own
