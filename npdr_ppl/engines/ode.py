@@ -25,9 +25,10 @@ __all__ = ["Forces", "ODESimulator"]
 Forces = tuple[Tensor | float, ...]
 """Generalised forces to add, one per joint; 0.0 where no effect acts."""
 
-FINER = "midpoint"
-"""Integrator of :meth:`ODESimulator.with_finer_steps`. At the zoo's steps it errs by a hundredth
-of what one Euler step does, less than encoders resolve, at half the price of Runge–Kutta steps."""
+FINER = "midpoint", "rk4"
+"""Integrators of :meth:`ODESimulator.with_finer_steps`, one after the other. At the zoo's steps
+the first errs by a hundredth of what one Euler step does, mostly less than can be noticed, at half
+the price of the second."""
 
 
 class ODESimulator(ClosedLoopSimulator):
@@ -121,13 +122,13 @@ class ODESimulator(ClosedLoopSimulator):
         return self.integrator.rate_lag / self.substeps
 
     def with_finer_steps(self) -> Self | None:
-        """Returns a copy with midpoint steps; ``None`` if its own are of their order or higher."""
-        finer = integrator(FINER)
-        if self.integrator.order >= finer.order:
-            return None
-        changed = copy.copy(self)
-        changed.integrator = finer
-        return changed
+        """Returns a copy with steps of the next higher order; ``None`` if there are none."""
+        for finer in map(integrator, FINER):
+            if finer.order > self.integrator.order:
+                changed = copy.copy(self)
+                changed.integrator = finer
+                return changed
+        return None
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
         """Replays the inputs' actions; see :meth:`Simulator.simulate`."""

@@ -21,7 +21,7 @@ __all__ = [
     "NoiseMessenger",
     "SkipSimulation",
     "add_effect",
-    "has_finer_steps",
+    "num_finer_steps",
     "remove_effect",
     "with_finer_steps",
     "with_noise",
@@ -173,24 +173,26 @@ class ModelWithFinerSteps:
         return FinerStepsMessenger()(self.base)(*args, **kwargs)
 
     def __repr__(self) -> str:
-        return f"{self.__name__} in finer steps"
+        return f"{self.__name__} in {'still ' * (num_finer_steps(self) - 1)}finer steps"
 
 
 def with_finer_steps(model: Model) -> Model:
     """Returns the model with simulators that integrate more accurately, where they can.
 
     One step per sample is enough to learn a policy in; set against measurements, the error of such
-    steps looks like a delay.
+    steps looks like a delay. What is still too coarse may be refined once more.
     """
     base, effects = _parts(model)
-    if not isinstance(base, ModelWithFinerSteps):
-        base = ModelWithFinerSteps(base)
+    base = ModelWithFinerSteps(base)
     return ModelWithEffects(base, effects) if effects else base
 
 
-def has_finer_steps(model: Model) -> bool:
-    """Returns whether a model's simulators take finer steps than it asks for."""
-    return isinstance(_parts(model)[0], ModelWithFinerSteps)
+def num_finer_steps(model: Model) -> int:
+    """Returns how often :func:`with_finer_steps` was applied to a model."""
+    base, number = _parts(model)[0], 0
+    while isinstance(base, ModelWithFinerSteps):
+        base, number = base.base, number + 1
+    return number
 
 
 class NoiseMessenger(Messenger):

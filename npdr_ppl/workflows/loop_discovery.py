@@ -82,7 +82,9 @@ class LoopDiscovery:
     def _read(self, result: Mapping[str, Any]) -> Revision:
         """Returns the revision that a saved discovery stands for."""
         own = {effect.name: effect for effect in self.options.effects or ()}
-        model = with_finer_steps(self.model) if result.get("finer_steps") else self.model
+        model = self.model
+        for _ in range(result.get("finer_steps", 0)):
+            model = with_finer_steps(model)
         for row in result["effects"]:
             name = f"{row['port']}.{row['effect']}"
             model = add_effect(model, own.get(name) or effect_class(row["effect"])(row["port"]))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from npdr_ppl.language.handlers import ModelWithEffects, add_effect, has_finer_steps
+from npdr_ppl.language.handlers import ModelWithEffects, add_effect, num_finer_steps
 from npdr_ppl.models.effects import CoulombFriction, InputDelay
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.policies.playback import Sinusoid
@@ -153,7 +153,7 @@ def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
             {
                 "reason": "Missing: torque.input_delay.",
                 "alarm": {"p_value": 0.001},
-                "finer_steps": True,
+                "finer_steps": 1,
                 "effects": [{"effect": "input_delay", "port": "torque"}],
             }
         )
@@ -161,7 +161,7 @@ def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
     revision = look.look(None, tmp_path)  # type: ignore[arg-type]
     assert isinstance(revision.model, ModelWithEffects)
     assert effect_names(revision.model) == ["hinge.coulomb_friction", "torque.input_delay"]
-    assert has_finer_steps(revision.model)
+    assert num_finer_steps(revision.model) == 1
     assert revision.reason == "Missing: torque.input_delay. (Alarm: p = 0.001.)"
     assert effect_names(look.model) == ["hinge.coulomb_friction"]
 

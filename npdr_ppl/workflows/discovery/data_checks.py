@@ -77,7 +77,10 @@ def recording_problems(sensors: Sequence[Channel], rollouts: Rollouts) -> list[s
 def _wrong_readings(
     hypothesis: Hypothesis, rollouts: Rollouts, options: BindingOptions
 ) -> list[str]:
-    present = _relative_misfit(hypothesis)
+    # As remedies are tried, with states as the smoother sees them: along the fit they would be
+    # where the wrong readings have led it.
+    as_read = fit_hypothesis(hypothesis.model, rollouts, options, max_steps=6, is_rough=True)
+    present = _relative_misfit(as_read)
     if present < GROSS:
         return []
     cured: dict[str, float] = {}

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.language.effects import Effect
-from npdr_ppl.language.handlers import has_finer_steps
+from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.rollouts.atomic import replacing
 from npdr_ppl.workflows.discovery.alarm import Alarm
 from npdr_ppl.workflows.discovery.credible import Estimate
@@ -126,7 +126,7 @@ class Discovery:
                 "unexplained": self.unexplained,
             },
             "where": [spot.to_dict() for spot in self.where],
-            "finer_steps": has_finer_steps(self.revised),
+            "finer_steps": num_finer_steps(self.revised),
             "effects": [finding.to_dict() for finding in self.effects],
             "ranking": [describe_candidate(s, self.alarm.p_values[s.name]) for s in self.ranking],
             "separation": {

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from npdr_ppl.language.effects import Effect
-from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps
+from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps, num_finer_steps
 
 __all__ = ["revised_source"]
 
@@ -30,15 +30,16 @@ def revised_source(
     base: Callable[..., Any] = model.base if isinstance(model, ModelWithEffects) else model
     present = [e for e, _ in model.effects] if isinstance(model, ModelWithEffects) else []
     every = [*present, *effects]
-    is_finer = isinstance(base, ModelWithFinerSteps)
-    head, name = _base(base.base if is_finer else base)
+    num_finer = num_finer_steps(base)
+    while isinstance(base, ModelWithFinerSteps):
+        base = base.base
+    head, name = _base(base)
     imports = sorted({f"from {type(e).__module__} import {type(e).__name__}" for e in every})
-    handlers = [*(["add_effect"] if every else []), *(["with_finer_steps"] if is_finer else [])]
+    handlers = [*(["add_effect"] if every else []), *(["with_finer_steps"] if num_finer else [])]
     if handlers:
         imports = [f"from npdr_ppl import {', '.join(handlers)}", *imports]
     lines = [head.rstrip(), "", "", *imports, "", f"{FUNCTION} = {name}"]
-    if is_finer:
-        lines += [f"{FUNCTION} = with_finer_steps({FUNCTION})"]
+    lines += [f"{FUNCTION} = with_finer_steps({FUNCTION})"] * num_finer
     lines += [f"{FUNCTION} = add_effect({FUNCTION}, {effect!r})" for effect in every]
     lines += ["", "# Where the model came closest to the recording."]
     lines += ["CLOSEST_FIT = {"]

@@ -35,9 +35,10 @@ LEAST_SHARE = 1e-4
 """Share of what was explained below which what is left is not looked into: where a large effect
 was missing, integrators and the laws' own details differ by as much."""
 
-NOTICEABLE = 0.05
-"""Error of integration, relative to what a fit leaves of a channel, from which finer steps are
-taken unless the recording speaks against them: effects would be found that make up for it."""
+NOTICEABLE = 5.0
+"""Distance by which steps of a higher order move all readings together, in standard deviations of
+what a fit leaves, from which they are taken unless the recording speaks against them: effects
+would be found that make up for it. Refitted parameters make up for four fifths of a distance."""
 
 PRIOR_OF_ANY = 0.5
 """Prior probability that anything of the catalogue is missing."""
@@ -130,30 +131,29 @@ class Searcher:
         Args:
             current: A fitted hypothesis.
         """
-        if current.simulator.with_finer_steps() is None:
-            return current
-        coarse, self.model = self.model, with_finer_steps(self.model)
-        if self._step_error(current) > NOTICEABLE:
-            finer = self._trials.refitted(current)
-            if finer is not None:
-                if weigh([current, finer], [0.0, 0.0], seed=0)[0] < self.options.confidence:
-                    self._report("the model's steps are too coarse for this recording: finer ones")
-                    self.are_steps_coarse = True
-                    return self._trials.with_own_starts(finer)
-        self.model = coarse
+        while current.simulator.with_finer_steps() is not None:
+            coarse, self.model = self.model, with_finer_steps(self.model)
+            finer = None
+            if self._step_error(current) > NOTICEABLE:
+                finer = self._trials.refitted(current)
+            if finer is None or _speaks_for(current, finer) > self.options.confidence:
+                self.model = coarse
+                break
+            self._report("the model's steps are too coarse for this recording: finer ones")
+            self.are_steps_coarse = True
+            current = self._trials.with_own_starts(finer)
         return current
 
     def _step_error(self, current: Hypothesis) -> float:
-        """Returns what the model's steps change, relative to what a hypothesis in others leaves.
+        """Returns how far the readings are from a hypothesis's in the steps of the model now.
 
-        The root mean square over the recording, of the channel where it is greatest.
+        In standard deviations of what the hypothesis leaves.
         """
         fit, model = current.fit, with_effects(self.model, current.effects)
         finer = SegmentModel(model, self.rollouts, self.binding, current.segments.starts)
         here = fit.z[None], fit.offsets[None]
         difference = finer.simulate(*here) - current.segments.simulate(*here)
-        error = finer.root_mean_square(difference[0]) / fit.scale
-        return float(error.nan_to_num(math.inf).max())
+        return float(finer.whitened(difference[0], fit.scale).norm().nan_to_num(math.inf))
 
     def run(self, first: Round, *, max_effects: int) -> Search:
         """Adds effects until no alarm fires, nothing helps, or there are enough.
@@ -180,7 +180,7 @@ class Searcher:
             current, needless = self._pruned(tried[best])
             current = self._trials.with_own_starts(current)
             removed += needless
-            if self.with_finer_steps(current) is not current:
+            if not self.are_steps_coarse and self.with_finer_steps(current) is not current:
                 # What was missing had hidden how coarse they are: begin anew.
                 current = self.fit_base()
                 first = now = self.look(current)
@@ -243,7 +243,7 @@ class Searcher:
             without = self._trials.without(current, effect)
             if without is None:
                 continue
-            if weigh([without, current], [0.0, 0.0], seed=0)[0] > self.options.confidence:
+            if _speaks_for(without, current) > self.options.confidence:
                 self._report(f"removing {effect.name}")
                 current, removed = without, [*removed, effect.name]
         return current, removed
@@ -291,6 +291,11 @@ class Searcher:
         found = side_by_side(function, new, number if len(new) >= number else 1)
         for effect in effects:
             yield known[effect.name] or next(found)
+
+
+def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:
+    """Returns the probability of one of two hypotheses."""
+    return weigh([one, other], [0.0, 0.0], seed=0)[0]
 
 
 def explained(first: Hypothesis, final: Hypothesis) -> float:

@@ -146,10 +146,11 @@ def test_the_revised_source_is_a_model(tmp_path):
 
 def test_the_revised_source_keeps_finer_steps(tmp_path):
     path = tmp_path / "revised_model.py"
-    path.write_text(revised_source(npdr.with_finer_steps(pendulum), (Bias("hinge"),), {}))
+    finest = npdr.with_finer_steps(npdr.with_finer_steps(pendulum))
+    path.write_text(revised_source(finest, (Bias("hinge"),), {}))
     model = runpy.run_path(str(path))["revised_model"]
     assert repr(model) == "pendulum + hinge.bias"
-    assert repr(model.base) == "pendulum in finer steps"
+    assert repr(model.base) == "pendulum in still finer steps"
 
 
 def test_saving_writes_json_with_the_names_of_the_architecture(tmp_path):
