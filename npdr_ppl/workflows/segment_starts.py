@@ -11,9 +11,7 @@ import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.language.effects import SensorEffect
@@ -25,8 +23,6 @@ from npdr_ppl.rollouts.segments import cut
 from npdr_ppl.rollouts.states import estimate_departures
 
 __all__ = ["Starts", "error_factors", "estimate_starts", "uncertain_components"]
-
-Array = NDArray[np.float64]
 
 ROUNDS = 30
 """Rounds of expectation maximisation; components that readings say little of hardly move."""
@@ -146,9 +142,7 @@ def estimate_starts(box: SimulatorBlackBox, inputs: Inputs, rollouts: Rollouts) 
         history=inputs.past_actions.shape[-2],
         dtype=inputs.actions.dtype,
     )
-    places = torch.tensor(
-        [s - first for (_, s), (_, first, _) in zip(wanted, layout, strict=True)]
-    )
+    places = inputs.start - around.start
     predicted = _predicted(box.simulator, box.parameters, around)
     rates = _predicted_rates(box, around, predicted, places)
     row = torch.arange(len(places))

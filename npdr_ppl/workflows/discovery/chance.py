@@ -33,6 +33,10 @@ DRAWS = 2000
 FEWEST_BLOCKS = 24
 """Neighbouring segments are joined in pairs as long as this many pairs remain."""
 
+MOST_BLOCKS = 100
+"""Of long recordings more neighbours are joined: finer deals would tell no more, and take time by
+the cube of their number."""
+
 MOST_NUMBERS = 1_000_000
 """Numbers of candidates' changes looked at together, which with their tables fit a processor's
 caches."""
@@ -59,7 +63,9 @@ class LargestStatistic:
     def __init__(self, projection: Projection, *, seed: int, draws: int = DRAWS) -> None:
         self._projection = projection
         residual = projection.whitened(projection.residual[..., None])[..., 0]
-        width = 2 if len(residual) >= 2 * FEWEST_BLOCKS else 1
+        width = max(1, -(-len(residual) // MOST_BLOCKS))
+        if len(residual) >= 2 * FEWEST_BLOCKS:
+            width = max(2, width)
         self._blocks = len(residual) // width
         self._num_used = self._blocks * width
         used = residual[: self._num_used]
