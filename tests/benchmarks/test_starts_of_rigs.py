@@ -3,25 +3,15 @@
 import numpy as np
 import pytest
 from hidden_rigs import RIGS
-from hidden_rigs.recording import record
 
-from npdr_ppl.randomness import derived_seed
 from npdr_ppl.rollouts.states import estimate_states
+from tests.rig_recordings import recording_of
 
 
 @pytest.mark.parametrize("name", ["pendulum", "emps", "cart_pole", "furuta"])
 def test_estimated_states_are_as_far_off_as_they_say(name):
     rig = RIGS[name]
-    generator = np.random.default_rng(derived_seed(0, name, "parameters"))
-    parameters = dict(rig.known)
-    parameters |= {key: generator.uniform(*ends) for key, ends in rig.unknown.items()}
-    recording = record(
-        rig,
-        ("multisine", "steps", "chirp"),
-        parameters=parameters,
-        measurement=rig.measurement,
-        seed=derived_seed(0, name, "recording"),
-    )
+    recording = recording_of(name)
     number = len(rig.layout.joints)
     off = []
     for readings, true in zip(recording.rollouts.readings, recording.true_states, strict=True):
