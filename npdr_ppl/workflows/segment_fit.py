@@ -322,6 +322,7 @@ def fit_segments(
     z: Tensor,
     *,
     offsets: Tensor | None = None,
+    held: Tensor | None = None,
     max_steps: int = 12,
     is_rough: bool = False,
 ) -> SegmentFit:
@@ -335,6 +336,7 @@ def fit_segments(
         segments: The model and the recording.
         z: Where to begin, ``(d,)``.
         offsets: Offsets of the initial states to begin with, ``(S, m)``; zero by default.
+        held: Coordinates that stay where they are, a mask ``(d,)``; none by default.
         max_steps: Greatest number of steps, first until the scale is known, then at that scale.
         is_rough: Whether the first will do; enough to rank what differs much.
 
@@ -348,9 +350,10 @@ def fit_segments(
     scale = segments.scale_of(z, offsets)
     if not bool(scale.isfinite().all()):
         raise DataError("The simulation fails at the parameters that the fit begins with.")
-    z, offsets, scale = _steps(segments, z, offsets, scale, max_steps, is_rough=True)
+    held = torch.zeros(z.shape, dtype=torch.bool) if held is None else held
+    z, offsets, scale = _steps(segments, z, offsets, scale, held, max_steps, is_rough=True)
     if not is_rough:
-        z, offsets, scale = _steps(segments, z, offsets, scale, max_steps, is_rough=False)
+        z, offsets, scale = _steps(segments, z, offsets, scale, held, max_steps, is_rough=False)
     return SegmentFit(z, offsets, scale)
 
 
@@ -359,6 +362,7 @@ def _steps(
     z: Tensor,
     offsets: Tensor,
     scale: Tensor,
+    held: Tensor,
     max_steps: int,
     *,
     is_rough: bool,
@@ -375,6 +379,7 @@ def _steps(
         z: Where to begin, ``(d,)``.
         offsets: Offsets of the initial states to begin with, ``(S, m)``.
         scale: Scale of what is left there, ``(C,)``.
+        held: Coordinates that stay, a mask ``(d,)``.
         max_steps: Greatest number of steps.
         is_rough: Whether steps are rough.
 
@@ -385,11 +390,12 @@ def _steps(
     factors, present_scale = NEAR, scale
     for _ in range(max_steps):
         now = segments.linearise(z, offsets, scale, is_rough=is_rough)
+        now = replace(now, by_parameters=now.by_parameters * ~held)
         parts = (now.residual, now.by_parameters, now.by_starts)
         if not all(bool(part.isfinite().all()) for part in parts):
             break
         present = sum(float(part.square().sum()) for part in (now.residual, offsets, z))
-        moves = [_step(now, z, offsets, damping * f, dampings, factors) for f in factors]
+        moves = [_step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]
         tried = torch.stack([point for point, _ in moves])
         begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
         squares = _squares(segments, tried, begun, scale)  # (a, b, S, C)
@@ -436,6 +442,7 @@ def _step(
     now: Linearisation,
     z: Tensor,
     offsets: Tensor,
+    held: Tensor,
     damping: float,
     dampings: Tensor,
     factors: tuple[float, ...],
@@ -446,6 +453,7 @@ def _step(
         now: Residuals and derivatives.
         z: Parameters, ``(d,)``.
         offsets: Offsets, ``(S, m)``.
+        held: Coordinates that stay, a mask ``(d,)``; nothing depends on them.
         damping: Of the parameters, relative to the mean curvature.
         dampings: Of the offsets, by segment, ``(S,)``.
         factors: Multiples of ``dampings`` to try, among them 1.
@@ -471,7 +479,7 @@ def _step(
     gradient = (by_z.mT @ now.residual[..., None] - cross.mT @ middle[..., d:]).sum(0)[:, 0] - z
     curvature = hessian.diagonal().mean().clamp_min(1.0)
     hessian = hessian + (1.0 + damping * curvature) * torch.eye(d, dtype=torch.float64)
-    change = torch.linalg.solve(hessian, gradient)
+    change = torch.linalg.solve(hessian, gradient.masked_fill(held, 0.0))
     change = change * min(1.0, LARGEST_STEP / float(change.abs().max().clamp_min(1e-12)))
     moved = (z + change).clamp(-MAX_COORDINATE, MAX_COORDINATE)
     begun = [offsets + part[..., d] - part[..., :d] @ (moved - z) for part in parts.values()]

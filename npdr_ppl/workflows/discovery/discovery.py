@@ -15,6 +15,7 @@ from npdr_ppl.workflows.discovery.credible import Estimate, estimates
 from npdr_ppl.workflows.discovery.data_checks import data_problems, recording_problems
 from npdr_ppl.workflows.discovery.equivalents import equivalents
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
+from npdr_ppl.workflows.discovery.limits import limits
 from npdr_ppl.workflows.discovery.next_experiment import NextExperiment, next_experiment
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.projection import Projection
@@ -147,6 +148,20 @@ class Investigation:
             )
 
     @cached_property
+    def _at_edge(self) -> list[tuple[str, ...]]:
+        """For each effect, the shapes that lie or may lie where their priors hardly go."""
+        search = self.search
+        final, explains = search.final, sum(added.share for added in search.added)
+        result = []
+        with _timed(self.seconds, "limits"):
+            for added in search.added:
+                names = list(final.at_edge(added.effect))
+                if added.share > MINOR * explains:
+                    names += limits(final, added.effect, self._searcher.trials)
+                result.append(tuple(dict.fromkeys(names)))
+        return result
+
+    @cached_property
     def gap(self) -> dict[str, Gap]:
         """Metrics on the held-out recording; empty without one."""
         if self.holdout is None:
@@ -162,7 +177,10 @@ class Investigation:
         final = search.final
         unexplained = _unexplained(search)
         every = estimates(final, _units(final), seed=self.options.seed)
-        effects = [_finding(added, search, every) for added in search.added]
+        effects = [
+            _finding(added, search, every, at_edge)
+            for added, at_edge in zip(search.added, self._at_edge, strict=True)
+        ]
         verdict, reason = _judge(search, effects, self.problems, unexplained, self.options)
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"
@@ -235,16 +253,18 @@ def _judge(
         if not search.rounds[-1].alarm.fired:
             return "none", "Nothing is missing that this recording could show."
         return "unknown", "Simulation and recording disagree, and no effect explains it."
-    if search.rounds[-1].alarm.fired and unexplained > MOST_UNEXPLAINED:
+    left = search.rounds[-1].alarm
+    # Of one look, however many there were: it adds nothing, it only says that something is left.
+    if left.p_value <= options.false_alarm_rate and unexplained > MOST_UNEXPLAINED:
         return "unknown", (
             f"What was found leaves {unexplained:.0%} of the disagreement unexplained, most of it "
-            f"in {search.rounds[-1].alarm.loudest}."
+            f"in {left.loudest}."
         )
     explains = sum(f.share for f in effects)
     strained = [f for f in effects if f.at_edge and f.share > MINOR * explains]
     if strained:
         return "unknown", (
-            f"{strained[0].effect.name} explains it only with {strained[0].at_edge[0]} where "
+            f"{strained[0].effect.name} explains it with {strained[0].at_edge[0]} where "
             "hardly any device has it, so the law is likely another that is alike there."
         )
     unsure = [f for f in effects if f.probability < options.confidence]
@@ -255,7 +275,9 @@ def _judge(
     return "ambiguous", f"The recording cannot tell which it is: {names}."
 
 
-def _finding(added: Added, search: Search, every: dict[str, Estimate]) -> Finding:
+def _finding(
+    added: Added, search: Search, every: dict[str, Estimate], at_edge: tuple[str, ...]
+) -> Finding:
     effect = added.effect
     survivors = [
         name
@@ -275,7 +297,7 @@ def _finding(added: Added, search: Search, every: dict[str, Estimate]) -> Findin
             for site in effect.parameter_names
             if site in every
         },
-        search.final.at_edge(effect),
+        at_edge,
     )
 
 

@@ -150,6 +150,7 @@ def fit_hypothesis(
     start: Mapping[str, Tensor] | None = None,
     offsets: Tensor | None = None,
     starts: Starts | None = None,
+    held: Mapping[str, float] | None = None,
     max_steps: int = 12,
     is_rough: bool = False,
 ) -> Hypothesis:
@@ -163,6 +164,7 @@ def fit_hypothesis(
         start: Parameters to begin with by site; the others begin in the middle of their priors.
         offsets: Offsets of the initial states to begin with, ``(S, m)``.
         starts: What the segments start from, if better known than by the smoother.
+        held: Reference coordinates of sites that are not fitted.
         max_steps: Greatest number of steps.
         is_rough: Whether to leave it at rough steps.
 
@@ -177,5 +179,11 @@ def fit_hypothesis(
         known = {name: torch.as_tensor(value)[None] for name, value in start.items()}
         z = segments.prior.to_reference({name: known.get(name, v) for name, v in middle.items()})
         z = z[0].nan_to_num(0.0).clamp(-START_LIMIT, START_LIMIT)
-    fit = fit_segments(segments, z, offsets=offsets, max_steps=max_steps, is_rough=is_rough)
+    stays = torch.zeros(z.shape, dtype=torch.bool)
+    for site in segments.prior.sites:
+        if held and site.name in held:
+            z[site.coordinates], stays[site.coordinates] = held[site.name], True
+    fit = fit_segments(
+        segments, z, offsets=offsets, held=stays, max_steps=max_steps, is_rough=is_rough
+    )
     return Hypothesis(model, effects, segments, fit)

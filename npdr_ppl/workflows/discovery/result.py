@@ -40,8 +40,8 @@ class Finding:
         equivalent_to: Ids of causes that the recording may not tell from it.
         share: Share of the misfit that it explains.
         parameters: Its parameters' estimates by short name.
-        at_edge: Those that give it its shape and lie where their priors hardly go: its law is
-            then the limit of its own that another law may be.
+        at_edge: Those that give it its shape and lie where their priors hardly go, or may as
+            well lie there: its law is then the limit of its own that another law may be.
     """
 
     effect: Effect

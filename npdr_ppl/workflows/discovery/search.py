@@ -113,14 +113,15 @@ class Searcher:
         self._report = report
 
     @property
-    def _trials(self) -> Trials:
+    def trials(self) -> Trials:
+        """Fits of the model in the steps that it has now."""
         return Trials(self.model, self.rollouts, self.binding)
 
     def fit_base(self) -> Hypothesis:
         """Fits the model as it is."""
         self._report("fitting the model as it is")
         fitted = fit_hypothesis(self.model, self.rollouts, self.binding)
-        return self._trials.with_own_starts(fitted)
+        return self.trials.with_own_starts(fitted)
 
     def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
         """Returns the hypothesis in finer steps, where its own err noticeably; else as it is.
@@ -135,13 +136,13 @@ class Searcher:
             coarse, self.model = self.model, with_finer_steps(self.model)
             finer = None
             if self._step_error(current) > NOTICEABLE:
-                finer = self._trials.refitted(current)
+                finer = self.trials.refitted(current)
             if finer is None or _speaks_for(current, finer) > self.options.confidence:
                 self.model = coarse
                 break
             self._report("the model's steps are too coarse for this recording: finer ones")
             self.are_steps_coarse = True
-            current = self._trials.with_own_starts(finer)
+            current = self.trials.with_own_starts(finer)
         return current
 
     def _step_error(self, current: Hypothesis) -> float:
@@ -178,7 +179,7 @@ class Searcher:
             if best is None:
                 break
             current, needless = self._pruned(tried[best])
-            current = self._trials.with_own_starts(current)
+            current = self.trials.with_own_starts(current)
             removed += needless
             if not self.are_steps_coarse and self.with_finer_steps(current) is not current:
                 # What was missing had hidden how coarse they are: begin anew.
@@ -219,10 +220,10 @@ class Searcher:
         against the model without it is strong.
         """
         ranking = now.ranking
-        trials = self._trials.extended(current, ranking, self._report)
+        trials = self.trials.extended(current, ranking, self._report)
         if not trials:
             return None, {}, {}
-        trials = self._trials.converged(trials)
+        trials = self.trials.converged(trials)
         each = math.log(PRIOR_OF_ANY / max(1, len(ranking)))
         hypotheses = [current, *trials.values()]
         prior = [math.log(1 - PRIOR_OF_ANY), *(each + log_prior(t) for t in trials.values())]
@@ -240,7 +241,7 @@ class Searcher:
         for effect in current.effects[:-1]:
             if loss_without(current, effect) > PLAINLY:
                 continue
-            without = self._trials.without(current, effect)
+            without = self.trials.without(current, effect)
             if without is None:
                 continue
             if _speaks_for(without, current) > self.options.confidence:
@@ -274,7 +275,7 @@ class Searcher:
                 tried = {effect.name: asked} | ({} if rivals is None else rivals.others)
                 trials |= {(effect.name, name): trial for name, trial in tried.items()}
                 if current is not asked:
-                    current = self._trials.with_own_starts(current)
+                    current = self.trials.with_own_starts(current)
                     break  # the rivals of the others are to be found beside what was swapped in
         return current, added, trials
 
@@ -285,7 +286,7 @@ class Searcher:
         seen = [(r.hypothesis, r.trials) for r in rounds]
         known = {effect.name: tried_before(current, effect, seen) for effect in effects}
         new = [effect for effect in effects if known[effect.name] is None]
-        function = partial(find_rivals, current, trials=self._trials, options=self.options)
+        function = partial(find_rivals, current, trials=self.trials, options=self.options)
         number = num_processes(current.simulator)
         # With fewer of them than processes, each search had better use all.
         found = side_by_side(function, new, number if len(new) >= number else 1)

@@ -59,6 +59,7 @@ class _Fit:
         offsets: Offsets of the initial states to begin with, ``(S, m)``.
         starts: What the segments start from.
         is_trial: Whether rough steps will do.
+        held: Reference coordinates of sites that are not fitted.
     """
 
     effects: tuple[Effect, ...]
@@ -66,6 +67,7 @@ class _Fit:
     offsets: Tensor
     starts: Starts | None
     is_trial: bool = False
+    held: Mapping[str, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -186,6 +188,23 @@ class Trials:
         )
         return found or current
 
+    def holding(
+        self, current: Hypothesis, held: Sequence[Mapping[str, float]]
+    ) -> list[Hypothesis | None]:
+        """Returns a hypothesis with some of its parameters held and all others fitted anew.
+
+        Args:
+            current: The hypothesis.
+            held: For each wanted hypothesis, reference coordinates by site.
+
+        Returns:
+            ``None`` in place of those that cannot be simulated.
+        """
+        effects, start = current.effects, current.parameters
+        offsets, starts = current.fit.offsets, current.segments.starts
+        asked = [_Fit(effects, start, offsets, starts, held=places) for places in held]
+        return list(self._fits(asked, current.simulator))
+
     def without(self, current: Hypothesis, effect: Effect) -> Hypothesis | None:
         """Returns a hypothesis without one of its effects, see :meth:`refitted`."""
         return self.refitted(current, tuple(e for e in current.effects if e.name != effect.name))
@@ -206,6 +225,7 @@ def _fitted(trials: Trials, asked: _Fit) -> Hypothesis | None:
             start=asked.start,
             offsets=asked.offsets,
             starts=asked.starts,
+            held=asked.held,
             max_steps=TRIAL_STEPS if asked.is_trial else MAX_STEPS,
             is_rough=asked.is_trial,
         )

@@ -15,8 +15,10 @@ import npdr_ppl as npdr
 from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.models.effects import (
     CoulombFriction,
+    FrictionDrift,
     InputDelay,
     Payload,
+    PeriodicDisturbance,
     Spring,
     ViscousFriction,
     Wind,
@@ -105,13 +107,29 @@ def test_an_effect_outside_the_catalogue_is_unknown():
     assert found.remainder.fired
 
 
-def test_a_law_that_fits_only_in_a_limit_is_not_named():
-    others = (Wind("hinge"), CoulombFriction("hinge"))
-    _, found = discover("pendulum", "one", (("hinge", "quadratic_drag"),), effects=others)
+@pytest.mark.parametrize(
+    ("hidden", "instead", "shape"),
+    [
+        ("quadratic_drag", Wind("hinge"), "speed"),
+        ("viscous_friction", FrictionDrift("hinge"), "time_constant"),  # as long as it does not
+        ("bias", PeriodicDisturbance("hinge"), "frequency"),  # an hour's wave
+    ],
+)
+def test_a_law_that_may_as_well_be_its_limit_is_not_named(hidden, instead, shape):
+    others = (instead, CoulombFriction("hinge"))
+    _, found = discover("pendulum", "one", (("hinge", hidden),), effects=others, max_effects=1)
     (finding,) = found.effects
-    assert finding.effect.id == "wind" and finding.at_edge == ("speed",)
+    assert finding.effect.id == instead.id and finding.at_edge == (shape,)
     assert found.verdict == "unknown"
-    assert "explains it only with speed where hardly any device has it" in found.reason
+    assert f"explains it with {shape} where hardly any device has it" in found.reason
+
+
+def test_a_law_whose_shape_shows_is_named():
+    # The same law as above, where the recording does tell it from a constant.
+    _, found = discover("pendulum", "one", (("hinge", "periodic_disturbance"),), max_effects=1)
+    (finding,) = found.effects
+    assert finding.effect.id == "periodic_disturbance" and finding.at_edge == ()
+    assert found.verdict == "named", found.reason
 
 
 ROD = """
