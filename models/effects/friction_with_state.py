@@ -36,6 +36,7 @@ class PreslidingFriction(ForceEffect):
         Parameter("relaxation", "s", 1e-3, "bristle damping over stiffness τ = σ₁/σ₀"),
     )
     strength = ("magnitude",)
+    incidental = ("relaxation",)
     needs_joint = True
     law = "−F (x + τ ẋ), ẋ = (v − |v| x)/z_s"
     excitation = "reversals"

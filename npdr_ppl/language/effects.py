@@ -57,6 +57,7 @@ class Effect(ABC):
         wave: Name of the parameter that is the frequency in Hz of a wave in time, empty if none
             is. Priors are too wide to meet a wave's frequency, so a search reads it from the
             spectrum of what the model leaves over, and counts all frequencies it looked at.
+        incidental: Names of shapes that a law may be without and still be the same cause.
         law: The law in one formula.
         equivalence: Causes that it may not be told from.
         excitation: The experiment that reveals it best.
@@ -69,6 +70,7 @@ class Effect(ABC):
     strength: ClassVar[tuple[str, ...]] = ()
     is_smooth: ClassVar[bool] = True
     wave: ClassVar[str] = ""
+    incidental: ClassVar[tuple[str, ...]] = ()
     law: ClassVar[str] = ""
     equivalence: ClassVar[tuple[EquivalenceClass, ...]] = ()
     excitation: ClassVar[Excitation] = "wide_range"

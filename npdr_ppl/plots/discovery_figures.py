@@ -11,9 +11,9 @@ from npdr_ppl.plots.fit_figures import scalar_columns
 from npdr_ppl.plots.latent_force import AFTER, BEFORE, plot_latent_force
 from npdr_ppl.plots.residual_map import plot_residual_map
 from npdr_ppl.plots.theme import save_figure
-from npdr_ppl.randomness import seeded
+from npdr_ppl.randomness import derived_seed, seeded
 from npdr_ppl.workflows.discovery import Discovery, Investigation
-from npdr_ppl.workflows.discovery.credible import parameter_density
+from npdr_ppl.workflows.discovery.credible import posterior_draws
 from npdr_ppl.workflows.discovery.folder import STAGES, Stage
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.notebook import short_name
@@ -108,5 +108,6 @@ def _draws(hypothesis: Hypothesis, seed: int) -> tuple[Columns, Columns]:
     prior = hypothesis.segments.prior
     with seeded(seed, "discovery", "figures"):
         before = prior.to_parameters(prior.sample(NUM_DRAWS))
-        after = prior.to_parameters(parameter_density(hypothesis).sample(NUM_DRAWS).double())
+        draws = posterior_draws(hypothesis, seed=derived_seed(seed, "discovery", "figures"))
+        after = prior.to_parameters(draws.resampled(NUM_DRAWS))
     return scalar_columns(before), scalar_columns(after)

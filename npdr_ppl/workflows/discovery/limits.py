@@ -8,6 +8,8 @@ less, that one has been preferred.
 
 import math
 
+from torch.distributions import constraints
+
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.workflows.discovery.hypothesis import START_LIMIT, Hypothesis
 from npdr_ppl.workflows.discovery.trials import Trials
@@ -26,8 +28,10 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
     """Returns the names of an effect's shapes that may as well be at one end of their priors.
 
     All other parameters are refitted there (a profile likelihood). Shapes that may be anywhere
-    are only unknown; the law needs them nowhere. Of a wave's frequency the low end counts: no
-    other law is a fast wave.
+    are only unknown; the law needs them nowhere. Those between two bounds have no limit: at its
+    bounds a share or a damping ratio is a device's as well. Incidental ones do not count: bristles
+    without damping are bristles. Of a wave's frequency the low end does: no other law is a fast
+    wave.
 
     Args:
         current: The model with the effect, fitted.
@@ -36,10 +40,12 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
     """
     if not effect.strength:
         return ()
+    priors = effect.priors(current.simulator.port(effect.port))
     shapes = {
         site: parameter.name
         for site, parameter in zip(effect.parameter_names, effect.parameters, strict=True)
-        if parameter.name not in effect.strength
+        if parameter.name not in (*effect.strength, *effect.incidental)
+        and not isinstance(priors[parameter.name].support, constraints.interval)
     }
     ends = [{site: end} for site in shapes for end in (-START_LIMIT, START_LIMIT)]
     best = current.losses(current.fit.scale).sum()

@@ -27,6 +27,9 @@ from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 
 __all__ = ["Projection", "Scores", "loss_without"]
 
+MOST_READINGS = 2_000_000
+"""Readings simulated together, which takes some hundred megabytes."""
+
 
 @dataclass(frozen=True)
 class Scores:
@@ -121,6 +124,22 @@ class Projection:
     def parameter_information(self) -> Tensor:
         """Information of the parameters with their prior, ``(d, d)``."""
         return self._information
+
+    def misfit_at(self, z: Tensor) -> Tensor:
+        """Returns rᵀ C⁻¹ r at other parameters, ``(n,)``; starts are taken to act as they do here.
+
+        Args:
+            z: Parameters, ``(n, d)``.
+        """
+        segments, fit = self.hypothesis.segments, self.hypothesis.fit
+        offsets = fit.offsets[None]
+        together = max(1, MOST_READINGS // max(1, segments.observed.numel()))
+        result = []
+        for points in z.split(together):
+            left = segments.residuals(points, offsets.expand(len(points), -1, -1), fit.scale)
+            columns = left.permute(1, 2, 0) + self._starts @ fit.offsets[..., None]
+            result.append((columns * self.solve(columns)).sum((0, 1)))
+        return torch.cat(result)
 
     def solve(self, columns: Tensor) -> Tensor:
         """Returns C⁻¹ x, ``(S, N, P)``."""

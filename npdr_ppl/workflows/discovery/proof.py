@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from npdr_ppl import metrics
-from npdr_ppl.randomness import seeded
+from npdr_ppl.randomness import derived_seed, seeded
 from npdr_ppl.rollouts import Rollouts, stitch
 from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.discovery.credible import parameter_density
+from npdr_ppl.workflows.discovery.credible import posterior_draws
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.segment_fit import SegmentModel
 
@@ -17,6 +17,9 @@ __all__ = ["Gap", "prove"]
 
 NUM_DRAWS = 40
 """Posterior predictive trajectories."""
+
+NUM_PROPOSALS = 64
+"""Draws of the posterior that they are taken from, each a simulation of the fitted recording."""
 
 LEVEL = 0.9
 """Probability of the predictive interval whose coverage is reported."""
@@ -72,8 +75,10 @@ def prove(
         seed: Seed of the predictive draws.
     """
     with seeded(seed, "discovery", "proof"):
-        old, new = _Scores.of(before, rollouts, options), _Scores.of(after, rollouts, options)
-        floor = _floor(after, rollouts, options)
+        drawn = _draws(after, seed)
+        old = _Scores.of(before, _draws(before, seed), rollouts, options)
+        new = _Scores.of(after, drawn, rollouts, options)
+        floor = _floor(after, drawn, rollouts, options)
     return {
         "rmse": Gap(old.rmse, new.rmse, floor["rmse"]),
         "dtw": Gap(old.dtw, new.dtw, floor["dtw"]),
@@ -90,11 +95,13 @@ class _Scores:
     coverage: float
 
     @classmethod
-    def of(cls, hypothesis: Hypothesis, rollouts: Rollouts, options: BindingOptions) -> "_Scores":
+    def of(
+        cls, hypothesis: Hypothesis, drawn: Tensor, rollouts: Rollouts, options: BindingOptions
+    ) -> "_Scores":
         segments = SegmentModel(hypothesis.model, rollouts, options)
         z = hypothesis.fit.z[None]
         centre = segments.simulate(z, _no_offsets(segments, 1))[0].double()
-        draws = _predictive(hypothesis, segments)
+        draws = _predictive(hypothesis, drawn, segments)
         return cls(
             *_distances(segments, centre, rollouts),
             _crps(segments, draws, segments.observed.double()),
@@ -103,7 +110,7 @@ class _Scores:
 
 
 def _floor(
-    hypothesis: Hypothesis, rollouts: Rollouts, options: BindingOptions
+    hypothesis: Hypothesis, drawn: Tensor, rollouts: Rollouts, options: BindingOptions
 ) -> dict[str, float]:
     """Returns the metrics of a recording that the model itself might have made.
 
@@ -120,7 +127,7 @@ def _floor(
     channels = segments.channel_names
     predicted = stitch(centre, segments.inputs, channels)
     recorded = stitch(made, segments.inputs, channels)
-    draws = _predictive(hypothesis, segments)
+    draws = _predictive(hypothesis, drawn, segments)
     return {
         "rmse": float(metrics.rmse(predicted, recorded).mean()),
         "dtw": float(metrics.dtw(predicted, recorded).mean()),
@@ -146,11 +153,16 @@ def _no_offsets(segments: SegmentModel, num: int) -> Tensor:
     return torch.zeros(shape, dtype=torch.float64)
 
 
-def _predictive(hypothesis: Hypothesis, segments: SegmentModel) -> Tensor:
+def _draws(hypothesis: Hypothesis, seed: int) -> Tensor:
+    """Returns parameters of the posterior, ``(NUM_DRAWS, d)``."""
+    own_seed = derived_seed(seed, "discovery", "proof")
+    return posterior_draws(hypothesis, seed=own_seed, num=NUM_PROPOSALS).resampled(NUM_DRAWS)
+
+
+def _predictive(hypothesis: Hypothesis, drawn: Tensor, segments: SegmentModel) -> Tensor:
     """Returns posterior predictive trajectories, readings' noise included."""
-    z = parameter_density(hypothesis).sample(NUM_DRAWS).double().clamp(-4.0, 4.0)
-    offsets = torch.randn(_no_offsets(segments, NUM_DRAWS).shape, dtype=torch.float64)
-    trajectory = segments.simulate(z, offsets).double()
+    offsets = torch.randn(_no_offsets(segments, len(drawn)).shape, dtype=torch.float64)
+    trajectory = segments.simulate(drawn, offsets).double()
     return trajectory + hypothesis.fit.scale * torch.randn(trajectory.shape, dtype=torch.float64)
 
 
