@@ -7,7 +7,7 @@ can be compressed into their score.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -25,12 +25,8 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.evaluation import declares_noise
 from npdr_ppl.workflows.progress import Step
-from npdr_ppl.workflows.segment_fit import (
-    Linearisation,
-    SegmentFit,
-    SegmentModel,
-    fit_segments,
-)
+from npdr_ppl.workflows.segment_fit import SegmentFit, fit_segments
+from npdr_ppl.workflows.segment_model import Linearisation, SegmentModel
 
 __all__ = ["ClosestFit", "Prepared", "closest_fit", "prepare", "score_embedding"]
 
@@ -114,6 +110,7 @@ def prepare(
     *,
     noise: Literal["auto", "model"] = "auto",
     wants_neighbourhood: bool = False,
+    near: Mapping[str, Tensor] | None = None,
     seed: int = 0,
     progress: Step | None = None,
 ) -> Prepared:
@@ -126,6 +123,7 @@ def prepare(
         noise: ``"auto"`` gives a model without noise that of the closest fit; ``"model"`` takes
             it as it is.
         wants_neighbourhood: Whether inference is to start near the closest fit.
+        near: Parameters near which the closest fit is known to be.
         seed: Seed of the search.
         progress: Called with the fraction done and a short status.
     """
@@ -133,7 +131,7 @@ def prepare(
     lacks_point = options.embedding == "score"
     if not (lacks_noise or lacks_point or wants_neighbourhood):
         return Prepared(model, options, None)
-    found = closest_fit(model, rollouts, options, seed=seed, progress=progress)
+    found = closest_fit(model, rollouts, options, near=near, seed=seed, progress=progress)
     if lacks_point:
         options = replace(options, embedding=score_embedding(found))
     return Prepared(
@@ -149,6 +147,7 @@ def closest_fit(
     rollouts: Rollouts,
     options: BindingOptions,
     *,
+    near: Mapping[str, Tensor] | None = None,
     seed: int = 0,
     progress: Step | None = None,
 ) -> ClosestFit:
@@ -163,6 +162,8 @@ def closest_fit(
         model: The Pyro model.
         rollouts: The recording to be fitted; never the held-out one.
         options: Segments, initial states and precision.
+        near: Parameters by latent site, from which to go on instead of searching; the others
+            begin in the middle of their priors.
         seed: Seed of the search.
         progress: Called with the fraction done and a short status.
 
@@ -174,6 +175,14 @@ def closest_fit(
     simulator = segments.simulator
     rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
     starts = torch.zeros(segments.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
+    z = segments.place_of(near) if near else _searched(segments, starts, seed, progress)
+    if segments.num_offsets:
+        return ClosestFit(segments, fit_segments(segments, z))
+    return ClosestFit(segments, SegmentFit(z, starts, segments.scale_of(z, starts)))
+
+
+def _searched(segments: SegmentModel, starts: Tensor, seed: int, progress: Step | None) -> Tensor:
+    """Returns the best place that a cross-entropy search finds, ``(d,)``; see `closest_fit`."""
     mask = segments.inputs.mask[..., None]
     ranges = (segments.observed * mask).abs().amax((0, 1)).double()
     ranges = ranges.clamp_min(torch.finfo(torch.float32).tiny)
@@ -202,9 +211,7 @@ def closest_fit(
             "No parameters of the prior could be simulated along the recording; check its units "
             "(radians, metres, seconds), the signs of its columns, and the prior."
         )
-    if segments.num_offsets:
-        return ClosestFit(segments, fit_segments(segments, z))
-    return ClosestFit(segments, SegmentFit(z, starts, segments.scale_of(z, starts)))
+    return z
 
 
 def score_embedding(found: ClosestFit) -> Score:

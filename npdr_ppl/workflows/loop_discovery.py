@@ -7,9 +7,12 @@ comes to is on disk before the loop goes on, and a resumed run reads it instead 
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+import torch
+from torch import Tensor
 
 from npdr_ppl.errors import DataError, NpdrError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect, with_finer_steps
@@ -36,10 +39,12 @@ class Revision:
     Attributes:
         model: The revised model; ``None`` where nothing is to be revised.
         reason: The finding in a sentence.
+        parameters: Where the revised model fits best, by latent site.
     """
 
     model: Model | None
     reason: str
+    parameters: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 class LoopDiscovery:
@@ -88,7 +93,9 @@ class LoopDiscovery:
         for row in result["effects"]:
             name = f"{row['port']}.{row['effect']}"
             model = add_effect(model, own.get(name) or effect_class(row["effect"])(row["port"]))
-        return Revision(None if model is self.model else model, _sentence(result))
+        means = {name: row["mean"] for name, row in result["parameters"].items()}
+        found = {name: torch.tensor(mean) for name, mean in means.items() if mean is not None}
+        return Revision(None if model is self.model else model, _sentence(result), found)
 
 
 def effect_names(model: Model) -> list[str]:

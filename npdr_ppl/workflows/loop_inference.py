@@ -1,6 +1,9 @@
 """INFER of Algorithm 1, as the loop calls it."""
 
+from collections.abc import Mapping
 from pathlib import Path
+
+from torch import Tensor
 
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.language.prior import Prior
@@ -23,6 +26,7 @@ def infer_posterior(
     rounds: int,
     prior: Prior,
     last: Posterior | None,
+    near: Mapping[str, Tensor],
     seed: int,
     checkpoint: Path,
     report: Reporter,
@@ -38,6 +42,7 @@ def infer_posterior(
         prior: The model's prior.
         last: Posterior of the last iteration, if there was one; of no use where the model has
             other parameters since.
+        near: Parameters near which the model is known to fit best; empty if nothing is known.
         seed: Seed of everything random.
         checkpoint: Folder of the run.
         report: Where to report progress.
@@ -48,6 +53,7 @@ def infer_posterior(
         options.binding,
         noise=options.noise,
         wants_neighbourhood=options.start == "closest fit" and backend.continues,
+        near=near,
         seed=seed,
         progress=report.stage("find the closest parameters"),
     )

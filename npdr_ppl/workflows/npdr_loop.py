@@ -18,11 +18,14 @@ killed continues to the same result; see :mod:`npdr_ppl.workflows.loop_folder`.
 """
 
 import logging
+from collections.abc import Mapping
 from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+
+from torch import Tensor
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.inference.registry import backend as backend_by_name
@@ -140,6 +143,7 @@ class _Loop:
         self.domain = {name: float(value) for name, value in simulator.nominal().items()}
         self.real = RealRollouts(target, task, simulator, folder.rollouts)
         self.rollouts: list[Rollouts] = []
+        self.near: Mapping[str, Tensor] = {}
         self.policy = task.policy
         self.posterior: Posterior | None = None
         self.records: list[dict[str, Any]] = []
@@ -322,6 +326,7 @@ class _Loop:
             step = report.stage("look for a missing effect")
             revision = self.discovery.look(rollouts, folder, step)
             found, finding = revision.model, revision.reason
+            self.near = revision.parameters if found is not None else {}
         if found is None:
             return False, finding
         target = self.target
@@ -341,6 +346,7 @@ class _Loop:
             rounds=rounds,
             prior=self.prior,
             last=self.posterior,
+            near=self.near,
             seed=derived_seed(self.seed, "inference", index, attempt),
             checkpoint=self.folder.inference(index, attempt),
             report=report,

@@ -15,7 +15,8 @@ from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions, bind
 from npdr_ppl.workflows.closest_fit import closest_fit, prepare, score_embedding
-from npdr_ppl.workflows.segment_fit import SegmentModel, fit_segments
+from npdr_ppl.workflows.segment_fit import fit_segments
+from npdr_ppl.workflows.segment_model import SegmentModel
 
 MASS, LENGTH, DAMPING, NOISE = 1.3, 0.8, 0.08, 2e-3
 UNCERTAIN = BindingOptions("score", 40, "uncertain", "float64")
@@ -72,6 +73,18 @@ def test_initial_states_that_are_fitted_leave_only_noise(rollouts):
     # Taking the estimated states as true leaves more, and blames it on the parameters.
     estimated = closest_fit(model, rollouts, BindingOptions("bayessim", 40, "estimated"))
     assert estimated.scale["angle"] > 2 * found.scale["angle"]
+
+
+def test_a_fit_goes_on_from_what_is_known(rollouts):
+    reports = []
+    known = {"mass": torch.tensor(1.2), "length": torch.tensor(0.85)}
+    found = closest_fit(
+        model, rollouts, UNCERTAIN, near=known, progress=lambda *step: reports.append(step)
+    )
+    assert reports == []  # nothing is searched
+    searched = closest_fit(model, rollouts, UNCERTAIN)
+    for name, value in found.parameters.items():
+        assert float(value) == pytest.approx(float(searched.parameters[name]), rel=0.01)
 
 
 def test_simulations_start_within_the_error(rollouts):

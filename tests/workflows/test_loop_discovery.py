@@ -155,6 +155,10 @@ def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
                 "alarm": {"p_value": 0.001},
                 "finer_steps": 1,
                 "effects": [{"effect": "input_delay", "port": "torque"}],
+                "parameters": {
+                    "torque.input_delay.delay": {"mean": 0.01},
+                    "hinge.coulomb_friction.magnitude": {"mean": None},
+                },
             }
         )
     )
@@ -164,6 +168,10 @@ def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
     assert num_finer_steps(revision.model) == 1
     assert revision.reason == "Missing: torque.input_delay. (Alarm: p = 0.001.)"
     assert effect_names(look.model) == ["hinge.coulomb_friction"]
+    # Inference goes on from where discovery fitted it, as far as that is a number.
+    assert {k: float(v) for k, v in revision.parameters.items()} == {
+        "torque.input_delay.delay": pytest.approx(0.01)
+    }
 
 
 @pytest.mark.slow

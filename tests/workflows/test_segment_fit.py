@@ -9,7 +9,8 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.segment_fit import LEAST_GAIN, SegmentModel, fit_segments
+from npdr_ppl.workflows.segment_fit import LEAST_GAIN, fit_segments
+from npdr_ppl.workflows.segment_model import SegmentModel
 
 OPTIONS = BindingOptions(None, 20, "uncertain", "float64")
 START = torch.tensor([0.5, -0.5], dtype=torch.float64)

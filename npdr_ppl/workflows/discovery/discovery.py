@@ -25,7 +25,7 @@ from npdr_ppl.workflows.discovery.result import Discovery, Finding, Verdict
 from npdr_ppl.workflows.discovery.rivals import Added
 from npdr_ppl.workflows.discovery.search import Round, Search, Searcher, explained
 from npdr_ppl.workflows.discovery.separation import separation_matrix
-from npdr_ppl.workflows.segment_fit import SegmentModel
+from npdr_ppl.workflows.segment_model import SegmentModel
 
 __all__ = ["Investigation", "discover"]
 

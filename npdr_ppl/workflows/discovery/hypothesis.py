@@ -15,19 +15,11 @@ from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.arviz_export import effective_share
 from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.segment_fit import (
-    Linearisation,
-    SegmentFit,
-    SegmentModel,
-    fit_segments,
-)
+from npdr_ppl.workflows.segment_fit import SegmentFit, fit_segments
+from npdr_ppl.workflows.segment_model import Linearisation, SegmentModel
 from npdr_ppl.workflows.segment_starts import Starts
 
 __all__ = ["Hypothesis", "fit_hypothesis", "with_effects"]
-
-START_LIMIT = 4.5
-"""How far from the prior's centre a fit may begin, in standard deviations: at the ends of a range
-a parameter hardly moves in reference coordinates."""
 
 LEAST_PENALISED = -1.0
 """Coordinate below which the prior no longer speaks against a hypothesis: that an effect is small
@@ -174,12 +166,7 @@ def fit_hypothesis(
     """
     model = with_effects(model, effects)
     segments = SegmentModel(model, rollouts, options, starts)
-    z = torch.zeros(segments.prior.num_parameters, dtype=torch.float64)
-    if start:
-        middle = segments.prior.to_parameters(z[None])
-        known = {name: torch.as_tensor(value)[None] for name, value in start.items()}
-        z = segments.prior.to_reference({name: known.get(name, v) for name, v in middle.items()})
-        z = z[0].nan_to_num(0.0).clamp(-START_LIMIT, START_LIMIT)
+    z = segments.place_of(start or {})
     stays = torch.zeros(z.shape, dtype=torch.bool)
     for site in segments.prior.sites:
         if held and site.name in held:

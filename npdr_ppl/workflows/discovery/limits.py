@@ -11,8 +11,9 @@ import math
 from torch.distributions import constraints
 
 from npdr_ppl.language.effects import Effect
-from npdr_ppl.workflows.discovery.hypothesis import START_LIMIT, Hypothesis
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.trials import Trials
+from npdr_ppl.workflows.segment_model import START_LIMIT
 
 __all__ = ["limits"]
 

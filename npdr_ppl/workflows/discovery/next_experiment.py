@@ -20,7 +20,8 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
-from npdr_ppl.workflows.segment_fit import SegmentFit, SegmentModel
+from npdr_ppl.workflows.segment_fit import SegmentFit
+from npdr_ppl.workflows.segment_model import SegmentModel
 
 __all__ = ["NextExperiment", "next_experiment"]
 

@@ -11,7 +11,7 @@ from npdr_ppl.rollouts import Rollouts, stitch
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.credible import posterior_draws
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
-from npdr_ppl.workflows.segment_fit import SegmentModel
+from npdr_ppl.workflows.segment_model import SegmentModel
 
 __all__ = ["Gap", "prove"]
 

@@ -27,7 +27,7 @@ from npdr_ppl.workflows.discovery.rivals import (
 from npdr_ppl.workflows.discovery.screening import Screened, screen
 from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.workflows.discovery.trials import PLAINLY, Trials
-from npdr_ppl.workflows.segment_fit import SegmentModel
+from npdr_ppl.workflows.segment_model import SegmentModel
 
 __all__ = ["Round", "Search", "Searcher", "explained"]
 

@@ -1,0 +1,309 @@
+"""A model with one black-box site along a recording, from initial states that may be off.
+
+The recording is cut into segments. Each starts from a state that is only known within the
+smoother's error, so that a simulation depends on the parameters, which all segments share, and on
+the offset of each segment's own initial state. Derivatives by both are finite differences, one
+batch of simulations for all parameters, all segments and all components of their initial states:
+the simulator stays a black box.
+"""
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.handlers import with_noise
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.simulator import Simulator
+from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.states import estimate_states
+from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.segment_starts import (
+    Starts,
+    error_factors,
+    estimate_starts,
+    uncertain_components,
+)
+
+__all__ = ["Linearisation", "SegmentModel"]
+
+PARAMETER_STEP = 1e-2
+"""Half the width of finite differences, in standard deviations of the prior: more than what
+single precision and dry friction blur."""
+
+RATE_SAMPLES = 200
+"""Steps of each rollout at which the change of a rate is looked at."""
+
+START_STEP = 0.1
+"""Half the width of finite differences of initial states, in standard deviations of the smoother's
+error."""
+
+START_LIMIT = 4.5
+"""How far from the prior's centre a fit may begin, in standard deviations: at the ends of a range
+a parameter hardly moves in reference coordinates."""
+
+LEAST_SCALE = 1e-9
+"""Of a channel's residuals, in its unit: a channel may be constant."""
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Residuals and their derivatives; S segments of N readings, d parameters, m offsets.
+
+    Attributes:
+        residual: What was measured less what was simulated, ``(S, N)``.
+        by_parameters: Derivative of the simulation by parameters, ``(S, N, d)``.
+        by_starts: Derivative by the offsets of each segment's own initial state, ``(S, N, m)``.
+    """
+
+    residual: Tensor
+    by_parameters: Tensor
+    by_starts: Tensor
+
+    def weights(self) -> Tensor:
+        """Returns C⁻¹ J, ``(S, N, d)``, with the initial states integrated out.
+
+        J is the derivative by the parameters and C = 1 + G Gᵀ the covariance of the residuals,
+        with the derivative G by the offsets, which are standard normal.
+        """
+        by_z, by_start = self.by_parameters, self.by_starts
+        inner = by_start.mT @ by_start + torch.eye(by_start.shape[-1], dtype=torch.float64)
+        return by_z - by_start @ torch.linalg.solve(inner, by_start.mT @ by_z)
+
+    def information(self) -> Tensor:
+        """Returns the Fisher information Jᵀ C⁻¹ J of the parameters, ``(d, d)``."""
+        return (self.by_parameters.mT @ self.weights()).sum(0)
+
+
+class SegmentModel:
+    """A model with one black-box site, simulated along a recording from shifted initial states.
+
+    Args:
+        model: The Pyro model.
+        rollouts: The recording.
+        options: Segments, initial states and precision; where initial states are ``"uncertain"``
+            they can be shifted, otherwise m is zero.
+        starts: What the segments start from, if better known than by the smoother.
+
+    Attributes:
+        prior: The model's prior.
+        inputs: The segments.
+        sensor_names: The channels that the simulator reports.
+        measured: The C of them that were measured, as the simulator declares them.
+        channel_names: Their names.
+        observed: What was measured, ``(S, K, C)``.
+        starts: What the segments start from, where that was given.
+    """
+
+    def __init__(
+        self,
+        model: Callable[..., Any],
+        rollouts: Rollouts,
+        options: BindingOptions,
+        starts: Starts | None = None,
+    ) -> None:
+        self.inputs = options.inputs(rollouts)
+        self.prior = Prior(with_noise(model, None), (self.inputs,))
+        boxes = self.prior.black_boxes
+        if len(boxes) != 1:
+            raise DataError(f"The model has {len(boxes)} black-box sites; expected one.")
+        self._site, box = next(iter(boxes.items()))
+        if not isinstance(box, SimulatorBlackBox):
+            raise DataError(f"Site {self._site!r} is a plain function and has no trajectory.")
+        self.sensor_names = names = tuple(sensor.name for sensor in box.simulator.sensors)
+        self.measured = tuple(s for s in box.simulator.sensors if s.name in rollouts.channel_names)
+        self.channel_names = tuple(sensor.name for sensor in self.measured)
+        if not self.measured:
+            raise DataError(
+                f"None of the recording's columns {', '.join(rollouts.channel_names)} is a sensor "
+                f"of the model, {', '.join(names)}; rename them."
+            )
+        self._columns = [names.index(name) for name in self.channel_names]
+        self.observed = rollouts.observation(self.inputs, channels=self.channel_names)
+        self._smoothed = _with_lagging_rates(self.inputs, rollouts, box.simulator.rate_lag)
+        self._start_from(starts)
+
+    def estimated_starts(self, z: Tensor, scale: Tensor, rollouts: Rollouts) -> Starts | None:
+        """Estimates what the segments start from along a fitted motion, and how well.
+
+        Args:
+            z: Parameters, ``(d,)``.
+            scale: Standard deviation of each channel's residuals, ``(C,)``.
+            rollouts: The recording.
+
+        Returns:
+            ``None`` if what the segments start from is certain.
+        """
+        starts = estimate_starts(self.black_box(z[None]), self._smoothed, rollouts)
+        if starts is None:
+            return None
+        segments = copy.copy(self)
+        segments._start_from(starts)
+        unmoved = torch.zeros(self.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
+        now = segments.linearise(z, unmoved, scale, is_rough=True)
+        return starts.scaled(segments.inputs, error_factors(now.residual, now.by_starts))
+
+    def _start_from(self, starts: Starts | None) -> None:
+        self.starts = starts
+        self.inputs = self._smoothed if starts is None else starts.put_into(self._smoothed)
+        self._offsets = uncertain_components(self.inputs)
+
+    @property
+    def num_offsets(self) -> int:
+        """Number m of components of an initial state that are uncertain."""
+        return len(self._offsets)
+
+    def simulate(self, z: Tensor, offsets: Tensor) -> Tensor:
+        """Returns readings after each step, ``(n, S, K, C)``.
+
+        Args:
+            z: Parameters, ``(n, d)``.
+            offsets: Offsets of the initial states, ``(n, S, m)``.
+        """
+        box = self.black_box(z)
+        return self.run(box.simulator, box.parameters, offsets)
+
+    @property
+    def simulator(self) -> Simulator:
+        """The model's simulator, effects included."""
+        box = self.prior.black_boxes[self._site]
+        assert isinstance(box, SimulatorBlackBox)
+        return box.simulator
+
+    def place_of(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns reference coordinates from which a fit may begin, ``(d,)``.
+
+        Args:
+            parameters: Parameters by latent site; the others are in the middle of their priors.
+        """
+        z = torch.zeros(self.prior.num_parameters, dtype=torch.float64)
+        if not parameters:
+            return z
+        middle = self.prior.to_parameters(z[None])
+        known = {name: torch.as_tensor(value)[None] for name, value in parameters.items()}
+        z = self.prior.to_reference({name: known.get(name, v) for name, v in middle.items()})
+        return z[0].nan_to_num(0.0).clamp(-START_LIMIT, START_LIMIT)
+
+    def black_box(self, z: Tensor) -> SimulatorBlackBox:
+        """Returns the black-box site as the model makes it at n points, ``(n, d)``."""
+        box = self.prior.black_boxes_at(z)[self._site]
+        assert isinstance(box, SimulatorBlackBox)
+        return box
+
+    def run(
+        self, simulator: Simulator, parameters: Mapping[str, Tensor], offsets: Tensor
+    ) -> Tensor:
+        """Returns readings of a simulator along the recording, ``(n, S, K, C)``.
+
+        Args:
+            simulator: The model's own, or one with further effects.
+            parameters: Parameters by name, ``(n,)`` each, or fewer that broadcast to n.
+            offsets: Offsets of the initial states, ``(n, S, m)``.
+        """
+        simulated = simulator.simulate(parameters, self._shifted(offsets))[..., self._columns]
+        num = torch.broadcast_shapes(simulated.shape[:-3], offsets.shape[:1])
+        return simulated.expand(*num, *self.observed.shape)
+
+    def residuals(self, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
+        """Returns whitened residuals, ``(n, S, K · C)`` float64, zero where nothing was measured.
+
+        Args:
+            z: Parameters, ``(n, d)``.
+            offsets: Offsets of the initial states, ``(n, S, m)``.
+            scale: Standard deviation of each channel's residuals, ``(C,)``.
+        """
+        return self.whitened(self.observed - self.simulate(z, offsets), scale)
+
+    def whitened(self, difference: Tensor, scale: Tensor) -> Tensor:
+        """Returns a difference of readings ``(…, S, K, C)`` in scales, as :meth:`residuals`."""
+        return (difference.double() * self.inputs.mask[..., None] / scale).flatten(-2)
+
+    def root_mean_square(self, difference: Tensor) -> Tensor:
+        """Returns the size of a difference of readings ``(S, K, C)`` per channel, ``(C,)``."""
+        square = difference.double().square() * self.inputs.mask[..., None]
+        return (square.sum((0, 1)) / self.inputs.mask.sum()).sqrt()
+
+    def scale_of(self, z: Tensor, offsets: Tensor) -> Tensor:
+        """Returns the root-mean-square residual per channel, ``(C,)``, at ``(d,)``, ``(S, m)``."""
+        residual = self.observed - self.simulate(z[None], offsets[None])[0]
+        return self.root_mean_square(residual).clamp_min(LEAST_SCALE)
+
+    def linearise(
+        self, z: Tensor, offsets: Tensor, scale: Tensor, *, is_rough: bool = False
+    ) -> Linearisation:
+        """Returns residuals and derivatives at one point.
+
+        Args:
+            z: Parameters, ``(d,)``.
+            offsets: Offsets of the initial states, ``(S, m)``.
+            scale: Standard deviation of each channel's residuals, ``(C,)``.
+            is_rough: Whether one-sided differences will do, at half the price.
+        """
+        d, m = len(z), self.num_offsets
+        shifts = PARAMETER_STEP * torch.eye(d, dtype=torch.float64)
+        moves = START_STEP * torch.eye(m, dtype=torch.float64)[:, None]
+        signs = (1.0,) if is_rough else (1.0, -1.0)
+        num = len(signs)
+        points = torch.cat([sign * shifts for sign in signs])
+        starts = torch.cat([sign * moves for sign in signs]).reshape(num * m, 1, m)
+        residual = self.residuals(
+            z + torch.cat((points, torch.zeros(num * m + 1, d, dtype=torch.float64))),
+            offsets + torch.cat((torch.zeros(num * d, 1, m), starts, torch.zeros(1, 1, m))),
+            scale,
+        )
+        by_z, by_start, here = residual.split((num * d, num * m, 1))
+        if is_rough:
+            down, right = here.expand_as(by_z), here.expand_as(by_start)
+            up, left = by_z, by_start
+        else:
+            up, down, left, right = by_z[:d], by_z[d:], by_start[:m], by_start[m:]
+        return Linearisation(
+            here[0],
+            ((down - up) / (num * PARAMETER_STEP)).permute(1, 2, 0),
+            ((right - left) / (num * START_STEP)).permute(1, 2, 0),
+        )
+
+    def _shifted(self, offsets: Tensor) -> Inputs:
+        """Returns the inputs with their initial states shifted, a batch of n."""
+        changed = {
+            "initial_values": self.inputs.initial_values,
+            "initial_rates": self.inputs.initial_rates,
+        }
+        for k, (name, column, error) in enumerate(self._offsets):
+            value = changed[name]
+            assert value is not None
+            shift = torch.zeros_like(value)
+            shift[..., column] = 1.0
+            changed[name] = value + shift * (offsets[..., k] * error).to(value)[..., None]
+        return replace(self.inputs, **changed, initial_value_errors=None, initial_rate_errors=None)
+
+
+def _with_lagging_rates(inputs: Inputs, rollouts: Rollouts, lag: float) -> Inputs:
+    """Returns inputs whose initial rates may be off by as much as they change during a lag.
+
+    Rates are estimated as derivatives; a simulator may have its own between the steps.
+
+    Args:
+        inputs: The segments.
+        rollouts: What they were made of.
+        lag: Part of a time step.
+    """
+    if lag == 0.0 or inputs.initial_rate_errors is None:
+        return inputs
+    changes = []
+    for readings in rollouts.readings:
+        steps = np.linspace(0, len(readings) - 2, RATE_SAMPLES).astype(np.int64)
+        now, then = (
+            estimate_states(readings, at, rollouts.time_step).rates for at in (steps, steps + 1)
+        )
+        changes.append(np.square(then - now))
+    change = np.sqrt(np.concatenate(changes).mean(0))
+    errors = inputs.initial_rate_errors
+    return replace(inputs, initial_rate_errors=errors.hypot(errors.new_tensor(lag * change)))
