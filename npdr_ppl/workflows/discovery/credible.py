@@ -27,7 +27,7 @@ NUM_PROPOSALS = 256
 Sobol's sequence; evenly spread they say as much as some thousand random ones."""
 
 LEAST_EFFECTIVE = 0.125
-"""Share of the draws that are to be worth an independent one."""
+"""Share of the draws, those that could be simulated, that are to be worth an independent one."""
 
 COPIES = 16
 BANDWIDTH = 0.3
@@ -128,7 +128,8 @@ def posterior_draws(hypothesis: Hypothesis, *, seed: int, num: int = NUM_PROPOSA
     share = min(1.0, len(centre) / float((curvature * covariance).sum().clamp_min(1e-12)))
     log_weights = (-0.5 * share * beyond).nan_to_num(-math.inf, -math.inf, -math.inf)
     weights = log_weights.softmax(0)
-    while float(weights.square().sum()) * LEAST_EFFECTIVE * num > 1.0:
+    enough = LEAST_EFFECTIVE * float(log_weights.isfinite().sum())
+    while float(weights.square().sum()) * enough > 1.0:
         log_weights = 0.7 * log_weights
         weights = log_weights.softmax(0)
     return Draws(z, weights)

@@ -60,3 +60,16 @@ def test_intervals_hold_the_mass_they_say(seed):
         # Of a normal distribution, 94 % lie within 1.881 standard deviations.
         assert (high - low) / (2.0 * estimate.sd) == pytest.approx(1.881, rel=0.05)
         assert 0.5 * (low + high) == pytest.approx(estimate.mean, abs=0.2 * estimate.sd)
+
+
+def test_draws_that_cannot_be_simulated_do_not_count(monkeypatch):
+    hypothesis = fitted(())
+
+    def misfit_at(self, z):
+        # All but a few fail, and those differ by more than weights can bear.
+        return torch.where(torch.arange(len(z)) < 5, 1e3 * torch.arange(len(z)), torch.nan)
+
+    monkeypatch.setattr(Projection, "misfit_at", misfit_at)
+    draws = posterior_draws(hypothesis, seed=0)
+    assert float(draws.weights.sum()) == pytest.approx(1.0)
+    assert float(draws.weights[5:].sum()) == 0.0
