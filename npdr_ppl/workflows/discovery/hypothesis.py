@@ -102,8 +102,7 @@ class Hypothesis:
         There a law is the limit of its own that another law may be: wind without a speed is drag.
         Strengths may be as small or large as they are, and frequencies are looked for anywhere.
         """
-        shapes = {p.name for p in effect.parameters} - {effect.wave}
-        shapes -= {*effect.strength, *effect.incidental}
+        shapes = {p.name for p in effect.parameters} - set(effect.strength) - {effect.wave}
         if not effect.strength:
             return ()
         sites = dict(zip(effect.parameter_names, (p.name for p in effect.parameters), strict=True))
