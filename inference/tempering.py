@@ -24,6 +24,7 @@ from torch.distributions import Categorical, MixtureSameFamily, MultivariateNorm
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density, Problem
+from npdr_ppl.inference.importance import longest_step, systematic
 from npdr_ppl.randomness import seeded
 
 __all__ = ["Particles", "UnnormalisedDensity", "tempered_particles"]
@@ -50,8 +51,6 @@ MAX_STAGES = 200
 
 MIN_PARTICLES = 1_000
 """Particles at least: fewer lose modes and know their covariance badly."""
-
-BISECTIONS = 40
 
 CHUNK = 16_384
 """Points evaluated at once."""
@@ -106,10 +105,10 @@ def tempered_particles(
                 f"The likelihood is too peaked: {MAX_STAGES} steps of tempering reached the "
                 f"exponent {exponent:.2g} of 1."
             )
-        step = _next_step(log_like, 1.0 - exponent)
+        step = longest_step(log_like, 1.0 - exponent, EFFECTIVE_SHARE)
         log_weight = step * log_like
         log_evidence += float(log_weight.logsumexp(0)) - math.log(num_particles)
-        chosen = _resample(log_weight)
+        chosen = systematic(log_weight, num_particles)
         z, log_like = z[chosen], log_like[chosen]
         exponent = 1.0 if step >= 1.0 - exponent else exponent + step
         stages += 1
@@ -119,37 +118,6 @@ def tempered_particles(
             if _correlation(start, z) < DECORRELATED:
                 break
     return Particles(z, log_evidence, stages)
-
-
-def _next_step(log_like: Tensor, longest: float) -> float:
-    """Returns the longest step of the exponent that keeps the effective share of particles."""
-
-    def share(step: float) -> float:
-        log_weight = step * log_like
-        log_weight = torch.where(log_like.isfinite(), log_weight, -torch.inf)
-        effective = 2 * log_weight.logsumexp(0) - (2 * log_weight).logsumexp(0)
-        return float(effective.exp()) / len(log_like)
-
-    # Particles without any likelihood leave at the first step, however short it is.
-    target = EFFECTIVE_SHARE * float(log_like.isfinite().double().mean())
-    if share(longest) >= target:
-        return longest
-    low, high = 0.0, longest
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        if share(middle) >= target:
-            low = middle
-        else:
-            high = middle
-    return max(low, torch.finfo(torch.float64).tiny)
-
-
-def _resample(log_weight: Tensor) -> Tensor:
-    """Returns systematically resampled indices (Douc & Cappé 2005), ``(n,)``."""
-    n = len(log_weight)
-    edges = torch.softmax(log_weight, 0).cumsum(0)
-    points = (torch.arange(n, dtype=torch.float64) + torch.rand((), dtype=torch.float64)) / n
-    return torch.searchsorted(edges, points * edges[-1]).clamp(max=n - 1)
 
 
 def _correlation(start: Tensor, end: Tensor) -> float:

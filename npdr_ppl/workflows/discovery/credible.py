@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npdr_ppl.inference.gaussian_mixture import GaussianMixture
+from npdr_ppl.inference.importance import longest_step, systematic
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.workflows.discovery.chance import block_sums
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.segment_fit import MAX_COORDINATE
 
-__all__ = ["Draws", "Estimate", "estimates", "parameter_density", "posterior_draws"]
+__all__ = ["Draws", "Estimate", "estimates", "posterior_draws"]
 
 NUM_PROPOSALS = 256
 """Draws of the normal approximation, each a simulation of the recording. A power of two, for
@@ -87,18 +87,8 @@ class Draws:
         return Draws(smeared.flatten(0, 1), self.weights.repeat_interleave(COPIES) / COPIES)
 
     def resampled(self, num: int) -> Tensor:
-        """Returns draws of equal weight, ``(num, d)``, in random order.
-
-        From torch's global stream (systematic resampling; Kitagawa 1996).
-
-        Args:
-            num: How many.
-        """
-        shuffled = torch.randperm(len(self.z))
-        steps = (torch.arange(num, dtype=torch.float64) + torch.rand(())) / num
-        places = torch.searchsorted(self.weights[shuffled].cumsum(0), steps)
-        rows = shuffled[places.clamp_max(len(shuffled) - 1)]
-        return self.z[rows[torch.randperm(num)]]
+        """Returns draws of equal weight, ``(num, d)``, chosen from torch's global stream."""
+        return self.z[systematic(self.weights.log(), num)]
 
 
 def posterior_draws(hypothesis: Hypothesis, *, seed: int, num: int = NUM_PROPOSALS) -> Draws:
@@ -113,8 +103,8 @@ def posterior_draws(hypothesis: Hypothesis, *, seed: int, num: int = NUM_PROPOSA
         seed: Seed of the draws.
         num: How many, a power of two.
     """
-    projection, density = Projection(hypothesis), parameter_density(hypothesis)
-    centre, covariance = density.means[0], density.covariances[0]
+    projection, centre = Projection(hypothesis), hypothesis.fit.z
+    covariance = _robust_covariance(projection)
     sobol = torch.quasirandom.SobolEngine(len(centre), scramble=True, seed=seed)
     even = sobol.draw(num, dtype=torch.float64).clamp(1e-6, 1.0 - 1e-6)
     normal = torch.special.ndtri(even)
@@ -127,27 +117,19 @@ def posterior_draws(hypothesis: Hypothesis, *, seed: int, num: int = NUM_PROPOSA
     beyond = projection.misfit_at(z) - parabola
     share = min(1.0, len(centre) / float((curvature * covariance).sum().clamp_min(1e-12)))
     log_weights = (-0.5 * share * beyond).nan_to_num(-math.inf, -math.inf, -math.inf)
-    weights = log_weights.softmax(0)
-    enough = LEAST_EFFECTIVE * float(log_weights.isfinite().sum())
-    while float(weights.square().sum()) * enough > 1.0:
-        log_weights = 0.7 * log_weights
-        weights = log_weights.softmax(0)
-    return Draws(z, weights)
+    exponent = longest_step(log_weights, 1.0, LEAST_EFFECTIVE)
+    return Draws(z, (exponent * log_weights).softmax(0))
 
 
-def parameter_density(hypothesis: Hypothesis) -> GaussianMixture:
-    """Returns the normal approximation of the posterior, in reference coordinates.
+def _robust_covariance(projection: Projection) -> Tensor:
+    """Returns the covariance of the posterior's normal approximation, ``(d, d)``.
 
-    Its covariance is the robust one, H⁻¹ V H⁻¹ with V from how the blocks' scores scatter (Huber
+    The robust one, H⁻¹ V H⁻¹ with V from how the blocks' scores scatter (Huber
     1967; White 1982; Müller 2013 for posteriors), which holds when readings within a block are
     correlated or the scale is wrong. Each block's score is what it would be had the block not been
     fitted (the jackknife, CR3 of Bell & McCaffrey 2002): few blocks may carry most of what is
     known. No parameter is taken to be surer than Laplace's approximation has it.
-
-    Args:
-        hypothesis: The fitted model.
     """
-    projection = Projection(hypothesis)
     information = projection.parameter_information
     d = len(information)
     eye = torch.eye(d, dtype=torch.float64)
@@ -165,9 +147,7 @@ def parameter_density(hypothesis: Hypothesis) -> GaussianMixture:
     robust = inverse @ (scatter + eye) @ inverse
     wider = (inverse.diagonal() / robust.diagonal()).clamp_min(1.0).sqrt()
     covariance = wider[:, None] * robust * wider
-    one = torch.ones(1, dtype=torch.float64)
-    covariance = 0.5 * (covariance + covariance.mT) + 1e-12 * eye
-    return GaussianMixture.from_moments(one, hypothesis.fit.z[None], covariance[None])
+    return 0.5 * (covariance + covariance.mT) + 1e-12 * eye
 
 
 def estimates(

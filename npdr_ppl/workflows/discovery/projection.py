@@ -24,11 +24,9 @@ from torch import Tensor
 
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
+from npdr_ppl.workflows.infer import MAX_READINGS_PER_CHUNK
 
 __all__ = ["Projection", "Scores", "loss_without"]
-
-MOST_READINGS = 2_000_000
-"""Readings simulated together, which takes some hundred megabytes."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ class Projection:
         """
         segments, fit = self.hypothesis.segments, self.hypothesis.fit
         offsets = fit.offsets[None]
-        together = max(1, MOST_READINGS // max(1, segments.observed.numel()))
+        together = max(1, MAX_READINGS_PER_CHUNK // max(1, segments.observed.numel()))
         result = []
         for points in z.split(together):
             left = segments.residuals(points, offsets.expand(len(points), -1, -1), fit.scale)
