@@ -46,9 +46,9 @@ MAX_COORDINATE = 5.0
 """How far from the prior's centre a fit may lie, in standard deviations. A strength that is much
 smaller than its half-normal prior expects lies at −3 and beyond."""
 
-LEAST_GAIN = 0.05
-"""Reduction of the objective, in units of the readings' variance, below which steps end: far less
-than what makes a difference between two models."""
+LEAST_GAIN = 0.5
+"""Reduction of the objective, in units of the readings' variance, below which steps end: a quarter
+of a unit of log evidence, a tenth of what makes one of two models ten times as likely."""
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,9 @@ LONGEST_DELAY = 0.04
 SPIKE = 12.0
 """Jumps, in standard deviations of a channel's second differences, that tell lost samples."""
 
+RESTS = 0.01
+"""Change within a step, in a channel's root-mean-square change, below which the channel rests."""
+
 MIN_STEPS = 20
 
 MOST_LOST = 0.02
@@ -165,17 +168,23 @@ def _lost_samples(rollouts: Rollouts, channels: Sequence[str]) -> list[str]:
     problems = []
     for index, readings in enumerate(rollouts.readings):
         first = np.diff(readings[:, columns], axis=0)
-        # Only what moves can jump; an encoder's count is no jump.
-        steady = np.median(np.abs(first), axis=0)
         second = np.abs(np.diff(first, axis=0))
-        spread = np.maximum(np.median(second, axis=0) / 0.6745, 0.1 * steady)
+        first = np.abs(first[1:])
+        # What is usual while the device moves: it may have stood still most of the time.
+        rests = first <= RESTS * np.sqrt(np.square(first).mean(0))
+        moves = rests.mean(1) <= 0.5
+        if moves.sum() < MIN_STEPS:
+            continue
+        # Only what moves can jump; an encoder's count is no jump.
+        steady = np.median(first[moves], axis=0)
+        spread = np.maximum(np.median(second[moves], axis=0) / 0.6745, 0.1 * steady)
         moving = steady > 0
-        if len(second) < MIN_STEPS or moving.sum() < 2:
+        if moving.sum() < 2:
             continue
         jumps = second[:, moving] > SPIKE * spread[moving]
         together = jumps.mean(1) > 0.5
         count = int((np.diff(together.astype(int), prepend=0) == 1).sum())
-        if 0 < count < MOST_LOST * len(second):
+        if 0 < count and together.mean() < MOST_LOST:
             begin = float(np.flatnonzero(together)[0] + 1) * rollouts.time_step
             problems.append(
                 f"Rollout {index} looks as if samples were lost {count} times, first at "

@@ -38,6 +38,9 @@ MINOR = 0.1
 SURVIVES = 0.05
 """Probability from which an alternative has to be reckoned with."""
 
+TOLD_APART = 3
+"""The likeliest, which the next experiment is to tell apart."""
+
 COARSE = (
     "The model's integration steps are too coarse for this recording; the revised model takes "
     "finer ones."
@@ -171,6 +174,19 @@ class Investigation:
             binding = _like(self._binding, self.rollouts, self.holdout)
             return prove(given, final, self.holdout, binding, seed=self.options.seed)
 
+    def _advice(self, name: str) -> NextExperiment | None:
+        """Returns the experiment that would tell the likeliest in an effect's place apart."""
+        search = self.search
+        added = next(a for a in search.added if a.effect.name == name)
+        likeliest = sorted(added.alternatives, key=lambda n: added.alternatives[n], reverse=True)
+        names = [n for n in likeliest[:TOLD_APART] if added.alternatives[n] >= SURVIVES]
+        survivors = [search.trials[added.place, n] for n in names]
+        if len(survivors) < 2:
+            return None
+        ids = {name.rsplit(".", 1)[1] for name in names}
+        classes = [g for g in added.effect.equivalence if len(ids & set(g.members)) > 1]
+        return next_experiment(survivors, self.rollouts, self._binding, classes)
+
     def conclude(self) -> Discovery:
         """Returns what all stages came to."""
         search = self.search
@@ -188,7 +204,7 @@ class Investigation:
         with _timed(self.seconds, "next experiment"):
             advice = None
             if verdict == "ambiguous":
-                advice = _advice(search, self.rollouts, self._binding)
+                advice = self._advice(_most_doubtful(effects, self.options).effect.name)
         return Discovery(
             verdict=verdict,
             reason=reason,
@@ -271,7 +287,8 @@ def _judge(
     sure = [f for f in effects if f.probability >= options.confidence]
     if sure and sum(f.share for f in unsure) <= MINOR * explains:
         return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
-    names = " or ".join(n for n, p in unsure[0].alternatives.items() if p >= SURVIVES)
+    doubtful = _most_doubtful(effects, options)
+    names = " or ".join(n for n, p in doubtful.alternatives.items() if p >= SURVIVES)
     return "ambiguous", f"The recording cannot tell which it is: {names}."
 
 
@@ -317,16 +334,12 @@ def _units(hypothesis: Hypothesis) -> dict[str, str]:
     return units
 
 
-def _advice(search: Search, rollouts: Rollouts, binding: BindingOptions) -> NextExperiment | None:
-    """Returns the experiment that would tell the survivors of the least certain effect apart."""
-    added = min(search.added, key=lambda a: a.probability)
-    names = [n for n, p in added.alternatives.items() if p >= SURVIVES]
-    survivors = [search.trials[added.place, n] for n in names if (added.place, n) in search.trials]
-    if len(survivors) < 2:
-        return None
-    ids = {name.rsplit(".", 1)[1] for name in names}
-    classes = [group for group in added.effect.equivalence if len(ids & set(group.members)) > 1]
-    return next_experiment(survivors, rollouts, binding, classes)
+def _most_doubtful(effects: list[Finding], options: DiscoveryOptions) -> Finding:
+    """Returns the effect that explains most of those that are in doubt."""
+    return max(
+        (found for found in effects if found.probability < options.confidence),
+        key=lambda found: found.share,
+    )
 
 
 def _like(binding: BindingOptions, rollouts: Rollouts, holdout: Rollouts) -> BindingOptions:

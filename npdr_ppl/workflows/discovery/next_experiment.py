@@ -6,7 +6,7 @@ to do is the one whose smallest separation, over all pairs, is largest.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -78,18 +78,18 @@ def next_experiment(
         classes: Equivalence classes of the effects in question.
     """
     largest = np.max([np.abs(actions).max(0) for actions in rollouts.actions], axis=0)
-    separations = {}
-    for name, shape in _excitations(rollouts.time_step).items():
-        actions = SAFE_SHARE * largest * shape[:, None]
-        try:
-            separations[name] = min(
-                _separation(a, b, _recorded(a, rollouts, actions), options)
-                for a in survivors
-                for b in survivors
-                if a is not b
-            )
-        except NpdrError:
-            separations[name] = math.nan
+    shapes = _excitations(rollouts.time_step)
+    commands = SAFE_SHARE * largest * np.stack(list(shapes.values()))[..., None]
+    made = [_made(survivor, rollouts, commands) for survivor in survivors]
+    works = np.all([np.isfinite(readings).all((1, 2)) for readings in made], axis=0)
+    smallest = np.where(works, math.inf, math.nan)
+    for a, readings in zip(survivors, made, strict=True) if works.any() else ():
+        recorded = _recorded(a, rollouts, readings[works], commands[works])
+        for b in survivors:
+            if a is not b:
+                found = _separations(a, b, recorded, options)
+                smallest[works] = np.minimum(smallest[works], found)
+    separations = dict(zip(shapes, smallest.tolist(), strict=True))
     finite = {name: s for name, s in separations.items() if math.isfinite(s)}
     best = max(finite, key=lambda name: finite[name]) if finite else None
     if best is not None and finite[best] < ENOUGH:
@@ -121,47 +121,82 @@ def _excitations(time_step: float) -> dict[str, NDArray[np.float64]]:
     return {name: np.asarray(shape, dtype=np.float64) for name, shape in shapes.items()}
 
 
-def _recorded(
-    hypothesis: Hypothesis, rollouts: Rollouts, actions: NDArray[np.float64]
-) -> Rollouts:
-    """Returns what a hypothesis would record under commands ``(T, A)``, from rest."""
+def _made(
+    hypothesis: Hypothesis, rollouts: Rollouts, commands: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Returns what a hypothesis would read under commands ``(E, T, A)``, from rest, ``(E, T, C)``.
+
+    NaN where it cannot be simulated.
+    """
     segments = hypothesis.segments
-    names = rollouts.channel_names
-    readings = rollouts.readings[0][0]
-    inputs = Inputs.single(
-        torch.tensor(actions),
-        torch.tensor(readings),
+    start = torch.tensor(rollouts.readings[0][0]).expand(len(commands), -1)
+    actions = torch.tensor(commands)
+    history = segments.inputs.past_actions.shape[-2]
+    inputs = Inputs(
+        actions=actions,
         action_names=rollouts.action_names,
-        state_names=names,
+        initial_readings=start,
+        initial_values=start,
+        channel_names=rollouts.channel_names,
+        past_actions=actions.new_zeros(len(commands), history, actions.shape[-1]),
         time_step=rollouts.time_step,
-        history=segments.inputs.past_actions.shape[-2],
+        mask=torch.ones(actions.shape[:2], dtype=torch.bool),
+        rollout=torch.arange(len(commands)),
+        start=torch.zeros(len(commands), dtype=torch.long),
+        initial_rates=torch.zeros_like(start),
     )
-    inputs = replace(inputs, initial_rates=torch.zeros_like(inputs.initial_values))
-    box = segments.black_box(hypothesis.fit.z[None])
-    simulated = box.simulator.simulate(box.parameters, inputs)[0, 0].double().numpy()
     columns = [segments.sensor_names.index(name) for name in segments.channel_names]
-    start = readings[[names.index(name) for name in segments.channel_names]]
-    series = np.concatenate((start[None], simulated[:, columns]))
+    box = segments.black_box(hypothesis.fit.z[None])
+    try:
+        simulated = box.simulator.simulate(box.parameters, inputs)[0]
+    except NpdrError:
+        return np.full((*commands.shape[:2], len(columns)), math.nan)
+    return simulated[..., columns].double().numpy()
+
+
+def _recorded(
+    hypothesis: Hypothesis,
+    rollouts: Rollouts,
+    readings: NDArray[np.float64],
+    commands: NDArray[np.float64],
+) -> Rollouts:
+    """Returns a recording of readings ``(E, T, C)`` under commands ``(E, T, A)``."""
+    names, channels = rollouts.channel_names, hypothesis.segments.channel_names
+    start = rollouts.readings[0][0][[names.index(name) for name in channels]]
     return Rollouts.from_arrays(
-        [series],
-        [actions],
-        channel_names=segments.channel_names,
+        [np.concatenate((start[None], series)) for series in readings],
+        list(commands),
+        channel_names=channels,
         action_names=rollouts.action_names,
         time_step=rollouts.time_step,
     )
 
 
-def _separation(
-    made: Hypothesis, refitted: Hypothesis, rollouts: Rollouts, options: BindingOptions
-) -> float:
-    """Returns how far a recording of one hypothesis is from the other once that is refitted."""
-    segments = SegmentModel(refitted.model, rollouts, options)
+def _separations(
+    made: Hypothesis, refitted: Hypothesis, recorded: Rollouts, options: BindingOptions
+) -> NDArray[np.float64]:
+    """Returns how far each rollout that one hypothesis made is from the other, refitted to it.
+
+    NaN where the other cannot be simulated there.
+    """
+    segments = SegmentModel(refitted.model, recorded, options)
     offsets: Tensor = torch.zeros(
         segments.inputs.num_segments, segments.num_offsets, dtype=torch.float64
     )
     fit = SegmentFit(refitted.fit.z, offsets, made.fit.scale)
-    hypothesis = Hypothesis(refitted.model, refitted.effects, segments, fit)
-    projection = Projection(hypothesis)
-    score = projection.parameter_scores.sum(0)
-    explained = score @ torch.linalg.solve(projection.parameter_information, score)
-    return max(0.0, projection.misfit - float(explained)) ** 0.5
+    num = len(recorded.readings)
+    try:
+        projection = Projection(Hypothesis(refitted.model, refitted.effects, segments, fit))
+    except NpdrError:
+        return np.full(num, math.nan)
+
+    def by_rollout(values: Tensor) -> Tensor:
+        result = values.new_zeros(num, *values.shape[1:])
+        return result.index_add(0, segments.inputs.rollout, values)
+
+    score = by_rollout(projection.parameter_scores)
+    prior = torch.eye(score.shape[-1], dtype=torch.float64)
+    information = by_rollout(projection.parameter_information_by_segment) + prior
+    explained = (score * torch.linalg.solve(information, score)).sum(-1)
+    left = by_rollout(projection.misfit_by_segment) - explained
+    return left.clamp_min(0.0).sqrt().numpy()

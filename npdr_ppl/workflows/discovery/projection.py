@@ -147,7 +147,12 @@ class Projection:
     @cached_property
     def misfit(self) -> float:
         """rᵀ C⁻¹ r."""
-        return float((self.residual * self._weighted).sum())
+        return float(self.misfit_by_segment.sum())
+
+    @property
+    def misfit_by_segment(self) -> Tensor:
+        """The same of each segment, ``(S,)``."""
+        return (self.residual * self._weighted).sum(-1)
 
     def scores(self, columns: Tensor) -> Scores:
         """Returns the scores of columns, ``(S, N, P)``."""

@@ -32,8 +32,8 @@ from npdr_ppl.workflows.segment_model import SegmentModel
 __all__ = ["Round", "Search", "Searcher", "explained"]
 
 LEAST_SHARE = 1e-4
-"""Share of what was explained below which what is left is not looked into: where a large effect
-was missing, integrators and the laws' own details differ by as much."""
+"""Share of what was explained below which what is left is not looked into and no effect is added:
+where a large effect was missing, integrators and the laws' own details differ by as much."""
 
 NOTICEABLE = 5.0
 """Distance by which steps of a higher order move all readings together, in standard deviations of
@@ -176,7 +176,7 @@ class Searcher:
         ):
             best, weights, tried = self._extended(current, now)
             rounds[-1] = replace(now, weights=weights, trials=tried)
-            if best is None:
+            if best is None or _is_negligible(first.hypothesis, current, tried[best]):
                 break
             current, needless = self._pruned(tried[best])
             current = self.trials.with_own_starts(current)
@@ -297,6 +297,11 @@ class Searcher:
 def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:
     """Returns the probability of one of two hypotheses."""
     return weigh([one, other], [0.0, 0.0], seed=0)[0]
+
+
+def _is_negligible(first: Hypothesis, current: Hypothesis, extended: Hypothesis) -> bool:
+    """Returns whether the last effect explains next to nothing beside all that was explained."""
+    return explained(current, extended) < LEAST_SHARE * explained(first, extended)
 
 
 def explained(first: Hypothesis, final: Hypothesis) -> float:
