@@ -14,6 +14,7 @@ from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.credible import Estimate, estimates
 from npdr_ppl.workflows.discovery.data_checks import data_problems, recording_problems
 from npdr_ppl.workflows.discovery.equivalents import equivalents
+from npdr_ppl.workflows.discovery.evidence import SURVIVES
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.limits import limits
 from npdr_ppl.workflows.discovery.next_experiment import NextExperiment, next_experiment
@@ -34,9 +35,6 @@ MOST_UNEXPLAINED = 0.02
 
 MINOR = 0.1
 """Share of the findings that may be in doubt where the rest is to be called named."""
-
-SURVIVES = 0.05
-"""Probability from which an alternative has to be reckoned with."""
 
 TOLD_APART = 3
 """The likeliest, which the next experiment is to tell apart."""

@@ -17,9 +17,12 @@ from torch import Tensor
 from npdr_ppl.workflows.discovery.chance import block_sums
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 
-__all__ = ["closest", "evidence", "weigh"]
+__all__ = ["SURVIVES", "closest", "evidence", "weigh"]
 
 RESAMPLINGS = 1000
+
+SURVIVES = 0.05
+"""Probability from which an alternative has to be reckoned with."""
 
 
 def closest(hypotheses: Sequence[Hypothesis]) -> Hypothesis:

@@ -88,7 +88,7 @@ def find_rivals(
     tried = {effect.name: current} | trials.extended(without, ranking)
     tried = trials.converged(tried, done=effect.name)
     others = {name: h for name, h in tried.items() if name != effect.name}
-    return Rivals(without, current, others)
+    return Rivals(without, current, trials.apart_from_waves_in_step(others))
 
 
 def tried_before(

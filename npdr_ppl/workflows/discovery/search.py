@@ -11,7 +11,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.alarm import Alarm, sound_alarm
 from npdr_ppl.workflows.discovery.candidates import candidates_at, variants_of
-from npdr_ppl.workflows.discovery.evidence import closest, weigh
+from npdr_ppl.workflows.discovery.evidence import SURVIVES, closest, weigh
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis, with_effects
 from npdr_ppl.workflows.discovery.latent_force import Responses, responses
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
@@ -229,6 +229,14 @@ class Searcher:
         prior = [math.log(1 - PRIOR_OF_ANY), *(each + log_prior(t) for t in trials.values())]
         weights = dict(zip(("", *trials), weigh(hypotheses, prior, seed=0), strict=True))
         best = max(trials, key=lambda name: weights[name])
+        trials = self.trials.apart_from_waves_in_step(trials)
+        if best not in trials:
+            self._report(f"{best} keeps in step with the motion, so it is a law of the state")
+            if not trials:
+                return None, weights, trials
+            wave, best = best, max(trials, key=lambda name: weights[name])
+            if weights[best] < SURVIVES * weights[wave]:
+                return None, weights, trials
         is_chance = now.alarm.p_values.get(best, 1.0) > self.options.false_alarm_rate
         if is_chance and weights[""] > 1.0 - self.options.confidence:
             return None, weights, trials

@@ -14,6 +14,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.evidence import closest
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
+from npdr_ppl.workflows.discovery.repetition import keeps_in_step
 from npdr_ppl.workflows.discovery.screening import Screened
 from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.workflows.segment_starts import Starts
@@ -204,6 +205,14 @@ class Trials:
         offsets, starts = current.fit.offsets, current.segments.starts
         asked = [_Fit(effects, start, offsets, starts, held=places) for places in held]
         return list(self._fits(asked, current.simulator))
+
+    def apart_from_waves_in_step(self, tried: Mapping[str, Hypothesis]) -> dict[str, Hypothesis]:
+        """Returns the models less those whose last effect is a wave in step with the motion."""
+        return {
+            name: trial
+            for name, trial in tried.items()
+            if not keeps_in_step(trial, trial.effects[-1], self.rollouts)
+        }
 
     def without(self, current: Hypothesis, effect: Effect) -> Hypothesis | None:
         """Returns a hypothesis without one of its effects, see :meth:`refitted`."""
