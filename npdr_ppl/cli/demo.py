@@ -24,6 +24,7 @@ def demo(
 
     Example: npdr demo --out demo-output
     """
+    import torch
     from rich.console import Console
 
     from npdr_ppl.cli.show import show_demo
@@ -33,6 +34,9 @@ def demo(
     from npdr_ppl.workflows.demo import run_demo
     from npdr_ppl.workflows.progress import reporter
 
+    # Batches are small here: a second thread makes training a fourth slower, and the search of
+    # discovery has its processes.
+    torch.set_num_threads(1)
     console = Console(quiet=quiet or as_json)
     console.print("A Furuta pendulum in MuJoCo is the rig; the model has the paper's equations …")
     with (

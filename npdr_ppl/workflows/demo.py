@@ -1,8 +1,8 @@
 """The demonstration: from a policy that fails on a rig to what the model lacked, and to success.
 
 A Furuta pendulum in MuJoCo, with MuJoCo's own dry friction of the arm and a filter of the rates
-that the paper's equations know nothing of, plays the device. A policy is trained on the prior and runs on
-it; the posterior is inferred and diagnosed; discovery finds that no parameters explain the
+that the paper's equations know nothing of, plays the device. A policy is trained on the prior and
+runs on it; the posterior is inferred and diagnosed; discovery finds that no parameters explain the
 rollout, and names what is missing; the revised model trains the policy again.
 """
 
