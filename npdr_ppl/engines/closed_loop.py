@@ -118,16 +118,7 @@ class LoopBody:
         for step in range(self.steps_per_call):
             time = start + step * self.stepper.time_step
             loop, _ = self.step(loop, tables, policy_constants, time)
-        return self.without_repetition(loop)
-
-    def without_repetition(self, loop: _Loop) -> _Loop:
-        """Returns the loop with no tensor in it twice.
-
-        One that came in twice would be another kind of argument, for which torch compiles anew.
-        """
-        if not self.stepper.sensor_effects:
-            return loop._replace(readings=())
-        return loop._replace(readings=tuple(reading.clone() for reading in loop.readings))
+        return loop
 
 
 def roll_out(simulator: "ODESimulator", request: EpisodeRequest) -> Episodes:
@@ -157,7 +148,7 @@ def roll_out(simulator: "ODESimulator", request: EpisodeRequest) -> Episodes:
         loop = begin(body, states, tables)
         if not is_compiled:
             return run_eagerly(body, loop, tables, constants, num_steps, shape, request.record)
-        loop = body.without_repetition(flatten(loop, loop.total.shape, expand=True))
+        loop = flatten(loop, loop.total.shape, expand=True)
         loop = _run_compiled(body, loop, tables, constants, num_steps)
         return _episodes(loop, shape, reward)
 
@@ -221,8 +212,12 @@ def _run_compiled(
         part, block_tables, block_constants = pytree.tree_map_only(
             Tensor, block, (loop, tables, constants)
         )
+        # A tensor that comes in twice, as a rate and a filter's memory of it, is another kind of
+        # argument, for which torch compiles anew; in the first state none has met another yet.
+        for start in starts[:1]:
+            part = body.run(part, block_tables, block_constants, start)
         mark_sizes_dynamic((part, block_tables, block_constants))
-        for start in starts:
+        for start in starts[1:]:
             part = run(part, block_tables, block_constants, start)
         for k in range(num_calls * at_once, num_steps):
             part, _ = body.step(part, block_tables, block_constants, k * time_step)

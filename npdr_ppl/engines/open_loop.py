@@ -94,8 +94,9 @@ def _replay(
         return _joined(readings, shape, inputs.num_steps)
     state = _start(body, tables, inputs, records, shape)
     at_once = steps_per_call(num_steps=inputs.num_steps, batch_size=shape.numel())
-    # The first state carries no gradient where later ones do, and would need its own kernel.
-    first = min(at_once, inputs.num_steps) if has_gradient else 0
+    # The first state would need its own kernel: in later ones a filter's memory is the last
+    # reading, the same tensor, and they carry gradients where there are any.
+    first = min(at_once, inputs.num_steps)
     last = inputs.num_steps - (inputs.num_steps - first) % at_once
     state = run_eagerly(state, 0, first)
     state = _run_compiled(body, state, tables, records, range(first, last, at_once), readings)
