@@ -14,6 +14,7 @@ from npdr_ppl.workflows.discovery.generic_laws import (
     wave_laws,
 )
 from npdr_ppl.workflows.discovery.latent_force import Responses
+from npdr_ppl.workflows.discovery.moments import forces_at_moments
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.screening import Screened
@@ -21,10 +22,9 @@ from npdr_ppl.workflows.discovery.sensitivities import Variant
 
 __all__ = ["Alarm", "sound_alarm"]
 
-
-CATALOGUE_SHARE = 0.75
-"""Share of the false alarms that the catalogue's candidates may raise; the rest is for generic
-laws."""
+CATALOGUE_SHARE, LAW_SHARE, MOMENT_SHARE = 0.7, 0.2, 0.1
+"""Shares of the false alarms that the catalogue's candidates, generic laws and forces at some
+moments may raise."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,18 @@ def sound_alarm(
         values[name] = min(values.get(name, 1.0), p / CATALOGUE_SHARE)
     groups = [law.change for law in (*laws, *listed)]
     for law, p in zip((*laws, *listed), chance.p_values(groups), strict=True):
-        values[law.name] = min(1.0, p / (1.0 - CATALOGUE_SHARE))
+        values[law.name] = min(1.0, p / LAW_SHARE)
     for effect in {v.effect.name: v.effect for v in variants if v.effect.wave}.values():
         own = [values[wave.name] for wave in waves.get(effect.port, [])]
         values[effect.name] = min([values[effect.name], *own])
+    moments = forces_at_moments(projection, found)
+    for moment in moments:
+        values[moment.name] = min(1.0, len(moments) * moment.p_value / MOMENT_SHARE)
     gains = {candidate.name: candidate.gain for candidate in ranking}
     gains |= {law.name: gain for law, gain in gained}
+    # Segments stand out by chance, and what they stand out by is no gain before it is heard.
+    heard = [moment for moment in moments if values[moment.name] <= options.false_alarm_rate]
+    gains |= {moment.name: moment.gain for moment in heard}
     if not values:
         return Alarm(1.0, False, "", 0.0, {})
     p_value = min(values.values())

@@ -297,7 +297,7 @@ def _finding(
     survivors = [
         name
         for name, probability in added.alternatives.items()
-        if probability >= SURVIVES and name != effect.name
+        if (probability >= SURVIVES or name in added.fitting) and name != effect.name
     ]
     known = equivalents(effect, search.final.names)
     ids = dict.fromkeys([name.rsplit(".", 1)[1] for name in survivors] + list(known))

@@ -17,12 +17,16 @@ from torch import Tensor
 from npdr_ppl.workflows.discovery.chance import block_sums
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 
-__all__ = ["SURVIVES", "closest", "evidence", "weigh"]
+__all__ = ["INDISTINCT", "SURVIVES", "closest", "evidence", "weigh"]
 
 RESAMPLINGS = 1000
 
 SURVIVES = 0.05
 """Probability from which an alternative has to be reckoned with."""
+
+INDISTINCT = 2.0
+"""Loss of log density up to which a recording does not tell two laws, or a law from its limit: two
+standard deviations of a likelihood ratio of one parameter."""
 
 
 def closest(hypotheses: Sequence[Hypothesis]) -> Hypothesis:

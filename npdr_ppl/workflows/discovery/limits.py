@@ -11,15 +11,12 @@ import math
 from torch.distributions import constraints
 
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.workflows.discovery.evidence import INDISTINCT
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.trials import Trials
 from npdr_ppl.workflows.segment_model import START_LIMIT
 
 __all__ = ["limits"]
-
-INDISTINCT = 2.0
-"""Loss of evidence up to which a recording does not tell a law from its limit: two standard
-deviations of a likelihood ratio of one parameter."""
 
 DISTINCT = 5.0
 """Loss of evidence at the other end from which it says something about the parameter at all."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.workflows.discovery.candidates import candidates_at, variants_of
-from npdr_ppl.workflows.discovery.evidence import closest, weigh
+from npdr_ppl.workflows.discovery.evidence import INDISTINCT, closest, weigh
 from npdr_ppl.workflows.discovery.generic_laws import FREQUENCIES
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.latent_force import responses
@@ -33,12 +33,16 @@ class Added:
         share: Share of all that was explained which is lost without it.
         alternatives: Probability of the effects that could stand in its place, itself included,
             given all others, by name.
+        fitting: Names of those that fit as well. The simplest is the likeliest, but a law that
+            contains it, as bristles contain dry friction, is as good where its further
+            parameters do not show.
     """
 
     effect: Effect
     place: str
     share: float
     alternatives: dict[str, float]
+    fitting: tuple[str, ...] = ()
 
     @property
     def probability(self) -> float:
@@ -140,14 +144,27 @@ def weigh_rivals(
     scale = closest([base, swapped]).fit.scale
     whole, lost = (float((h.losses(scale) - swapped.losses(scale)).sum()) for h in (base, without))
     share = max(0.0, lost) / max(whole, 1e-12)
+    fitting = _fitting(trials, best)
     swapped = current if best == effect.name else swapped
-    return swapped, Added(chosen, effect.name, share, alternatives)
+    return swapped, Added(chosen, effect.name, share, alternatives, fitting)
 
 
 def log_prior(hypothesis: Hypothesis) -> float:
     """Returns what the search over frequencies costs, as so many hypotheses share one's prior."""
     waves = sum(bool(effect.wave) for effect in hypothesis.effects)
     return -waves * math.log(FREQUENCIES)
+
+
+def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
+    """Returns the names of those that fit no worse than the likeliest, whatever they cost."""
+    reference = closest(list(trials.values()))
+    least = trials[best].losses(reference.fit.scale).sum()
+    return tuple(
+        name
+        for name, trial in trials.items()
+        if name != best
+        and reference.share * float(trial.losses(reference.fit.scale).sum() - least) < INDISTINCT
+    )
 
 
 def _strains(trials: Mapping[str, Hypothesis], without: Hypothesis) -> list[float]:

@@ -19,6 +19,7 @@ from npdr_ppl.models.effects import (
     InputDelay,
     Payload,
     PeriodicDisturbance,
+    PreslidingFriction,
     Spring,
     ViscousFriction,
     Wind,
@@ -91,6 +92,24 @@ def test_an_inseparable_pair_is_reported_as_a_class():
     assert found.verdict == "ambiguous"
     assert found.next_experiment is not None
     assert found.next_experiment.separated_by
+
+
+def test_a_law_that_contains_another_is_named_where_it_shows_and_else_reported():
+    few = CoulombFriction("hinge"), PreslidingFriction("hinge"), ViscousFriction("hinge")
+
+    def name(hidden):
+        place = ("hinge", hidden)
+        _, found = discover("pendulum", "one", (place,), strength=0.3, effects=few)
+        (finding,) = found.effects
+        return finding
+
+    dry = name("coulomb_friction")
+    assert dry.effect.id == "coulomb_friction"
+    assert dry.probability > 0.9
+    assert "presliding_friction" in dry.equivalent_to
+    bent = name("presliding_friction")
+    assert bent.effect.id == "presliding_friction"
+    assert "coulomb_friction" not in bent.equivalent_to
 
 
 def test_nothing_is_found_where_nothing_is_missing():
