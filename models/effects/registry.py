@@ -4,6 +4,7 @@ Other packages add theirs by an entry point of group ``npdr_ppl.effects``: its n
 id, its value a subclass of :class:`~npdr_ppl.language.effects.Effect`.
 """
 
+from dataclasses import replace
 from importlib.metadata import entry_points
 
 from npdr_ppl.errors import ModelError
@@ -72,13 +73,7 @@ def effect_class(name: str) -> type[Effect]:
     Raises:
         ModelError: There is no such effect, it cannot be loaded, or its id is another.
     """
-    effect = _REGISTRY.find(name)
-    if effect.id != name:
-        raise ModelError(
-            f"The entry point {name!r} of group {GROUP} names an effect whose id is "
-            f"{effect.id!r}; both have to be the same."
-        )
-    return effect
+    return _found(_REGISTRY, name)
 
 
 def effects() -> dict[str, type[Effect]]:
@@ -88,4 +83,18 @@ def effects() -> dict[str, type[Effect]]:
         >>> effects()["coulomb_friction"]("arm")
         CoulombFriction(port='arm')
     """
-    return {name: effect_class(name) for name in _locations()}
+    locations = _locations()
+    # Which packages are installed is read once, not for every effect.
+    registry = replace(_REGISTRY, locations=lambda: locations)
+    return {name: _found(registry, name) for name in locations}
+
+
+def _found(registry: Registry[Effect], name: str) -> type[Effect]:
+    """Returns the class of an effect, see :func:`effect_class`."""
+    effect = registry.find(name)
+    if effect.id != name:
+        raise ModelError(
+            f"The entry point {name!r} of group {GROUP} names an effect whose id is "
+            f"{effect.id!r}; both have to be the same."
+        )
+    return effect
