@@ -15,16 +15,16 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from discovery_report import print_summary
 from discovery_rows import REMOVED
-from hidden_rigs import RIGS, Case, make_case, places
+from hidden_rigs import RIGS, Case, Place, make_case, places
 from sparse_regression import sparse_choice
 
 import npdr_ppl as npdr
@@ -41,6 +41,10 @@ SEEDS = {"tune": range(100), "test": range(1000, 1100)}
 SEPARATIONS = (5.0, 10.0, 30.0)
 MEASURABLE = (25.0, 60.0)
 """Separations that stand out of the noise and are not yet too far for refitting."""
+
+CHECKABLE, NEARLY, BISECTIONS = 10.0, 1.5, 8
+"""From which separation on it is measured whether it was met, within which factor that will do,
+and how often another strength is tried."""
 
 STRONGEST = 30.0
 """Multiple of a typical size beyond which no rig of this kind is."""
@@ -125,33 +129,72 @@ def judge(task: Task) -> dict[str, Any]:
     return row | {"cpu": time.process_time() - start}
 
 
-def _case(task: Task) -> tuple[Case, float, float]:
-    """Returns a case, its strength and its separation."""
+def _case(task: Task) -> tuple[Case, float | tuple[float, ...], float]:
+    """Returns a case, its strength and its separation; of two effects each one's strength."""
     condition: Any = "one" if task.condition in REMOVED else task.condition
     chosen = places(task.rig, condition, task.seed)[task.place]
 
-    def at(strength: float) -> Case:
+    def at(strength: float | tuple[float, ...]) -> Case:
         return make_case(task.rig, condition, chosen, strength=strength, seed=task.seed)
 
     if not task.separation:
         return at(1.0), 1.0, float("nan")
     if task.condition == "beyond":
         return _beyond(task, at)
+    if task.condition == "two":
+        # Of the same multiple of their typical sizes one may be heard alone.
+        each = tuple(_strength(replace(task, condition="one"), (place,)) for place in chosen)
+        return at(each), each, task.separation
+    strength = _strength(task, chosen)
+    return at(strength), strength, task.separation
+
+
+def _strength(task: Task, hidden: Sequence[Place]) -> float:
+    """Returns the multiple of its typical size at which what is hidden has the separation.
+
+    Raises:
+        ValueError: There is none.
+    """
+    condition: Any = "one" if task.condition in REMOVED else task.condition
+    tried: dict[float, float] = {}
+
+    def separated(strength: float) -> float:
+        case = make_case(task.rig, condition, hidden, strength=strength, seed=task.seed)
+        tried[strength] = separation(case)
+        return tried[strength]
+
     # Where it can be measured well; below, it is proportional to the strength.
-    strength, found = 1.0, separation(at(1.0))
+    strength, found = 1.0, separated(1.0)
     for _ in range(4):
         if MEASURABLE[0] < found < MEASURABLE[1]:
             break
         aim = math.sqrt(MEASURABLE[0] * MEASURABLE[1])
         strength *= 10.0 if found < 3.0 else aim / found
-        found = separation(at(strength))
-    if found < MEASURABLE[0]:
-        raise ValueError(f"{chosen} cannot be made strong enough")
-    # Elasticity and play grow faster than their strength.
-    half = separation(at(0.5 * strength))
-    power = min(3.0, max(1.0, math.log2(found / max(half, 1e-9))))
-    wanted = strength * (task.separation / found) ** (1.0 / power)
-    return at(wanted), wanted, task.separation
+        found = separated(strength)
+    wanted = None
+    if MEASURABLE[0] < found < MEASURABLE[1]:
+        # Elasticity and play grow faster than their strength.
+        half = separated(0.5 * strength)
+        power = min(3.0, max(1.0, math.log2(found / max(half, 1e-9))))
+        wanted = strength * (task.separation / found) ** (1.0 / power)
+        if task.separation < CHECKABLE:
+            return wanted
+    # A stop is hit or not, so that little may lie between nothing and too much.
+    for _ in range(BISECTIONS if task.separation >= CHECKABLE else 0):
+        wanted = _between(tried, task.separation) if wanted is None else wanted
+        if task.separation / NEARLY < separated(wanted) < task.separation * NEARLY:
+            return wanted
+        wanted = None
+    raise ValueError(f"{hidden} cannot be given the separation {task.separation:g}")
+
+
+def _between(tried: dict[float, float], separation: float) -> float:
+    """Returns a strength between those that separated too little and too much."""
+    strong = min((s for s, found in tried.items() if found > separation), default=math.inf)
+    weak = max(
+        (s for s, found in tried.items() if found <= separation and s < strong), default=0.0
+    )
+    return 2.0 * weak if math.isinf(strong) else 0.5 * (weak + strong)
 
 
 def _beyond(task: Task, at: Callable[[float], Case]) -> tuple[Case, float, float]:

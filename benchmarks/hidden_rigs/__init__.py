@@ -12,6 +12,17 @@ effects but :mod:`hidden_rigs.under_test`, which holds the models to be judged.
 
 from hidden_rigs.cases import CONDITIONS, Case, Condition, cases, make_case, places
 from hidden_rigs.hidden import Hidden
+from hidden_rigs.rig import Place
 from hidden_rigs.rigs import RIGS
 
-__all__ = ["CONDITIONS", "RIGS", "Case", "Condition", "Hidden", "cases", "make_case", "places"]
+__all__ = [
+    "CONDITIONS",
+    "RIGS",
+    "Case",
+    "Condition",
+    "Hidden",
+    "Place",
+    "cases",
+    "make_case",
+    "places",
+]

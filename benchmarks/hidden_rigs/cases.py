@@ -59,7 +59,7 @@ class Case:
         alternatives: What these recordings cannot tell from the truth, each the names of effects
             that together take the truth's place; any of them, or all as a class, is right.
         condition: The condition.
-        strength: Multiple of a typical size.
+        strength: Multiple of a typical size, or one for each effect.
         seed: The seed.
         parameters: True domain parameters.
     """
@@ -71,7 +71,7 @@ class Case:
     truth: tuple[Hidden, ...]
     alternatives: tuple[tuple[str, ...], ...]
     condition: Condition
-    strength: float
+    strength: float | Sequence[float]
     seed: int
     parameters: Mapping[str, float]
 
@@ -142,7 +142,7 @@ def make_case(
     condition: Condition,
     hidden: Sequence[Place] = (),
     *,
-    strength: float = 1.0,
+    strength: float | Sequence[float] = 1.0,
     seed: int,
 ) -> Case:
     """Records one case.
@@ -154,7 +154,7 @@ def make_case(
         rig: Name of the rig.
         condition: The condition.
         hidden: What to hide; for bad data, ``("data", <kind>)``.
-        strength: Multiple of a typical size.
+        strength: Multiple of a typical size, or one for each effect.
         seed: The seed.
 
     Raises:
@@ -164,14 +164,15 @@ def make_case(
     generator = np.random.default_rng(derived_seed(seed, rig, "parameters"))
     parameters = dict(chosen.known)
     parameters |= {name: generator.uniform(*ends) for name, ends in chosen.unknown.items()}
+    strengths = tuple(strength) if isinstance(strength, Sequence) else (strength,) * len(hidden)
     truth = tuple(
         drawn(
             chosen.port(port),
             effect_id,
-            strength,
+            size,
             np.random.default_rng(derived_seed(seed, rig, "effect", port, effect_id)),
         )
-        for port, effect_id in hidden
+        for (port, effect_id), size in zip(hidden, strengths, strict=True)
         if condition != "bad_data"
     )
     measurement = chosen.measurement
