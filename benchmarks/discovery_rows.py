@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from itertools import permutations
 from typing import Any
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "estimates",
     "found_names",
     "has_all",
+    "has_all_classes",
     "has_any",
     "has_too_many",
     "is_bic_right",
@@ -88,6 +90,29 @@ def is_confident_and_wrong(row: Row) -> bool:
 def has_all(row: Row) -> bool:
     """Returns whether all hidden effects were found, or what stands for all."""
     return any(right <= set(found_names(row)) for right in right_sets(row))
+
+
+def has_all_classes(row: Row) -> bool:
+    """Returns whether all hidden effects were found, or are among what could stand in a place.
+
+    Each in the place of another finding, where several are hidden.
+    """
+
+    def stand_in(finding: Row) -> set[str]:
+        found = {name for name, p in finding["alternatives"].items() if p >= NAMED}
+        return {effect_id(name) for name in found} | {
+            finding["effect"],
+            *finding["equivalent_to"],
+        }
+
+    places = [stand_in(finding) for finding in row.get("effects", [])]
+    return any(
+        any(
+            all(effect_id(name) in place for name, place in zip(right, chosen, strict=True))
+            for chosen in permutations(places, len(right))
+        )
+        for right in right_sets(row)
+    )
 
 
 def has_any(row: Row) -> bool:

@@ -16,6 +16,7 @@ from discovery_rows import (
     effect_id,
     estimates,
     has_all,
+    has_all_classes,
     has_any,
     has_too_many,
     is_bic_right,
@@ -69,6 +70,7 @@ def summary_lines(rows: Sequence[Row]) -> list[Line]:
         _rate("inseparable: class reported", of["inseparable"], is_class_right, lower=0.95),
         _wrong("inseparable: confident wrong name", of["inseparable"], upper=0.02),
         _rate("two effects: both", two, has_all, lower=0.80),
+        _rate("… by name or class", two, has_all_classes),
         _rate("two effects: at least one", two, has_any, lower=0.98, baselines=_naming(two)),
         _rate("two effects: spurious third", two, has_too_many, upper=0.05),
         *(

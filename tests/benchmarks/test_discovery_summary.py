@@ -122,6 +122,15 @@ def test_alternatives_stand_for_the_truth_in_pairs():
     assert table["two effects: spurious third"].value == pytest.approx(1 / 3)
 
 
+def test_each_of_a_pair_needs_a_finding_in_whose_place_it_could_stand():
+    pair = ("hinge.bias", "torque.input_delay")
+    bias = finding("hinge.bias", equivalent=["input_delay"])
+    late = finding("angle.sensor_delay", equivalent=["input_delay"])
+    table = lines([row("two", pair, [bias, late]), row("two", pair, [bias])])
+    assert table["two effects: both"].value == 0.0
+    assert table["… by name or class"].value == 0.5
+
+
 def test_what_has_no_name_is_unknown_or_has_an_impostor():
     rows = [
         row("outside", ("hinge.cubic_damping",), (), "unknown", sparse=sparse("hinge: v³")),
