@@ -72,11 +72,16 @@ def is_class_right(row: Row) -> bool:
         return True
     if not row.get("effects"):
         return False
-    alternatives = row["effects"][0]["alternatives"]
-    named = {name for name, p in alternatives.items() if p >= NAMED}
-    ids = set(row["effects"][0]["equivalent_to"])
-    return any(
-        named & right or ids & {effect_id(name) for name in right} for right in right_sets(row)
+    first = row["effects"][0]
+    return any(stands_for(first, name) for right in right_sets(row) for name in right)
+
+
+def stands_for(finding: Row, name: str) -> bool:
+    """Returns whether a finding is an effect, or reports that it could be that one."""
+    return (
+        f"{finding['port']}.{finding['effect']}" == name
+        or finding["alternatives"].get(name, 0.0) >= NAMED
+        or effect_id(name) in finding["equivalent_to"]
     )
 
 
@@ -97,19 +102,10 @@ def has_all_classes(row: Row) -> bool:
 
     Each in the place of another finding, where several are hidden.
     """
-
-    def stand_in(finding: Row) -> set[str]:
-        found = {name for name, p in finding["alternatives"].items() if p >= NAMED}
-        return {effect_id(name) for name in found} | {
-            finding["effect"],
-            *finding["equivalent_to"],
-        }
-
-    places = [stand_in(finding) for finding in row.get("effects", [])]
     return any(
         any(
-            all(effect_id(name) in place for name, place in zip(right, chosen, strict=True))
-            for chosen in permutations(places, len(right))
+            all(stands_for(*pair) for pair in zip(chosen, right, strict=True))
+            for chosen in permutations(row.get("effects", []), len(right))
         )
         for right in right_sets(row)
     )

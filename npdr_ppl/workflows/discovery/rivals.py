@@ -156,7 +156,7 @@ def log_prior(hypothesis: Hypothesis) -> float:
 
 
 def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
-    """Returns the names of those that fit no worse than the likeliest, whatever they cost."""
+    """Returns the names of those that fit hardly worse than the likeliest, if at all."""
     reference = closest(list(trials.values()))
     least = trials[best].losses(reference.fit.scale).sum()
     return tuple(
