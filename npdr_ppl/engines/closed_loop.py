@@ -31,10 +31,7 @@ _BLOCK = 1 << 16
 
 
 class _Loop(NamedTuple):
-    """What the loop carries from step to step.
-
-    ``readings`` may be empty where sensors report the truth.
-    """
+    """What the loop carries from step to step."""
 
     state: State
     readings: Components
@@ -86,10 +83,7 @@ class LoopBody:
     ) -> tuple[_Loop, Components]:
         """Advances the loop by one step; also returns the commands before any limit."""
         state, stepper = loop.state, self.stepper
-        readings = loop.readings or stepper.true_readings(
-            state.positions, state.velocities, tables
-        )
-        observation = tuple(readings[i] for i in self.observed)
+        observation = tuple(loop.readings[i] for i in self.observed)
         chosen, memory = self.policy.act(observation, time, loop.policy_memory, policy_constants)
         commands = tuple(chosen[i] for i in self.order)
         limited = tuple(

@@ -227,6 +227,16 @@ def test_code_that_the_compiler_refuses_runs_eagerly(tmp_path):
 )  # torch's compiler, of itself
 @needs_compiler
 @pytest.mark.usefixtures("short_kernels")
+def test_a_loop_with_a_filter_compiles_one_kernel():
+    filtered = Pendulum(compile="always").with_effects(SensorLowPass("velocity"))
+    time_constant = {"velocity.sensor_low_pass.time_constant": torch.full((3,), 0.05)}
+    policy = Linear(("angle", "velocity"), ("torque",))
+    graphs = torch._dynamo.utils.counters["stats"]
+    before = graphs["unique_graphs"]
+    filtered.roll_out(time_constant, policy, torch.tensor([[0.1, 0.0]]), 11)
+    assert graphs["unique_graphs"] == before + 1
+
+
 def test_compiled_replay_agrees_with_the_eager_one_and_has_its_gradients():
     attached = (
         ActuatorLag("torque"),
