@@ -222,9 +222,6 @@ def test_code_that_the_compiler_refuses_runs_eagerly(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings(
-    "ignore:The .grad attribute:UserWarning"
-)  # torch's compiler, of itself
 @needs_compiler
 @pytest.mark.usefixtures("short_kernels")
 def test_a_loop_with_a_filter_compiles_one_kernel():
@@ -237,6 +234,12 @@ def test_a_loop_with_a_filter_compiles_one_kernel():
     assert graphs["unique_graphs"] == before + 1
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings(
+    "ignore:The .grad attribute:UserWarning"
+)  # torch's compiler, of itself
+@needs_compiler
+@pytest.mark.usefixtures("short_kernels")
 def test_compiled_replay_agrees_with_the_eager_one_and_has_its_gradients():
     attached = (
         ActuatorLag("torque"),
