@@ -39,18 +39,14 @@ SEEDS = {"tune": range(100), "test": range(1000, 1100)}
 """Seeds of both parts."""
 
 SEPARATIONS = (5.0, 10.0, 30.0)
-MEASURABLE = (25.0, 60.0)
-"""Separations that stand out of the noise and are not yet too far for refitting."""
+CHECKABLE, MEASURABLE = 10.0, 40.0
+"""From which separation on it stands out of the noise, and one that is measured well."""
 
-CHECKABLE, NEARLY, BISECTIONS = 10.0, 1.5, 8
-"""From which separation on it is measured whether it was met, within which factor that will do,
-and how often another strength is tried."""
+NEARLY, TRIES = 1.5, 12
+"""How many times the wanted separation is not too much, and how many strengths are tried."""
 
 STRONGEST = 30.0
-"""Multiple of a typical size beyond which no rig of this kind is."""
-
-BEYOND_TRIES = 7
-"""Strengths tried for what the other entries leave; each takes a search."""
+"""Multiple of a typical size beyond which no rig of this kind is, of what others leave."""
 
 
 @dataclass(frozen=True)
@@ -143,58 +139,32 @@ def _case(task: Task) -> tuple[Case, float | tuple[float, ...], float]:
         return _beyond(task, at)
     if task.condition == "two":
         # Of the same multiple of their typical sizes one may be heard alone.
-        each = tuple(_strength(replace(task, condition="one"), (place,)) for place in chosen)
-        return at(each), each, task.separation
-    strength = _strength(task, chosen)
-    return at(strength), strength, task.separation
+        alone = replace(task, condition="one")
+        each, found = zip(*(_strength(alone, (place,)) for place in chosen), strict=True)
+        return at(each), each, min(found)
+    strength, found = _strength(task, chosen)
+    return at(strength), strength, found
 
 
-def _strength(task: Task, hidden: Sequence[Place]) -> float:
-    """Returns the multiple of its typical size at which what is hidden has the separation.
+def _strength(task: Task, hidden: Sequence[Place]) -> tuple[float, float]:
+    """Returns the multiple of its typical size that has the separation, and what it has.
 
     Raises:
         ValueError: There is none.
     """
     condition: Any = "one" if task.condition in REMOVED else task.condition
-    tried: dict[float, float] = {}
 
     def separated(strength: float) -> float:
         case = make_case(task.rig, condition, hidden, strength=strength, seed=task.seed)
-        tried[strength] = separation(case)
-        return tried[strength]
+        return separation(case)
 
-    # Where it can be measured well; below, it is proportional to the strength.
-    strength, found = 1.0, separated(1.0)
-    for _ in range(4):
-        if MEASURABLE[0] < found < MEASURABLE[1]:
-            break
-        aim = math.sqrt(MEASURABLE[0] * MEASURABLE[1])
-        strength *= 10.0 if found < 3.0 else aim / found
-        found = separated(strength)
-    wanted = None
-    if MEASURABLE[0] < found < MEASURABLE[1]:
-        # Elasticity and play grow faster than their strength.
-        half = separated(0.5 * strength)
-        power = min(3.0, max(1.0, math.log2(found / max(half, 1e-9))))
-        wanted = strength * (task.separation / found) ** (1.0 / power)
-        if task.separation < CHECKABLE:
-            return wanted
-    # A stop is hit or not, so that little may lie between nothing and too much.
-    for _ in range(BISECTIONS if task.separation >= CHECKABLE else 0):
-        wanted = _between(tried, task.separation) if wanted is None else wanted
-        if task.separation / NEARLY < separated(wanted) < task.separation * NEARLY:
-            return wanted
-        wanted = None
-    raise ValueError(f"{hidden} cannot be given the separation {task.separation:g}")
-
-
-def _between(tried: dict[float, float], separation: float) -> float:
-    """Returns a strength between those that separated too little and too much."""
-    strong = min((s for s, found in tried.items() if found > separation), default=math.inf)
-    weak = max(
-        (s for s, found in tried.items() if found <= separation and s < strong), default=0.0
-    )
-    return 2.0 * weak if math.isinf(strong) else 0.5 * (weak + strong)
+    if task.separation >= CHECKABLE:
+        return meet_separation(separated, task.separation)
+    strength, found = meet_separation(separated, MEASURABLE)
+    # Elasticity and play grow faster than their strength.
+    power = math.log2(found / max(separated(0.5 * strength), 1e-9))
+    less = (task.separation / found) ** (1.0 / min(3.0, max(1.0, power)))
+    return less * strength, task.separation
 
 
 def _beyond(task: Task, at: Callable[[float], Case]) -> tuple[Case, float, float]:
@@ -203,25 +173,46 @@ def _beyond(task: Task, at: Callable[[float], Case]) -> tuple[Case, float, float
     Raises:
         ValueError: They leave less even of a strength that no rig of this kind has.
     """
-    weak, strong, strength, most = 0.0, math.inf, 1.0, 0.0
-    for _ in range(BEYOND_TRIES):
+
+    def left(strength: float) -> float:
         case = at(strength)
-        found = separation(case, _catalogue(task, case))
+        return separation(case, _catalogue(task, case))
+
+    strength, found = meet_separation(left, task.separation, strongest=STRONGEST)
+    return at(strength), strength, found
+
+
+def meet_separation(
+    measure: Callable[[float], float], wanted: float, *, strongest: float = math.inf
+) -> tuple[float, float]:
+    """Returns a strength that has the wanted separation or little more, and what it has.
+
+    Args:
+        measure: Returns the separation of a multiple of the typical size.
+        wanted: The least separation.
+        strongest: Strength beyond which none is tried.
+
+    Raises:
+        ValueError: There is none.
+    """
+    weak, strong, strength, most = 0.0, math.inf, 1.0, 0.0
+    for _ in range(TRIES):
+        found = measure(strength)
         most = max(most, found)
-        if task.separation / 1.5 < found < task.separation * 1.5:
-            return case, strength, found
-        # What the others leave need not grow steadily: once it is bracketed, halve the bracket.
-        if found < task.separation:
+        if wanted <= found < wanted * NEARLY:
+            return strength, found
+        # It need not grow steadily, and a stop is hit or not: once bracketed, halve the bracket.
+        if found < wanted:
             weak = strength
         else:
             strong = strength
         if 0.0 < weak < strong < math.inf:
             strength = math.sqrt(weak * strong)
         else:
-            strength *= min(4.0, max(0.25, task.separation / max(found, 1e-9)))
-        if strength > STRONGEST:
+            strength *= min(10.0, max(0.1, wanted * math.sqrt(NEARLY) / max(found, 1e-9)))
+        if strength > strongest:
             break
-    raise ValueError(f"others imitate {case.names} up to a separation of {most:.1f}")
+    raise ValueError(f"no strength separates by {wanted:g}, the most was {most:.1f}")
 
 
 def separation(case: Case, catalogue: tuple[npdr.Effect, ...] = ()) -> float:
