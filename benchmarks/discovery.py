@@ -12,6 +12,7 @@ seeds, hence other parameters, excitations and noise.
 """
 
 import argparse
+import functools
 import json
 import math
 import time
@@ -30,7 +31,7 @@ from sparse_regression import sparse_choice
 import npdr_ppl as npdr
 from npdr_ppl.models.effects import candidate_effects
 from npdr_ppl.workflows.discovery.equivalents import irreducible
-from npdr_ppl.workflows.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, fit_hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.proof import prove
 from npdr_ppl.workflows.discovery.search import Searcher
@@ -225,15 +226,21 @@ def separation(case: Case, catalogue: tuple[npdr.Effect, ...] = ()) -> float:
         case: The case.
         catalogue: Effects that a search may add to the model before it is judged.
     """
-    quiet = make_case(case.rig, "null", (), seed=case.seed)
     options = npdr.DiscoveryOptions(effects=catalogue)
     searcher = Searcher(case.model, case.fit, options)
-    hidden, null = searcher.fit_base(), Searcher(quiet.model, quiet.fit, options).fit_base()
+    hidden, null = searcher.fit_base(), _quiet(case.rig, case.seed)
     if catalogue:
         hidden = searcher.run(searcher.look(hidden), max_effects=options.max_effects).final
     scale = null.fit.scale
     excess = 2.0 * float((hidden.losses(scale) - null.losses(scale)).sum())
     return max(excess, 0.0) ** 0.5
+
+
+@functools.lru_cache(maxsize=1)
+def _quiet(rig: str, seed: int) -> Hypothesis:
+    """Returns the fit to a case without anything hidden; every strength is compared with it."""
+    case = make_case(rig, "null", (), seed=seed)
+    return Searcher(case.model, case.fit, npdr.DiscoveryOptions()).fit_base()
 
 
 def _catalogue(task: Task, case: Case) -> tuple[npdr.Effect, ...] | None:

@@ -15,6 +15,7 @@ from npdr_ppl.models.mini_golf import MiniGolf, mini_golf
 from npdr_ppl.models.mini_golf.course import OBSTACLES
 from npdr_ppl.plots.mini_golf import measured_shifts, write_mini_golf_figures
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows import mini_golf_fit
 from npdr_ppl.workflows.mini_golf_clock import clocks_aligned
 from npdr_ppl.workflows.mini_golf_fit import score_strikes
 from npdr_ppl.workflows.mini_golf_posterior import obstacle_angles
@@ -82,7 +83,8 @@ def test_clocks_of_ball_and_arm_are_aligned(strikes):
         clocks_aligned(replace(straight, readings=(resting,)))
 
 
-def test_the_table_has_every_row_and_what_figure_4_shows(strikes, tmp_path):
+def test_the_table_has_every_row_and_what_figure_4_shows(strikes, tmp_path, monkeypatch):
+    monkeypatch.setattr(mini_golf_fit, "NUM_DRAWS", 200)  # of a posterior that knows little
     posteriors, result = reproduce_mini_golf(
         strikes, tmp_path, backends=[f"snpe-c = {QUICK}"], rounds=1, num_simulations=40,
         progress=False,

@@ -30,10 +30,13 @@ SEED = 2000
 """No seed of the benchmark's, neither of its tuning nor of its reporting."""
 
 
-def discover(rig, condition, places, *, strength=1.0, max_effects=3, effects=None):
+def discover(
+    rig, condition, places, *, strength=1.0, max_effects=3, effects=None, num_rollouts=None
+):
     case = make_case(rig, condition, places, strength=strength, seed=SEED)
     options = npdr.DiscoveryOptions(max_effects=max_effects, effects=effects)
-    return case, npdr.discover(case.model, case.fit, holdout=case.holdout, options=options)
+    fit = case.fit[list(range(num_rollouts or len(case.fit)))]
+    return case, npdr.discover(case.model, fit, holdout=case.holdout, options=options)
 
 
 def covers(finding, name, true):
@@ -71,7 +74,9 @@ def test_an_effect_of_the_environment_in_an_mjcf():
         InputDelay("elbow_torque"),
     )
     place = ("payload", "payload")
-    case, found = discover("two_link_arm", "one", (place,), max_effects=1, effects=few)
+    case, found = discover(
+        "two_link_arm", "one", (place,), max_effects=1, effects=few, num_rollouts=2
+    )
     assert [finding.effect.name for finding in found.effects] == ["payload.payload"], found.reason
     assert covers(found.effects[0], "mass", case.truth[0].parameters["mass"])
     assert found.gap["rmse"].after < found.gap["rmse"].before
