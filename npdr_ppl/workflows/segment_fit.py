@@ -51,6 +51,13 @@ LEAST_GAIN = 0.5
 of a unit of log evidence, a tenth of what makes one of two models ten times as likely."""
 
 
+STANDS_OUT = 10.0
+"""Multiple of the middle segment's misfit from which other initial states are tried …"""
+
+ELSEWHERE = 1.0, 4.0
+"""… so far away, in standard deviations of the smoother's error, along each component."""
+
+
 @dataclass(frozen=True)
 class SegmentFit:
     """What a fit came to.
@@ -104,7 +111,38 @@ def fit_segments(
     z, offsets, scale = _steps(segments, z, offsets, scale, held, max_steps, is_rough=True)
     if not is_rough:
         z, offsets, scale = _steps(segments, z, offsets, scale, held, max_steps, is_rough=False)
+        freed = _freed(segments, z, offsets, scale)
+        if freed is not None:
+            z, offsets, scale = _steps(segments, z, freed, scale, held, max_steps, is_rough=False)
     return SegmentFit(z, offsets, scale)
+
+
+def _freed(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor | None:
+    """Returns offsets from which segments that are stuck can go on; ``None`` if none is.
+
+    Where friction holds, nothing depends on the rate that a segment starts with, and no step leads
+    away from it. Left there, the segment would look as if a force had acted in it alone.
+
+    Args:
+        segments: The model and the recording.
+        z: Parameters, ``(d,)``.
+        offsets: Offsets of the initial states, ``(S, m)``.
+        scale: Standard deviation of each channel's residuals, ``(C,)``.
+    """
+    misfit = _squares(segments, z[None], offsets[None, None], scale)[0, 0].sum(-1)
+    stands_out = misfit > STANDS_OUT * misfit.median()
+    if not bool(stands_out.any()):
+        return None
+    axes = torch.eye(segments.num_offsets, dtype=torch.float64)
+    moves = torch.cat([sign * far * axes for far in ELSEWHERE for sign in (1.0, -1.0)])
+    tried = offsets + moves[:, None]  # (b, S, m)
+    losses = _squares(segments, z[None], tried[None], scale)[0].sum(-1) + tried.square().sum(-1)
+    least, chosen = losses.nan_to_num(torch.inf).min(0)
+    is_stuck = stands_out & (least < misfit + offsets.square().sum(-1) - LEAST_GAIN)
+    if not bool(is_stuck.any()):
+        return None
+    best = tried[chosen, torch.arange(len(offsets))]
+    return torch.where(is_stuck[:, None], best, offsets)
 
 
 def _steps(

@@ -2,11 +2,16 @@
 
 import dataclasses
 
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 
+import npdr_ppl as npdr
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.effects import CoulombFriction
+from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.segment_fit import LEAST_GAIN, fit_segments
@@ -61,6 +66,17 @@ def test_a_segment_that_begins_far_off_is_reached_and_holds_up_no_other(segments
     assert promised(segments, found) < 2 * LEAST_GAIN
 
 
+def test_a_segment_that_friction_holds_is_freed():
+    rates = torch.linspace(0.4, 0.6, 12, dtype=torch.float64)
+    segments = SegmentModel(coasting, _coasts(rates), OPTIONS)
+    values = segments.inputs.initial_values.clone()
+    values[3, 1] = 0.0  # nothing that is nearly at rest moves against 0.4 N m
+    segments.inputs = dataclasses.replace(segments.inputs, initial_values=values)
+    found = fit_segments(segments, torch.zeros(1))
+    begun = segments.inputs.initial_value_errors[:, 1] * found.offsets[:, 1] + values[:, 1]
+    torch.testing.assert_close(begun, rates, rtol=0.0, atol=0.1)
+
+
 def test_where_the_simulation_fails_is_said(segments, monkeypatch):
     monkeypatch.setattr(
         segments, "simulate", lambda z, offsets: torch.nan * segments.observed[None]
@@ -84,6 +100,41 @@ def test_a_recording_with_none_of_the_sensors(noisy_pendulum, recording):
     )
     with pytest.raises(DataError, match="rename them"):
         SegmentModel(noisy_pendulum, renamed, OPTIONS)
+
+
+DRY = Pendulum().with_effects(CoulombFriction("hinge"))
+FRICTION = {"hinge.coulomb_friction.magnitude": torch.tensor(0.4, dtype=torch.float64)}
+
+
+def coasting(inputs, *, noise=None):
+    parameters = {"mass": pyro.sample("mass", dist.Uniform(0.3, 1.7)), **FRICTION}
+    return npdr.simulate("trajectory", DRY, parameters, inputs, noise=noise)
+
+
+def _coasts(rates):
+    """Returns a recording of each rate at which the pendulum is left to itself, hanging down."""
+    torque = torch.zeros(20, 1, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    readings = []
+    for rate in rates:
+        start = torch.stack((torch.zeros_like(rate), rate))
+        inputs = Inputs.single(
+            torque,
+            start,
+            action_names=("torque",),
+            state_names=("angle", "velocity"),
+            time_step=0.02,
+        )
+        exact = torch.cat((start[None], DRY.simulate(FRICTION, inputs).reshape(-1, 2)))
+        noise = torch.randn(exact.shape, generator=generator, dtype=torch.float64)
+        readings.append((exact + torch.tensor([0.002, 0.02]) * noise).numpy())
+    return Rollouts.from_arrays(
+        readings=readings,
+        actions=[torque.numpy()] * len(readings),
+        channel_names=("angle", "velocity"),
+        action_names=("torque",),
+        time_step=0.02,
+    )
 
 
 def _at(segments, z):

@@ -10,6 +10,7 @@ from npdr_ppl.workflows.discovery.chance import LargestStatistic
 from npdr_ppl.workflows.discovery.generic_laws import (
     GenericLaw,
     generic_laws,
+    reading_laws,
     ripple_laws,
     wave_laws,
 )
@@ -69,7 +70,8 @@ def sound_alarm(
         num_looks: How often the recording was looked at before.
     """
     chance = LargestStatistic(projection, seed=options.seed)
-    gained = _gains(projection, generic_laws(found, sensors))
+    generic = generic_laws(found, sensors) + reading_laws(projection)
+    gained = _gains(projection, generic)
     laws = [law for law, _ in gained]
     waves = wave_laws(found)
     listed = [wave for port in waves.values() for wave in port] + ripple_laws(found, sensors)

@@ -2,7 +2,8 @@
 
 Polynomials, signs and products of whatever is recorded, waves in time, and ripples: waves in a
 position, by themselves or as a factor of a command or of the direction of motion. Each is a force
-at a joint, and what it would change is a weighted sum of the responses to pulses.
+at a joint, and what it would change is a weighted sum of the responses to pulses. Errors of a
+sensor are functions of what it reads.
 """
 
 import math
@@ -20,6 +21,7 @@ __all__ = [
     "FREQUENCIES",
     "GenericLaw",
     "generic_laws",
+    "reading_laws",
     "ripple_laws",
     "strongest_frequency",
     "wave_laws",
@@ -111,6 +113,28 @@ def ripple_laws(found: Responses, sensors: Sequence[Channel]) -> list[GenericLaw
     return laws
 
 
+def reading_laws(projection: Projection) -> list[GenericLaw]:
+    """Returns what errors of each sensor that depend on its reading would change.
+
+    A segment starts from where its sensor says it is, so errors count from there on.
+
+    Args:
+        projection: The fitted model.
+    """
+    hypothesis, segments = projection.hypothesis, projection.hypothesis.segments
+    # Of readings, not of what was read: that has its noise in common with the residuals.
+    simulated = segments.observed - hypothesis.difference
+    laws = []
+    for c, sensor in enumerate(segments.measured):
+        x = simulated[..., c]
+        for name, value in _of_one(sensor.name, x, sensor.unit == "rad").items():
+            error = torch.zeros_like(simulated)
+            error[..., c] = value - value[:, :1]
+            change = segments.whitened(error, hypothesis.fit.scale)
+            laws.append(GenericLaw(f"{sensor.name}: error of {name}", change[..., None]))
+    return laws
+
+
 def strongest_frequency(projection: Projection, found: Responses, port: str) -> float:
     """Returns the frequency in Hz of the wave in time that explains most as a force at a port.
 
@@ -155,18 +179,10 @@ def _dictionary(found: Responses, angles: set[str]) -> dict[str, Tensor]:
     values: dict[str, Tensor] = {"1": torch.ones_like(time), "t": time}
     unit = {name: x / x.square().mean().sqrt().clamp_min(1e-12) for name, x in channels.items()}
     signs = {name: _sign(x) for name, x in channels.items()}
-    for name, x in unit.items():
-        values[name] = x
-        values[f"{name}²"] = x.square()
-        values[f"{name}³"] = x**3
-        values[f"{name}|{name}|"] = x * x.abs()
-        values[f"|{name}|"] = x.abs()
+    for name, x in channels.items():
+        values |= _of_one(name, x, name in angles)
         values[f"sign {name}"] = signs[name]
-        values[f"t·{name}"] = time * x
-        if name in angles:
-            for order in (1, 2, 3):
-                values[f"sin {order} {name}"] = torch.sin(order * channels[name])
-                values[f"cos {order} {name}"] = torch.cos(order * channels[name])
+        values[f"t·{name}"] = time * unit[name]
     names = list(unit)
     for i, one in enumerate(names):
         for other in names[i + 1 :]:
@@ -176,3 +192,20 @@ def _dictionary(found: Responses, angles: set[str]) -> dict[str, Tensor]:
             values[f"|{one}|·sign {other}"] = unit[one].abs() * signs[other]
             values[f"|{other}|·sign {one}"] = unit[other].abs() * signs[one]
     return {k: v / v.square().mean().sqrt().clamp_min(1e-12) for k, v in values.items()}
+
+
+def _of_one(name: str, channel: Tensor, is_angle: bool) -> dict[str, Tensor]:
+    """Returns functions of one channel by what they are."""
+    x = channel / channel.square().mean().sqrt().clamp_min(1e-12)
+    values = {
+        name: x,
+        f"{name}²": x.square(),
+        f"{name}³": x**3,
+        f"{name}|{name}|": x * x.abs(),
+        f"|{name}|": x.abs(),
+    }
+    if is_angle:
+        for order in (1, 2, 3):
+            values[f"sin {order} {name}"] = torch.sin(order * channel)
+            values[f"cos {order} {name}"] = torch.cos(order * channel)
+    return values

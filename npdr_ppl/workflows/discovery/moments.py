@@ -8,8 +8,8 @@ since coloured noise resembles a force everywhere. Outliers enlarge what they ar
 
 A few segments stand out by chance. Of the k smallest of S tail probabilities the greatest is p
 with the probability that at least k of S are below p (higher criticism; Donoho & Jin 2004), and
-the least of these over k counts, once for each k. One segment alone never speaks: where friction
-holds, the fit of its initial state may have stuck.
+the least of these over k counts, once for each k. A stop may be hit once, so one segment may speak
+alone.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ __all__ = ["Moments", "forces_at_moments"]
 SHAPES = 3
 """Directions in which a force may act in one segment: those that change the readings most."""
 
-FEWEST, MOST = 2, 20
+MOST = 20
 """Segments that are looked at together."""
 
 
@@ -71,9 +71,9 @@ def forces_at_moments(projection: Projection, found: Responses) -> list[Moments]
         tails = torch.from_numpy(special.fdtrc(shapes, size - shapes, (ratio / usual).numpy()))
         order = tails.argsort()[:MOST]
         least = tails[order].numpy()
-        together = special.bdtrc(np.arange(len(order)), num, least)[FEWEST - 1 :]
+        together = special.bdtrc(np.arange(len(order)), num, least)
         best = int(together.argmin())
-        stand_out = order[: best + FEWEST]
+        stand_out = order[: best + 1]
         gain = (along - shapes * usual * across)[stand_out].sum()
         p_value = min(1.0, len(together) * float(together[best]))
         result.append(Moments(f"{port}: force at moments", p_value, float(gain)))

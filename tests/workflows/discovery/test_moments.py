@@ -1,5 +1,6 @@
 """Forces that act at some moments only."""
 
+import torch
 from hidden_rigs import make_case
 
 import npdr_ppl as npdr
@@ -16,22 +17,42 @@ HEARD = MOMENT_SHARE * npdr.DiscoveryOptions().false_alarm_rate
 """From which on the alarm fires."""
 
 
-def moments(condition, places, strength=1.0):
-    case = make_case("pendulum", condition, places, strength=strength, seed=SEED)
-    binding = npdr.DiscoveryOptions().binding(case.fit)
-    fitted = fit_hypothesis(case.model, case.fit, binding)
-    (found,) = forces_at_moments(Projection(fitted), responses(fitted))
-    return found
+def seen(condition, places=()):
+    """Returns a fitted pendulum, and what pulses of force would change."""
+    case = make_case("pendulum", condition, places, strength=1.0, seed=SEED)
+    fitted = fit_hypothesis(case.model, case.fit, npdr.DiscoveryOptions().binding(case.fit))
+    return Projection(fitted), responses(fitted)
+
+
+def moments(projection, found):
+    (result,) = forces_at_moments(projection, found)
+    return result
 
 
 def test_bursts_of_force_stand_out():
-    found = moments("outside", (("hinge", "torque_bursts"),))
+    found = moments(*seen("outside", (("hinge", "torque_bursts"),)))
     assert found.name == "hinge: force at moments"
     assert found.p_value < HEARD
     assert found.gain > SHAPES * MOST  # what chance explains in as many segments
 
 
 def test_coloured_noise_and_outliers_resemble_no_force():
-    assert moments("null", ()).p_value > HEARD
-    assert moments("null_coloured", ()).p_value > HEARD
-    assert moments("null_outliers", ()).p_value > HEARD
+    assert moments(*seen("null")).p_value > HEARD
+    assert moments(*seen("null_coloured")).p_value > HEARD
+    assert moments(*seen("null_outliers")).p_value > HEARD
+
+
+def test_a_kick_in_one_segment_is_heard_and_as_large_an_error_of_the_readings_is_not():
+    projection, found = seen("null")
+    kick = found.by_port["hinge"][7, :, 3]
+    generator = torch.Generator().manual_seed(0)
+    error = torch.randn(kick.shape, generator=generator, dtype=torch.float64)
+    quiet = projection.residual.clone()
+
+    def with_residual(change):
+        projection.residual = quiet.clone()
+        projection.residual[7] += 60.0 * change / change.norm()
+        return moments(projection, found)
+
+    assert with_residual(kick).p_value < HEARD
+    assert with_residual(error).p_value > HEARD
