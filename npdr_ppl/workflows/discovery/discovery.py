@@ -30,7 +30,7 @@ from npdr_ppl.workflows.segment_model import SegmentModel
 
 __all__ = ["Investigation", "discover"]
 
-MOST_UNEXPLAINED = 0.02
+MOST_UNEXPLAINED = 0.01
 """Share of the misfit that may stay unexplained where what was found is to be called the cause."""
 
 MINOR = 0.1
