@@ -29,6 +29,7 @@ from hidden_rigs import RIGS, Case, Place, make_case, places
 from sparse_regression import sparse_choice
 
 import npdr_ppl as npdr
+from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
 from npdr_ppl.workflows.discovery.equivalents import irreducible
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, fit_hypothesis
@@ -198,7 +199,10 @@ def meet_separation(
     """
     weak, strong, strength, most = 0.0, math.inf, 1.0, 0.0
     for _ in range(TRIES):
-        found = measure(strength)
+        try:
+            found = measure(strength)
+        except DataError:  # the truth is unstable
+            found = math.inf
         most = max(most, found)
         if wanted <= found < wanted * NEARLY:
             return strength, found

@@ -3,6 +3,8 @@
 import pytest
 from discovery import NEARLY, meet_separation
 
+from npdr_ppl.errors import DataError
+
 
 @pytest.mark.parametrize(
     "separates",
@@ -18,6 +20,15 @@ def test_a_strength_has_the_separation_or_little_more(separates):
     strength, found = meet_separation(separates, 10.0)
     assert found == separates(strength)
     assert 10.0 <= found <= 10.0 * NEARLY
+
+
+def test_a_truth_that_is_unstable_is_too_strong():
+    def separates(strength):
+        if strength > 0.5:
+            raise DataError("angle is nan at step 228")
+        return 30.0 * strength
+
+    assert meet_separation(separates, 10.0)[0] < 0.5
 
 
 def test_what_is_imitated_at_any_strength_has_none():
