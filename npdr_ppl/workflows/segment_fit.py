@@ -129,6 +129,8 @@ def _freed(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) ->
         offsets: Offsets of the initial states, ``(S, m)``.
         scale: Standard deviation of each channel's residuals, ``(C,)``.
     """
+    if not segments.num_offsets:
+        return None
     misfit = _squares(segments, z[None], offsets[None, None], scale)[0, 0].sum(-1)
     stands_out = misfit > STANDS_OUT * misfit.median()
     if not bool(stands_out.any()):

@@ -77,6 +77,15 @@ def test_a_segment_that_friction_holds_is_freed():
     torch.testing.assert_close(begun, rates, rtol=0.0, atol=0.1)
 
 
+def test_a_segment_that_stands_out_stays_where_it_was_recorded():
+    rates = torch.linspace(0.4, 0.6, 12, dtype=torch.float64)
+    recorded = BindingOptions(None, 20, "recorded", "float64")
+    segments = SegmentModel(coasting, _coasts(rates), recorded)
+    segments.observed[3] += 1.0
+    found = fit_segments(segments, torch.zeros(1))
+    assert segments.num_offsets == 0 and found.offsets.shape == (12, 0)
+
+
 def test_where_the_simulation_fails_is_said(segments, monkeypatch):
     monkeypatch.setattr(
         segments, "simulate", lambda z, offsets: torch.nan * segments.observed[None]
