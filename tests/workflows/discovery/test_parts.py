@@ -28,6 +28,7 @@ from npdr_ppl.workflows.discovery.chance import LargestStatistic
 from npdr_ppl.workflows.discovery.credible import Estimate
 from npdr_ppl.workflows.discovery.equivalents import equivalents, irreducible
 from npdr_ppl.workflows.discovery.evidence import weigh
+from npdr_ppl.workflows.discovery.generic_laws import reading_laws
 from npdr_ppl.workflows.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.workflows.discovery.latent_force import latent_force, responses
 from npdr_ppl.workflows.discovery.projection import Projection, loss_without
@@ -95,6 +96,19 @@ def test_a_drag_is_no_chance(dragged):
     (variant,) = sensitivities(hypothesis, (QuadraticDrag("hinge"),))
     values = LargestStatistic(Projection(hypothesis), seed=0, draws=400).p_values([variant.change])
     assert values == [1 / 400]
+
+
+def test_errors_of_a_sensor_that_depend_on_its_reading_are_no_chance(quiet):
+    projection = Projection(quiet)
+    laws = reading_laws(projection)
+    groups = [law.change for law in laws]
+    assert min(LargestStatistic(projection, seed=0).p_values(groups)) > 0.01
+    names = [law.name for law in laws]
+    own = projection.projected(groups[names.index("angle: error of sin 2 angle")])[..., 0]
+    projection.residual = projection.residual + 10.0 * own / own.norm()
+    values = LargestStatistic(projection, seed=0).p_values(groups)
+    assert names[values.index(min(values))].startswith("angle: error of ")
+    assert min(values) < 0.01
 
 
 def test_the_latent_force_is_the_drag(dragged):
