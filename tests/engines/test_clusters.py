@@ -58,8 +58,8 @@ def test_a_cluster_returns_what_one_process_does_and_outlives_the_pool(executor)
     )
     with CLUSTERS[executor]() as address:
         for options in (
-            WorkerOptions(executor, address=address, time_limit=1.0, chunk_size=4),
-            WorkerOptions(executor, address=address, time_limit=1.0),
+            WorkerOptions(executor, address=address, time_limit=2.0, chunk_size=4),
+            WorkerOptions(executor, address=address, time_limit=2.0),
         ):
             with Pool(options) as pool:
                 outcome = pool.run(Faulty(Noise(), RATES), range(60), seed=7)
