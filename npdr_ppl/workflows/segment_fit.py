@@ -50,7 +50,6 @@ LEAST_GAIN = 0.5
 """Reduction of the objective, in units of the readings' variance, below which steps end: a quarter
 of a unit of log evidence, a tenth of what makes one of two models ten times as likely."""
 
-
 STANDS_OUT = 10.0
 """Multiple of the middle segment's misfit from which other initial states are tried …"""
 

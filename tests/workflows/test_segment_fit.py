@@ -74,6 +74,7 @@ def test_a_segment_that_friction_holds_is_freed():
     segments.inputs = dataclasses.replace(segments.inputs, initial_values=values)
     found = fit_segments(segments, torch.zeros(1))
     begun = segments.inputs.initial_value_errors[:, 1] * found.offsets[:, 1] + values[:, 1]
+    # What the smoother is said to be sure of holds a tenth of it back; stuck, it is 0.45 off.
     torch.testing.assert_close(begun, rates, rtol=0.0, atol=0.1)
 
 

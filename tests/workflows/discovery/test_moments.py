@@ -51,6 +51,7 @@ def test_a_kick_in_one_segment_is_heard_and_as_large_an_error_of_the_readings_is
 
     def with_residual(change):
         projection.residual = quiet.clone()
+        # What a kick does is large beside the smoother's error, which may explain most of it.
         projection.residual[7] += 60.0 * change / change.norm()
         return moments(projection, found)
 
