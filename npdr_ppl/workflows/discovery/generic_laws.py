@@ -177,13 +177,13 @@ def _dictionary(found: Responses, angles: set[str]) -> dict[str, Tensor]:
     """Returns the laws' values at the pulses, each of unit spread."""
     channels, time = found.channels, found.time
     values: dict[str, Tensor] = {"1": torch.ones_like(time), "t": time}
-    unit = {name: x / x.square().mean().sqrt().clamp_min(1e-12) for name, x in channels.items()}
     signs = {name: _sign(x) for name, x in channels.items()}
     for name, x in channels.items():
         values |= _of_one(name, x, name in angles)
         values[f"sign {name}"] = signs[name]
-        values[f"t·{name}"] = time * unit[name]
-    names = list(unit)
+        values[f"t·{name}"] = time * values[name]
+    names = list(channels)
+    unit = {name: values[name] for name in names}
     for i, one in enumerate(names):
         for other in names[i + 1 :]:
             values[f"{one}·{other}"] = unit[one] * unit[other]
