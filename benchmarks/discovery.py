@@ -31,7 +31,7 @@ from sparse_regression import sparse_choice
 import npdr_ppl as npdr
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
-from npdr_ppl.workflows.discovery.equivalents import irreducible
+from npdr_ppl.workflows.discovery.candidates import candidates_at
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, fit_hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.proof import prove
@@ -252,7 +252,7 @@ def _catalogue(task: Task, case: Case) -> tuple[npdr.Effect, ...] | None:
     if task.condition not in REMOVED:
         return None
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions())
-    every = irreducible(candidate_effects(searcher.fit_base().simulator))
+    every = candidates_at(searcher.fit_base(), searcher.options)
     gone = {name for names in (case.names, *case.alternatives) for name in names}
     ids = {name.rsplit(".", 1)[1] for name in case.names}
     return tuple(e for e in every if e.name not in gone and e.id not in ids)

@@ -142,6 +142,7 @@ class Quantisation(SensorEffect):
     id = "quantisation"
     parameters = (Parameter("count", "{port}", 0.0, "size of a count Δ"),)
     is_smooth = False
+    is_noise = True
     law = "round(x/Δ) Δ"
     excitation = "slow_ramp"
     reference = LJUNG_1999

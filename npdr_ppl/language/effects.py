@@ -54,6 +54,10 @@ class Effect(ABC):
             shape, and their nominal values are those of a typical device. Empty for all.
         is_smooth: Whether trajectories are differentiable in the strengths at zero. Where they
             are not, sensitivities take finite steps of the size that :meth:`probe` gives.
+        is_resonant: Whether it swings at a rate that its strength sets, a time constant. Of two
+            sizes none is more of the other, so that a search tries many.
+        is_noise: Whether it only scatters readings about the truth. No search asks for such an
+            effect: a fit that simulates the scatter follows it by chance.
         wave: Name of the parameter that is the frequency in Hz of a wave in time, empty if none
             is. Priors are too wide to meet a wave's frequency, so a search reads it from the
             spectrum of what the model leaves over, and counts all frequencies it looked at.
@@ -69,6 +73,8 @@ class Effect(ABC):
     parameters: ClassVar[tuple[Parameter, ...]]
     strength: ClassVar[tuple[str, ...]] = ()
     is_smooth: ClassVar[bool] = True
+    is_resonant: ClassVar[bool] = False
+    is_noise: ClassVar[bool] = False
     wave: ClassVar[str] = ""
     incidental: ClassVar[tuple[str, ...]] = ()
     law: ClassVar[str] = ""
@@ -181,6 +187,15 @@ class ForceEffect(Effect):
         """Returns a generalised force that is smooth in the state, or ``None``.
 
         Evaluated within the integrator's stages.
+        """
+        return None
+
+    def moment(self, parameters: Mapping[str, Tensor], memory: Any) -> Tensor | None:
+        """Returns the first moment of the force within a step, or ``None`` if it is constant.
+
+        ∫ (t − h/2) f dt about the middle of a step of length h, in the force's unit times s², of
+        an effect that asks for its joint; see :class:`Uneven`. Engines that hold forces for a step
+        make do without.
         """
         return None
 

@@ -19,8 +19,10 @@ __all__ = ["candidates_at", "variants_of"]
 def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Effect, ...]:
     """Returns the effects that may be added to a hypothesis."""
     if options.effects is not None:
-        return tuple(e for e in options.effects if e.name not in hypothesis.names)
-    return irreducible(candidate_effects(hypothesis.simulator), hypothesis.names)
+        candidates = tuple(e for e in options.effects if e.name not in hypothesis.names)
+    else:
+        candidates = irreducible(candidate_effects(hypothesis.simulator), hypothesis.names)
+    return tuple(effect for effect in candidates if not effect.is_noise)
 
 
 def variants_of(

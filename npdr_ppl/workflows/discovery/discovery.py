@@ -8,9 +8,10 @@ from typing import Any
 
 from torch import Tensor
 
-from npdr_ppl.errors import DataError
+from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.discovery.counts import counts
 from npdr_ppl.workflows.discovery.credible import Estimate, estimates
 from npdr_ppl.workflows.discovery.data_checks import data_problems, recording_problems
 from npdr_ppl.workflows.discovery.equivalents import equivalents
@@ -106,6 +107,11 @@ class Investigation:
         for effect in self.options.effects or ():
             # Screening leaves out what the simulator cannot have; who asks by name is told.
             fitted.simulator.with_effects(effect)
+            if effect.is_noise:
+                raise ModelError(
+                    f"{effect.name} only scatters readings, so that no fit can find it; counts "
+                    "are read off the recording."
+                )
         return fitted
 
     @cached_property
@@ -220,6 +226,7 @@ class Investigation:
             model=search.rounds[0].hypothesis.model,
             revised=final.model,
             parameters=every,
+            counts=counts(final, self.rollouts),
             search=search,
             options=self.options,
             seconds=self.seconds,
@@ -246,7 +253,7 @@ def discover(
 
     Raises:
         DataError: The recording is too short, or does not fit the model.
-        ModelError: The model cannot be inferred.
+        ModelError: The model cannot be inferred, or an effect to search for cannot be found.
     """
     return Investigation(
         model, rollouts, holdout=holdout, options=options, report=report

@@ -12,6 +12,7 @@ from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.rollouts.atomic import replacing
 from npdr_ppl.workflows.discovery.alarm import Alarm
+from npdr_ppl.workflows.discovery.counts import Count
 from npdr_ppl.workflows.discovery.credible import Estimate
 from npdr_ppl.workflows.discovery.next_experiment import NextExperiment
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
@@ -88,6 +89,8 @@ class Discovery:
         model: The model as it was.
         revised: The model with the effects.
         parameters: All parameters' estimates in the revised model, by site.
+        counts: Channels that are read in whole counts, as an encoder's, and what rounding makes
+            of what the revised model leaves there.
         search: How it was found.
         options: How it was searched.
         seconds: Time spent, by stage.
@@ -109,6 +112,7 @@ class Discovery:
     model: Callable[..., Any]
     revised: Callable[..., Any]
     parameters: dict[str, Estimate]
+    counts: dict[str, Count]
     search: Search
     options: DiscoveryOptions
     seconds: dict[str, float]
@@ -136,6 +140,7 @@ class Discovery:
             "gap": {name: gap.to_dict() for name, gap in self.gap.items()},
             "next_experiment": self.next_experiment and self.next_experiment.to_dict(),
             "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
+            "counts": {name: count.to_dict() for name, count in self.counts.items()},
             "seconds": self.seconds,
         }
 
