@@ -28,8 +28,9 @@ from npdr_ppl.models.effects.references import SPONG_1987, TAO_1996
 
 __all__ = ["Backlash", "JointElasticity"]
 
-_Memory = tuple[Tensor, Tensor, Tensor]
-"""How far the motor is ahead (NaN before it is known), the rate of that, the mean force."""
+_Memory = tuple[Tensor, Tensor, Tensor, Tensor]
+"""How far the motor is ahead (NaN before it is known), the rate of that; the force's mean during
+the step and its moment within."""
 
 _SHARE = Parameter("motor_share", "1", 0.3, "share ρ of the inertia on the motor's side")
 
@@ -45,6 +46,26 @@ def _pull(joint: Joint, share: Tensor) -> Tensor:
     return (joint.drive * joint.inverse_inertia / share - joint.acceleration) / (1.0 - share)
 
 
+def _force(
+    joint: Joint,
+    share: Tensor,
+    motion: tuple[Tensor, Tensor, Tensor, Tensor],
+    time_step: float,
+) -> tuple[Tensor, Tensor]:
+    """Returns mean and moment of the force −ρ J δ̈ on the link.
+
+    Args:
+        joint: The joint.
+        share: The motor's share ρ of the inertia.
+        motion: How far the motor is ahead at the step's start and end, and the rates of that.
+        time_step: Length of the step in s.
+    """
+    before, after, rate, next_rate = motion
+    motor_inertia = share / joint.inverse_inertia
+    lag = 0.5 * time_step * (rate + next_rate) - (after - before)
+    return -motor_inertia * (next_rate - rate) / time_step, -motor_inertia * lag
+
+
 class _Transmission(ForceEffect):
     """What joins a motor to its link; how far the motor is ahead is found in the first step."""
 
@@ -57,13 +78,17 @@ class _Transmission(ForceEffect):
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> _Memory:
         """Returns an advance that is not known yet."""
         zero = torch.zeros_like(position)
-        return torch.full_like(position, torch.nan), zero, zero
+        return torch.full_like(position, torch.nan), zero, zero, zero
 
     def force(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: _Memory
     ) -> Tensor:
         """Returns the mean force during the step."""
         return memory[2]
+
+    def moment(self, parameters: Mapping[str, Tensor], memory: _Memory) -> Tensor:
+        """Returns the moment with which the link is where the motor's advance has left it."""
+        return memory[3]
 
 
 class JointElasticity(_Transmission):
@@ -80,6 +105,7 @@ class JointElasticity(_Transmission):
         _SHARE,
     )
     strength = ("time_constant",)
+    is_resonant = True
     law = "motor and link joined by k δ + d δ̇"
     excitation = "chirp"
     reference = SPONG_1987
@@ -106,7 +132,7 @@ class JointElasticity(_Transmission):
         least = time_step / _STEPS_PER_LEAST_TIME_CONSTANT
         frequency = 1.0 / time_constant.clamp_min(least)
         settled = _pull(joint, share) * time_constant * time_constant
-        deflection, rate, _ = memory
+        deflection, rate, *_ = memory
         deflection = torch.where(deflection.isnan(), settled, deflection)
         # A damped oscillation about the settled deflection.
         decay = ratio * frequency
@@ -117,8 +143,9 @@ class JointElasticity(_Transmission):
         sin, cos = torch.sin(swing * time_step), torch.cos(swing * time_step)
         moved = shrunk * (offset * cos + other * sin)
         next_rate = shrunk * swing * (other * cos - offset * sin) - decay * moved
-        change = (next_rate - rate) / time_step
-        return settled + moved, next_rate, -share / joint.inverse_inertia * change
+        next_deflection = settled + moved
+        motion = deflection, next_deflection, rate, next_rate
+        return next_deflection, next_rate, *_force(joint, share, motion, time_step)
 
 
 class Backlash(_Transmission):
@@ -153,11 +180,11 @@ class Backlash(_Transmission):
         """Returns the motor's advance and its rate at the step's end, and the mean force."""
         share, play = parameters["motor_share"], parameters["play"]
         pull = _pull(joint, share)
-        advance, rate, _ = memory
+        advance, rate, *_ = memory
         advance = torch.where(advance.isnan(), play * pull.sign(), advance)
         free = advance + time_step * (rate + time_step * pull)
         reached = free.clamp(-play, play)
         # The rate that arrives at the end of the gap when the step ends, and zero once there.
         next_rate = (reached - advance) / time_step
-        change = (next_rate - rate) / time_step
-        return reached, next_rate, -share / joint.inverse_inertia * change
+        motion = advance, reached, rate, next_rate
+        return reached, next_rate, *_force(joint, share, motion, time_step)

@@ -419,6 +419,18 @@ class EffectChain(ABC):
                 forces[joint] = force if present is None else present + force
         return tuple(forces)
 
+    def force_moments(self, state: State, tables: Tables) -> tuple[Tensor | None, ...]:
+        """Returns the moments of the forces within the step that has begun, per joint."""
+        moments: list[Tensor | None] = [None] * len(state.positions)
+        for k, (place, effect, joint) in enumerate(self.force_effects):
+            if not effect.needs_joint:
+                continue
+            moment = effect.moment(tables.effects[place], state.force_memory[k])
+            if moment is not None:
+                present = moments[joint]
+                moments[joint] = moment if present is None else present + moment
+        return tuple(moments)
+
     def begin_step(self, state: State, joints: Sequence[Joint | None], tables: Tables) -> State:
         """Shows the joints to the force effects that ask for them.
 

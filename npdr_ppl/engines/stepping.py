@@ -83,12 +83,13 @@ class Stepper(EffectChain):
         forces = self._forces(*start, state, tables, dry)
         first = even = simulator.accelerations(*start, actions, forces, constants)
         late: Components | None = None
-        if simulator.integrator.order > 1 and any(moment is not None for moment in moments):
+        within = self.force_moments(state, tables)
+        is_uneven = any(moment is not None for moment in (*moments, *within))
+        if simulator.integrator.order > 1 and is_uneven:
             # Positions move by ∫ (h − t) a dt, of which the integrator sees ½ h² times the mean.
-            shifted = tuple(
-                a if m is None else a + m for a, m in zip(actions, moments, strict=True)
+            late = simulator.accelerations(
+                *start, _shifted(actions, moments), _shifted(forces, within), constants
             )
-            late = simulator.accelerations(*start, shifted, forces, constants)
 
         def bounds_at(velocities: Components) -> tuple[Tensor | None, ...]:
             return self.dry_friction_bounds(state._replace(velocities=velocities), tables)
@@ -153,6 +154,13 @@ class Stepper(EffectChain):
             return dry
         smooth = self.applied_forces(positions, velocities, state, tables, before_step=before_step)
         return tuple(d if f is None else d + f for d, f in zip(dry, smooth, strict=True))
+
+
+def _shifted(values: tuple[Any, ...], moments: Moments) -> tuple[Any, ...]:
+    """Returns actions or forces with their moments added; no moments are none of any."""
+    if not moments:
+        return values
+    return tuple(v if m is None else v + m for v, m in zip(values, moments, strict=True))
 
 
 def flatten(tree: Any, shape: torch.Size, *, expand: bool = False) -> Any:

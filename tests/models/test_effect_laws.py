@@ -248,6 +248,26 @@ def test_an_elastic_joint_rings_at_its_resonance_about_its_centre_of_mass():
     torch.testing.assert_close(out - rigid, expected, rtol=0.0, atol=0.06 * share * settled)
 
 
+def test_a_link_swings_about_where_it_would_be_although_steps_are_longer_than_its_period():
+    """Its way is known to the step's end, however often it turns round within the step."""
+    share, ratio, push = 0.4, 0.1, 2.0
+    midpoint = Emps().with_finer_steps()
+    time_constant = 0.15 * Emps.time_step
+    simulator = midpoint.with_effects(JointElasticity("carriage"))
+    site = "carriage.joint_elasticity."
+    parameters = FREE | {
+        f"{site}time_constant": time_constant,
+        f"{site}damping_ratio": ratio,
+        f"{site}motor_share": share,
+    }
+    drive = [0.0] + [push] * 19 + [-push] * 180
+    lag = (replay(simulator, parameters, drive) - replay(midpoint, FREE, drive))[:, 0]
+    settled = push / share * time_constant**2
+    # It ends behind the rigid joint's centre of mass, by the motor's share of what is settled.
+    torch.testing.assert_close(lag[-1].item(), share * settled, rtol=1e-6, atol=0.0)
+    assert lag.abs().max() < 4.0 * share * settled
+
+
 @pytest.mark.parametrize("simulator", [Pendulum(), CartPole(), Furuta(), Emps()])
 def test_a_payload_adds_its_inertia_and_weight(simulator):
     """ΔM is the Hessian of the payload's kinetic energy, and its weight that of its height."""

@@ -24,8 +24,14 @@ from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 
 __all__ = ["Variant", "sensitivities"]
 
+NEXT = 1.1
+"""Ratio of one resonance to the next that is tried: lightly damped, it is a tenth wide."""
+
 SIZES = (1.0, 0.25)
 """Sizes of an effect that is not smooth, in those its probe gives."""
+
+RESONANT_SIZES = tuple(0.05 * NEXT**k for k in range(40))
+"""Sizes of a resonance, in those its probe gives: up to twice as large."""
 
 BITES = 0.7
 """Where in the commands' range a limit is tried first."""
@@ -152,6 +158,8 @@ def _probe(
     if hint:
         shapes.append(({**shapes[0][0], **hint}, True))
     sizes = SIZES if _needs_size(effect, strengths) else (SMALL,)
+    if effect.is_resonant:
+        shapes, sizes = shapes[:1], RESONANT_SIZES
     cases = [
         ({**probe, **shape}, is_hinted, size)
         for (shape, is_hinted), size in itertools.product(shapes, sizes)
@@ -214,6 +222,8 @@ def _variants(probe: _Probe, rows: Tensor) -> list[Variant]:
             continue
         full = torch.tensor([values[n] for n in strengths], dtype=torch.float64)
         lower, upper, deviation = _limits(probe.priors, strengths, nominal, full)
+        if probe.effect.is_resonant:
+            lower, upper = lower.clamp_min(size / NEXT), upper.clamp_max(size * NEXT)
         change = difference.permute(1, 2, 0)
         result.append(
             Variant(

@@ -45,6 +45,20 @@ def covers(finding, name, true):
     return low - 0.25 * width <= true <= high + 0.25 * width
 
 
+def test_a_resonance_is_found_wherever_it_is():
+    """Of 2.5 ms and 10 ms, between which the prior's typical sizes lie, it is neither."""
+    place = ("hinge", "joint_elasticity")
+    case, found = discover("pendulum", "one", (place,), strength=0.4, max_effects=2)
+    assert found.verdict == "named", found.reason
+    (finding,) = found.effects
+    assert finding.effect.name == "hinge.joint_elasticity"
+    (true,) = case.truth
+    estimate = finding.parameters["time_constant"]
+    assert covers(finding, "time_constant", true.parameters["time_constant"])
+    assert estimate.mean == pytest.approx(true.parameters["time_constant"], rel=0.03)
+    assert found.gap["rmse"].after < found.gap["rmse"].before
+
+
 @pytest.mark.parametrize(
     ("place", "parameter", "strength"),
     [
