@@ -24,6 +24,9 @@ __all__ = [
 FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
 """Columns of figures with the width they need."""
 
+WORTH_TELLING = 0.1
+"""Share of what is left in a channel from which its encoder's counts are told."""
+
 MOST_ROWS = 10
 """Rows of a ranking."""
 
@@ -156,6 +159,12 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
     if found["remainder"]["fired"] and found["verdict"] != "unknown":
         share = found["remainder"]["unexplained"]
         console.print(f"Something smaller is left over: {share:.2%} of the disagreement.")
+    for channel, count in found["counts"].items():
+        if count["share"] > WORTH_TELLING:
+            console.print(
+                f"{escape(channel)} is read in counts of {count['size']:.3g}, which make "
+                f"{count['share']:.0%} of the variance that is left there."
+            )
     if (experiment := found["next_experiment"]) is not None:
         _print_reason(console, "next experiment", _advice(experiment))
 

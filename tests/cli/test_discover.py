@@ -194,6 +194,7 @@ def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, t
     found = {
         "data_problems": [], "verdict": "ambiguous", "reason": "It cannot tell.", "effects": [],
         "gap": {}, "remainder": {"fired": True, "unexplained": 0.05},
+        "counts": {"angle": {"size": 0.00307, "share": 0.42}, "way": {"size": 1.0, "share": 0.01}},
         "next_experiment": {
             "excitation": "slow_ramp", "separations": {"slow_ramp": 12.3, "hold": None},
             "amplitude": {"torque": 4.0}, "separated_by": "a change of load",
@@ -204,6 +205,7 @@ def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, t
     assert "ambiguous: It cannot tell." in shown
     assert "slow ramp with torque up to 4, which sets the survivors 12 standard" in shown
     assert "a change of load" in shown and "5.00%" in shown
+    assert "angle is read in counts of 0.00307, which make 42%" in shown and "way" not in shown
 
 
 def test_the_command_has_the_defaults_of_the_options():
