@@ -12,7 +12,14 @@ from matplotlib.figure import Figure
 
 from npdr_ppl.displays.theme import COLORS, save_figure, theme
 
-__all__ = ["Bin", "calibration_error", "confusion", "reliability", "write_figures"]
+__all__ = [
+    "Bin",
+    "calibration_error",
+    "calibration_error_by_chance",
+    "confusion",
+    "reliability",
+    "write_figures",
+]
 
 EDGES = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97, 1.0)
 """Bins of the reported probabilities."""
@@ -55,6 +62,20 @@ def calibration_error(bins: Sequence[Bin]) -> float:
     """Returns the expected calibration error: the bins' mean distance, weighted by cases."""
     total = sum(part.right.total for part in bins)
     return sum(part.right.total * abs(part.mean - part.right.value) for part in bins) / total
+
+
+def calibration_error_by_chance(bins: Sequence[Bin], *, num_draws: int = 10_000) -> float:
+    """Returns what the error of perfect probabilities stays below in 95 of 100 such samples.
+
+    Args:
+        bins: The bins, whose means are taken for true and whose numbers of cases are kept.
+        num_draws: Samples that are drawn.
+    """
+    totals = np.array([part.right.total for part in bins])
+    means = np.array([part.mean for part in bins])
+    right = np.random.default_rng(0).binomial(totals, means, (num_draws, len(bins)))
+    errors = np.abs(right - totals * means).sum(-1) / totals.sum()
+    return float(np.quantile(errors, 0.95))
 
 
 def confusion(rows: Iterable[Row]) -> dict[str, Counter[str]]:

@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
-from discovery_figures import calibration_error, reliability
+from discovery_figures import calibration_error, calibration_error_by_chance, reliability
 from discovery_rows import (
     Row,
     effect_id,
@@ -98,7 +98,7 @@ def summary_lines(rows: Sequence[Row]) -> list[Line]:
         _rate("spoilt data: problem reported", of["bad_data"], lambda row: bool(row["problems"])),
         *_gap_lines(rows),
         *_parameter_lines([row for row in of["one"] if row["d"] >= STRONG]),
-        _calibration_line(rows),
+        *_calibration_lines(rows),
         *_time_lines(rows),
     ]
 
@@ -267,11 +267,15 @@ def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
     ]
 
 
-def _calibration_line(rows: Sequence[Row]) -> Line:
+def _calibration_lines(rows: Sequence[Row]) -> list[Line]:
     bins = reliability(rows)
     total = sum(part.right.total for part in bins)
     value = calibration_error(bins) if bins else math.nan
-    return Line("expected calibration error", total, value, upper=0.05, unit="")
+    chance = calibration_error_by_chance(bins) if bins else math.nan
+    return [
+        Line("expected calibration error", total, value, upper=0.05, unit=""),
+        Line("… of perfect probabilities, 95 % of the time at most", total, chance, unit=""),
+    ]
 
 
 def _time_lines(rows: Sequence[Row]) -> list[Line]:

@@ -4,7 +4,13 @@ import json
 import math
 
 import pytest
-from discovery_figures import calibration_error, confusion, reliability
+from discovery_figures import (
+    Bin,
+    calibration_error,
+    calibration_error_by_chance,
+    confusion,
+    reliability,
+)
 from discovery_report import print_summary
 from discovery_summary import gap_closed, summary_lines
 from discovery_table import Line, Rate
@@ -181,6 +187,13 @@ def test_the_calibration_error_weighs_bins_by_their_cases():
     bins = reliability([*sure, *unsure, row()])
     assert [(part.right.hits, part.right.total) for part in bins] == [(1, 2), (3, 3)]
     assert calibration_error(bins) == pytest.approx(2 / 5 * 0.02)
+
+
+def test_perfect_probabilities_err_by_chance():
+    few, many = ([Bin(0.8, 0.9, 0.85, Rate(round(0.85 * n), n))] for n in (20, 2000))
+    normal = 1.96 * (0.85 * 0.15 / 2000) ** 0.5
+    assert calibration_error_by_chance(many) == pytest.approx(normal, rel=0.1)
+    assert 8.0 < calibration_error_by_chance(few) / calibration_error_by_chance(many) < 12.0
 
 
 def test_confusion_tells_places_and_verdicts_apart():
