@@ -6,7 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from discovery_rows import REMOVED, Row, effect_id, found_names, is_first_right
+from discovery_rows import (
+    REMOVED,
+    Row,
+    effect_id,
+    first_probability,
+    found_names,
+    is_first_right,
+)
 from discovery_table import Rate
 from matplotlib.figure import Figure
 
@@ -45,7 +52,7 @@ class Bin:
 def reliability(rows: Iterable[Row]) -> list[Bin]:
     """Returns how often first effects are right, by their reported probability."""
     pairs = [
-        (row["effects"][0]["probability"], is_first_right(row))
+        (first_probability(row), is_first_right(row))
         for row in rows
         if row["condition"] in ("one", "inseparable", "two") and row["effects"]
     ]

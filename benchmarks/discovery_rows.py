@@ -5,11 +5,14 @@ from collections.abc import Iterator
 from itertools import permutations
 from typing import Any
 
+from hidden_rigs import RIGS
+
 __all__ = [
     "REMOVED",
     "Row",
     "effect_id",
     "estimates",
+    "first_probability",
     "found_names",
     "has_all",
     "has_all_classes",
@@ -61,6 +64,22 @@ def is_right(row: Row, name: str | None) -> bool:
 def is_first_right(row: Row) -> bool:
     """Returns whether the first effect is the true one, or stands for it."""
     return is_right(row, next(iter(found_names(row)), None))
+
+
+def first_probability(row: Row) -> float:
+    """Returns the reported probability that :func:`is_first_right`.
+
+    Of the first effect, and of those that no recording of the rig can tell from it: where one of
+    them is hidden, the first effect counts as right.
+    """
+    first, rig = row["effects"][0], RIGS[row["rig"]]
+    table = rig.inseparable if row["condition"] == "inseparable" else rig.same
+    others = table.get((first["port"], first["effect"]), ())
+    alone = {
+        f"{port}.{effect}" for places in others if len(places) == 1 for port, effect in places
+    }
+    names = {found_names(row)[0], *alone}
+    return sum(first["alternatives"].get(name, 0.0) for name in names)
 
 
 def is_class_right(row: Row) -> bool:

@@ -189,6 +189,17 @@ def test_the_calibration_error_weighs_bins_by_their_cases():
     assert calibration_error(bins) == pytest.approx(2 / 5 * 0.02)
 
 
+def test_what_cannot_be_told_apart_has_its_probability_together():
+    found = finding("angle.encoder_bias", 0.7)
+    found["alternatives"] |= {"gravity.tilt": 0.2, "hinge.bias": 0.1}
+    hidden = row(truth=("gravity.tilt",), found=[found]) | {
+        "alternatives": [["angle.encoder_bias"], ["hinge.unbalance"]]
+    }
+    (part,) = reliability([hidden])
+    assert part.mean == pytest.approx(0.9)  # of a pendulum's offset, whichever it is
+    assert part.right.hits == 1
+
+
 def test_perfect_probabilities_err_by_chance():
     few, many = ([Bin(0.8, 0.9, 0.85, Rate(round(0.85 * n), n))] for n in (20, 2000))
     normal = 1.96 * (0.85 * 0.15 / 2000) ** 0.5
