@@ -46,26 +46,6 @@ def _pull(joint: Joint, share: Tensor) -> Tensor:
     return (joint.drive * joint.inverse_inertia / share - joint.acceleration) / (1.0 - share)
 
 
-def _force(
-    joint: Joint,
-    share: Tensor,
-    motion: tuple[Tensor, Tensor, Tensor, Tensor],
-    time_step: float,
-) -> tuple[Tensor, Tensor]:
-    """Returns mean and moment of the force −ρ J δ̈ on the link.
-
-    Args:
-        joint: The joint.
-        share: The motor's share ρ of the inertia.
-        motion: How far the motor is ahead at the step's start and end, and the rates of that.
-        time_step: Length of the step in s.
-    """
-    before, after, rate, next_rate = motion
-    motor_inertia = share / joint.inverse_inertia
-    lag = 0.5 * time_step * (rate + next_rate) - (after - before)
-    return -motor_inertia * (next_rate - rate) / time_step, -motor_inertia * lag
-
-
 class _Transmission(ForceEffect):
     """What joins a motor to its link; how far the motor is ahead is found in the first step."""
 
@@ -85,10 +65,6 @@ class _Transmission(ForceEffect):
     ) -> Tensor:
         """Returns the mean force during the step."""
         return memory[2]
-
-    def moment(self, parameters: Mapping[str, Tensor], memory: _Memory) -> Tensor:
-        """Returns the moment with which the link is where the motor's advance has left it."""
-        return memory[3]
 
 
 class JointElasticity(_Transmission):
@@ -144,8 +120,15 @@ class JointElasticity(_Transmission):
         moved = shrunk * (offset * cos + other * sin)
         next_rate = shrunk * swing * (other * cos - offset * sin) - decay * moved
         next_deflection = settled + moved
-        motion = deflection, next_deflection, rate, next_rate
-        return next_deflection, next_rate, *_force(joint, share, motion, time_step)
+        motor_inertia = share / joint.inverse_inertia
+        mean = -motor_inertia * (next_rate - rate) / time_step
+        # With it the link is where the motor's advance has left it.
+        ahead = 0.5 * time_step * (rate + next_rate) - (next_deflection - deflection)
+        return next_deflection, next_rate, mean, -motor_inertia * ahead
+
+    def moment(self, parameters: Mapping[str, Tensor], memory: _Memory) -> Tensor:
+        """Returns the moment of the force: a joint may swing more than once within a step."""
+        return memory[3]
 
 
 class Backlash(_Transmission):
@@ -186,5 +169,6 @@ class Backlash(_Transmission):
         reached = free.clamp(-play, play)
         # The rate that arrives at the end of the gap when the step ends, and zero once there.
         next_rate = (reached - advance) / time_step
-        motion = advance, reached, rate, next_rate
-        return reached, next_rate, *_force(joint, share, motion, time_step)
+        change = (next_rate - rate) / time_step
+        mean = -share / joint.inverse_inertia * change
+        return reached, next_rate, mean, torch.zeros_like(mean)
