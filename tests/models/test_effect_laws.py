@@ -265,7 +265,8 @@ def test_a_link_swings_about_where_it_would_be_although_steps_are_longer_than_it
     settled = push / share * time_constant**2
     # It ends behind the rigid joint's centre of mass, by the motor's share of what is settled.
     torch.testing.assert_close(lag[-1].item(), share * settled, rtol=1e-6, atol=0.0)
-    assert lag.abs().max() < 4.0 * share * settled
+    # Undamped, it would swing as far beyond one rest as the other rest is away.
+    assert lag.abs().max() < 3.0 * share * settled
 
 
 @pytest.mark.parametrize("simulator", [Pendulum(), CartPole(), Furuta(), Emps()])
