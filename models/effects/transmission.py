@@ -28,9 +28,9 @@ from npdr_ppl.models.effects.references import SPONG_1987, TAO_1996
 
 __all__ = ["Backlash", "JointElasticity"]
 
-_Memory = tuple[Tensor, Tensor, Tensor, Tensor]
-"""How far the motor is ahead (NaN before it is known), the rate of that; the force's mean during
-the step and its moment within."""
+_Memory = tuple[Tensor, ...]
+"""How far the motor is ahead (NaN before it is known), the rate of that, the mean force; and the
+force's moment within the step, where it has one."""
 
 _SHARE = Parameter("motor_share", "1", 0.3, "share ρ of the inertia on the motor's side")
 
@@ -58,7 +58,7 @@ class _Transmission(ForceEffect):
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> _Memory:
         """Returns an advance that is not known yet."""
         zero = torch.zeros_like(position)
-        return torch.full_like(position, torch.nan), zero, zero, zero
+        return torch.full_like(position, torch.nan), zero, zero
 
     def force(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: _Memory
@@ -93,6 +93,10 @@ class JointElasticity(_Transmission):
             "damping_ratio": dist.Uniform(0.005, 0.3),
             "motor_share": dist.Uniform(0.05, 0.9),
         }
+
+    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> _Memory:
+        """Returns a deflection that is not known yet, and no moment."""
+        return *super().initial_memory(position, velocity, start), torch.zeros_like(position)
 
     def begin_step(
         self,
@@ -163,12 +167,11 @@ class Backlash(_Transmission):
         """Returns the motor's advance and its rate at the step's end, and the mean force."""
         share, play = parameters["motor_share"], parameters["play"]
         pull = _pull(joint, share)
-        advance, rate, *_ = memory
+        advance, rate, _ = memory
         advance = torch.where(advance.isnan(), play * pull.sign(), advance)
         free = advance + time_step * (rate + time_step * pull)
         reached = free.clamp(-play, play)
         # The rate that arrives at the end of the gap when the step ends, and zero once there.
         next_rate = (reached - advance) / time_step
         change = (next_rate - rate) / time_step
-        mean = -share / joint.inverse_inertia * change
-        return reached, next_rate, mean, torch.zeros_like(mean)
+        return reached, next_rate, -share / joint.inverse_inertia * change
