@@ -110,6 +110,7 @@ class Plant:
                 self._transmission = Transmission(
                     h.parameters,
                     self._mechanics.drive_inertia(self._geared),
+                    substep,
                     TRANSMISSIONS[h.effect_id],
                 )
         self._drives: list[Array] = []

@@ -13,6 +13,7 @@ from hidden_rigs.mechanics import Array
 from hidden_rigs.plant import Plant
 from hidden_rigs.rig import Rig
 from hidden_rigs.sensors import sensed
+from hidden_rigs.transmissions import TRANSMISSIONS
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.rollouts import Rollouts
 
@@ -21,6 +22,10 @@ __all__ = ["Recording", "record"]
 # Seconds that a rig has been simulated when its recording begins, without commands: what a late
 # sensor reports first has happened by then.
 _LEAD = 0.2
+
+# With that many times the rig's substeps, flanks of gears give way by a fortieth of the smallest
+# play that shows, and the fastest shafts that show swing in twenty substeps.
+_FINER_BEHIND_GEARS = 10
 
 
 @dataclass(frozen=True)
@@ -62,9 +67,11 @@ def record(
             is let go from somewhere else.
         seed: The seed.
         duration: Seconds per rollout; ``None`` for the rig's.
-        substeps: Integration steps per sample; ``None`` for the rig's.
+        substeps: Integration steps per sample; ``None`` for the rig's, and ten times those behind
+            a gear or a shaft.
     """
-    num_substeps = substeps or rig.substeps
+    is_behind_gears = any(h.effect_id in TRANSMISSIONS for h in hidden)
+    num_substeps = substeps or rig.substeps * (_FINER_BEHIND_GEARS if is_behind_gears else 1)
     substep = rig.time_step / num_substeps
     num_steps = round((duration or rig.duration) / rig.time_step)
     lead = math.ceil(_LEAD / rig.time_step)

@@ -8,9 +8,8 @@ from hidden_rigs.mechanics import Array
 
 __all__ = ["TRANSMISSIONS", "Transmission"]
 
-# Seconds over 2π that the flanks of a gear take to swing on each other. A gear is stiffer, and
-# this is stiff enough: the flanks give way by a thousandth of a typical play.
-_CONTACT_TIME = 1.0e-3
+_ForceOf = Callable[[Mapping[str, float], float, float], Callable[[Array, Array], Array]]
+"""Makes s of the parameters, the reduced inertia ρ (1 − ρ) J and the seconds per substep."""
 
 
 class Transmission:
@@ -19,7 +18,8 @@ class Transmission:
     Args:
         parameters: The effect's true parameters.
         inertia: Inertia J that a force at the joint sees, in kg m² or kg.
-        force_of: Makes s of the parameters and the reduced inertia ρ (1 − ρ) J.
+        substep: Seconds per substep of the integration.
+        force_of: Makes s.
 
     Attributes:
         motor_inertia: ρ J.
@@ -30,15 +30,18 @@ class Transmission:
         self,
         parameters: Mapping[str, float],
         inertia: float,
-        force_of: Callable[[Mapping[str, float], float], Callable[[Array, Array], Array]],
+        substep: float,
+        force_of: _ForceOf,
     ) -> None:
         share = parameters["motor_share"]
         self.motor_inertia = share * inertia
         # Two masses on a spring swing with the reduced one.
-        self.force = force_of(parameters, share * (1.0 - share) * inertia)
+        self.force = force_of(parameters, share * (1.0 - share) * inertia, substep)
 
 
-def _shaft(p: Mapping[str, float], reduced: float) -> Callable[[Array, Array], Array]:
+def _shaft(
+    p: Mapping[str, float], reduced: float, substep: float
+) -> Callable[[Array, Array], Array]:
     """A spring and a damper, given by the resonance of the free masses."""
     frequency = 1.0 / p["time_constant"]
     stiffness = reduced * frequency**2
@@ -46,21 +49,26 @@ def _shaft(p: Mapping[str, float], reduced: float) -> Callable[[Array, Array], A
     return lambda ahead, rate: stiffness * ahead + damping * rate
 
 
-def _play(p: Mapping[str, float], reduced: float) -> Callable[[Array, Array], Array]:
-    """Nothing within ±g, and beyond it flanks that are stiff and meet without a bounce."""
-    frequency = 1.0 / _CONTACT_TIME
+def _play(
+    p: Mapping[str, float], reduced: float, substep: float
+) -> Callable[[Array, Array], Array]:
+    """Nothing within ±g, and beyond it flanks that meet without a bounce.
+
+    They are as stiff as the substeps allow: softer ones give way by more than a small play, and
+    then the recording is one of an elastic joint.
+    """
+    frequency = 1.0 / substep
     stiffness, damping = reduced * frequency**2, 2.0 * reduced * frequency
 
     def force(ahead: Array, rate: Array) -> Array:
         depth = np.abs(ahead) - p["play"]
+        # While they touch they also pull, as with grease between: if they did not, they would part
+        # with an eighth of the speed that they met with.
         push = stiffness * depth + damping * np.sign(ahead) * rate
-        # Flanks push and never pull.
-        return np.where(depth > 0.0, np.sign(ahead) * np.maximum(push, 0.0), 0.0)
+        return np.where(depth > 0.0, np.sign(ahead) * push, 0.0)
 
     return force
 
 
-TRANSMISSIONS: dict[
-    str, Callable[[Mapping[str, float], float], Callable[[Array, Array], Array]]
-] = {"joint_elasticity": _shaft, "backlash": _play}
+TRANSMISSIONS: dict[str, _ForceOf] = {"joint_elasticity": _shaft, "backlash": _play}
 """Laws by the effect's id."""
