@@ -29,8 +29,8 @@ from npdr_ppl.models.effects.references import SPONG_1987, TAO_1996
 __all__ = ["Backlash", "JointElasticity"]
 
 _Memory = tuple[Tensor, ...]
-"""How far the motor is ahead (NaN before it is known), the rate of that, the mean force; and the
-force's moment within the step, where it has one."""
+"""How far the motor is ahead (NaN before it is known), the rate of that, the mean force and the
+force's moment within the step."""
 
 _SHARE = Parameter("motor_share", "1", 0.3, "share ρ of the inertia on the motor's side")
 
@@ -58,13 +58,41 @@ class _Transmission(ForceEffect):
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> _Memory:
         """Returns an advance that is not known yet."""
         zero = torch.zeros_like(position)
-        return torch.full_like(position, torch.nan), zero, zero
+        return torch.full_like(position, torch.nan), zero, zero, zero
 
     def force(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: _Memory
     ) -> Tensor:
         """Returns the mean force during the step."""
         return memory[2]
+
+    def moment(self, parameters: Mapping[str, Tensor], memory: _Memory) -> Tensor:
+        """Returns the moment of the force: motors may turn or hit several times within a step."""
+        return memory[3]
+
+
+def _felt(
+    joint: Joint,
+    share: Tensor,
+    before: tuple[Tensor, Tensor],
+    after: tuple[Tensor, Tensor],
+    time_step: float,
+) -> tuple[Tensor, Tensor]:
+    """Returns mean and moment of the force that the link feels while the motor gets ahead.
+
+    Args:
+        joint: The joint.
+        share: Motor's share of the inertia.
+        before: How far the motor is ahead, and the rate of that, at the step's start.
+        after: The same at its end.
+        time_step: Seconds per step.
+    """
+    motor_inertia = share / joint.inverse_inertia
+    (advance, rate), (next_advance, next_rate) = before, after
+    mean = -motor_inertia * (next_rate - rate) / time_step
+    # With the moment the link is where the motor's advance has left it.
+    ahead = 0.5 * time_step * (rate + next_rate) - (next_advance - advance)
+    return mean, -motor_inertia * ahead
 
 
 class JointElasticity(_Transmission):
@@ -94,10 +122,6 @@ class JointElasticity(_Transmission):
             "motor_share": dist.Uniform(0.05, 0.9),
         }
 
-    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> _Memory:
-        """Returns a deflection that is not known yet, and no moment."""
-        return *super().initial_memory(position, velocity, start), torch.zeros_like(position)
-
     def begin_step(
         self,
         joint: Joint,
@@ -124,15 +148,8 @@ class JointElasticity(_Transmission):
         moved = shrunk * (offset * cos + other * sin)
         next_rate = shrunk * swing * (other * cos - offset * sin) - decay * moved
         next_deflection = settled + moved
-        motor_inertia = share / joint.inverse_inertia
-        mean = -motor_inertia * (next_rate - rate) / time_step
-        # With it the link is where the motor's advance has left it.
-        ahead = 0.5 * time_step * (rate + next_rate) - (next_deflection - deflection)
-        return next_deflection, next_rate, mean, -motor_inertia * ahead
-
-    def moment(self, parameters: Mapping[str, Tensor], memory: _Memory) -> Tensor:
-        """Returns the moment of the force: a joint may swing more than once within a step."""
-        return memory[3]
+        before, after = (deflection, rate), (next_deflection, next_rate)
+        return *after, *_felt(joint, share, before, after, time_step)
 
 
 class Backlash(_Transmission):
@@ -146,6 +163,7 @@ class Backlash(_Transmission):
     parameters = (Parameter("play", "{coordinate}", 0.0, "half width g of the gap"), _SHARE)
     strength = ("play",)
     is_smooth = False
+    has_hits = True
     law = "motor ahead of the link by up to ±g"
     excitation = "reversals"
     reference = TAO_1996
@@ -164,14 +182,55 @@ class Backlash(_Transmission):
         memory: _Memory,
         time_step: float,
     ) -> _Memory:
-        """Returns the motor's advance and its rate at the step's end, and the mean force."""
+        """Returns the motor's advance and its rate at the step's end, mean force and moment."""
         share, play = parameters["motor_share"], parameters["play"]
         pull = _pull(joint, share)
-        advance, rate, _ = memory
+        advance, rate, *_ = memory
         advance = torch.where(advance.isnan(), play * pull.sign(), advance)
-        free = advance + time_step * (rate + time_step * pull)
-        reached = free.clamp(-play, play)
-        # The rate that arrives at the end of the gap when the step ends, and zero once there.
-        next_rate = (reached - advance) / time_step
-        change = (next_rate - rate) / time_step
-        return reached, next_rate, -share / joint.inverse_inertia * change
+        before = advance, rate
+        if joint.takes_moments:
+            after = _flown(advance, rate, pull, play, time_step)
+            return *after, *_felt(joint, share, before, after, time_step)
+        reached = (advance + time_step * (rate + time_step * pull)).clamp(-play, play)
+        # The rate that arrives at the end of the gap when the step ends, and zero once there: the
+        # mean force alone then leaves the link where it belongs.
+        after = reached, (reached - advance) / time_step
+        mean, _ = _felt(joint, share, before, after, time_step)
+        return *after, mean, torch.zeros_like(mean)
+
+
+def _flown(
+    advance: Tensor, rate: Tensor, pull: Tensor, play: Tensor, time_step: float
+) -> tuple[Tensor, Tensor]:
+    """Returns the motor's advance and its rate after a flight that may end at a flank."""
+    sides = [_time_to_flank(play, s * advance, s * rate, s * pull) for s in (-1.0, 1.0)]
+    flight = torch.minimum(*sides).clamp_max(time_step)
+    flank = torch.where(sides[0] < sides[1], -play, play)
+    has_hit = torch.minimum(*sides) < time_step
+    # Without a bounce: from where it hits it leaves only if the drive pulls it off.
+    left = time_step - flight
+    off = torch.where(pull * flank < 0.0, pull, 0.0)
+    reached = torch.where(
+        has_hit,
+        flank + 0.5 * off * left * left,
+        advance + time_step * (rate + 0.5 * time_step * pull),
+    )
+    next_rate = torch.where(has_hit, off * left, rate + time_step * pull)
+    within = reached.clamp(-play, play)
+    return within, torch.where(within == reached, next_rate, 0.0)
+
+
+def _time_to_flank(play: Tensor, advance: Tensor, rate: Tensor, pull: Tensor) -> Tensor:
+    """Returns the seconds to the flank at +g; infinitely many where the flight does not end there.
+
+    The least root of g = δ + δ̇ t + p t²/2 that is not negative.
+    """
+    distance = (play - advance).clamp_min(0.0)
+    discriminant = rate * rate + 2.0 * pull * distance
+    # What no flight needs must not make its derivatives infinite.
+    is_real = discriminant > 0.0
+    closing = rate + torch.where(is_real, discriminant, 1.0).sqrt()
+    is_flight = is_real & (closing > 0.0)
+    time = 2.0 * distance / torch.where(is_flight, closing, 1.0)
+    rests = (distance == 0.0) & (rate == 0.0) & (pull >= 0.0)
+    return torch.where(rests, 0.0, torch.where(is_flight, time, torch.inf))

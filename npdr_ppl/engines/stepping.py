@@ -38,6 +38,8 @@ class Stepper(EffectChain):
         super().__init__(simulator, simulator.joints, time_step, histories)
         self.simulator: ODESimulator = simulator
         self._substep = time_step / simulator.substeps
+        # Of the first order, positions are no better than that anyway.
+        self._takes_moments = simulator.integrator.order > 1
 
     @property
     def force_step(self) -> float:
@@ -82,14 +84,15 @@ class Stepper(EffectChain):
 
         forces = self._forces(*start, state, tables, dry)
         first = even = simulator.accelerations(*start, actions, forces, constants)
-        late: Components | None = None
         within = self.force_moments(state, tables)
         is_uneven = any(moment is not None for moment in (*moments, *within))
-        if simulator.integrator.order > 1 and is_uneven:
+        shifts: Components | None = None
+        if self._takes_moments and is_uneven:
             # Positions move by ∫ (h − t) a dt, of which the integrator sees ½ h² times the mean.
             late = simulator.accelerations(
                 *start, _shifted(actions, moments), _shifted(forces, within), constants
             )
+            shifts = tuple(a - b for a, b in zip(even, late, strict=True))
 
         def bounds_at(velocities: Components) -> tuple[Tensor | None, ...]:
             return self.dry_friction_bounds(state._replace(velocities=velocities), tables)
@@ -112,8 +115,15 @@ class Stepper(EffectChain):
                         a + row[joint] * force for a, row in zip(first, inertia, strict=True)
                     )
         q, v = simulator.integrator.step(acceleration, *start, first, self._substep)
-        if late is not None:
-            q = tuple(qi - (b - a) for qi, a, b in zip(q, even, late, strict=True))
+        if shifts is not None:
+            q = tuple(qi + shift for qi, shift in zip(q, shifts, strict=True))
+            # What moved further was faster on the way, and more was damped.
+            h = self._substep
+            faster = tuple(
+                vi + shift / h for vi, shift in zip(state.velocities, shifts, strict=True)
+            )
+            damped = simulator.accelerations(state.positions, faster, actions, forces, constants)
+            v = tuple(vi + h * (b - a) for vi, a, b in zip(v, even, damped, strict=True))
         if friction is not None:
             # Rounding must not leave a velocity whose sign then means something to a policy.
             v = tuple(
@@ -136,7 +146,8 @@ class Stepper(EffectChain):
         inertia = inverse_inertia(simulator, q, v, actions, forces, constants, acceleration)
         drive = drive_forces(simulator, q, v, actions, forces, constants, acceleration, inertia)
         return tuple(
-            Joint(q[i], v[i], acceleration[i], inertia[i][i], drive[i]) for i in range(len(q))
+            Joint(q[i], v[i], acceleration[i], inertia[i][i], drive[i], self._takes_moments)
+            for i in range(len(q))
         )
 
     def _forces(

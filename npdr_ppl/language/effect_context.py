@@ -90,6 +90,8 @@ class Joint(NamedTuple):
         inverse_inertia: Acceleration per unit force at the joint, all joints free to move.
         drive: Generalised force that the drive exerts at the joint. Where the equations alone are
             known, the part that depends on the actions: a motor's torque without its back-EMF.
+        takes_moments: Whether the engine moves the joint by a force's moment within a step besides
+            its mean; see :meth:`ForceEffect.moment`.
     """
 
     position: Tensor
@@ -97,3 +99,4 @@ class Joint(NamedTuple):
     acceleration: Tensor
     inverse_inertia: Tensor
     drive: Tensor
+    takes_moments: bool = False

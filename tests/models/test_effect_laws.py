@@ -223,6 +223,27 @@ def test_backlash_lets_the_link_fly_for_as_long_as_the_motor_takes_across_the_ga
     torch.testing.assert_close(velocity[-1], rigid[-1], rtol=1e-9, atol=1e-9)
 
 
+def test_a_gap_is_crossed_within_a_step_as_in_short_ones():
+    """So is what damping takes meanwhile from the link, which coasts and has gone less far."""
+    play, share, push = 2e-7, 0.35, 2.0
+    assert 2.0 * math.sqrt(2.0 * play * share / push) < Emps.time_step  # it takes no longer
+    site = "carriage.backlash."
+    parameters = FREE | {
+        "viscous_friction": 2.0,
+        f"{site}play": play,
+        f"{site}motor_share": share,
+    }
+    drive = [push] * 50 + [-push] * 50 + [push] * 50
+
+    def replayed(**options):
+        simulator = Emps(integrator="rk4", **options).with_effects(Backlash("carriage"))
+        return replay(simulator, parameters, drive)
+
+    coarse, fine = replayed(), replayed(substeps=100)
+    torch.testing.assert_close(coarse[:, 0], fine[:, 0], rtol=0.0, atol=0.01 * play * share)
+    torch.testing.assert_close(coarse[:, 1], fine[:, 1], rtol=0.0, atol=0.01 * 2.0 * play * share)
+
+
 def test_an_elastic_joint_rings_at_its_resonance_about_its_centre_of_mass():
     share, time_constant, ratio, push = 0.4, 0.01, 0.1, 2.0
     simulator = Emps().with_effects(JointElasticity("carriage"))
