@@ -56,6 +56,19 @@ STANDS_OUT = 10.0
 ELSEWHERE = 1.0, 4.0
 """… so far away, in standard deviations of the smoother's error, along each component."""
 
+LEAPS = 1.0, 3.0, 10.0
+"""How far from a fit a better one is looked for where parts hit each other, in standard deviations
+of what the fit leaves open …"""
+
+WIDE_LEAPS = 0.03, 0.1, 0.3
+"""… and in those of the priors, since a dent in the misfit says little of what is beyond it …"""
+
+DIRECTIONS = 6
+"""… in so many directions for each coordinate that leaps …"""
+
+MOST_LEAPS = 4
+"""… so many times at most."""
+
 
 @dataclass(frozen=True)
 class SegmentFit:
@@ -113,6 +126,11 @@ def fit_segments(
         freed = _freed(segments, z, offsets, scale)
         if freed is not None:
             z, offsets, scale = _steps(segments, z, freed, scale, held, max_steps, is_rough=False)
+        for _ in range(MOST_LEAPS):
+            better = _leap(segments, z, offsets, scale, held)
+            if better is None:
+                break
+            z, offsets, scale = _steps(segments, *better, scale, held, max_steps, is_rough=False)
     return SegmentFit(z, offsets, scale)
 
 
@@ -144,6 +162,55 @@ def _freed(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) ->
         return None
     best = tried[chosen, torch.arange(len(offsets))]
     return torch.where(is_stuck[:, None], best, offsets)
+
+
+def _leap(
+    segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor, held: Tensor
+) -> tuple[Tensor, Tensor] | None:
+    """Returns parameters and offsets that are better than a fit; ``None`` if none is found.
+
+    Slopes lead to the nearest dent of the misfit. The parameters along which it has dents leap,
+    and all others follow along the parabola about the fit; of the offsets each segment's follow or
+    stay, whichever is better.
+
+    Args:
+        segments: The model and the recording.
+        z: Parameters, ``(d,)``.
+        offsets: Offsets of the initial states, ``(S, m)``.
+        scale: Standard deviation of each channel's residuals, ``(C,)``.
+        held: Coordinates that stay, a mask ``(d,)``.
+    """
+    leaping = segments.dented_coordinates & ~held
+    num = int(leaping.sum())
+    if not num:
+        return None
+    now = segments.linearise(z, offsets, scale)
+    parts = (now.residual, now.by_parameters, now.by_starts)
+    if not all(bool(part.isfinite().all()) for part in parts):
+        return None
+    now = replace(now, by_parameters=now.by_parameters * ~held)
+    covariance = torch.linalg.inv(now.information() + torch.eye(len(z), dtype=torch.float64))
+    spread = torch.linalg.cholesky(covariance[leaping][:, leaping])
+    following = torch.linalg.solve_triangular(spread, covariance[leaping], upper=False)
+    generator = torch.Generator().manual_seed(0)
+    shape = DIRECTIONS * num, num
+    directions = torch.randn(shape, generator=generator, dtype=torch.float64)
+    wide = torch.linalg.solve_triangular(spread, directions.T, upper=False).T
+    leaps = torch.cat([f * directions for f in LEAPS] + [f * wide for f in WIDE_LEAPS])
+    tried = (z + (leaps @ following) * ~held).clamp(-MAX_COORDINATE, MAX_COORDINATE)
+    inner = now.by_starts.mT @ now.by_starts + torch.eye(offsets.shape[-1], dtype=torch.float64)
+    follow = torch.linalg.solve(inner, now.by_starts.mT @ now.by_parameters)  # (S, m, d)
+    followed = offsets - torch.einsum("smd,nd->nsm", follow, tried - z)
+    begun = torch.stack((followed, offsets.expand_as(followed)), 1)  # (n, 2, S, m)
+    squares = _squares(segments, tried, begun, scale)
+    losses = (squares.sum(-1) + begun.square().sum(-1)).nan_to_num(torch.inf)
+    least, chosen = losses.min(1)  # (n, S)
+    outcome = least.sum(-1) + tried.square().sum(-1)
+    best = int(outcome.argmin())
+    present = sum(float(part.square().sum()) for part in (now.residual, offsets, z))
+    if float(outcome[best]) > present - LEAST_GAIN:
+        return None
+    return tried[best], begun[best][chosen[best], torch.arange(len(offsets))]
 
 
 def _steps(

@@ -177,6 +177,21 @@ class SegmentModel:
         assert isinstance(box, SimulatorBlackBox)
         return box.simulator
 
+    @property
+    def dented_coordinates(self) -> Tensor:
+        """Which coordinates the misfit has dents along, a mask ``(d,)``; see ``has_hits``."""
+        dented = torch.zeros(self.prior.num_parameters, dtype=torch.bool)
+        names = {
+            name
+            for effect in self.simulator.effects
+            if effect.has_hits
+            for name in effect.parameter_names
+        }
+        for site in self.prior.sites:
+            if site.name in names:
+                dented[site.coordinates] = True
+        return dented
+
     def place_of(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Returns reference coordinates from which a fit may begin, ``(d,)``.
 

@@ -6,11 +6,13 @@ import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from hidden_rigs import make_case
 
 import npdr_ppl as npdr
 from npdr_ppl.errors import DataError
+from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import CoulombFriction
+from npdr_ppl.models.effects import Backlash, CoulombFriction
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
@@ -85,6 +87,24 @@ def test_a_segment_that_stands_out_stays_where_it_was_recorded():
     segments.observed[3] += 1.0
     found = fit_segments(segments, torch.zeros(1))
     assert segments.num_offsets == 0 and found.offsets.shape == (12, 0)
+
+
+def test_a_fit_leaps_out_of_the_dents_that_play_leaves_in_the_misfit():
+    case = make_case("pendulum", "one", (("hinge", "backlash"),), strength=0.72, seed=72)
+    model = add_effect(case.model, Backlash("hinge"))
+    segments = SegmentModel(model, case.fit, BindingOptions(None, 10, "uncertain", "float64"))
+    (hidden,) = case.truth
+    true = {
+        name: torch.tensor(value) for name, value in {**case.parameters, **hidden.sites}.items()
+    }
+    names = {site.name for site in segments.prior.sites}
+    start = segments.place_of({name: value for name, value in true.items() if name in names})
+    away = torch.zeros_like(start)
+    away[segments.dented_coordinates] = torch.tensor([-0.5, -0.1], dtype=torch.float64)
+    found, least = fit_segments(segments, start + away), fit_segments(segments, start)
+    scale = least.scale
+    losses = [objective(segments, fit.z, fit.offsets, scale) for fit in (found, least)]
+    assert losses[0] < losses[1] + 10.0
 
 
 def test_where_the_simulation_fails_is_said(segments, monkeypatch):
