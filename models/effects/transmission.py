@@ -47,13 +47,9 @@ def _pull(joint: Joint, share: Tensor) -> Tensor:
 
 
 class _Transmission(ForceEffect):
-    """What joins a motor to its link; how far the motor is ahead is found in the first step.
-
-    In engines other than ODE models segments start without those that came before.
-    """
+    """What joins a motor to its link; how far the motor is ahead is found in the first step."""
 
     needs_joint = True
-    runs_in = True
 
     def suits(self, port: Port) -> bool:
         """Returns whether a motor drives the joint."""
@@ -103,8 +99,7 @@ class JointElasticity(_Transmission):
     """s = k δ + d δ̇: a spring and a damper between motor and link.
 
     In terms of the free resonance ω = 1/T: δ̈ = p − ω² δ − 2 ζ ω δ̇ with the pull p of the drive,
-    solved exactly over a step in which p is constant. A segment starts with a spring that had
-    settled ten steps before.
+    solved exactly over a step in which p is constant. A segment starts with the spring settled.
     """
 
     id = "joint_elasticity"
@@ -161,8 +156,7 @@ class Backlash(_Transmission):
     """|δ| ≤ g: play of half width g between motor and link, which meet without a bounce.
 
     While the gap is open no drive reaches the link, and the link moves without the motor's
-    inertia. A segment starts with a gap that was closed ten steps before, on the side to which
-    the drive pushed.
+    inertia. A segment starts with the gap closed on the side to which the drive pushes.
     """
 
     id = "backlash"

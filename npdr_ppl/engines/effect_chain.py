@@ -81,7 +81,6 @@ class EffectChain(ABC):
         action_effects: Place, effect and action channel of each action effect.
         sensor_effects: Place, effect and sensor channels of each sensor effect.
         needs_joints: Whether a force effect asks for :class:`Joint` before every step.
-        runs_in: Whether a force effect is to be taken through the last steps before a segment.
     """
 
     def __init__(
@@ -110,7 +109,6 @@ class EffectChain(ABC):
                 columns = tuple(sensors.index(name) for name in channels)
                 self.sensor_effects.append((place, effect, columns))
         self.needs_joints = any(effect.needs_joint for _, effect, _ in self.force_effects)
-        self.runs_in = any(effect.runs_in for _, effect, _ in self.force_effects)
 
     @property
     def force_step(self) -> float:
@@ -232,18 +230,6 @@ class EffectChain(ABC):
                 time,
             ),
         )
-
-    def run_in(self, state: State, past: Sequence[Components], tables: Tables) -> State:
-        """Returns the state at a segment's start with the memory of what is still on its way.
-
-        Engines that are not asked for a joint before they run leave it as it is.
-
-        Args:
-            state: State at the start.
-            past: What reached the dynamics in the last steps before, latest last.
-            tables: Constants of the simulation.
-        """
-        return state
 
     def _sensor_memory(
         self,

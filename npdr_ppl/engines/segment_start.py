@@ -15,9 +15,6 @@ from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["RecordedStart", "recorded_start", "true_start", "with_past_commands"]
 
-RUN_IN = 10
-"""Steps before a segment through which force effects are taken that may still be swinging then."""
-
 
 class RecordedStart(NamedTuple):
     """What is known of the segments' start; tensors of the flat batch shape ``(N,)``.
@@ -127,9 +124,7 @@ def with_past_commands(
     records: tuple[CommandRecord, ...],
     num_steps: int,
 ) -> State:
-    """Returns the state with the effects' memory as the recorded past made it.
-
-    That of action effects, and of force effects that are run in.
+    """Returns the state with the action effects' memory as the recorded past made it.
 
     Args:
         chain: The effects.
@@ -138,10 +133,8 @@ def with_past_commands(
         records: Commands of each action channel.
         num_steps: Steps of the past that are on record.
     """
-    reached: list[Components] = []
-    if chain.action_effects or chain.runs_in:
+    if chain.action_effects:
         for step in range(-num_steps, 0):
             views = tuple(record.view(step) for record in records)
-            state, actions, _ = chain.act(state, commands_at(records, step), tables, views)
-            reached.append(actions)
-    return chain.run_in(state, reached[-RUN_IN:], tables)
+            state, _, _ = chain.act(state, commands_at(records, step), tables, views)
+    return state

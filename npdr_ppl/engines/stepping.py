@@ -1,6 +1,5 @@
 """One step of a mechanical system with its effects: what open and closed loop share."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -59,27 +58,6 @@ class Stepper(EffectChain):
         """Returns the accelerations without any effect."""
         none = (0.0,) * len(positions)
         return self.simulator.accelerations(positions, velocities, actions, none, tables.constants)
-
-    def run_in(self, state: State, past: Sequence[Components], tables: Tables) -> State:
-        """Returns the state with the memory of what was on its way; see the base class.
-
-        The joints are held where the segment starts: over so few steps commands change most.
-        """
-        memory = state.force_memory
-        for actions in past if self.runs_in else ():
-            for _ in range(self.simulator.substeps):
-                now = state._replace(force_memory=memory)
-                memory = self.begin_step(
-                    now, self._joints(now, actions, tables), tables
-                ).force_memory
-        return state._replace(
-            force_memory=tuple(
-                changed if effect.runs_in else kept
-                for (_, effect, _), kept, changed in zip(
-                    self.force_effects, state.force_memory, memory, strict=True
-                )
-            )
-        )
 
     def move(
         self, state: State, actions: Components, tables: Tables, moments: Moments = ()

@@ -160,14 +160,10 @@ class ForceEffect(Effect):
     Attributes:
         needs_joint: Whether :meth:`begin_step` is called, which costs the engine two evaluations
             of the accelerations per step.
-        runs_in: Whether :meth:`begin_step` is also called for the last steps before a segment,
-            with the joint as it is at the start under the commands of then: what drives push
-            against may still be swinging or on its way.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("force",)
     needs_joint: ClassVar[bool] = False
-    runs_in: ClassVar[bool] = False
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Any:
         """Returns the effect's own state at a segment's start; ``None`` if it has none."""

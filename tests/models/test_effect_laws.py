@@ -33,7 +33,6 @@ from npdr_ppl.models.effects import (
 from npdr_ppl.models.emps import Emps
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.pendulum import Pendulum
-from npdr_ppl.rollouts import Rollouts
 from tests.models.effect_replay import FREE, replay
 
 
@@ -243,41 +242,6 @@ def test_a_gap_is_crossed_within_a_step_as_in_short_ones():
     coarse, fine = replayed(), replayed(substeps=100)
     torch.testing.assert_close(coarse[:, 0], fine[:, 0], rtol=0.0, atol=0.01 * play * share)
     torch.testing.assert_close(coarse[:, 1], fine[:, 1], rtol=0.0, atol=0.01 * 2.0 * play * share)
-
-
-@pytest.mark.parametrize(
-    ("effect", "shape"),
-    [
-        (Backlash("carriage"), {"play": 1e-4, "motor_share": 0.35}),
-        (
-            JointElasticity("carriage"),
-            {"time_constant": 1e-3, "damping_ratio": 0.2, "motor_share": 0.35},
-        ),
-    ],
-)
-def test_a_segment_begins_with_what_was_under_way(effect, shape):
-    """A motor between its flanks, or that swings, as the commands before have left it."""
-    simulator = Emps(integrator="rk4").with_effects(effect)
-    parameters = FREE | {f"{effect.name}.{name}": value for name, value in shape.items()}
-    drive = torch.cat((torch.full((102,), 2.0), torch.full((100,), -2.0)))
-    whole = replay(simulator, parameters, drive).numpy()
-    rollouts = Rollouts.from_arrays(
-        [np.concatenate(([[0.0, 0.0]], whole))],
-        [drive[:, None].numpy()],
-        channel_names=("position", "velocity"),
-        action_names=("voltage",),
-        time_step=Emps.time_step,
-    )
-
-    def error(**options):
-        inputs = rollouts.inputs(105, initial_state="recorded", **options)
-        parts = simulator.simulate(
-            {name: torch.tensor(value).double() for name, value in parameters.items()}, inputs
-        )
-        return (parts - rollouts.observation(inputs)).abs()[1].max()
-
-    # The second begins three steps after the drive has turned round.
-    assert error() < 0.05 * error(history=0)
 
 
 def test_an_elastic_joint_rings_at_its_resonance_about_its_centre_of_mass():
