@@ -28,7 +28,7 @@ from npdr_ppl.models.effects.references import SPONG_1987, TAO_1996
 
 __all__ = ["Backlash", "JointElasticity"]
 
-_Memory = tuple[Tensor, ...]
+_Memory = tuple[Tensor, Tensor, Tensor, Tensor]
 """How far the motor is ahead (NaN before it is known), the rate of that, the mean force and the
 force's moment within the step."""
 

@@ -185,8 +185,7 @@ def _leap(
     if not num:
         return None
     now = segments.linearise(z, offsets, scale)
-    parts = (now.residual, now.by_parameters, now.by_starts)
-    if not all(bool(part.isfinite().all()) for part in parts):
+    if not now.is_finite:
         return None
     now = replace(now, by_parameters=now.by_parameters * ~held)
     covariance = torch.linalg.inv(now.information() + torch.eye(len(z), dtype=torch.float64))
@@ -247,8 +246,7 @@ def _steps(
     for _ in range(max_steps):
         now = segments.linearise(z, offsets, scale, is_rough=is_rough)
         now = replace(now, by_parameters=now.by_parameters * ~held)
-        parts = (now.residual, now.by_parameters, now.by_starts)
-        if not all(bool(part.isfinite().all()) for part in parts):
+        if not now.is_finite:
             break
         present = sum(float(part.square().sum()) for part in (now.residual, offsets, z))
         moves = [_step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]

@@ -67,6 +67,12 @@ class Linearisation:
     by_parameters: Tensor
     by_starts: Tensor
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether the simulation succeeded at the point and everywhere beside it."""
+        parts = self.residual, self.by_parameters, self.by_starts
+        return all(bool(part.isfinite().all()) for part in parts)
+
     def weights(self) -> Tensor:
         """Returns C⁻¹ J, ``(S, N, d)``, with the initial states integrated out.
 

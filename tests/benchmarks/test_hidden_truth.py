@@ -157,6 +157,7 @@ def test_small_play_is_no_elasticity_and_a_fast_shaft_is_not_damped_by_the_integ
     hidden = drawn(rig.port("carriage"), effect_id, strength, np.random.default_rng(7))
     rollouts = after_silence(truth(rig, (hidden,), 0.8, is_from_rest=True).rollouts)
     without = size(simulated(rig, rig.simulator(), rollouts))
+    # What soft flanks, a damping integrator or a coarse law leave is half of it and more.
     assert size(simulated(rig, rig.simulator(), rollouts, (hidden,))) < 0.1 * without
 
 
