@@ -117,7 +117,10 @@ class Stepper(EffectChain):
         q, v = simulator.integrator.step(acceleration, *start, first, self._substep)
         if shifts is not None:
             q = tuple(qi + shift for qi, shift in zip(q, shifts, strict=True))
-            # What moved further was faster on the way, and more was damped.
+        if shifts is not None and any(moment is not None for moment in within):
+            # What moved further was faster on the way, and more was damped. Springs' and impacts'
+            # forces move things far within a step; where a command changes, this is below a
+            # hundredth of its delay and not worth another evaluation.
             h = self._substep
             faster = tuple(
                 vi + shift / h for vi, shift in zip(state.velocities, shifts, strict=True)
