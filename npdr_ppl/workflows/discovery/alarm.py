@@ -11,6 +11,7 @@ from npdr_ppl.workflows.discovery.generic_laws import (
     GenericLaw,
     generic_laws,
     reading_laws,
+    ringing_laws,
     ripple_laws,
     wave_laws,
 )
@@ -21,11 +22,11 @@ from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.screening import Screened
 from npdr_ppl.workflows.discovery.sensitivities import Variant
 
-__all__ = ["Alarm", "sound_alarm"]
+__all__ = ["Alarm", "gains_of", "sound_alarm"]
 
-CATALOGUE_SHARE, LAW_SHARE, MOMENT_SHARE = 0.7, 0.2, 0.1
-"""Shares of the false alarms that the catalogue's candidates, generic laws and forces at some
-moments may raise."""
+CATALOGUE_SHARE, LAW_SHARE, RINGING_SHARE, MOMENT_SHARE = 0.6, 0.2, 0.1, 0.1
+"""Shares of the false alarms that the catalogue's candidates, generic laws, what rings and forces
+at some moments may raise."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,9 @@ def sound_alarm(
     """
     chance = LargestStatistic(projection, seed=options.seed)
     generic = generic_laws(found, sensors) + reading_laws(projection)
-    gained = _gains(projection, generic)
+    gained = gains_of(projection, generic)
     laws = [law for law, _ in gained]
+    ringing = ringing_laws(projection)
     waves = wave_laws(found)
     listed = [wave for port in waves.values() for wave in port] + ripple_laws(found, sensors)
     # Each kind is a search of its own: a hundred laws that no one believes in must not make the
@@ -81,9 +83,9 @@ def sound_alarm(
     for variant, p in zip(variants, chance.p_values([v.change for v in variants]), strict=True):
         name = variant.effect.name
         values[name] = min(values.get(name, 1.0), p / CATALOGUE_SHARE)
-    groups = [law.change for law in (*laws, *listed)]
-    for law, p in zip((*laws, *listed), chance.p_values(groups), strict=True):
-        values[law.name] = min(1.0, p / LAW_SHARE)
+    for kind, share in (((*laws, *listed), LAW_SHARE), (ringing, RINGING_SHARE)):
+        for law, p in zip(kind, chance.p_values([law.change for law in kind]), strict=True):
+            values[law.name] = min(1.0, p / share)
     for effect in {v.effect.name: v.effect for v in variants if v.effect.wave}.values():
         own = [values[wave.name] for wave in waves.get(effect.port, [])]
         values[effect.name] = min([values[effect.name], *own])
@@ -91,7 +93,7 @@ def sound_alarm(
     for moment in moments:
         values[moment.name] = min(1.0, len(moments) * moment.p_value / MOMENT_SHARE)
     gains = {candidate.name: candidate.gain for candidate in ranking}
-    gains |= {law.name: gain for law, gain in gained}
+    gains |= {law.name: gain for law, gain in (*gained, *gains_of(projection, ringing))}
     # Segments stand out by chance, and what they stand out by is no gain before it is heard.
     heard = [moment for moment in moments if values[moment.name] <= options.false_alarm_rate]
     gains |= {moment.name: moment.gain for moment in heard}
@@ -109,12 +111,23 @@ def sound_alarm(
     )
 
 
-def _gains(projection: Projection, laws: list[GenericLaw]) -> list[tuple[GenericLaw, float]]:
-    """Returns the laws that refitted parameters do not explain, and what each would gain."""
+def gains_of(projection: Projection, laws: list[GenericLaw]) -> list[tuple[GenericLaw, float]]:
+    """Returns the laws that refitted parameters do not explain, and what each would gain.
+
+    Args:
+        projection: The fitted hypothesis.
+        laws: The laws.
+    """
     if not laws:
         return []
     scores = projection.scores(torch.cat([law.change for law in laws], dim=-1))
-    gains = scores.score.square() / scores.information.diagonal().clamp_min(1e-30)
-    # What is absorbed up to rounding errors leaves nothing to judge.
-    rows = zip(laws, gains.tolist(), scores.absorbed.tolist(), strict=True)
-    return [(law, gain) for law, gain, absorbed in rows if absorbed < 1.0 - 1e-6]
+    result, last = [], 0
+    for law in laws:
+        first, last = last, last + law.change.shape[-1]
+        own = slice(first, last)
+        # What is absorbed up to rounding errors leaves nothing to judge.
+        if float(scores.absorbed[own].min()) < 1.0 - 1e-6:
+            score = scores.score[own]
+            inverse = torch.linalg.pinv(scores.information[own, own], hermitian=True)
+            result.append((law, float(score @ inverse @ score)))
+    return result

@@ -22,6 +22,7 @@ __all__ = [
     "GenericLaw",
     "generic_laws",
     "reading_laws",
+    "ringing_laws",
     "ripple_laws",
     "strongest_frequency",
     "wave_laws",
@@ -35,6 +36,15 @@ FREQUENCIES = 120
 
 RIPPLES = 40
 """Wave numbers tried of a ripple, spaced by half the resolution of a position's range."""
+
+RINGS = 30
+"""Frequencies tried of what rings …"""
+
+SLOWEST_RING = 0.02
+"""… from so many periods per time step to half of one, evenly in their logarithm …"""
+
+RING_DAMPING = 0.1
+"""… with this damping ratio."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +143,57 @@ def reading_laws(projection: Projection) -> list[GenericLaw]:
             change = segments.whitened(error, hypothesis.fit.scale)
             laws.append(GenericLaw(f"{sensor.name}: error of {name}", change[..., None]))
     return laws
+
+
+def ringing_laws(projection: Projection) -> list[GenericLaw]:
+    """Returns what a part that rings after every change of speed would change.
+
+    A mass on a spring that the measured part carries, or that carries it; which phase its swing
+    has in the readings is left open. A segment begins without a swing.
+
+    Args:
+        projection: The fitted model.
+    """
+    hypothesis, segments = projection.hypothesis, projection.hypothesis.segments
+    simulated = (segments.observed - hypothesis.difference).double()
+    steps = torch.arange(simulated.shape[1])
+    ages = (steps[:, None] - steps).clamp_min(0)
+    laws = []
+    for name, position, rate in _motions(segments.measured):
+        moving = simulated[..., position if rate is None else rate]
+        if rate is None:
+            moving = moving.diff(dim=1, prepend=moving[:, :1])
+        kick = moving.diff(dim=1, prepend=moving[:, :1])
+        for periods in torch.logspace(math.log10(SLOWEST_RING), math.log10(0.5), RINGS).tolist():
+            angle = 2.0 * math.pi * periods
+            decay = complex(-RING_DAMPING, math.sqrt(1.0 - RING_DAMPING**2)) * angle
+            after = torch.exp(decay * ages).tril()
+            swing = kick.to(after.dtype) @ after.mT  # of the rate, (S, K)
+            changed = torch.zeros((*simulated.shape, 2), dtype=torch.float64)
+            if rate is not None:
+                changed[..., rate, :] = torch.view_as_real(swing)
+            if position is not None:
+                h = 1.0 if rate is None else segments.inputs.time_step
+                changed[..., position, :] = torch.view_as_real(swing * h / decay)
+            change = torch.stack(
+                [segments.whitened(c, hypothesis.fit.scale) for c in changed.unbind(-1)], dim=-1
+            )
+            frequency = periods / segments.inputs.time_step
+            laws.append(GenericLaw(f"{name}: ringing at {frequency:.3g} Hz", change))
+    return laws
+
+
+def _motions(measured: Sequence[Channel]) -> list[tuple[str, int | None, int | None]]:
+    """Returns what moves: its name, and the columns of its position and its velocity."""
+    columns = {sensor.name: c for c, sensor in enumerate(measured)}
+    positions = {s.rate_of: c for c, s in enumerate(measured) if s.rate_of}
+    result: list[tuple[str, int | None, int | None]] = [
+        (sensor.name, c, positions.get(sensor.name))
+        for c, sensor in enumerate(measured)
+        if not sensor.rate_of
+    ]
+    alone = (s for s in measured if s.rate_of and s.rate_of not in columns)
+    return result + [(s.name, None, columns[s.name]) for s in alone]
 
 
 def strongest_frequency(projection: Projection, found: Responses, port: str) -> float:

@@ -23,6 +23,7 @@ from npdr_ppl.models.effects import (
     Spring,
     ViscousFriction,
     Wind,
+    candidate_effects,
 )
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 
@@ -141,6 +142,17 @@ def test_an_effect_outside_the_catalogue_is_unknown():
     _, found = discover("pendulum", "outside", (place,), strength=0.15, max_effects=2)
     assert found.verdict == "unknown", found.effects
     assert found.remainder.fired
+
+
+def test_a_resonance_without_its_entry_is_unknown():
+    """Play is as like it as anything, and explains a part."""
+    effects = tuple(
+        e for e in candidate_effects(Pendulum()) if e.id != "joint_elasticity" and not e.is_noise
+    )
+    place = ("hinge", "joint_elasticity")
+    _, found = discover("pendulum", "one", (place,), strength=0.3, max_effects=2, effects=effects)
+    assert found.verdict == "unknown", found.reason
+    assert "ringing" in found.remainder.loudest
 
 
 @pytest.mark.parametrize(

@@ -24,11 +24,12 @@ from npdr_ppl.models.effects import (
     candidate_effects,
 )
 from npdr_ppl.models.pendulum import Pendulum, pendulum
+from npdr_ppl.workflows.discovery.alarm import RINGING_SHARE, gains_of
 from npdr_ppl.workflows.discovery.chance import LargestStatistic
 from npdr_ppl.workflows.discovery.credible import Estimate
 from npdr_ppl.workflows.discovery.equivalents import equivalents, irreducible
 from npdr_ppl.workflows.discovery.evidence import weigh
-from npdr_ppl.workflows.discovery.generic_laws import reading_laws
+from npdr_ppl.workflows.discovery.generic_laws import reading_laws, ringing_laws
 from npdr_ppl.workflows.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.workflows.discovery.latent_force import latent_force, responses
 from npdr_ppl.workflows.discovery.projection import Projection, loss_without
@@ -109,6 +110,29 @@ def test_errors_of_a_sensor_that_depend_on_its_reading_are_no_chance(quiet):
     values = LargestStatistic(projection, seed=0).p_values(groups)
     assert names[values.index(min(values))].startswith("angle: error of ")
     assert min(values) < 0.01
+
+
+def test_what_rings_is_heard_at_its_frequency(quiet):
+    hidden = make_case(
+        "pendulum", "one", (("hinge", "joint_elasticity"),), strength=1.0, seed=2001
+    )
+    binding = npdr.DiscoveryOptions().binding(hidden.fit)
+    ringing = Projection(fit_hypothesis(hidden.model, hidden.fit, binding))
+
+    def heard(projection):
+        laws = ringing_laws(projection)
+        values = LargestStatistic(projection, seed=0).p_values([law.change for law in laws])
+        gains = [gain for _, gain in gains_of(projection, laws)]
+        return min(values), laws[gains.index(max(gains))].name
+
+    from_which_on = RINGING_SHARE * npdr.DiscoveryOptions().false_alarm_rate
+    assert heard(Projection(quiet))[0] > from_which_on
+    p_value, loudest = heard(ringing)
+    assert p_value <= from_which_on
+    (true,) = hidden.truth
+    frequency = 1.0 / (2.0 * math.pi * true.parameters["time_constant"])
+    found = float(loudest.removeprefix("angle: ringing at ").removesuffix(" Hz"))
+    assert found == pytest.approx(frequency, rel=0.15)
 
 
 def test_the_latent_force_is_the_drag(dragged):
