@@ -197,9 +197,7 @@ def _leap(
     wide = torch.linalg.solve_triangular(spread, directions.T, upper=False).T
     leaps = torch.cat([f * directions for f in LEAPS] + [f * wide for f in WIDE_LEAPS])
     tried = (z + (leaps @ following) * ~held).clamp(-MAX_COORDINATE, MAX_COORDINATE)
-    inner = now.by_starts.mT @ now.by_starts + torch.eye(offsets.shape[-1], dtype=torch.float64)
-    follow = torch.linalg.solve(inner, now.by_starts.mT @ now.by_parameters)  # (S, m, d)
-    followed = offsets - torch.einsum("smd,nd->nsm", follow, tried - z)
+    followed = offsets - torch.einsum("smd,nd->nsm", now.followed(), tried - z)
     begun = torch.stack((followed, offsets.expand_as(followed)), 1)  # (n, 2, S, m)
     squares = _squares(segments, tried, begun, scale)
     losses = (squares.sum(-1) + begun.square().sum(-1)).nan_to_num(torch.inf)

@@ -79,9 +79,13 @@ class Linearisation:
         J is the derivative by the parameters and C = 1 + G Gᵀ the covariance of the residuals,
         with the derivative G by the offsets, which are standard normal.
         """
+        return self.by_parameters - self.by_starts @ self.followed()
+
+    def followed(self) -> Tensor:
+        """Returns how much of each parameter's change the offsets take back, ``(S, m, d)``."""
         by_z, by_start = self.by_parameters, self.by_starts
         inner = by_start.mT @ by_start + torch.eye(by_start.shape[-1], dtype=torch.float64)
-        return by_z - by_start @ torch.linalg.solve(inner, by_start.mT @ by_z)
+        return torch.linalg.solve(inner, by_start.mT @ by_z)
 
     def information(self) -> Tensor:
         """Returns the Fisher information Jᵀ C⁻¹ J of the parameters, ``(d, d)``."""
