@@ -3,8 +3,8 @@
 Polynomials, signs and products of whatever is recorded, waves in time, and ripples: waves in a
 position, by themselves or as a factor of a command or of the direction of motion. Each is a force
 at a joint, and what it would change is a weighted sum of the responses to pulses. Errors of a
-sensor are functions of what it reads. And what is carried on a spring, or stands on one, rings after
-every change of speed.
+sensor are functions of what it reads. And what is carried on a spring, or stands on one, rings
+after every change of speed.
 """
 
 import math
