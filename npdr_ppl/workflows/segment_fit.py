@@ -197,7 +197,7 @@ def _leap(
     wide = torch.linalg.solve_triangular(spread, directions.T, upper=False).T
     leaps = torch.cat([f * directions for f in LEAPS] + [f * wide for f in WIDE_LEAPS])
     tried = (z + (leaps @ following) * ~held).clamp(-MAX_COORDINATE, MAX_COORDINATE)
-    followed = offsets - torch.einsum("smd,nd->nsm", now.followed(), tried - z)
+    followed = offsets - torch.einsum("smd,nd->nsm", now.taken_back(), tried - z)
     begun = torch.stack((followed, offsets.expand_as(followed)), 1)  # (n, 2, S, m)
     squares = _squares(segments, tried, begun, scale)
     losses = (squares.sum(-1) + begun.square().sum(-1)).nan_to_num(torch.inf)

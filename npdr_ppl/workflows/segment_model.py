@@ -79,9 +79,9 @@ class Linearisation:
         J is the derivative by the parameters and C = 1 + G Gᵀ the covariance of the residuals,
         with the derivative G by the offsets, which are standard normal.
         """
-        return self.by_parameters - self.by_starts @ self.followed()
+        return self.by_parameters - self.by_starts @ self.taken_back()
 
-    def followed(self) -> Tensor:
+    def taken_back(self) -> Tensor:
         """Returns how much of each parameter's change the offsets take back, ``(S, m, d)``."""
         by_z, by_start = self.by_parameters, self.by_starts
         inner = by_start.mT @ by_start + torch.eye(by_start.shape[-1], dtype=torch.float64)

@@ -127,7 +127,5 @@ def gains_of(projection: Projection, laws: list[GenericLaw]) -> list[tuple[Gener
         own = slice(first, last)
         # What is absorbed up to rounding errors leaves nothing to judge.
         if float(scores.absorbed[own].min()) < 1.0 - 1e-6:
-            score = scores.score[own]
-            inverse = torch.linalg.pinv(scores.information[own, own], hermitian=True)
-            result.append((law, float(score @ inverse @ score)))
+            result.append((law, scores.gain(own)))
     return result

@@ -207,15 +207,11 @@ def strongest_frequency(projection: Projection, found: Responses, port: str) -> 
     """
     frequencies = _frequencies(found)
     change = found.by_port[port]
-    gains = []
+    gains: list[float] = []
     for chunk in frequencies.split(20):
         waves = torch.cat([_wave(found, frequency) for frequency in chunk.tolist()], dim=-1)
         scores = projection.scores(change @ waves)
-        for k in range(len(chunk)):
-            own = slice(2 * k, 2 * k + 2)
-            score = scores.score[own]
-            inverse = torch.linalg.pinv(scores.information[own, own], hermitian=True)
-            gains.append(float(score @ inverse @ score))
+        gains += [scores.gain(slice(2 * k, 2 * k + 2)) for k in range(len(chunk))]
     return float(frequencies[max(range(len(gains)), key=gains.__getitem__)])
 
 

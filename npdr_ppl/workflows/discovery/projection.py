@@ -53,6 +53,12 @@ class Scores:
         """Share of each column that refitted parameters explain, ``(P,)``."""
         return 1.0 - self.information.diagonal() / self.total.clamp_min(1e-30)
 
+    def gain(self, own: slice) -> float:
+        """Returns by how much some of the columns together reduce the misfit."""
+        score = self.score[own]
+        inverse = torch.linalg.pinv(self.information[own, own], hermitian=True)
+        return float(score @ inverse @ score)
+
 
 class Projection:
     """A fitted hypothesis, ready to be asked about columns.

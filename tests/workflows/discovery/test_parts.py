@@ -132,6 +132,7 @@ def test_what_rings_is_heard_at_its_frequency(quiet):
     (true,) = hidden.truth
     frequency = 1.0 / (2.0 * math.pi * true.parameters["time_constant"])
     found = float(loudest.removeprefix("angle: ringing at ").removesuffix(" Hz"))
+    # The next frequency that is tried is a ninth away.
     assert found == pytest.approx(frequency, rel=0.15)
 
 
