@@ -11,6 +11,7 @@ import math
 from torch.distributions import constraints
 
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.discovery.evidence import INDISTINCT
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.trials import Trials
@@ -29,7 +30,7 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
     are only unknown; the law needs them nowhere. Those between two bounds have no limit: at its
     bounds a share or a damping ratio is a device's as well. Incidental ones do not count: bristles
     without damping are bristles. Of a wave's frequency the low end does: no other law is a fast
-    wave.
+    wave; and where no rollout lasts a period, something else may bend like the part that is seen.
 
     Args:
         current: The model with the effect, fitted.
@@ -38,6 +39,8 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
     """
     if not effect.strength:
         return ()
+    if effect.wave and not _is_seen_through(current, effect, trials.rollouts):
+        return (effect.wave,)
     priors = effect.priors(current.simulator.port(effect.port))
     shapes = {
         site: parameter.name
@@ -59,3 +62,10 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
         if near < INDISTINCT and far > DISTINCT:
             result.append(name)
     return tuple(result)
+
+
+def _is_seen_through(current: Hypothesis, effect: Effect, rollouts: Rollouts) -> bool:
+    """Returns whether a rollout lasts for a period of a wave."""
+    frequency = float(current.parameters[f"{effect.name}.{effect.wave}"])
+    steps = max(len(readings) - 1 for readings in rollouts.readings)
+    return frequency * steps * rollouts.time_step >= 1.0

@@ -156,16 +156,21 @@ def test_a_resonance_without_its_entry_is_unknown():
 
 
 @pytest.mark.parametrize(
-    ("hidden", "instead", "shape"),
+    ("hidden", "strength", "instead", "shape"),
     [
-        ("quadratic_drag", Wind("hinge"), "speed"),
-        ("viscous_friction", FrictionDrift("hinge"), "time_constant"),  # as long as it does not
-        ("bias", PeriodicDisturbance("hinge"), "frequency"),  # an hour's wave
+        ("quadratic_drag", 1.0, Wind("hinge"), "speed"),
+        # as long as it does not fade
+        ("viscous_friction", 1.0, FrictionDrift("hinge"), "time_constant"),
+        ("bias", 1.0, PeriodicDisturbance("hinge"), "frequency"),  # an hour's wave
+        # Half a minute's, of which rollouts have five seconds: a force that large is more like it.
+        ("bias", 20.0, PeriodicDisturbance("hinge"), "frequency"),
     ],
 )
-def test_a_law_that_may_as_well_be_its_limit_is_not_named(hidden, instead, shape):
-    others = (instead, CoulombFriction("hinge"))
-    _, found = discover("pendulum", "one", (("hinge", hidden),), effects=others, max_effects=1)
+def test_a_law_that_may_as_well_be_its_limit_is_not_named(hidden, strength, instead, shape):
+    others, place = (instead, CoulombFriction("hinge")), ("hinge", hidden)
+    _, found = discover(
+        "pendulum", "one", (place,), strength=strength, effects=others, max_effects=1
+    )
     (finding,) = found.effects
     assert finding.effect.id == instead.id and finding.at_edge == (shape,)
     assert found.verdict == "unknown"
