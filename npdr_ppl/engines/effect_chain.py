@@ -359,8 +359,7 @@ class EffectChain(ABC):
             reached, memory[k] = effect.act(seen, tables.effects[place], memory[k], self.time_step)
             if isinstance(reached, Uneven):
                 reached, moment = reached
-                known = moments[channel]
-                moments[channel] = moment if known is None else known + moment
+                _add(moments, channel, moment)
             present[channel] = reached
             if self.histories[k]:
                 past[k] = (command, *past[k][:-1])
@@ -414,21 +413,16 @@ class EffectChain(ABC):
             force = effect.force(
                 positions[joint], velocities[joint], tables.effects[place], state.force_memory[k]
             )
-            if force is not None:
-                present = forces[joint]
-                forces[joint] = force if present is None else present + force
+            _add(forces, joint, force)
         return tuple(forces)
 
     def force_moments(self, state: State, tables: Tables) -> tuple[Tensor | None, ...]:
         """Returns the moments of the forces within the step that has begun, per joint."""
         moments: list[Tensor | None] = [None] * len(state.positions)
         for k, (place, effect, joint) in enumerate(self.force_effects):
-            if not effect.needs_joint:
-                continue
-            moment = effect.moment(tables.effects[place], state.force_memory[k])
-            if moment is not None:
-                present = moments[joint]
-                moments[joint] = moment if present is None else present + moment
+            if effect.needs_joint:
+                moment = effect.moment(tables.effects[place], state.force_memory[k])
+                _add(moments, joint, moment)
         return tuple(moments)
 
     def begin_step(self, state: State, joints: Sequence[Joint | None], tables: Tables) -> State:
@@ -458,9 +452,7 @@ class EffectChain(ABC):
                 tables.effects[place],
                 state.force_memory[k],
             )
-            if bound is not None:
-                present = bounds[joint]
-                bounds[joint] = bound if present is None else present + bound
+            _add(bounds, joint, bound)
         return tuple(bounds)
 
     def next_force_memory(self, state: State, tables: Tables) -> tuple[Any, ...]:
@@ -494,3 +486,10 @@ def needed_histories(
         if isinstance(effect, kind)
     ]
     return tuple(-(-number // _HISTORY_GRAIN) * _HISTORY_GRAIN for number in needed)
+
+
+def _add(totals: list[Tensor | None], place: int, part: Tensor | None) -> None:
+    """Adds to a total; ``None`` is nothing, and costs no operation."""
+    total = totals[place]
+    if part is not None:
+        totals[place] = part if total is None else total + part
