@@ -4,7 +4,8 @@ No law of what is recorded is resembled by a force that comes when it likes. But
 residuals of a segment lie along what a force would change, and where it does not, they lie
 anywhere. In every segment the residuals' energy along the largest responses to pulses is compared
 with that in all other directions (an F statistic), and with the same in the segment in the middle,
-since coloured noise resembles a force everywhere. Outliers enlarge what they are compared with.
+since coloured noise resembles a force everywhere. A single reading that is far off may lie where
+all forces end; the one that speaks most for a force is left out of its segment.
 
 A few segments stand out by chance. Of the k smallest of S tail probabilities the greatest is p
 with the probability that at least k of S are below p (higher criticism; Donoho & Jin 2004), and
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy import special
+from torch import Tensor
 
 from npdr_ppl.workflows.discovery.chance import FEWEST_BLOCKS
 from npdr_ppl.workflows.discovery.latent_force import Responses
@@ -53,22 +55,23 @@ def forces_at_moments(projection: Projection, found: Responses) -> list[Moments]
         projection: The fitted model.
         found: The responses to pulses.
     """
-    residual = projection.whitened(projection.residual[..., None])
-    num, size = residual.shape[:2]
+    residual = projection.whitened(projection.residual[..., None])[..., 0]
+    num, size = residual.shape
     if num < FEWEST_BLOCKS:
         return []
-    whole = residual.square().sum((1, 2))
     result = []
     for port, change in found.by_port.items():
         directions = torch.linalg.svd(projection.whitened(change), full_matrices=False)[0]
         directions = directions[..., :SHAPES]
         shapes = directions.shape[-1]
-        along = (directions.mT @ residual).square().sum((1, 2))
-        across = (whole - along).clamp_min(1e-30) / (size - shapes)
-        ratio = along / shapes / across
-        usual = float(ratio.median()) / float(special.fdtri(shapes, size - shapes, 0.5))
-        usual = max(1.0, usual)
-        tails = torch.from_numpy(special.fdtrc(shapes, size - shapes, (ratio / usual).numpy()))
+        along, across = _energies(residual, directions)
+        freedom = size - shapes
+        usual = float((along / across).median()) * freedom / shapes
+        usual = max(1.0, usual / float(special.fdtri(shapes, freedom, 0.5)))
+        along, across = _energies_without_one(residual, directions)
+        across = across / (freedom - 1)
+        ratio = along / shapes / across / usual
+        tails = torch.from_numpy(special.fdtrc(shapes, freedom - 1, ratio.numpy()))
         order = tails.argsort()[:MOST]
         least = tails[order].numpy()
         together = special.bdtrc(np.arange(len(order)), num, least)
@@ -78,3 +81,30 @@ def forces_at_moments(projection: Projection, found: Responses) -> list[Moments]
         p_value = min(1.0, len(together) * float(together[best]))
         result.append(Moments(f"{port}: force at moments", p_value, float(gain)))
     return result
+
+
+def _energies(residual: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the residuals' energy along orthonormal directions and across them, ``(S,)`` each.
+
+    Args:
+        residual: Residuals, ``(S, N)``.
+        directions: The directions, ``(S, N, k)``.
+    """
+    along = torch.einsum("snk,sn->sk", directions, residual).square().sum(-1)
+    return along, (residual.square().sum(-1) - along).clamp_min(1e-30)
+
+
+def _energies_without_one(residual: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the same without the reading in each segment that speaks most for the directions.
+
+    Without its row the directions D are no longer orthonormal; by Sherman and Morrison's formula
+    (DᵀD)⁻¹ is 1 + d dᵀ / (1 − dᵀd) with d that row.
+    """
+    scores = torch.einsum("snk,sn->sk", directions, residual)[:, None]
+    scores = scores - directions * residual[..., None]  # (S, N, k), each without a reading
+    left = (1.0 - directions.square().sum(-1)).clamp_min(1e-9)
+    along = scores.square().sum(-1) + (scores * directions).sum(-1).square() / left
+    energy = residual.square()
+    across = (energy.sum(-1, keepdim=True) - energy - along).clamp_min(1e-30)
+    least = (along / across).argmin(-1, keepdim=True)
+    return along.gather(-1, least)[:, 0], across.gather(-1, least)[:, 0]

@@ -17,9 +17,9 @@ HEARD = MOMENT_SHARE * npdr.DiscoveryOptions().false_alarm_rate
 """From which on the alarm fires."""
 
 
-def seen(condition, places=()):
-    """Returns a fitted pendulum, and what pulses of force would change."""
-    case = make_case("pendulum", condition, places, strength=1.0, seed=SEED)
+def seen(condition, places=(), rig="pendulum"):
+    """Returns a fitted rig, and what pulses of force would change."""
+    case = make_case(rig, condition, places, strength=1.0, seed=SEED)
     fitted = fit_hypothesis(case.model, case.fit, npdr.DiscoveryOptions().binding(case.fit))
     return Projection(fitted), responses(fitted)
 
@@ -57,3 +57,21 @@ def test_a_kick_in_one_segment_is_heard_and_as_large_an_error_of_the_readings_is
 
     assert with_residual(kick).p_value < HEARD
     assert with_residual(error).p_value > HEARD
+
+
+def test_outliers_are_seldom_taken_for_forces():
+    """Where all forces end, a part of an outlier lies along what they change."""
+    projection, found = seen("null", rig="cart_pole")
+    quiet = projection.residual.clone()
+    generator = torch.Generator().manual_seed(0)
+
+    def uniform():
+        return torch.rand(quiet.shape, generator=generator, dtype=torch.float64)
+
+    def least_p_value():
+        projection.residual = quiet + 20.0 * (2.0 * uniform() - 1.0) * (uniform() < 0.02)
+        return min(moment.p_value for moment in forces_at_moments(projection, found))
+
+    values = [least_p_value() for _ in range(50)]
+    assert sum(p < 0.05 for p in values) <= 5  # of which 2.5 are to be expected
+    assert min(values) > HEARD
