@@ -8,8 +8,10 @@ is minimised is
 
     Σ_s |r_s(z, δ_s)|² + |δ_s|² + |z|²
 
-by damped Gauss-Newton steps (Levenberg 1944, Marquardt 1963) whose linear systems are reduced to
-the parameters segment by segment.
+by damped Gauss-Newton steps (Levenberg 1944) whose linear systems are reduced to the parameters
+segment by segment. Each parameter is damped by its own curvature (Marquardt 1963): damped alike, a
+Furuta pendulum's lengths, which are known ten thousand times better than its masses, held those up
+until steps ran out.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +26,7 @@ __all__ = ["SegmentFit", "fit_segments"]
 
 FIRST_DAMPING = 1e-2
 LIMITS = 1e-8, 1e6
-"""Of the parameters relative to the mean curvature, and of each segment's initial state."""
+"""Of the parameters relative to their curvatures, and of each segment's initial state."""
 
 NEAR = 0.1, 1.0, 10.0
 """Multiples of the last good dampings that are tried next."""
@@ -306,7 +308,7 @@ def _step(
         z: Parameters, ``(d,)``.
         offsets: Offsets, ``(S, m)``.
         held: Coordinates that stay, a mask ``(d,)``; nothing depends on them.
-        damping: Of the parameters, relative to the mean curvature.
+        damping: Of the parameters, relative to their curvatures.
         dampings: Of the offsets, by segment, ``(S,)``.
         factors: Multiples of ``dampings`` to try, among them 1.
 
@@ -329,8 +331,8 @@ def _step(
     middle = parts[1.0]
     hessian = (by_z.mT @ by_z - cross.mT @ middle[..., :d]).sum(0)
     gradient = (by_z.mT @ now.residual[..., None] - cross.mT @ middle[..., d:]).sum(0)[:, 0] - z
-    curvature = hessian.diagonal().mean().clamp_min(1.0)
-    hessian = hessian + (1.0 + damping * curvature) * torch.eye(d, dtype=torch.float64)
+    curvature = hessian.diagonal().clamp_min(1.0)
+    hessian = hessian + torch.diag(1.0 + damping * curvature)
     change = torch.linalg.solve(hessian, gradient.masked_fill(held, 0.0))
     change = change * min(1.0, LARGEST_STEP / float(change.abs().max().clamp_min(1e-12)))
     moved = (z + change).clamp(-MAX_COORDINATE, MAX_COORDINATE)
