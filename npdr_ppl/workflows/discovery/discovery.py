@@ -27,12 +27,17 @@ from npdr_ppl.workflows.discovery.result import Discovery, Finding, Verdict
 from npdr_ppl.workflows.discovery.rivals import Added
 from npdr_ppl.workflows.discovery.search import Round, Search, Searcher, explained
 from npdr_ppl.workflows.discovery.separation import separation_matrix
+from npdr_ppl.workflows.discovery.trials import PLAINLY
 from npdr_ppl.workflows.segment_model import SegmentModel
 
 __all__ = ["Investigation", "discover"]
 
 MOST_UNEXPLAINED = 0.01
 """Share of the misfit that may stay unexplained where what was found is to be called the cause."""
+
+MOST_UNHEARD = 0.05
+"""The same where the alarm takes what is left for chance, although it is worth as much evidence as
+settles which of two it is."""
 
 MINOR = 0.1
 """Share of the findings that may be in doubt where the rest is to be called named."""
@@ -276,7 +281,10 @@ def _judge(
         return "unknown", "Simulation and recording disagree, and no effect explains it."
     left = search.rounds[-1].alarm
     # Of one look, however many there were: it adds nothing, it only says that something is left.
-    if left.p_value <= options.false_alarm_rate and unexplained > MOST_UNEXPLAINED:
+    is_heard = left.p_value <= options.false_alarm_rate
+    # The alarm allows for every kind of noise, and misses what shows in few segments.
+    is_plain = 0.5 * search.final.share * left.gain > PLAINLY
+    if (is_heard and unexplained > MOST_UNEXPLAINED) or (is_plain and unexplained > MOST_UNHEARD):
         return "unknown", (
             f"What was found leaves {unexplained:.0%} of the disagreement unexplained, most of it "
             f"in {left.loudest}."

@@ -144,6 +144,14 @@ def test_an_effect_outside_the_catalogue_is_unknown():
     assert found.remainder.fired
 
 
+def test_a_silent_alarm_does_not_hide_what_is_plainly_left():
+    place = ("hinge", "bouc_wen_hysteresis")
+    case = make_case("pendulum", "outside", (place,), strength=0.276, seed=2003)
+    found = npdr.discover(case.model, case.fit)
+    assert found.remainder.p_value > npdr.DiscoveryOptions().false_alarm_rate
+    assert found.verdict == "unknown" and "unexplained" in found.reason
+
+
 def test_a_resonance_without_its_entry_is_unknown():
     """Play is as like it as anything, and explains a part."""
     effects = tuple(
