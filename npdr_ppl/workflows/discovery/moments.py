@@ -49,7 +49,9 @@ class Moments:
 
 
 def forces_at_moments(projection: Projection, found: Responses) -> list[Moments]:
-    """Tests every joint for a force that acts in some segments; too few segments say nothing.
+    """Tests every joint for a force that acts in some segments.
+
+    Too few segments say nothing, and none with hardly more readings than forces have shapes.
 
     Args:
         projection: The fitted model.
@@ -57,7 +59,7 @@ def forces_at_moments(projection: Projection, found: Responses) -> list[Moments]
     """
     residual = projection.whitened(projection.residual[..., None])[..., 0]
     num, size = residual.shape
-    if num < FEWEST_BLOCKS:
+    if num < FEWEST_BLOCKS or size < SHAPES + 2:
         return []
     result = []
     for port, change in found.by_port.items():

@@ -1,5 +1,7 @@
 """Forces that act at some moments only."""
 
+import types
+
 import torch
 from hidden_rigs import make_case
 
@@ -75,3 +77,9 @@ def test_outliers_are_seldom_taken_for_forces():
     values = [least_p_value() for _ in range(50)]
     assert sum(p < 0.05 for p in values) <= 5  # of which 2.5 are to be expected
     assert min(values) > HEARD
+
+
+def test_segments_of_few_readings_say_nothing():
+    projection, found = seen("null")
+    short = types.SimpleNamespace(residual=projection.residual[:, :4], whitened=lambda x: x)
+    assert forces_at_moments(short, found) == []
