@@ -1,5 +1,6 @@
 """Forces that act at some moments only."""
 
+import dataclasses
 import types
 
 import torch
@@ -81,5 +82,7 @@ def test_outliers_are_seldom_taken_for_forces():
 
 def test_segments_of_few_readings_say_nothing():
     projection, found = seen("null")
-    short = types.SimpleNamespace(residual=projection.residual[:, :4], whitened=lambda x: x)
-    assert forces_at_moments(short, found) == []
+    few = SHAPES + 1
+    short = types.SimpleNamespace(residual=projection.residual[:, :few], whitened=lambda x: x)
+    ports = {port: change[:, :few] for port, change in found.by_port.items()}
+    assert forces_at_moments(short, dataclasses.replace(found, by_port=ports)) == []
