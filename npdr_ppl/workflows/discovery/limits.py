@@ -67,5 +67,4 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
 def _is_seen_through(current: Hypothesis, effect: Effect, rollouts: Rollouts) -> bool:
     """Returns whether a rollout lasts for a period of a wave."""
     frequency = float(current.parameters[f"{effect.name}.{effect.wave}"])
-    steps = max(len(readings) - 1 for readings in rollouts.readings)
-    return frequency * steps * rollouts.time_step >= 1.0
+    return frequency * max(rollouts.lengths) * rollouts.time_step >= 1.0
