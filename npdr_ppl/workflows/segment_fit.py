@@ -10,7 +10,7 @@ is minimised is
 
 by damped Gauss-Newton steps (Levenberg 1944) whose linear systems are reduced to the parameters
 segment by segment. Each parameter is damped by its own curvature (Marquardt 1963): damped alike, a
-Furuta pendulum's lengths, which are known ten thousand times better than its masses, held those up
+Furuta pendulum's lengths, which are known a thousand times better than its masses, held those up
 until steps ran out.
 """
 
