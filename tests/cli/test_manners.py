@@ -153,7 +153,7 @@ def test_ctrl_c_leaves_a_run_that_continues(recording, tmp_path):
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == INTERRUPTED
+    assert process.returncode == INTERRUPTED, err
     assert f"npdr: interrupted; the same command again continues the run in {out}." in err
     assert not (out / "fit.json").exists()
 

@@ -41,6 +41,9 @@ def side_by_side(
         # Not at the top: joblib takes a quarter of a second to import.
         from joblib import Parallel, delayed
 
+        # A process whose memory has grown is replaced by a fresh one, with no harm to its work.
+        # Not in a block, which another thread could be in: the executor's own one warns.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         parallel = Parallel(number, backend="loky", return_as="generator", max_nbytes=None)
         results = cast(
             Generator[Result, None, None], parallel(delayed(function)(item) for item in items)

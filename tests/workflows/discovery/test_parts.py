@@ -2,8 +2,11 @@
 
 import json
 import math
+import os
 import runpy
+import sys
 import threading
+import time
 from dataclasses import replace
 
 import pytest
@@ -322,6 +325,19 @@ def test_what_cannot_travel_is_done_here():
             return 2 * x
 
     assert list(side_by_side(doubled, [1, 2, 3], 2)) == [2, 4, 6]
+
+
+@pytest.mark.slow
+def test_a_process_that_is_replaced_as_its_memory_has_grown_is_no_warning(recwarn):
+    def hoarding(x):
+        # A half more than what the executor takes for a leak, after the second it waits to look.
+        hoard = sys.modules["__main__"].__dict__.setdefault("hoard", [])
+        hoard.append(torch.ones(450_000_000 // 4))
+        time.sleep(1.1)
+        return os.getpid()
+
+    assert len(set(side_by_side(hoarding, range(6), 2))) > 2
+    assert not [str(warning.message) for warning in recwarn]
 
 
 class WhiteNoise:
