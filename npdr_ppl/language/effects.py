@@ -99,6 +99,11 @@ class Effect(ABC):
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Returns the priors of all parameters, scaled to the port's rated value."""
 
+    @property
+    def given_priors(self) -> Mapping[str, Distribution]:
+        """Priors that its user gave, by parameter name."""
+        return self._priors
+
     def priors(self, port: Port) -> dict[str, Distribution]:
         """Returns the priors of all parameters, the user's where given."""
         return {**self.default_priors(port), **self._priors}

@@ -6,6 +6,10 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
+import pyro.distributions
+from torch import Tensor
+from torch.distributions import Distribution
+
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps, num_finer_steps
 
@@ -38,13 +42,47 @@ def revised_source(
     handlers = [*(["add_effect"] if every else []), *(["with_finer_steps"] if num_finer else [])]
     if handlers:
         imports = [f"from npdr_ppl import {', '.join(handlers)}", *imports]
+    if any(effect.given_priors for effect in every):
+        imports = ["import pyro.distributions", "", *imports]
     lines = [head.rstrip(), "", "", *imports, "", f"{FUNCTION} = {name}"]
     lines += [f"{FUNCTION} = with_finer_steps({FUNCTION})"] * num_finer
-    lines += [f"{FUNCTION} = add_effect({FUNCTION}, {effect!r})" for effect in every]
+    for effect in every:
+        lines += _added(effect)
     lines += ["", "# Where the model came closest to the recording."]
     lines += ["CLOSEST_FIT = {"]
     lines += [f'    "{site}": {value:.6g},' for site, value in fitted.items()]
     return "\n".join([*lines, "}", ""])
+
+
+def _added(effect: Effect) -> list[str]:
+    """Returns the lines that add an effect, with the priors that its user gave it."""
+    lines, priors = [], []
+    for name, prior in effect.given_priors.items():
+        written = _distribution(prior)
+        if written is None:
+            lines.append(f"# The prior given to {effect.name}.{name} has no source: put it here.")
+        else:
+            priors.append(f'    "{name}": {written},')
+    made = repr(effect)
+    if priors:
+        lines += ["PRIORS = {", *priors, "}"]
+        made = f"{type(effect).__name__}({effect.port!r}, priors=PRIORS)"
+    return [*lines, f"{FUNCTION} = add_effect({FUNCTION}, {made})"]
+
+
+def _distribution(prior: Distribution) -> str | None:
+    """Returns a distribution of Pyro's as source; None where its class does not say how."""
+    name = type(prior).__name__
+    if getattr(pyro.distributions, name, None) is not type(prior):
+        return None
+    given = []
+    for word in inspect.signature(type(prior)).parameters:
+        value = getattr(prior, word, None)
+        if isinstance(value, Tensor) and value.ndim == 0:
+            given.append(f"{word}={value.item()!r}")
+        elif word != "validate_args":
+            return None
+    return f"pyro.distributions.{name}({', '.join(given)})"
 
 
 def _base(model: Callable[..., Any]) -> tuple[str, str]:

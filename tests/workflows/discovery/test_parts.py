@@ -9,9 +9,11 @@ import threading
 import time
 from dataclasses import replace
 
+import pyro.distributions as dist
 import pytest
 import torch
 from hidden_rigs import make_case
+from torch.distributions import AffineTransform
 
 import npdr_ppl as npdr
 from npdr_ppl.errors import DataError
@@ -193,6 +195,23 @@ def test_the_revised_source_keeps_finer_steps(tmp_path):
     model = runpy.run_path(str(path))["revised_model"]
     assert repr(model) == "pendulum + hinge.bias"
     assert repr(model.base) == "pendulum in still finer steps"
+
+
+def test_the_revised_source_keeps_priors_that_were_given(tmp_path):
+    path = tmp_path / "revised_model.py"
+    drag = QuadraticDrag("hinge", priors={"drag": dist.LogNormal(-3.0, 0.1)})
+    shifted = dist.TransformedDistribution(dist.Normal(0.0, 1.0), [AffineTransform(0.3, 0.1)])
+    bias = Bias("hinge", priors={"offset": shifted})
+    path.write_text(revised_source(pendulum, (drag, bias), {}))
+    model = runpy.run_path(str(path))["revised_model"]
+    (found, _), (other, _) = model.effects
+    prior = found.given_priors["drag"]
+    assert (type(prior), float(prior.loc), float(prior.scale)) == (
+        dist.LogNormal, -3.0, pytest.approx(0.1)
+    )  # fmt: skip
+    # Transforms of one's own have no source. The file says so and still is a model.
+    assert not other.given_priors
+    assert "# The prior given to hinge.bias.offset has no source: put it here." in path.read_text()
 
 
 def test_saving_writes_json_with_the_names_of_the_architecture(tmp_path):
