@@ -123,7 +123,10 @@ def judge(task: Task) -> dict[str, Any]:
             "seconds": found.seconds,
         }
     except Exception as error:  # a failure is a row with its message
-        row["error"] = f"{type(error).__name__}: {error}"[:300]
+        if task.condition == "bad_data" and isinstance(error, DataError):
+            row |= {"verdict": "refused", "problems": [str(error)], "effects": [], "seconds": {}}
+        else:
+            row["error"] = f"{type(error).__name__}: {error}"[:300]
     return row | {"cpu": time.process_time() - start}
 
 

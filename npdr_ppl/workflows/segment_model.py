@@ -69,9 +69,13 @@ class Linearisation:
 
     @property
     def is_finite(self) -> bool:
-        """Whether the simulation succeeded at the point and everywhere beside it."""
+        """Whether the simulation succeeded at the point and everywhere beside it.
+
+        Squares, of which sums are made, are to be finite too: what diverges takes a few steps more
+        to be infinite itself.
+        """
         parts = self.residual, self.by_parameters, self.by_starts
-        return all(bool(part.isfinite().all()) for part in parts)
+        return all(bool(part.square().sum().isfinite()) for part in parts)
 
     def weights(self) -> Tensor:
         """Returns C⁻¹ J, ``(S, N, d)``, with the initial states integrated out.
@@ -149,7 +153,8 @@ class SegmentModel:
             rollouts: The recording.
 
         Returns:
-            ``None`` if what the segments start from is certain.
+            ``None`` if what the segments start from is certain, or where simulations from what was
+            estimated fail.
         """
         starts = estimate_starts(self.black_box(z[None]), self._smoothed, rollouts)
         if starts is None:
@@ -158,6 +163,8 @@ class SegmentModel:
         segments._start_from(starts)
         unmoved = torch.zeros(self.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
         now = segments.linearise(z, unmoved, scale, is_rough=True)
+        if not now.is_finite:
+            return None
         return starts.scaled(segments.inputs, error_factors(now.residual, now.by_starts))
 
     def _start_from(self, starts: Starts | None) -> None:

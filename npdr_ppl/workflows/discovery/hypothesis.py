@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npdr_ppl.errors import DataError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.language.simulator import Simulator
@@ -64,9 +65,27 @@ class Hypothesis:
         return self.segments.observed - simulated
 
     @cached_property
-    def linearisation(self) -> Linearisation:
-        """Residuals and derivatives at the fit, whitened by its own scale."""
+    def _linearised(self) -> Linearisation:
         return self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
+
+    @property
+    def can_be_linearised(self) -> bool:
+        """Whether the simulation succeeds at the fit and everywhere beside it."""
+        return self._linearised.is_finite
+
+    @property
+    def linearisation(self) -> Linearisation:
+        """Residuals and derivatives at the fit, whitened by its own scale.
+
+        Raises:
+            DataError: Simulations fail beside the fit.
+        """
+        if not self.can_be_linearised:
+            raise DataError(
+                "Simulations fail right beside the model's closest fit; check the recording's "
+                "units, take shorter segments, or narrow the priors."
+            )
+        return self._linearised
 
     def estimated_starts(self, rollouts: Rollouts) -> Starts | None:
         """Estimates what the segments start from along the fitted motion, and how well."""

@@ -118,10 +118,17 @@ class Searcher:
         return Trials(self.model, self.rollouts, self.binding)
 
     def fit_base(self) -> Hypothesis:
-        """Fits the model as it is."""
+        """Fits the model as it is.
+
+        Raises:
+            DataError: The simulation fails at the start of the fit or beside its end, or the data
+                do not fit the model.
+        """
         self._report("fitting the model as it is")
         fitted = fit_hypothesis(self.model, self.rollouts, self.binding)
-        return self.trials.with_own_starts(fitted)
+        found = self.trials.with_own_starts(fitted)
+        _ = found.linearisation  # all that follows needs it
+        return found
 
     def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
         """Returns the hypothesis in finer steps, where its own err noticeably; else as it is.

@@ -187,7 +187,8 @@ class Trials:
         (found,) = self._fits(
             [_Fit(current.effects, current.parameters, unmoved, starts)], current.simulator
         )
-        return found or current
+        # Starts that are told badly may be such that simulations from beside them fail.
+        return current if found is None or not found.can_be_linearised else found
 
     def holding(
         self, current: Hypothesis, held: Sequence[Mapping[str, float]]

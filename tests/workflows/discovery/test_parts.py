@@ -12,7 +12,7 @@ from dataclasses import replace
 import pyro.distributions as dist
 import pytest
 import torch
-from hidden_rigs import make_case
+from hidden_rigs import make_case, places
 from torch.distributions import AffineTransform
 
 import npdr_ppl as npdr
@@ -238,6 +238,18 @@ def test_the_same_seed_finds_the_same():
     first, second = (npdr.discover(case.model, case.fit, options=options) for _ in range(2))
     assert first.effects[0].to_dict() == second.effects[0].to_dict()
     assert first.alarm == second.alarm
+
+
+@pytest.mark.parametrize(
+    ("place", "seed"),
+    [(0, 1040), (1, 1040), (1, 1041)],
+    ids=["infinite starts", "infinite derivatives", "derivatives with infinite squares"],
+)
+def test_degrees_from_which_simulations_fail_are_told_in_a_sentence(place, seed):
+    spoilt = places("cart_pole", "bad_data", seed)[place]
+    case = make_case("cart_pole", "bad_data", spoilt, seed=seed)
+    with pytest.raises(DataError, match=r"^Simulations fail .* rad; are these degrees\?$"):
+        npdr.discover(case.model, case.fit)
 
 
 def test_numbers_of_rollouts_are_no_rollouts():
