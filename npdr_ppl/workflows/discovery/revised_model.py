@@ -66,7 +66,7 @@ def _added(effect: Effect) -> list[str]:
     made = repr(effect)
     if priors:
         lines += ["PRIORS = {", *priors, "}"]
-        made = f"{type(effect).__name__}({effect.port!r}, priors=PRIORS)"
+        made = f"{made.removesuffix(')')}, priors=PRIORS)"
     return [*lines, f"{FUNCTION} = add_effect({FUNCTION}, {made})"]
 
 

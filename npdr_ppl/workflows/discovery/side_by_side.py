@@ -42,7 +42,7 @@ def side_by_side(
         from joblib import Parallel, delayed
 
         # A process whose memory has grown is replaced by a fresh one, with no harm to its work.
-        # Not in a block, which another thread could be in: the executor's own one warns.
+        # For good: it is a thread of the executor's that warns, whenever that happens.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         parallel = Parallel(number, backend="loky", return_as="generator", max_nbytes=None)
         results = cast(

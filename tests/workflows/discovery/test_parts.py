@@ -202,9 +202,11 @@ def test_the_revised_source_keeps_priors_that_were_given(tmp_path):
     drag = QuadraticDrag("hinge", priors={"drag": dist.LogNormal(-3.0, 0.1)})
     shifted = dist.TransformedDistribution(dist.Normal(0.0, 1.0), [AffineTransform(0.3, 0.1)])
     bias = Bias("hinge", priors={"offset": shifted})
-    path.write_text(revised_source(pendulum, (drag, bias), {}))
+    cogging = Cogging("hinge", order=7, priors={"sine": dist.Normal(0.1, 0.2)})
+    path.write_text(revised_source(pendulum, (drag, bias, cogging), {}))
     model = runpy.run_path(str(path))["revised_model"]
-    (found, _), (other, _) = model.effects
+    (found, _), (other, _), (ripple, _) = model.effects
+    assert ripple.order == 7 and list(ripple.given_priors) == ["sine"]
     prior = found.given_priors["drag"]
     assert (type(prior), float(prior.loc), float(prior.scale)) == (
         dist.LogNormal, -3.0, pytest.approx(0.1)
@@ -361,7 +363,8 @@ def test_what_cannot_travel_is_done_here():
 @pytest.mark.slow
 def test_a_process_that_is_replaced_as_its_memory_has_grown_is_no_warning(recwarn):
     def hoarding(x):
-        # A half more than what the executor takes for a leak, after the second it waits to look.
+        # A half more than what the executor takes for a leak, after the second it waits to look;
+        # kept where it outlives this function, which travels anew with every item.
         hoard = sys.modules["__main__"].__dict__.setdefault("hoard", [])
         hoard.append(torch.ones(450_000_000 // 4))
         time.sleep(1.1)
