@@ -32,10 +32,12 @@ import npdr_ppl as npdr
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
 from npdr_ppl.workflows.discovery.candidates import candidates_at
+from npdr_ppl.workflows.discovery.data_checks import recording_problems
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, fit_hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.proof import prove
 from npdr_ppl.workflows.discovery.search import Searcher
+from npdr_ppl.workflows.segment_model import SegmentModel
 
 SEEDS = {"tune": range(100), "test": range(1000, 1100)}
 """Seeds of both parts."""
@@ -124,7 +126,11 @@ def judge(task: Task) -> dict[str, Any]:
         }
     except Exception as error:  # a failure is a row with its message
         if task.condition == "bad_data" and isinstance(error, DataError):
-            row |= {"verdict": "refused", "problems": [str(error)], "effects": [], "seconds": {}}
+            # Reported is what the refusal names, not that there is one.
+            segments = SegmentModel(case.model, case.fit, options.binding(case.fit))
+            problems = recording_problems(segments.measured, case.fit)
+            told = [problem for problem in problems if problem in str(error)]
+            row |= {"verdict": "refused", "problems": told, "effects": [], "seconds": {}}
         else:
             row["error"] = f"{type(error).__name__}: {error}"[:300]
     return row | {"cpu": time.process_time() - start}
