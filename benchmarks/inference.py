@@ -4,6 +4,12 @@
     python benchmarks/inference.py --methods ours:snpe-c,sbi:npe-c --tasks slcp \
         --observations 1 --rounds 5 --out sequential.json
     python benchmarks/inference.py --methods ours:snpe-a --rounds 3 --seeds 50 --out seeds.json
+    python benchmarks/inference.py --methods ours:snpe-c,sbi:npe-c --observations test \
+        --samples 2000 --out test.json
+
+Observations 1 to 3 are the public ones, with their reference posteriors. ``tune`` and ``test`` are
+twenty more each, drawn from the prior predictive distribution and sampled exactly; options were
+chosen with the first and are reported with the second.
 
 All get the same number of simulations and their own defaults. With one round a fit serves all
 observations; with several there is a fit per observation. Seconds of the fit, simulations
@@ -25,12 +31,28 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from exact_posteriors import OBSERVATION_SETS, make_reference
 from methods import PEERS, Sampler, default_methods, find_method
-from tasks import DATA, TASKS, load_reference
+from tasks import DATA, TASKS, Reference, load_reference
 
 from npdr_ppl.metrics import c2st
 
-NUM_SAMPLES = 10_000
+NUM_PUBLIC = 3
+"""Observations with public reference posteriors, numbered from 1."""
+
+
+def find_reference(task: str, number: int, data: Path) -> Reference:
+    """Returns a public observation's reference posterior, or makes an exact one."""
+    if number <= NUM_PUBLIC:
+        return load_reference(task, number, data)
+    return make_reference(task, number)
+
+
+def find_observations(text: str) -> list[int]:
+    """Returns the observations' numbers: those of a set, or numbers between commas."""
+    if text in OBSERVATION_SETS:
+        return list(OBSERVATION_SETS[text])
+    return [int(k) for k in text.split(",")]
 
 
 @dataclass(frozen=True)
@@ -136,19 +158,20 @@ def seed_all(seed: int) -> None:
     np.random.seed(seed)
 
 
-def measure(keys: list[Key], data: Path, results: Results) -> None:
+def measure(keys: list[Key], data: Path, num_samples: int, results: Results) -> None:
     """Fits one method with one seed to one task and adds a row for every observation.
 
     Args:
         keys: Rows to measure; they differ in the observation only.
         data: Folder of the reference posteriors.
+        num_samples: Draws that are compared with as many of the reference posterior's.
         results: Where rows go.
     """
     sample: Sampler | None = None
     error, wall, cpu = None, 0.0, 0.0
     for key in keys:
         task = TASKS[key.task]
-        reference = load_reference(task.name, key.observation, data)
+        reference = find_reference(task.name, key.observation, data)
         if (sample is None and error is None) or key.rounds > 1:
             seed_all(key.seed)
             clock = Clock()
@@ -165,7 +188,7 @@ def measure(keys: list[Key], data: Path, results: Results) -> None:
         seed_all(key.seed + 1)
         clock = Clock()
         try:
-            draws = sample(reference.observation, NUM_SAMPLES)
+            draws = sample(reference.observation, num_samples)
             seconds = clock.read()
             score = c2st(draws, reference.samples)
         except Exception as failure:
@@ -242,11 +265,28 @@ def summarise(rows: dict[Key, Row]) -> str:
             f"{number(line['times_faster_in_all'], 8, 1)} {number(line['c2st'], 7, 4)} "
             f"{number(line['c2st_peer'], 7, 4)} {verdict[line['is_lower_or_equal']]}"
         )
+    lines += [describe_task(*names, rows) for names in dict.fromkeys(
+        (key.method, key.task) for key in rows
+    )]  # fmt: skip
     for method in dict.fromkeys(key.method for key in rows):
         own = [row for key, row in rows.items() if key.method == method]
         failed = sum(row.error is not None for row in own)
         lines.append(f"{method}: {failed} failures in {len(own)} rows")
     return "\n".join(lines)
+
+
+def describe_task(method: str, task: str, rows: dict[Key, Row]) -> str:
+    """Prints a method's mean and worst score and mean seconds of a fit over a task's rows."""
+    own = [row for key, row in rows.items() if (key.method, key.task) == (method, task)]
+    scores = [row.c2st for row in own if row.c2st is not None]
+    seconds = [row.fit_cpu for row in own if row.fit_cpu is not None]
+    mean = sum(scores) / len(scores) if scores else None
+    worst = max(scores, default=None)
+    fit = sum(seconds) / len(seconds) if seconds else None
+    return (
+        f"{method:14} {task:17} C2ST of {len(scores):3} rows: mean {number(mean, 6, 4)}, "
+        f"worst {number(worst, 6, 4)}; fit {number(fit, 6, 1)} CPU s"
+    )
 
 
 def main() -> None:
@@ -256,14 +296,16 @@ def main() -> None:
     )
     parser.add_argument("--methods", default=",".join(default_methods()))
     parser.add_argument("--tasks", default=",".join(TASKS))
-    parser.add_argument("--observations", default="1,2,3")
+    parser.add_argument("--observations", default="1,2,3", help="numbers, tune or test")
+    parser.add_argument("--samples", type=int, default=10_000, help="draws that are compared")
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--simulations", type=int, default=10_000, help="in all rounds together")
     parser.add_argument("--seeds", type=int, default=1, help="how many seeds, from 0")
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--out", type=Path, help="JSON; rows that it holds are not measured again")
     arguments = parser.parse_args()
-    if not (arguments.data / "sbibm").is_dir():
+    observations = find_observations(arguments.observations)
+    if min(observations) <= NUM_PUBLIC and not (arguments.data / "sbibm").is_dir():
         print(f"Skipped: there are no reference posteriors in {arguments.data / 'sbibm'}.")
         return
     methods = arguments.methods.split(",")
@@ -281,10 +323,11 @@ def main() -> None:
         for task in arguments.tasks.split(","):
             for method in methods:
                 keys = [
-                    Key(method, task, int(k), arguments.rounds, arguments.simulations, seed)
-                    for k in arguments.observations.split(",")
+                    Key(method, task, k, arguments.rounds, arguments.simulations, seed)
+                    for k in observations
                 ]
-                measure([key for key in keys if key not in results.rows], arguments.data, results)
+                missing = [key for key in keys if key not in results.rows]
+                measure(missing, arguments.data, arguments.samples, results)
     print(summarise(results.rows))
 
 
