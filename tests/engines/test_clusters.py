@@ -14,7 +14,7 @@ from npdr_ppl.randomness import derived_seed
 sys.path.insert(0, str(Path(__file__).parent))
 
 from faulty import FaultRates, Faulty  # noqa: E402
-from tasks import Noise  # noqa: E402
+from pool_tasks import Noise  # noqa: E402
 
 RATES = FaultRates(crash=0.05, hang=0.06, nan=0.05)
 

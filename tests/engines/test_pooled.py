@@ -126,7 +126,7 @@ def test_inference_survives_faults_and_reports_them(recording, tmp_path):
     log.mkdir()
     options = {
         "backend": backend("snpe-c", members=1), "num_simulations": 300, "embedding": "all/10",
-        "initial_state": "recorded", "seed": 1, "progress": False,
+        "segment_length": None, "initial_state": "recorded", "seed": 1, "progress": False,
     }  # fmt: skip
     with npdr.workers("threads", 2, time_limit=3.0) as used:
         clean = npdr.infer(model, rollouts, **options)
@@ -179,7 +179,8 @@ def test_the_command_line_chooses_workers(monkeypatch, capsys, recording, tmp_pa
         out = tmp_path / f"fit-{len(list(tmp_path.iterdir()))}"
         command = [
             "npdr", "fit", str(model), "--data", str(folder / "recording.csv"), "--out", str(out),
-            "--rounds", "1", "--simulations", "100", "--embedding", "all/20", "--quiet", *words,
+            "--rounds", "1", "--simulations", "100", "--embedding", "all/20", "--quiet",
+            "--segment-length", "0", "--initial-state", "estimated", *words,
         ]  # fmt: skip
         monkeypatch.setattr(sys, "argv", command)
         with pytest.raises(SystemExit) as stop:

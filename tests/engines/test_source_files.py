@@ -72,7 +72,8 @@ def test_a_run_folder_holds_what_the_simulator_was_made_from(tmp_path):
     )  # fmt: skip
     npdr.infer(
         model, rollouts, backend="abc", num_simulations=200, embedding="all/10",
-        initial_state="recorded", seed=0, progress=False, checkpoint=tmp_path / "run",
+        segment_length=None, initial_state="recorded", seed=0, progress=False,
+        checkpoint=tmp_path / "run",
     )  # fmt: skip
     (tmp_path / "mine" / "robot.xml").write_text("<mujoco/>")
     engine = json.loads((tmp_path / "run" / "run.json").read_text())["engines"]["trajectory"]

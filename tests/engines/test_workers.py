@@ -18,7 +18,7 @@ from npdr_ppl.errors import ModelError, SimulationError
 sys.path.insert(0, str(Path(__file__).parent))
 
 from faulty import FaultRates, Faulty  # noqa: E402
-from tasks import (  # noqa: E402
+from pool_tasks import (  # noqa: E402
     CountSetUps,
     FailsToLoad,
     FailsToSetUp,
@@ -175,7 +175,7 @@ def test_an_interrupt_ends_all_processes(tmp_path, executor):
         # Where the tests run in the background, a shell has told them to ignore interrupts.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "import npdr_ppl as npdr\n"
-        "from tasks import Sleep\n"
+        "from pool_tasks import Sleep\n"
         "if __name__ == '__main__':\n"
         f"    with npdr.workers({executor!r}) as used:\n"
         f"        used.pool.run(Sleep({str(tmp_path)!r}), [60.0] * 4)\n"
