@@ -32,6 +32,7 @@ import npdr_ppl as npdr
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
 from npdr_ppl.workflows.discovery.candidates import candidates_at
+from npdr_ppl.workflows.discovery.credible import posterior_draws
 from npdr_ppl.workflows.discovery.data_checks import recording_problems
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, fit_hypothesis
 from npdr_ppl.workflows.discovery.projection import Projection
@@ -288,7 +289,15 @@ def true_model_errors(case: Case, found: npdr.Discovery) -> dict[str, float] | N
         start={name: value.double() for name, value in truth.items()},
         max_steps=0,
     )
-    gap = prove(given, true, case.holdout, options.binding(case.holdout), seed=options.seed)
+    gap = prove(
+        given,
+        true,
+        case.holdout,
+        options.binding(case.holdout),
+        draws_before=found.draws_before,
+        draws_after=posterior_draws(true, seed=options.seed),
+        seed=options.seed,
+    )
     return {name: part.after for name, part in gap.items()}
 
 

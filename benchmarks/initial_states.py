@@ -14,8 +14,8 @@ from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.furuta_targets import furuta_target
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.closest_fit import closest_fit
 from npdr_ppl.workflows.control_task import control_task
+from npdr_ppl.workflows.preparation import prepare
 from npdr_ppl.workflows.real_rollouts import RealRollouts
 from npdr_ppl.workflows.rig_study import furuta_with_effects
 
@@ -57,8 +57,9 @@ def main() -> None:
         rollouts = record(rig)
         for start in ("recorded", "estimated", "uncertain"):
             options = BindingOptions("bayessim", arguments.segment_length, start, "float32")
-            found = closest_fit(model, rollouts, options)
-            arm, pole = (1e3 * found.scale[name] for name in ("arm_angle", "pole_angle"))
+            noise = prepare(model, rollouts, options).noise
+            assert noise is not None  # the model declares none
+            arm, pole = (1e3 * noise[name] for name in ("arm_angle", "pole_angle"))
             print(f"{rig:20} {start:14} {arm:9.2f} {pole:9.2f}", flush=True)
 
 

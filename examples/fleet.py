@@ -128,6 +128,7 @@ def learn(inputs: npdr.Inputs, num_simulations: int, seed: int) -> npdr.Posterio
         backend=NLE(coordinates="bounded"),
         num_simulations=num_simulations,
         embedding="all",
+        segment_length=None,
         initial_state="recorded",
         seed=seed,
     )

@@ -58,6 +58,8 @@ class FurutaRig:
         arm_friction: Dry friction of the arm's joint, in N m.
         pole_friction: Dry friction of the pole's joint, in N m.
         input_delay: Delay of the voltage, in s, rounded to the physics' half milliseconds.
+        voltage_dead_zone: Half width of the amplifier's dead zone, in V: it puts out
+            sign(u) max(|u| − δ, 0), while recordings hold u.
         velocity_time_constant: Time constant of the filter that turns differences of encoder
             readings into rates, in s; 0 reports true rates.
         encoder_counts: Encoder counts per turn; 0 reports true angles.
@@ -68,6 +70,7 @@ class FurutaRig:
     arm_friction: float = 0.0
     pole_friction: float = 0.0
     input_delay: float = 0.0
+    voltage_dead_zone: float = 0.0
     velocity_time_constant: float = 0.0
     encoder_counts: int = 2048
     tilt: tuple[float, float] = (0.0, 0.0)
@@ -132,7 +135,7 @@ class FurutaRig:
         # A voltage arrives some whole steps and some substeps after it was commanded.
         whole, late = divmod(round(self.input_delay / physics_step), num_substeps)
         voltages = [0.0] * (whole + 1)
-        limit = Furuta.actions[0].upper
+        limit, dead_zone = Furuta.actions[0].upper, self.voltage_dead_zone
         bounds = [state.upper for state in Furuta.states]
         count = 2.0 * math.pi / self.encoder_counts if self.encoder_counts else 0.0
         decay = 0.0
@@ -147,7 +150,8 @@ class FurutaRig:
         for step in range(num_steps):
             command = _voltage(controller(np.array(readings[-1]), step * time_step))
             commands.append(command)
-            voltages.append(min(max(command, -limit), limit))
+            limited = min(max(command, -limit), limit)
+            voltages.append(math.copysign(max(abs(limited) - dead_zone, 0.0), limited))
             if late:
                 data.ctrl[0] = voltages[step]
                 mujoco.mj_step(model, data, nstep=late)

@@ -8,6 +8,7 @@ import torch
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.models.furuta import Furuta, initial_states
+from npdr_ppl.models.furuta_hidden_rigs import HIDDEN, Hidden, hidden_rig
 from npdr_ppl.models.furuta_mujoco import FurutaRig
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.rollouts import Rollouts
@@ -52,12 +53,15 @@ class FurutaTarget(TargetDomain):
 def furuta_target(name: str) -> FurutaTarget:
     """Returns one of the rigs.
 
-    ========================  ==================================================================
-    ``furuta-easy``           nominal, but more viscous friction; encoders and velocity filter
-    ``furuta-medium``         parameters up to 8 % off; half the dry friction and filter of hard
-    ``furuta-hard``           shorter arm, longer pole, 10 to 20 % off; dry friction, slow filter
-    ``furuta-random-<seed>``  all parameters up to 25 % off, all effects; the seed is a number
-    ========================  ==================================================================
+    ===========================  ===============================================================
+    ``furuta-easy``              nominal, but more viscous friction; encoders, velocity filter
+    ``furuta-medium``            parameters up to 8 % off; half of hard's dry friction and filter
+    ``furuta-hard``              shorter arm, longer pole, 10 to 20 % off; dry friction, filter
+    ``furuta-random-<seed>``     all parameters up to 25 % off, all effects; seed is a number
+    ``furuta-delay-<seed>``      parameters up to 15 % off; voltage 15 to 25 ms late
+    ``furuta-friction-<seed>``   parameters up to 15 % off; dry friction 3 to 5 times random's
+    ``furuta-dead-zone-<seed>``  parameters up to 15 % off; amplifier's dead zone 0.3 to 0.6 V
+    ===========================  ===============================================================
 
     Raises:
         ModelError: There is no such rig.
@@ -65,8 +69,12 @@ def furuta_target(name: str) -> FurutaTarget:
     found = re.fullmatch(r"furuta-random-(\d+)", name)
     if found:
         return FurutaTarget(name, _random_rig(int(found.group(1))))
+    found = re.fullmatch(rf"furuta-({'|'.join(HIDDEN)})-(\d+)", name)
+    if found:
+        kind: Hidden = found.group(1)  # pyright: ignore[reportAssignmentType]
+        return FurutaTarget(name, hidden_rig(kind, int(found.group(2))))
     if name not in _PRESETS:
-        known = [*_PRESETS, "furuta-random-<seed>"]
+        known = [*_PRESETS, "furuta-random-<seed>", *(f"furuta-{kind}-<seed>" for kind in HIDDEN)]
         close = get_close_matches(name, known, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}."
         raise ModelError(f"There is no Furuta pendulum {name!r}; {hint}")

@@ -40,6 +40,7 @@ __all__ = [
     "with_likelihood",
     "with_finer_steps",
     "with_noise",
+    "with_wider_priors",
     "workers",
 ]
 
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
     from npdr_ppl.language.inputs import Inputs
     from npdr_ppl.language.simulator import Simulator
     from npdr_ppl.language.sites import simulate
+    from npdr_ppl.language.wider_priors import with_wider_priors
     from npdr_ppl.rollouts import Rollouts
     from npdr_ppl.workflows.calibration import calibrate
     from npdr_ppl.workflows.calibration_result import Calibration
@@ -100,6 +102,7 @@ _HOMES = {
     "train": "workflows.npdr_loop",
     "with_likelihood": "workflows.learned_likelihood",
     "with_finer_steps": "language.handlers",
+    "with_wider_priors": "language.wider_priors",
     "with_noise": "language.handlers",
     "workers": "engines.workers",
 }

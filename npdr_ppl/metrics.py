@@ -25,6 +25,7 @@ from npdr_ppl.errors import DependencyError, ShapeError
 __all__ = [
     "Summary",
     "c2st",
+    "check_c2st",
     "coverage",
     "crps",
     "crps_by_step",
@@ -244,6 +245,21 @@ def coverage(pit_values: Tensor, levels: Sequence[float], mask: Tensor | None = 
     return inside.to(distance.dtype).mean(-1)
 
 
+def check_c2st() -> None:
+    """Checks that :func:`c2st` can be computed, before work that would be wasted without it.
+
+    Raises:
+        DependencyError: scikit-learn is not installed.
+    """
+    try:
+        importlib.import_module("sklearn")
+    except ImportError as error:
+        raise DependencyError(
+            "The classifier test C2ST needs scikit-learn, which is not installed: "
+            "pip install scikit-learn."
+        ) from error
+
+
 def c2st(samples: Tensor, reference: Tensor, *, seed: int = 0) -> float:
     """Classifier two-sample test: how well a network tells two sets of samples apart.
 
@@ -260,12 +276,11 @@ def c2st(samples: Tensor, reference: Tensor, *, seed: int = 0) -> float:
         DependencyError: scikit-learn is not installed.
         ShapeError: The sets do not fit each other.
     """
-    try:
-        from sklearn.exceptions import ConvergenceWarning
-        from sklearn.model_selection import KFold, cross_val_score
-        from sklearn.neural_network import MLPClassifier
-    except ImportError as error:
-        raise DependencyError("C2ST needs scikit-learn: pip install npdr-ppl[bench].") from error
+    check_c2st()
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.model_selection import KFold, cross_val_score
+    from sklearn.neural_network import MLPClassifier
+
     if samples.ndim != 2 or reference.ndim != 2 or samples.shape[1] != reference.shape[1]:
         raise ShapeError(
             f"c2st compares (n, d) with (m, d), got {tuple(samples.shape)} and "

@@ -13,6 +13,7 @@ from npdr_ppl.cli.names import (
     complete_embedding,
     complete_model,
 )
+from npdr_ppl.cli.segment_length import SegmentLengthOption, resolve_segment_length
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -54,16 +55,14 @@ def compare(
     embedding: Annotated[
         str,
         typer.Option(
-            help="Trajectory features: bayessim, score, all/50, gru/10, ...",
+            help="Trajectory features: score, all/50, gru/10, bayessim, ...",
             autocompletion=complete_embedding,
         ),
-    ] = "bayessim",
-    segment_length: Annotated[
-        int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")
-    ] = 0,
+    ] = "score",
+    segment_length: SegmentLengthOption = "auto",
     initial_state: Annotated[
         InitialState, typer.Option(help="State at a segment's start.")
-    ] = InitialState.ESTIMATED,
+    ] = InitialState.UNCERTAIN,
     precision: Annotated[
         Precision, typer.Option(help="Floating-point type of the simulation.")
     ] = Precision.FLOAT64,
@@ -119,7 +118,10 @@ def compare(
             num_simulations=simulations,
             seed=seed,
             options=BindingOptions(
-                embedding, segment_length or None, initial_state.value, precision.value
+                embedding,
+                resolve_segment_length(segment_length),
+                initial_state.value,
+                precision.value,
             ),
             noise=noise.value,
             device=device,

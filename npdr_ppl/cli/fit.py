@@ -13,6 +13,7 @@ from npdr_ppl.cli.names import (
     complete_embedding,
     complete_model,
 )
+from npdr_ppl.cli.segment_length import SegmentLengthOption, resolve_segment_length
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -61,8 +62,11 @@ def fit(
             help="Inference backend; see npdr backends.", autocompletion=complete_backend
         ),
     ] = "snpe-c",
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds of simulating and training.")] = 2,
-    simulations: Annotated[int, typer.Option(min=10, help="Simulations per round.")] = 2_000,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of simulating and training.")] = 1,
+    extra_rounds: Annotated[
+        int, typer.Option(min=0, help="Rounds to add where the estimator has not converged.")
+    ] = 2,
+    simulations: Annotated[int, typer.Option(min=10, help="Simulations per round.")] = 1_000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     holdout: Annotated[str, typer.Option(help="Rollouts to hold out, e.g. 3,4.")] = "",
     effect: Annotated[
@@ -74,16 +78,14 @@ def fit(
     embedding: Annotated[
         str,
         typer.Option(
-            help="Trajectory features: bayessim, score, all/50, gru/10, ...",
+            help="Trajectory features: score, all/50, gru/10, bayessim, ...",
             autocompletion=complete_embedding,
         ),
-    ] = "bayessim",
-    segment_length: Annotated[
-        int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")
-    ] = 0,
+    ] = "score",
+    segment_length: SegmentLengthOption = "auto",
     initial_state: Annotated[
         InitialState, typer.Option(help="State at a segment's start.")
-    ] = InitialState.ESTIMATED,
+    ] = InitialState.UNCERTAIN,
     precision: Annotated[
         Precision, typer.Option(help="Floating-point type of the simulation.")
     ] = Precision.FLOAT64,
@@ -132,10 +134,14 @@ def fit(
             out=out,
             backend=backend,
             rounds=rounds,
+            extra_rounds=extra_rounds,
             num_simulations=simulations,
             seed=seed,
             options=BindingOptions(
-                embedding, segment_length or None, initial_state.value, precision.value
+                embedding,
+                resolve_segment_length(segment_length),
+                initial_state.value,
+                precision.value,
             ),
             noise=noise.value,
             device=device,

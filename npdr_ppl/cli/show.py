@@ -62,6 +62,7 @@ def show_fit(result: Mapping[str, Any], out: Path) -> None:
         f"rollouts (most likely draw); simulate {seconds['simulate']:.1f} s, "
         f"train {seconds['train']:.1f} s, sample {seconds['sample']:.1f} s"
     )
+    console.print(result["preparation"]["sentence"], highlight=False)
     console.print(
         f"[bold]{result['diagnosis']['decision']}[/bold]: {result['diagnosis']['reason']}"
     )
@@ -240,6 +241,8 @@ def show_training(result: Mapping[str, Any], out: Path) -> None:
     console.print(table)
     last = result["iterations"][-1]
     _print_reason(console, last["decision"], last["reason"])
+    for check in last.get("checks", [])[-1:]:
+        _print_reason(console, check["decision"], check["reason"])
     console.print(f"Results and figures are in {out}/")
 
 

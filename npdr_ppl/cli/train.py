@@ -117,8 +117,24 @@ def train(
         typer.Option("--decisions/--no-decisions", help="Follow diagnoses, or only log them."),
     ] = True,
     extra_rollouts: Annotated[
-        int, typer.Option(min=0, help="Real rollouts that diagnoses may ask for in all.")
+        int,
+        typer.Option(
+            min=0, help="Real rollouts that diagnoses and simulated checks may ask for in all."
+        ),
     ] = 0,
+    least_success: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Share of the posterior's draws in which a policy must succeed before it runs "
+            "on the target; else another rollout, or training for the worst domains.",
+        ),
+    ] = 0.9,
+    tail_share: Annotated[
+        float,
+        typer.Option(min=0, max=1, help="Share of the domains that counts as the worst."),
+    ] = 0.2,
     discover: Annotated[
         bool,
         typer.Option(
@@ -147,7 +163,8 @@ def train(
 
     The simulator is fitted to what the policy does on the target, and the policy is trained in
     simulators drawn from the posterior. With --discover the model gets what the rollouts say it
-    lacks. An interrupted run continues with --resume.
+    lacks. Before a policy runs on the target it is tried in draws of the posterior. An interrupted
+    run continues with --resume.
 
     Example: npdr train furuta --target furuta-hard --effects
     arm.coulomb_friction,pole.coulomb_friction --iterations 3 --out run
@@ -196,6 +213,8 @@ def train(
         ),
         follows_decisions=decisions,
         stop_return=stop_return,
+        least_success=least_success,
+        tail_share=tail_share,
         discovers="before inference" if discover else "never",
     )
     with resumable(f"the same command with --resume continues the run in {out}."):

@@ -135,7 +135,7 @@ def roll_out(simulator: "ODESimulator", request: EpisodeRequest) -> Episodes:
         middle = torch.tensor(0.5 * num_steps * step, dtype=dtype, device=device)
         present = simulator.changed(domain, middle)
         tables, histories = simulator.tables(present, shape, step, expand=is_compiled)
-        constants = flatten(policy.constants(domain), shape, expand=is_compiled)
+        constants = flatten(policy.constants(request.believed(domain)), shape, expand=is_compiled)
         stepper = Stepper(simulator, step, histories)
         body = LoopBody(stepper, policy, reward, steps_per_call(**size))
         states = flatten(initial_states.to(dtype).unbind(-1), shape, expand=True)

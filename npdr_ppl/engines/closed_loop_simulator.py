@@ -27,6 +27,7 @@ class ClosedLoopSimulator(Simulator):
         record: bool = False,
         compile: CompileMode | None = None,
         expected_calls: int = 1,
+        internal_model: Mapping[str, float] | None = None,
     ) -> Episodes:
         """Simulates closed-loop episodes of a batch of policies, domains and initial states.
 
@@ -46,6 +47,8 @@ class ClosedLoopSimulator(Simulator):
             compile: Replaces the simulator's choice; an engine that is compiled ignores it.
             expected_calls: How many calls of this size are to come, so that ``auto`` can tell
                 whether compilation pays back.
+            internal_model: Parameters that the policies' own model has in every domain, as on a
+                device whose parameters nobody knows; ``None`` for each domain's own.
 
         Raises:
             ModelError: A parameter is unknown, or the policy's channels are not the simulator's.
@@ -60,6 +63,7 @@ class ClosedLoopSimulator(Simulator):
             record,
             compile,
             expected_calls,
+            internal_model,
         )
         request.check(self)
         return self.run_episodes(request)

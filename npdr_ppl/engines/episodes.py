@@ -90,6 +90,7 @@ class EpisodeRequest:
         record: Whether to return readings and commands.
         compile: Replaces the simulator's choice.
         expected_calls: How many calls of this size are to come.
+        internal_model: Parameters of the policies' own model; ``None`` for each domain's own.
     """
 
     parameters: Mapping[str, Tensor]
@@ -101,6 +102,13 @@ class EpisodeRequest:
     record: bool
     compile: CompileMode | None
     expected_calls: int
+    internal_model: Mapping[str, float] | None = None
+
+    def believed(self, domain: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Returns what the policy's own model takes for a domain's parameters."""
+        given = self.internal_model or {}
+        like = next(iter(domain.values()))
+        return {**domain, **{name: like.new_tensor(value) for name, value in given.items()}}
 
     def check(self, simulator: Simulator) -> None:
         """Raises a ModelError where parameters or channels are not the simulator's."""

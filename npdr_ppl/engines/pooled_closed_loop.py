@@ -81,7 +81,7 @@ class _RunEpisode(Task):
         stepper = _OneStepper(simulator, simulation, segment, present)
         policy = copy.copy(request.policy)
         policy.parameters = torch.from_numpy(one.policy)
-        constants = flatten(policy.constants(domain), _ONE)
+        constants = flatten(policy.constants(request.believed(domain)), _ONE)
         body = LoopBody(stepper, policy, request.reward)
         loop = begin(body, stepper.states(), stepper.tables)
         readings, commands = [loop.readings], []

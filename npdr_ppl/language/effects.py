@@ -4,11 +4,14 @@ An effect is data plus one law. The law is written against plain tensors that ca
 dimensions, so any engine that can hand over velocities, commands or readings can apply it.
 """
 
+import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
+from pyro.distributions import Uniform
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -33,6 +36,17 @@ __all__ = [
     "SensorEffect",
     "Uneven",
 ]
+
+
+LONGEST_TIME = 3.0
+"""Time steps that the default priors of delays and lags reach at least."""
+
+
+def _upper_end(prior: Distribution) -> float:
+    """Returns where a range that begins at zero ends; infinity for other priors."""
+    if isinstance(prior, Uniform) and float(prior.low) == 0.0:
+        return float(prior.high)
+    return math.inf
 
 
 class Effect(ABC):
@@ -107,6 +121,31 @@ class Effect(ABC):
     def priors(self, port: Port) -> dict[str, Distribution]:
         """Returns the priors of all parameters, the user's where given."""
         return {**self.default_priors(port), **self._priors}
+
+    def at_rate(self, port: Port, time_step: float) -> Self:
+        """Returns the effect with priors of times that reach ``LONGEST_TIME`` time steps.
+
+        A recording cannot tell times that are much shorter than its time step, and devices that
+        are sampled slowly have delays and lags of several steps. Priors that the user gave, and
+        those that reach further, stay.
+
+        Args:
+            port: The port it attaches to.
+            time_step: Seconds between the recording's samples.
+        """
+        longest = LONGEST_TIME * time_step
+        wider = {
+            parameter.name: Uniform(0.0, longest)
+            for parameter in self.parameters
+            if parameter.unit == "s"
+            and parameter.name not in self._priors
+            and _upper_end(self.priors(port)[parameter.name]) < longest
+        }
+        if not wider:
+            return self
+        changed = copy.copy(self)
+        changed._priors = {**self._priors, **wider}
+        return changed
 
     def probe(self, port: Port) -> dict[str, float]:
         """Returns a typical value of every parameter: the effect switched on.

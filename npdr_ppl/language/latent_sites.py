@@ -10,10 +10,10 @@ from pyro.poutine.indep_messenger import CondIndepStackFrame
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
+from npdr_ppl.language.program_runs import BATCH_PLATE
 from npdr_ppl.language.reference import reference_map
 
 __all__ = [
-    "BATCH_PLATE",
     "Batch",
     "CheckSupport",
     "LatentSite",
@@ -21,8 +21,6 @@ __all__ = [
     "WriteCoordinates",
     "per_point",
 ]
-
-BATCH_PLATE = "_npdr_batch"
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from torch import Tensor
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.handlers import SkipSimulation
 from npdr_ppl.language.latent_sites import (
-    BATCH_PLATE,
     Batch,
     CheckSupport,
     LatentSite,
@@ -25,7 +24,13 @@ from npdr_ppl.language.latent_sites import (
     WriteCoordinates,
     per_point,
 )
-from npdr_ppl.language.program_runs import alone, sample_sites, traced
+from npdr_ppl.language.program_runs import (
+    ALL_POINTS,
+    BATCH_PLATE,
+    alone,
+    sample_sites,
+    traced,
+)
 from npdr_ppl.language.reference import reference_map
 from npdr_ppl.language.sites import BlackBox
 
@@ -42,13 +47,14 @@ class Prior:
     Attributes:
         sites: The latent sites, in the order of sampling.
         black_boxes: The black-box sites by name, as one run of the program made them.
+        distributions: The latent sites' distributions by name, as one run made them.
         num_parameters: Dimension d of the reference coordinates.
         is_standard_normal: Whether the prior over z is exactly N(0, I).
         max_plate_nesting: Depth of the model's plates.
 
     Raises:
-        ModelError: A latent site is discrete, there is none, or an ordinary site is observed
-            whose density depends on latent sites.
+        ModelError: A latent site is discrete, there is none, a site does not fit its plates, or an
+            ordinary site is observed whose density depends on latent sites.
     """
 
     def __init__(self, model: Callable[..., Any], args: tuple[Any, ...] = ()) -> None:
@@ -65,12 +71,14 @@ class Prior:
         self.sites: tuple[LatentSite, ...] = self._latent_sites(prototype)
         if not self.sites:
             raise ModelError("The model has no latent sample sites, so there is nothing to infer.")
+        self._check_plates(prototype)
         self.num_parameters = self.sites[-1].coordinates.stop
         self._check_observed_sites(prototype)
 
     def _latent_sites(self, prototype: Any) -> tuple[LatentSite, ...]:
         depths = [0]
         sites = []
+        self.distributions: dict[str, Any] = {}
         stop = 0
         self.is_standard_normal = True
         for name, site in sample_sites(prototype):
@@ -83,6 +91,7 @@ class Prior:
                     f"Site {name!r} is discrete ({type(fn).__name__}); latent sites must be "
                     "continuous: marginalise it inside the simulator, or relax it."
                 )
+            self.distributions[name] = fn
             to_value = reference_map(fn)
             self.is_standard_normal &= to_value.is_standard_normal
             coordinate_shape = torch.Size(fn.batch_shape + to_value.event_shape)
@@ -103,6 +112,24 @@ class Prior:
             )
         self.max_plate_nesting = max(depths)
         return tuple(sites)
+
+    def _check_plates(self, prototype: Any) -> None:
+        """Refuses sites with more dimensions than the plates around them."""
+        for site in self.sites:
+            loose = len(site.batch_shape) - self.max_plate_nesting
+            if loose > 0:
+                raise ModelError(
+                    f"Site {site.name!r} has the batch shape {tuple(site.batch_shape)} and no "
+                    f"plate around it; put it into a pyro.plate, or make it one vector with "
+                    f".to_event({loose})."
+                )
+        for name, box in self.black_boxes.items():
+            shape = tuple(box.batch_shape)
+            if any(size != 1 for size in shape[: max(0, len(shape) - _depth(prototype, name))]):
+                raise ModelError(
+                    f"Site {name!r} takes parameters of shape {shape} outside of the plate that "
+                    "they belong to; move it into the plate."
+                )
 
     def _check_observed_sites(self, prototype: Any) -> None:
         """Refuses ordinary likelihoods, which no likelihood-free backend would see."""
@@ -230,13 +257,15 @@ class Prior:
     def _outputs(self, trace: Any) -> dict[str, Tensor]:
         result = {}
         for name in self.black_boxes:
-            node = trace.nodes[name]
-            depths = [
-                -frame.dim for frame in node["cond_indep_stack"] if frame.name != BATCH_PLATE
-            ]
+            value = trace.nodes[name]["value"]
             # Dimensions of plates that do not enclose this site stand behind the batch.
-            skipped = self.max_plate_nesting - max(depths, default=0)
-            value = node["value"]
+            skipped = self.max_plate_nesting - _depth(trace, name)
+            if any(size != 1 for size in value.shape[1 : 1 + skipped]):
+                size = max(value.shape[1 : 1 + skipped])
+                raise ModelError(
+                    f"Site {name!r} has {size} values in a dimension that no plate around it has. "
+                    f"{ALL_POINTS}"
+                )
             result[name] = value.reshape((value.shape[0], *value.shape[1 + skipped :]))
         return result
 
@@ -274,3 +303,9 @@ class Prior:
 
     def _without_padding(self, site: LatentSite, value: Tensor) -> Tensor:
         return value.reshape((value.shape[0], *site.shape))
+
+
+def _depth(trace: Any, name: str) -> int:
+    """Returns how many dimensions the program's own plates around a site take."""
+    frames = trace.nodes[name]["cond_indep_stack"]
+    return max((-frame.dim for frame in frames if frame.name != BATCH_PLATE), default=0)

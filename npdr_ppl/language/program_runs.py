@@ -1,5 +1,6 @@
 """Runs of a program that nothing outside notices."""
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -8,9 +9,18 @@ from pyro import poutine
 from pyro.poutine.util import site_is_subsample
 from torch.distributions import Distribution
 
-from npdr_ppl.errors import NpdrError
+from npdr_ppl.errors import ModelError, NpdrError
 
-__all__ = ["alone", "sample_sites", "traced"]
+__all__ = ["BATCH_PLATE", "alone", "sample_sites", "traced"]
+
+BATCH_PLATE = "_npdr_batch"
+"""Name of the plate left of a program's own, in which all points are run at once."""
+
+ALL_POINTS = (
+    "A program runs at many points at once, whose dimension comes first: index from the right, a "
+    "vector's component as mass[..., 0], a member of a plate as mass[..., :1]."
+)
+"""What to do about a program that takes the dimension of the points for one of its own."""
 
 
 @contextmanager
@@ -31,13 +41,51 @@ def alone() -> Iterator[None]:
 
 
 def traced(model: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-    """Traces a run of the program; our own errors come out without Pyro's table of shapes."""
+    """Traces a run of the program; our own errors come out without Pyro's table of shapes.
+
+    Raises:
+        ModelError: A site does not fit its plates, or plates do not fit each other.
+    """
     try:
         return poutine.trace(model).get_trace(*args)
+    except ValueError as error:
+        if isinstance(error, NpdrError):
+            raise _innermost(error) from None
+        sentence = _about_plates(str(error))
+        if sentence is None:
+            raise
+        raise ModelError(sentence) from error
     except NpdrError as error:
-        while isinstance(error.__cause__, NpdrError):
-            error = error.__cause__
-        raise error from None
+        raise _innermost(error) from None
+
+
+def _innermost(error: NpdrError) -> NpdrError:
+    while isinstance(error.__cause__, NpdrError):
+        error = error.__cause__
+    return error
+
+
+def _about_plates(message: str) -> str | None:
+    """Returns what Pyro says of plates as a sentence; ``None`` for what is not about plates."""
+    found = re.match(
+        r"Shape mismatch inside plate\('(.*?)'\) at site (\S+) dim (-\d+), (\d+) vs (\d+)", message
+    )
+    if found is not None:
+        plate, site, dim, size, came = found.groups()
+        if plate == BATCH_PLATE:
+            return f"Site {site!r} has {came} values in the dimension of the points. {ALL_POINTS}"
+        return (
+            f"Site {site!r} has {came} values in dimension {dim}, where the plate {plate!r} has "
+            f"{size}; give the site the plate's size there, or one value that all share."
+        )
+    found = re.match(r'at plates "(.*?)" and "(.*?)", collide at dim=(-\d+)', message)
+    if found is not None:
+        first, second, dim = found.groups()
+        return (
+            f"The plates {first!r} and {second!r} both take dimension {dim}; give one of them "
+            f"another, e.g. dim={int(dim) - 1}."
+        )
+    return None
 
 
 def sample_sites(trace: Any) -> list[tuple[str, Any]]:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from npdr_ppl.plots.marginals import MAX_COLUMNS, Samples, add_legend, density
@@ -20,6 +21,9 @@ PEAK_RATIO = 6.0
 
 SHARPEST = 1e-6
 """A posterior narrower than this part of the axis is drawn as a line."""
+
+LEVELS = (0.05, 0.95, 0.25), (0.25, 0.75, 0.45)
+"""Quantiles between which bands lie, and their opacity."""
 
 NUM_POINTS = 300
 """Points of a density's curve."""
@@ -96,11 +100,13 @@ def plot_bands_by_backend(
     *,
     channel_names: Sequence[str],
     units: Sequence[str] = (),
+    lines: Mapping[str, NDArray[np.float64]] | None = None,
     resets: NDArray[np.float64] | None = None,
 ) -> Figure:
     """Draws every posterior's predictive bands over the recording, a column for each.
 
-    In the manner of Figure 5 of Muratore et al. (2021).
+    In the manner of Figure 5 of Muratore et al. (2021), in which the recording is drawn beside
+    what nominal parameters and draws of a posterior make of it.
 
     Args:
         time: Seconds, ``(T,)``.
@@ -108,6 +114,7 @@ def plot_bands_by_backend(
         predictives: Posterior predictive draws, ``(n, T, C)``, by title of the column.
         channel_names: Names of the C channels.
         units: Units of the C channels.
+        lines: Simulations ``(T, C)`` by legend entry that every column shows, e.g. nominal.
         resets: Times at which the simulation was re-synchronised.
     """
     channels = measured.shape[-1]
@@ -125,7 +132,7 @@ def plot_bands_by_backend(
             for c, axis in enumerate(axes[:, column]):
                 for reset in [] if resets is None else resets:
                     axis.axvline(reset, color="0.9", lw=0.6, zorder=0)
-                for low, high, alpha in ((0.05, 0.95, 0.25), (0.25, 0.75, 0.45)):
+                for low, high, alpha in LEVELS:
                     if not len(whole):
                         continue
                     band = np.quantile(whole[..., c], [low, high], axis=0)
@@ -135,7 +142,12 @@ def plot_bands_by_backend(
                     middle = np.median(whole[..., c], axis=0)
                     for start, stop in _stretches(time, resets):
                         axis.plot(time[start:stop], middle[start:stop], color=color, lw=0.8)
-                axis.plot(time, measured[:, c], color=COLORS["measured"], lw=0.8)
+                for entry, line in (lines or {}).items():
+                    # Colours are the columns': the second one's is what nominal has elsewhere.
+                    look = {"color": "0.4", "lw": 0.7, "ls": "--"}
+                    for start, stop in _stretches(time, resets):
+                        axis.plot(time[start:stop], line[start:stop, c], label=entry, **look)
+                axis.plot(time, measured[:, c], color=COLORS["measured"], lw=0.8, label="measured")
                 if column == 0:
                     unit = units[c] if c < len(units) else ""
                     name = channel_names[c]
@@ -147,6 +159,13 @@ def plot_bands_by_backend(
             low, high = measured[:, c].min(), measured[:, c].max()
             margin = 0.25 * (high - low) + np.finfo(float).tiny
             row[0].set_ylim(low - margin, high + margin)
+        # Columns have colours of their own, so that the legend's bands have none.
+        for low, high, alpha in LEVELS:
+            label = f"posterior {high - low:.0%}"
+            axes[0, 0].add_patch(
+                Rectangle((0, 0), 0, 0, color="k", alpha=alpha, lw=0, label=label)
+            )
+        add_legend(figure, loc="outside upper center", ncols=2 + len(predictives))
     return figure
 
 

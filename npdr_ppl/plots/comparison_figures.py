@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from npdr_ppl.plots.bands import nominal_line
 from npdr_ppl.plots.comparison import plot_bands_by_backend, plot_overlaid_marginals, plot_seconds
 from npdr_ppl.plots.fit_figures import NUM_DRAWS, NUM_PREDICTIVE, scalar_columns
 from npdr_ppl.plots.heatmap import plot_heatmaps
@@ -14,6 +15,7 @@ from npdr_ppl.plots.theme import save_figure
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.comparison import Comparison
+from npdr_ppl.workflows.draw_budget import BUDGET, affordable_draws
 from npdr_ppl.workflows.evaluation import replay
 from npdr_ppl.workflows.progress import Step
 from npdr_ppl.workflows.units import parameter_units
@@ -75,8 +77,11 @@ def write_comparison_figures(
     step(0.5, "predictions")
     options = some.bound.options
     shown = rollouts[[0]]
+    # The posteriors' simulations are drawn together, so that they share what there is.
+    budget = BUDGET // (4 * len(draws))
+    num = affordable_draws(NUM_PREDICTIVE, shown.readings[0].size, budget=budget)
     replays = {
-        label: replay(model, shown, {n: v[:NUM_PREDICTIVE] for n, v in values.items()}, options)
+        label: replay(model, shown, {n: v[:num] for n, v in values.items()}, options)
         for label, values in draws.items()
     }
     replayed = next(iter(replays.values()))
@@ -86,7 +91,8 @@ def write_comparison_figures(
         shown.series(names)[0].numpy(),
         {label: found.series()[0].double().cpu().numpy() for label, found in replays.items()},
         channel_names=names,
-        units=[shown.channel_units[shown.channel_names.index(name)] for name in names],
+        units=replayed.units,
+        lines=nominal_line(model, shown, options),
         resets=replayed.inputs.start.double().numpy() * shown.time_step,
     )
     paths.append(save_figure(figure, out / "bands.png"))

@@ -11,9 +11,9 @@ from npdr_ppl.plots.fit_figures import scalar_columns
 from npdr_ppl.plots.latent_force import AFTER, BEFORE, plot_latent_force
 from npdr_ppl.plots.residual_map import plot_residual_map
 from npdr_ppl.plots.theme import save_figure
-from npdr_ppl.randomness import derived_seed, seeded
+from npdr_ppl.randomness import seeded
 from npdr_ppl.workflows.discovery import Discovery, Investigation
-from npdr_ppl.workflows.discovery.credible import posterior_draws
+from npdr_ppl.workflows.discovery.credible import Draws
 from npdr_ppl.workflows.discovery.folder import STAGES, Stage
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.notebook import short_name
@@ -48,10 +48,10 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
         figures["separation"] = plot_separation(matrix, discovery.separation_names)
     seed = discovery.options.seed
     units = {name: estimate.unit for name, estimate in discovery.parameters.items()}
-    prior, draws = _draws(start, seed)
+    prior, draws = _draws(start, discovery.draws_before, seed)
     posteriors = {BEFORE: draws}
     if after is not None:
-        wide, narrow = _draws(after, seed)
+        wide, narrow = _draws(after, discovery.draws_after, seed)
         # First, so that it has the colour that it has in the other figures.
         posteriors = {AFTER: {name: narrow[name] for name in draws}, **posteriors}
         new = [name for name in narrow if name not in draws]
@@ -103,11 +103,10 @@ def _label(site: str) -> str:
     return f"{short_name(name)}\n{parameter.replace('_', ' ')}"
 
 
-def _draws(hypothesis: Hypothesis, seed: int) -> tuple[Columns, Columns]:
+def _draws(hypothesis: Hypothesis, draws: Draws, seed: int) -> tuple[Columns, Columns]:
     """Returns draws of prior and posterior by scalar parameter."""
     prior = hypothesis.segments.prior
     with seeded(seed, "discovery", "figures"):
         before = prior.to_parameters(prior.sample(NUM_DRAWS))
-        draws = posterior_draws(hypothesis, seed=derived_seed(seed, "discovery", "figures"))
         after = prior.to_parameters(draws.resampled(NUM_DRAWS))
     return scalar_columns(before), scalar_columns(after)

@@ -6,12 +6,13 @@ from typing import Any
 from torch import Tensor
 
 from npdr_ppl.displays.columns import scalar_columns
-from npdr_ppl.plots.bands import plot_bands
+from npdr_ppl.plots.bands import nominal_line, plot_bands
 from npdr_ppl.plots.marginals import plot_marginals
 from npdr_ppl.plots.pair import plot_pair
 from npdr_ppl.plots.theme import save_figure
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.draw_budget import BUDGET, affordable_draws
 from npdr_ppl.workflows.evaluation import replay
 from npdr_ppl.workflows.posterior import PosteriorBase
 from npdr_ppl.workflows.progress import Step
@@ -66,9 +67,10 @@ def write_fit_figures(
         figure = plot_pair(samples, prior_samples, marks=marks)
         paths.append(save_figure(figure, out / "pairs.png"))
     step(0.7, "predictions")
-    few = {name: value[:NUM_PREDICTIVE] for name, value in draws.items()}
     options = posterior.bound.options
     shown = rollouts[[0]]
+    num = affordable_draws(NUM_PREDICTIVE, shown.readings[0].size, budget=BUDGET // 4)
+    few = {name: value[:num] for name, value in draws.items()}
     replayed = replay(model, shown, few, options)
     single = replay(model, shown, {n: v[None] for n, v in most_likely.items()}, options)
     names = replayed.channel_names
@@ -77,8 +79,11 @@ def write_fit_figures(
         shown.series(names)[0].numpy(),
         replayed.series()[0].double().cpu().numpy(),
         channel_names=names,
-        units=[shown.channel_units[shown.channel_names.index(name)] for name in names],
-        lines={"most likely": single.series()[0][0].double().numpy()},
+        units=replayed.units,
+        lines={
+            "most likely": single.series()[0][0].double().cpu().numpy(),
+            **nominal_line(model, shown, options),
+        },
         resets=replayed.inputs.start.double().numpy() * shown.time_step,
     )
     paths.append(save_figure(figure, out / "bands.png"))

@@ -134,7 +134,10 @@ def _gap(gap: Mapping[str, Any]) -> list[Part]:
         ]
         for metric, values in gap.items()
     ]
-    caption = "Closed: share of the way from before to the noise floor, which no model can beat."
+    caption = (
+        "Closed: share of the way from before to the noise floor, which is what the revised model "
+        "would leave of a recording of its own."
+    )
     columns = ("metric", "before", "after", "noise floor", "closed")
     parts: list[Part] = [TablePart(columns, rows, caption)]
     # Metrics have scales of their own, so each is drawn in units of what it was before.

@@ -18,6 +18,7 @@ SMALL_PIT_DEVIATION = 0.15
 _TONES: Mapping[str, Tone] = {
     Decision.ACCEPT: "good",
     Decision.MORE_ROUNDS: "warn",
+    Decision.OTHER_EXCITATION: "warn",
     Decision.WIDEN: "warn",
     Decision.NEW_ROLLOUT: "warn",
     Decision.REVISE_MODEL: "bad",
@@ -35,11 +36,44 @@ def findings(diagnosis: Mapping[str, Any]) -> list[Finding]:
     """Returns the figures of a diagnosis with their meaning."""
     limits = Thresholds()
     return [
+        *_against_simulator(diagnosis, limits),
         *_convergence(diagnosis, limits),
         *_prediction(diagnosis, limits),
         *_against_prior(diagnosis, limits),
         *_leaving_out(diagnosis, limits),
     ]
+
+
+def _against_simulator(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+    """Returns what the simulator itself says of model and estimator, where it was asked."""
+    result = []
+    p_value, k = _value(diagnosis, "model_p_value"), _value(diagnosis, "estimator_k")
+    if not math.isnan(p_value):
+        is_missing = diagnosis.get("decision") == Decision.REVISE_MODEL
+        result.append(
+            Finding(
+                "what no parameters explain",
+                f"p = {p_value:.2g}",
+                "bad" if is_missing else "good",
+                "Residuals at the best parameters show something regular: an effect is missing."
+                if is_missing
+                else "At the best parameters nothing regular is left of the recording.",
+            )
+        )
+    if not math.isnan(k):
+        is_right = k <= limits.pareto_k
+        result.append(
+            Finding(
+                "posterior against the simulator, Pareto k",
+                number(k, ".2f"),
+                "good" if is_right else "warn",
+                f"The draws are weighted evenly by the simulator (limit {limits.pareto_k})."
+                if is_right
+                else "Few draws carry most of the weight that the simulator gives them: the "
+                "estimator has not converged.",
+            )
+        )
+    return result
 
 
 def _convergence(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:

@@ -24,6 +24,7 @@ from npdr_ppl.reports.fit import parameters_table
 from npdr_ppl.reports.meanings import findings
 from npdr_ppl.reports.provenance import provenance_section, run_description, source_section
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.loop_check import NextStep
 from npdr_ppl.workflows.run_folder import read_json
 
 __all__ = ["training_report"]
@@ -98,6 +99,11 @@ def _key_figures(records: Records) -> list[KeyFigure]:
         KeyFigure(
             "Last return in simulation", number(last.get("sim_return"), ".4g"), "over domains"
         ),
+        KeyFigure(
+            "Last success in simulation",
+            number(last.get("simulated_success"), ".0%"),
+            "of the posterior's draws",
+        ),
         KeyFigure("Real rollouts", str(last.get("num_rollouts", count))),
         *added,
         KeyFigure("Last decision", str(last.get("decision", "–"))),
@@ -128,6 +134,11 @@ def _decisions(records: Records) -> list[Finding]:
                 else str(decision.get("reason", ""))
             )
             result.append(Finding(f"Iteration {index}", word, tone, meaning))
+        for check in record.get("checks") or []:
+            word = str(check["decision"])
+            passed: Tone = "good" if word == NextStep.DEPLOY else "warn"
+            name = f"Iteration {index}, the new policy"
+            result.append(Finding(name, word, passed, str(check["reason"])))
     return result
 
 

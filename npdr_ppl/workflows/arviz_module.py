@@ -40,6 +40,7 @@ __all__ = [
     "group_names",
     "hdi",
     "loo",
+    "pareto_smoothed",
     "rhat",
     "summary",
     "to_netcdf",
@@ -47,6 +48,10 @@ __all__ = [
 
 HAS_DATATREE: bool = int(az.__version__.split(".")[0]) >= 1
 """Whether this ArviZ keeps groups in a ``DataTree``."""
+
+FEWEST_WEIGHTS = 25
+"""Weights without which a Pareto distribution is not fitted: a fifth of them are its tail, and
+five are needed for its shape."""
 
 # The other release's names are unknown to a type checker that sees one of them installed.
 _az: Any = az
@@ -266,3 +271,34 @@ def _quiet_loo() -> Iterator[None]:
         # A plain function's output counts as one observation.
         warnings.filterwarnings("ignore", message="The point-wise LOO is the same")
         yield
+
+
+def pareto_smoothed(log_weights: ArrayLike) -> tuple[NDArray[np.float64], float]:
+    """Smooths the largest importance weights with a generalised Pareto distribution.
+
+    Args:
+        log_weights: Log weights of n draws, ``(n,)``; minus infinity for draws without weight.
+
+    Returns:
+        Normalised log weights ``(n,)`` and the distribution's shape k, which is infinite where
+        fewer draws than the distribution's tail needs have a weight.
+
+    References:
+        A. Vehtari, D. Simpson, A. Gelman, Y. Yao and J. Gabry, Pareto smoothed importance
+        sampling, 2024.
+    """
+    values = np.asarray(log_weights, dtype=float)
+    is_used = np.isfinite(values)
+    result = np.full(values.shape, -np.inf)
+    if int(is_used.sum()) < FEWEST_WEIGHTS:
+        return result, float("inf")
+    if HAS_DATATREE:
+        from arviz_stats.base import array_stats  # pyright: ignore[reportMissingImports]
+
+        smoothed, k = array_stats.psislw(values[is_used])
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # k is returned, and the caller judges it
+            smoothed, k = _az.psislw(values[is_used])
+    result[is_used] = np.asarray(smoothed, dtype=float)
+    return result, float(np.asarray(k))

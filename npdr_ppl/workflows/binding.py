@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
@@ -20,8 +20,46 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.differentiation import Smoothing
 from npdr_ppl.rollouts.segments import InitialState
 from npdr_ppl.workflows.linear_regression import regression_of
+from npdr_ppl.workflows.segment_starts import Starts
 
-__all__ = ["BindingOptions", "BoundModel", "Data", "bind", "problem_of"]
+if TYPE_CHECKING:
+    from npdr_ppl.workflows.segment_likelihood import SegmentLikelihood
+
+__all__ = [
+    "MAX_READINGS_PER_CHUNK",
+    "PLAIN_FEATURES",
+    "BindingOptions",
+    "BoundModel",
+    "Data",
+    "SegmentLength",
+    "bind",
+    "default_segment_length",
+    "problem_of",
+]
+
+MAX_READINGS_PER_CHUNK = 2_000_000
+"""Measurements that one chunk of simulations may hold, 16 MiB in float64: larger arrays leave the
+cache and are mapped afresh by the allocator every time, smaller ones pay the overhead of many
+calls."""
+
+SEGMENT_SECONDS = 0.2
+"""Default length of a segment: long compared with delays and lags, short compared with the time in
+which an unstable motion forgets its initial state."""
+
+FEWEST_STEPS, MOST_STEPS = 20, 200
+"""Bounds of a segment's default length in steps: shorter segments spend most of their measurements
+on their initial states, longer ones cost memory and say no more."""
+
+FEWEST_SEGMENTS = 8
+"""Segments that a recording is cut into where it is long enough; with fewer there is nothing to
+tell an effect from chance by."""
+
+PLAIN_FEATURES = "bayessim"
+"""Features where there is no closest fit at which a score could be taken."""
+
+SegmentLength = int | Literal["auto"] | None
+"""Steps between re-synchronisations: a number, ``"auto"`` for :func:`default_segment_length`, or
+``None`` for whole rollouts."""
 
 Data = Rollouts | Tensor | Mapping[str, Rollouts | Tensor]
 """Observations: rollouts or a tensor for a model with one black-box site, or one for each site by
@@ -61,22 +99,40 @@ class Observation:
         return torch.stack(elements, dim=1).flatten(1, 2)
 
 
+def default_segment_length(rollouts: Rollouts) -> int:
+    """Returns the default length of a segment in steps.
+
+    ``SEGMENT_SECONDS`` within ``FEWEST_STEPS`` and ``MOST_STEPS``, and less where a recording is
+    so short that it would have fewer than ``FEWEST_SEGMENTS`` segments: it is then cut into
+    twice as many.
+    """
+    length = round(SEGMENT_SECONDS / rollouts.time_step)
+    length, total = max(FEWEST_STEPS, min(MOST_STEPS, length)), sum(rollouts.lengths)
+    if total >= FEWEST_SEGMENTS * length:
+        return length
+    return max(2, min(length, total // (2 * FEWEST_SEGMENTS)))
+
+
 @dataclass(frozen=True)
 class BindingOptions:
     """How measured data are prepared for inference.
 
     Attributes:
         embedding: Maps trajectories to features: a name such as ``"bayessim"`` or ``"all/10"``,
-            or an embedding of one's own. Plain functions have none.
-        segment_length: Steps between re-synchronisations; ``None`` for whole rollouts.
-        initial_state: How the state at a segment's start is found: ``"estimated"`` by a smoother,
-            ``"recorded"``, or ``"uncertain"``, which draws it within the smoother's error.
+            an embedding of one's own, or ``"score"``, which
+            :func:`~npdr_ppl.workflows.preparation.prepare` makes for a recording. Plain functions
+            have none.
+        segment_length: Steps between re-synchronisations; see :data:`SegmentLength`.
+        initial_state: How the state at a segment's start is found: ``"uncertain"`` estimates it
+            and takes the estimate's error into account; ``"estimated"`` takes the estimate for the
+            truth, and ``"recorded"`` the measurement, which gives posteriors that are too narrow
+            and biased unless measurements have no noise.
         precision: ``"float64"`` or ``"float32"``, of the simulation.
     """
 
-    embedding: str | Embedding | None = "bayessim"
-    segment_length: int | None = None
-    initial_state: InitialState = "estimated"
+    embedding: str | Embedding | None = "score"
+    segment_length: SegmentLength = "auto"
+    initial_state: InitialState = "uncertain"
     precision: Literal["float64", "float32"] = "float64"
 
     @property
@@ -86,7 +142,14 @@ class BindingOptions:
 
     def inputs(self, rollouts: Rollouts) -> Inputs:
         """Returns the inputs of rollouts, prepared like this."""
-        return rollouts.inputs(self.segment_length, self.initial_state, dtype=self.dtype)
+        length = self.steps(rollouts)
+        return rollouts.inputs(length, self.initial_state, dtype=self.dtype)
+
+    def steps(self, rollouts: Rollouts) -> int | None:
+        """Returns the length of a segment of rollouts; ``None`` for whole rollouts."""
+        if self.segment_length == "auto":
+            return default_segment_length(rollouts)
+        return self.segment_length
 
     def with_certain_start(self) -> "BindingOptions":
         """Returns the options that start every simulation from the best estimate."""
@@ -106,6 +169,9 @@ class BoundModel:
         observations: What was observed, by black-box site.
         data: The data as given, by black-box site.
         options: How the data were prepared.
+        starts: Initial states of the segments where they are better known than by the smoother.
+        likelihood: Likelihood of the recording with initial states integrated out, for models of
+            one deterministic simulator; ``None`` for all others.
     """
 
     model: Callable[..., Any]
@@ -114,6 +180,8 @@ class BoundModel:
     observations: Mapping[str, Observation]
     data: Mapping[str, Rollouts | Tensor]
     options: "BindingOptions"
+    starts: Starts | None = None
+    likelihood: "SegmentLikelihood | None" = None
 
     def features(self, outputs: Mapping[str, Tensor]) -> Tensor:
         """Maps the sites' outputs to one feature array per simulation."""
@@ -153,6 +221,9 @@ def bind(
     data: Data,
     options: BindingOptions,
     device: str | torch.device = "cpu",
+    *,
+    starts: Starts | None = None,
+    likelihood: "SegmentLikelihood | None" = None,
 ) -> BoundModel:
     """Binds a model to measured data.
 
@@ -163,6 +234,9 @@ def bind(
         data: The observations.
         options: How they are prepared.
         device: Where trajectories are simulated.
+        starts: Initial states of the segments of the only rollouts, if better known than by the
+            smoother.
+        likelihood: Likelihood of the recording, if it has one; see :class:`BoundModel`.
 
     Raises:
         DataError: The data do not fit the model.
@@ -171,7 +245,10 @@ def bind(
     named: Mapping[str, Rollouts | Tensor] | None = data if isinstance(data, Mapping) else None
     every: list[Rollouts | Tensor] = [data] if not isinstance(data, Mapping) else [*data.values()]
     recorded = [part for part in every if isinstance(part, Rollouts)]
-    layout = [options.inputs(part).to(device=device) for part in recorded]
+    layout = [options.inputs(part) for part in recorded]
+    if starts is not None:
+        layout = [starts.put_into(inputs) for inputs in layout]
+    layout = [inputs.to(device=device) for inputs in layout]
     args: tuple[Any, ...] = ()
     if len(layout) == 1:
         args = (layout[0],)
@@ -197,13 +274,14 @@ def bind(
     site_inputs = dict(
         zip([n for n, part in named.items() if isinstance(part, Rollouts)], layout, strict=True)
     )
-    embedding = options.embedding
+    # Where no preparation has found a closest fit, there is none to take a score at.
+    embedding = PLAIN_FEATURES if options.embedding == "score" else options.embedding
     chosen = embedding_by_name(embedding) if isinstance(embedding, str) else embedding
     observations = {
         name: _observe(name, box, named[name], site_inputs.get(name), chosen, prior)
         for name, box in boxes.items()
     }
-    return BoundModel(model, args, prior, observations, named, options)
+    return BoundModel(model, args, prior, observations, named, options, starts, likelihood)
 
 
 def problem_of(bound: BoundModel, device: str | torch.device = "cpu") -> Problem:
@@ -224,7 +302,9 @@ def problem_of(bound: BoundModel, device: str | torch.device = "cpu") -> Problem
 
 def _log_likelihood(bound: BoundModel) -> Callable[[Tensor], Tensor] | None:
     """Returns the log density of all that was measured, if the model has one with gradients."""
-    prior = bound.prior
+    prior, marginal = bound.prior, bound.likelihood
+    if marginal is not None and marginal.is_differentiable:
+        return marginal.log_prob
     for box in prior.black_boxes.values():
         if box.noise is None or not box.is_differentiable:
             return None

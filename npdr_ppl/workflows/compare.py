@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import BackendError, DataError, NpdrError
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data, bind
+from npdr_ppl.workflows.binding import PLAIN_FEATURES, BindingOptions, BoundModel, Data, bind
 from npdr_ppl.workflows.candidates import Backends, Candidate, candidates, folder_name
 from npdr_ppl.workflows.comparison import Comparison, Figures, Row
 from npdr_ppl.workflows.diagnostics import diagnose
@@ -21,6 +21,7 @@ from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.memory import sampled_memory
 from npdr_ppl.workflows.posterior import Posterior, PosteriorBase
 from npdr_ppl.workflows.predictive_scores import predictive_scores
+from npdr_ppl.workflows.preparation import held_out
 from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.run_folder import holds_this_run, make_folder, read_json, write_json
 from npdr_ppl.workflows.stacking import StackedPosterior, Stacking, mixture_elpd, stack
@@ -114,13 +115,23 @@ def compare(
             seed=seed,
             progress=report.stage("find the closest parameters"),
         )
-        exact = dataclasses.replace(options.with_certain_start(), precision="float64")
-        if exact.embedding == "score":  # posteriors are judged without features
-            exact = dataclasses.replace(exact, embedding="bayessim")
+        prepared = error_model.prepared
+        # Posteriors are judged without features.
+        exact = dataclasses.replace(options, precision="float64", embedding=PLAIN_FEATURES)
+        likelihood = None
+        if prepared is not None and isinstance(judged_by, Rollouts):
+            likelihood = prepared.likelihood if test is None else held_out(prepared, judged_by)
         judge = _Judge(
             error_model,
             judged_by,
-            bind(error_model.judged, judged_by, exact, device),
+            bind(
+                error_model.judged,
+                judged_by,
+                exact,
+                device,
+                starts=None if likelihood is None else likelihood.segments.starts,
+                likelihood=likelihood,
+            ),
             exact,
             is_held_out=test is not None,
             seed=seed,
@@ -140,7 +151,7 @@ def compare(
                 report.under(label),
             )
             try:
-                posterior, peak = run.posterior(error_model.fitted, train, seed)
+                posterior, peak = run.posterior(error_model, train, seed)
                 rows[label] = run.row(posterior, peak, judge)
                 posteriors[label] = posterior
             except NpdrError as error:
@@ -207,13 +218,15 @@ class _Run:
     report: Reporter
 
     def posterior(
-        self, model: Callable[..., Any], data: Data, seed: int
+        self, error_model: ErrorModel, data: Data, seed: int
     ) -> tuple[Posterior, float | None]:
         """Infers, or continues; returns the posterior and the peak of memory in MiB."""
-        own = self.candidate.embedding
+        own, prepared = self.candidate.embedding, error_model.prepared
+        if own is not None and prepared is not None:
+            prepared = prepared.with_features(own)
         with sampled_memory() as memory:
             posterior = infer(
-                model,
+                error_model.fitted,
                 data,
                 backend=self.candidate.backend,
                 rounds=self.rounds,
@@ -223,6 +236,9 @@ class _Run:
                 segment_length=self.options.segment_length,
                 initial_state=self.options.initial_state,
                 precision=self.options.precision,
+                preparation=prepared,
+                start=None if prepared is None else prepared.neighbourhood(),
+                corrects=False,
                 device=self.device,
                 checkpoint=None if self.folder is None else self.folder / "run",
                 progress=self.report,

@@ -52,6 +52,8 @@ DEMO_OPTIONS = LoopOptions(
     search_iterations=45,
     num_domains=30,
     num_initial_states=2,
+    # The story is of one policy before and one after; a check might ask for more of both.
+    least_success=0.0,
     deploys="last",
     discovers="after diagnosis",
     discovery=DiscoveryOptions(max_effects=2, precision="float32"),

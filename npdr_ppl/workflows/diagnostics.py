@@ -2,28 +2,44 @@
 
 Only the exported object is read, through ArviZ, so a posterior from anywhere can be diagnosed.
 
-The figures: r̂ and effective sample size across independently trained members (disagreement means
-the estimator, not the posterior, decides); contraction 1 − sd/sd_prior per parameter; coverage and
-probability integral transform (PIT) of the recording under the posterior predictive; a Bayesian
-p-value of the worst segment's error; PSIS-LOO over segments with Pareto k.
+The figures: r̂ and effective sample size across chains (independently trained members, or disjoint
+draws of a corrected posterior); contraction 1 − sd/sd_prior per parameter, alone and given all
+others; coverage and probability integral transform (PIT) of the recording under the posterior
+predictive; a Bayesian p-value of the worst segment's error; PSIS-LOO over segments with Pareto k.
+Posteriors of this package export the checks of :mod:`npdr_ppl.workflows.checks` as well.
+
+The order of the decisions is that of the evidence. That the model is wrong is said first, and only
+where its best parameters leave what no parameters explain; then that a prior ends too early; then
+that the estimator has not converged; then what the recording does not determine.
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.workflows.checks import ATTRIBUTE
+from npdr_ppl.workflows.diagnostic_figures import (
+    against_prior,
+    conditional_contraction,
+    extreme,
+    leave_one_out,
+    predictive_checks,
+)
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from npdr_ppl.workflows.arviz_module import Data
 
 __all__ = ["Decision", "Diagnosis", "Thresholds", "diagnose"]
+
+
+CONTRACTS = 0.5
+"""Contraction given all other parameters from which a parameter is determined in combination with
+them: half of what would be known of it if they were known."""
 
 
 class Decision(StrEnum):
@@ -33,6 +49,7 @@ class Decision(StrEnum):
     MORE_ROUNDS = "more rounds"
     WIDEN = "widen"
     NEW_ROLLOUT = "new rollout"
+    OTHER_EXCITATION = "other excitation"
     REVISE_MODEL = "revise the model"
     STOP = "stop"
 
@@ -42,21 +59,30 @@ class Thresholds:
     """Limits behind the decisions.
 
     Attributes:
-        r_hat: Members agree below this (Vehtari et al. 2021 advise 1.01 for MCMC; networks trained
+        r_hat: Chains agree below this (Vehtari et al. 2021 advise 1.01 for MCMC; networks trained
             on the same simulations differ by more).
+        ess: Least effective sample size: what five chains at the limit of r̂ have. Where there is
+            one chain, the ends of a 90 % interval are known to half a standard deviation.
         coverage_shortfall: The recording leaves its 90 % band by this much more than it should.
         segment_p_value: The worst segment is this unlikely under the posterior predictive.
+        noise_ratio: Residuals at the best parameters are this many times the declared noise: at
+            1.25 an interval of 90 % holds 81 %.
         edge_mass: Share of a marginal in the outermost 2 % of the prior that makes it too narrow.
-        contraction: Every parameter learnt less than this: the data say nothing.
-        pareto_k: PSIS-LOO is unreliable above it.
+        contraction: A parameter that learnt less than this is not determined by the data.
+        pareto_k: PSIS-LOO is unreliable for segments above it.
+        influential_share: Share of the segments above ``pareto_k`` from which the posterior is
+            said to hang on few of them.
     """
 
     r_hat: float = 1.1
+    ess: float = 20.0
     coverage_shortfall: float = 0.2
     segment_p_value: float = 0.01
+    noise_ratio: float = 1.25
     edge_mass: float = 0.25
     contraction: float = 0.1
     pareto_k: float = 0.7
+    influential_share: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -74,7 +100,13 @@ class Diagnosis:
         pit_deviation: Greatest distance of the PIT's distribution from uniform.
         segment_p_value: Bayesian p-value of the worst segment.
         elpd_loo: Expected log predictive density over segments, and its standard error.
-        pareto_k: Greatest Pareto k.
+        pareto_k: Greatest Pareto k of a segment.
+        conditional_contraction: Contraction given all other parameters.
+        influential_share: Share of the segments whose Pareto k is above the limit.
+        estimator_k: Pareto k of the posterior's draws weighted by what the simulator says of them;
+            NaN where that is not known.
+        model_p_value: Probability of as large a disagreement at the best parameters by chance, as
+            ``npdr discover`` computes it; NaN where that is not known.
     """
 
     decision: Decision
@@ -88,6 +120,10 @@ class Diagnosis:
     segment_p_value: float
     elpd_loo: tuple[float, float]
     pareto_k: float
+    conditional_contraction: Mapping[str, float] = field(default_factory=dict)
+    influential_share: float = float("nan")
+    estimator_k: float = float("nan")
+    model_p_value: float = float("nan")
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the figures as JSON-serialisable values."""
@@ -98,7 +134,7 @@ def diagnose(
     data: "Data",
     thresholds: Thresholds | None = None,
     *,
-    rounds_left: int = 0,
+    rounds_left: int = 1,
     rollouts_left: int = 1,
 ) -> Diagnosis:
     """Diagnoses a posterior and decides what to do next.
@@ -120,26 +156,16 @@ def diagnose(
     if missing:
         raise DataError(f"The ArviZ object lacks the groups {', '.join(sorted(missing))}.")
     groups = {name: group(data, name) for name in group_names(data)}
-    least_ess = _extreme(ess(data), np.nanmin)
-    r_hat = _extreme(rhat(data), np.nanmax)
-    contraction, edge_mass = _against_prior(groups)
-    coverage, pit_deviation, p_value = _predictive_checks(groups)
-    elpd, k = _loo(data)
-    decision, reason = _decide(
-        limits,
-        rounds_left,
-        rollouts_left,
-        r_hat,
-        contraction,
-        edge_mass,
-        coverage,
-        p_value,
-    )
-    return Diagnosis(
-        decision,
-        reason,
-        r_hat,
-        least_ess,
+    checks: dict[str, Any] = json.loads(data.attrs.get(ATTRIBUTE, "{}"))
+    contraction, edge_mass = against_prior(groups)
+    coverage, pit_deviation, p_value = predictive_checks(groups)
+    elpd, k, influential = leave_one_out(data, limits.pareto_k)
+    estimator, model = checks.get("estimator", {}), checks.get("model", {})
+    figures = Diagnosis(
+        Decision.ACCEPT,
+        "",
+        extreme(rhat(data), np.nanmax),
+        extreme(ess(data), np.nanmin),
         contraction,
         edge_mass,
         coverage,
@@ -147,152 +173,189 @@ def diagnose(
         p_value,
         elpd,
         k,
+        conditional_contraction(groups),
+        influential,
+        _number(estimator.get("pareto_k")),
+        _number(model.get("p_value")),
     )
+    reads = _Reading(figures, limits, checks, rounds_left, rollouts_left)
+    decision, reason = reads.decide()
+    return replace(figures, decision=decision, reason=reason)
 
 
-def _decide(
-    limits: Thresholds,
-    rounds_left: int,
-    rollouts_left: int,
-    r_hat: float,
-    contraction: Mapping[str, float],
-    edge_mass: Mapping[str, float],
-    coverage: float,
-    p_value: float,
-) -> tuple[Decision, str]:
-    misfit = 0.9 - coverage > limits.coverage_shortfall or p_value < limits.segment_p_value
-    shown = f"the 90 % band holds {coverage:.0%} of the recording, worst segment p = {p_value:.3f}"
-    if r_hat > limits.r_hat and rounds_left > 0:
-        return (
-            Decision.MORE_ROUNDS,
-            f"The ensemble members disagree (r-hat {r_hat:.2f} > {limits.r_hat}), so more "
-            "simulations are needed before the posterior can be believed.",
+@dataclass(frozen=True)
+class _Reading:
+    """Figures, and what they mean together."""
+
+    figures: Diagnosis
+    limits: Thresholds
+    checks: Mapping[str, Any]
+    rounds_left: int
+    rollouts_left: int
+
+    def decide(self) -> tuple[Decision, str]:
+        """Returns the first decision that there is reason for."""
+        found = (
+            self._of_model()
+            or self._of_priors()
+            or self._of_estimator()
+            or self._of_excitation()
+            or self._of_influence()
         )
-    at_edge = {name: mass for name, mass in edge_mass.items() if mass > limits.edge_mass}
-    if misfit and at_edge:
-        worst = max(at_edge, key=lambda name: at_edge[name])
+        return found or (Decision.ACCEPT, f"{self._agreement()}{self._undetermined()}")
+
+    @property
+    def _shown(self) -> str:
+        figures = self.figures
         return (
-            Decision.WIDEN,
-            f"The posterior presses {worst} against the edge of its prior ({at_edge[worst]:.0%} "
-            f"of its mass) and still misses the recording ({shown}): widen the prior.",
+            f"the 90 % band holds {figures.coverage_90:.0%} of the recording, worst segment "
+            f"p = {figures.segment_p_value:.3f}"
         )
-    if misfit:
+
+    def _agreement(self) -> str:
+        model = self.checks.get("model")
+        if model is None:
+            return f"The chains agree and the posterior explains the recording ({self._shown})."
+        return (
+            "The posterior is what the simulator says, and nothing in the recording speaks "
+            f"against the model (p = {model['p_value']:.2g})."
+        )
+
+    def _misfit(self) -> bool:
+        """Whether predictions miss the recording, where nothing better is known."""
+        figures, limits = self.figures, self.limits
+        return (
+            0.9 - figures.coverage_90 > limits.coverage_shortfall
+            or figures.segment_p_value < limits.segment_p_value
+        )
+
+    def _of_model(self) -> tuple[Decision, str] | None:
+        model = self.checks.get("model")
+        if model is None:
+            return self._of_predictions()
+        if model["fired"]:
+            priors = "".join(f" Also, {text}." for text in self.checks.get("priors", ()))
+            return (
+                Decision.REVISE_MODEL,
+                f"No parameters explain the recording (p = {model['p_value']:.2g} at the best "
+                f"ones, clearest in {model['loudest']}): an effect is missing in the model. "
+                f"`npdr discover` looks for it.{priors}",
+            )
+        ratio = _number(model.get("misfit"))
+        if ratio > self.limits.noise_ratio and not self.checks.get("priors"):
+            return (
+                Decision.REVISE_MODEL,
+                f"The best parameters leave residuals {ratio:.2g} times as large as the declared "
+                "noise, and nothing regular in them: declare more noise, or none to have it "
+                "estimated.",
+            )
+        return None
+
+    def _of_predictions(self) -> tuple[Decision, str] | None:
+        """Decides about the model by predictions alone, once the estimator can be believed."""
+        if not self._misfit():
+            return None
+        if self.figures.r_hat > self.limits.r_hat and self.rounds_left > 0:
+            return self._more_rounds()
+        at_edge = {n: m for n, m in self.figures.edge_mass.items() if m > self.limits.edge_mass}
+        if at_edge:
+            worst = max(at_edge, key=lambda name: at_edge[name])
+            return (
+                Decision.WIDEN,
+                f"The posterior presses {worst} against the edge of its prior "
+                f"({at_edge[worst]:.0%} of its mass) and still misses the recording "
+                f"({self._shown}): widen the prior.",
+            )
         return (
             Decision.REVISE_MODEL,
-            f"No parameters explain the recording ({shown}): an effect is missing in the model.",
+            f"No parameters explain the recording ({self._shown}): an effect is missing in the "
+            "model.",
         )
-    if contraction and max(contraction.values()) < limits.contraction:
-        learnt = f"The data contract no parameter by more than {max(contraction.values()):.0%}"
-        if rollouts_left > 0:
-            return (
-                Decision.NEW_ROLLOUT,
-                f"{learnt}: record a rollout that excites the system more.",
-            )
-        return Decision.STOP, f"{learnt}, and no more can be recorded."
-    if r_hat > limits.r_hat:
+
+    def _of_priors(self) -> tuple[Decision, str] | None:
+        priors = self.checks.get("priors")
+        if not priors:
+            return None
+        return Decision.WIDEN, f"{'. '.join(priors)}."
+
+    def _of_estimator(self) -> tuple[Decision, str] | None:
+        figures, limits = self.figures, self.limits
+        estimator = self.checks.get("estimator", {"is_reliable": True})
+        is_off = not estimator["is_reliable"]
+        if not (is_off or figures.r_hat > limits.r_hat or figures.ess < limits.ess):
+            return None
+        if self.rounds_left > 0:
+            return self._more_rounds()
         return (
             Decision.WIDEN,
-            f"The ensemble members still disagree (r-hat {r_hat:.2f} > {limits.r_hat}) and no "
-            "rounds are left: mix the posterior with the prior.",
+            f"The estimator has not converged ({self._convergence()}) and no rounds are left: mix "
+            "the posterior with the prior.",
         )
-    return (
-        Decision.ACCEPT,
-        f"The members agree and the posterior explains the recording ({shown}).",
-    )
 
-
-def _extreme(dataset: Any, reduce: Any) -> float:
-    values = [np.asarray(dataset[name]).ravel() for name in dataset.data_vars]
-    joined = np.concatenate(values)
-    return float(reduce(joined)) if np.isfinite(joined).any() else float("nan")
-
-
-def _against_prior(
-    data: Mapping[str, "xr.Dataset"],
-) -> tuple[dict[str, float], dict[str, float]]:
-    contraction, edge_mass = {}, {}
-    for name in data["posterior"].data_vars:
-        posterior = np.asarray(data["posterior"][name]).reshape(
-            -1, *data["posterior"][name].shape[2:]
+    def _more_rounds(self) -> tuple[Decision, str]:
+        return (
+            Decision.MORE_ROUNDS,
+            f"The estimator has not converged ({self._convergence()}): more rounds, more "
+            "simulations or other features are needed before the posterior can be believed.",
         )
-        prior = np.asarray(data["prior"][name]).reshape(-1, *posterior.shape[1:])
-        labels = (
-            [str(name)]
-            if posterior.ndim == 1
-            else [
-                f"{name}[{','.join(map(str, index))}]" for index in np.ndindex(posterior.shape[1:])
-            ]
+
+    def _convergence(self) -> str:
+        figures = self.figures
+        parts = [f"r-hat {figures.r_hat:.2f}", f"effective sample size {figures.ess:.0f}"]
+        estimator = self.checks.get("estimator")
+        if estimator is not None and not estimator["is_reliable"]:
+            k = _number(estimator["pareto_k"])
+            shown = f"{k:.1f}" if np.isfinite(k) else "unknown"
+            parts.append(f"Pareto k {shown} against the simulator")
+        return ", ".join(parts)
+
+    def _unlearnt(self) -> list[str]:
+        return [n for n, c in self.figures.contraction.items() if c < self.limits.contraction]
+
+    def _of_excitation(self) -> tuple[Decision, str] | None:
+        unlearnt = self._unlearnt()
+        if not unlearnt:
+            return None
+        everything = len(unlearnt) == len(self.figures.contraction)
+        if self.rollouts_left <= 0:
+            if not everything:
+                return None
+            return (
+                Decision.STOP,
+                "The data determine no parameter "
+                f"({_listed(unlearnt)}), and no more can be recorded.",
+            )
+        alone = [n for n in unlearnt if self.figures.conditional_contraction[n] < CONTRACTS]
+        if alone:
+            return (
+                Decision.NEW_ROLLOUT,
+                f"The recording says nothing of {_listed(alone)}: record a rollout that excites "
+                "the system more.",
+            )
+        return (
+            Decision.OTHER_EXCITATION,
+            f"The recording determines {_listed(unlearnt)} only in combination with other "
+            "parameters: record another excitation, or fix one of them.",
         )
-        columns = zip(
-            labels,
-            posterior.reshape(len(posterior), -1).T,
-            prior.reshape(len(prior), -1).T,
-            strict=True,
+
+    def _of_influence(self) -> tuple[Decision, str] | None:
+        share = self.figures.influential_share
+        if not share > self.limits.influential_share or self.rollouts_left <= 0:
+            return None
+        return (
+            Decision.NEW_ROLLOUT,
+            f"The posterior hangs on few segments ({share:.0%} of them have a Pareto k above "
+            f"{self.limits.pareto_k}): record another rollout.",
         )
-        for label, q, p in columns:
-            contraction[label] = float(1 - q.std() / max(p.std(), np.finfo(float).tiny))
-            low, high = np.quantile(p, [0.01, 0.99])
-            edge_mass[label] = float(np.mean(q < low) + np.mean(q > high))
-    return contraction, edge_mass
+
+    def _undetermined(self) -> str:
+        unlearnt = self._unlearnt()
+        return f" It does not determine {_listed(unlearnt)}." if unlearnt else ""
 
 
-def _predictive_checks(data: Mapping[str, "xr.Dataset"]) -> tuple[float, float, float]:
-    coverages, deviations, p_values = [], [], []
-    for name in data["observed_data"].data_vars:
-        observed = np.asarray(data["observed_data"][name])
-        predictive = np.asarray(data["posterior_predictive"][name])
-        predictive = predictive.reshape(-1, *observed.shape)
-        counted = _counted(data, str(name), observed.shape)
-        # Without any spread of its own, a deterministic simulator's draws are compared as ranks.
-        pit = (predictive < observed).mean(0) + 0.5 * (predictive == observed).mean(0)
-        pit = pit[counted]
-        coverages.append(float(np.mean((pit >= 0.05) & (pit <= 0.95))))
-        grid = np.sort(pit)
-        uniform = (np.arange(len(grid)) + 0.5) / len(grid)
-        deviations.append(float(np.abs(grid - uniform).max()))
-        p_values.append(_worst_segment_p_value(predictive, observed, counted))
-    return min(coverages), max(deviations), min(p_values)
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _counted(
-    data: Mapping[str, "xr.Dataset"], name: str, shape: tuple[int, ...]
-) -> NDArray[np.bool_]:
-    """Returns which readings exist and were measured."""
-    if "constant_data" not in data or f"{name}_mask" not in data["constant_data"]:
-        return np.ones(shape, dtype=bool)
-    mask = np.asarray(data["constant_data"][f"{name}_mask"])[..., None]
-    measured = np.asarray(data["constant_data"][f"{name}_measured"])
-    return np.broadcast_to(mask & measured, shape)
-
-
-def _worst_segment_p_value(
-    predictive: NDArray[np.float64], observed: NDArray[np.float64], counted: NDArray[np.bool_]
-) -> float:
-    """Returns how often a draw's segment is as far from the mean as the worst recorded one.
-
-    Discrepancy: the greatest over segments of the mean squared distance from the predictive
-    mean, in units of the predictive variance; with the draws themselves as replicates.
-    """
-    mean = predictive.mean(0)
-    scale = predictive.std(0)
-    floor = 1e-3 * np.abs(observed).max() + np.finfo(float).tiny
-    weight = counted / np.maximum(scale, floor) ** 2
-    axes = tuple(range(observed.ndim))[-2:] if observed.ndim >= 3 else None
-
-    def discrepancy(value: NDArray[np.float64]) -> float:
-        return float(np.max(((value - mean) ** 2 * weight).sum(axis=axes)))
-
-    replicated = np.array([discrepancy(draw) for draw in predictive])
-    return float(np.mean(replicated >= discrepancy(observed)))
-
-
-def _loo(data: "Data") -> tuple[tuple[float, float], float]:
-    from npdr_ppl.workflows.arviz_module import group, group_names, loo
-
-    unknown = (float("nan"), float("nan")), float("nan")
-    if "log_likelihood" not in group_names(data):
-        return unknown
-    if len(group(data, "log_likelihood").data_vars) != 1:
-        return unknown
-    found = loo(data)
-    return (found.elpd, found.se), float(np.max(found.pareto_k))
+def _number(value: Any) -> float:
+    return float("nan") if value is None else float(value)

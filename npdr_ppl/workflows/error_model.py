@@ -1,34 +1,31 @@
 """The error model that posteriors of several backends are compared under.
 
-A segment's log likelihood depends on how large the readings' errors are and on how many of them
-are independent. Were either estimated from each posterior's own residuals, a posterior that
-misses the recording would earn itself a wide error and few independent readings, and its elpd
-would not be comparable. Both are therefore found once, from the recording that is fitted and
-before any backend has seen it:
-
-* the *scale* is the noise that the model declares; without any, the root-mean-square residual of
-  the closest parameters a short search of the prior finds, which is also what the backends'
-  simulations carry;
-* the *share* of independent readings per channel is that of the residuals which these parameters
-  leave (see :func:`npdr_ppl.workflows.arviz_export.effective_share`). Readings weighted by it make
-  a composite likelihood of the right magnitude (Ribatet, Cooley & Davison 2012).
+A segment's log likelihood depends on how large the measurements' errors are and on how many of
+them are independent. Were either estimated from each posterior's own residuals, a posterior that
+misses the recording would earn itself a wide error and few independent measurements, and its elpd
+would not be comparable. Both are therefore found once, by the common preparation of the recording
+that is fitted, before any backend has seen it.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.arviz_export import effective_share
-from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data
-from npdr_ppl.workflows.closest_fit import closest_fit
-from npdr_ppl.workflows.evaluation import declares_noise, replay
-from npdr_ppl.workflows.infer import MAX_READINGS_PER_CHUNK
+from npdr_ppl.workflows.binding import (
+    MAX_READINGS_PER_CHUNK,
+    BindingOptions,
+    BoundModel,
+    Data,
+)
+from npdr_ppl.workflows.closest_fit import ClosestFit, closest_fit
+from npdr_ppl.workflows.evaluation import replay
+from npdr_ppl.workflows.preparation import Preparation, prepare
 from npdr_ppl.workflows.progress import Step
 
 __all__ = ["ErrorModel", "find_error_model", "segment_log_likelihood"]
@@ -39,14 +36,17 @@ class ErrorModel:
     """What the backends' simulations and their comparison have in common.
 
     Attributes:
+        prepared: What was done with the recording first; ``None`` for observations of plain
+            functions and for several sites, which keep the model's own noise.
         fitted: The model the backends get.
         judged: The model with the error that likelihoods are computed under; another one only
             where a model without noise is fitted as it is.
         noise: Estimated standard deviation by channel, in its unit; ``None`` if the model declares
             its own.
-        share: Share of independent readings by channel; empty counts every reading.
+        share: Share of independent measurements by channel; empty counts every one.
     """
 
+    prepared: Preparation | None
     fitted: Callable[..., Any]
     judged: Callable[..., Any]
     noise: Mapping[str, float] | None
@@ -85,20 +85,34 @@ def find_error_model(
         DataError: No parameters could be simulated along the recording.
     """
     if not isinstance(train, Rollouts):
-        return ErrorModel(model, model, None, {})
-    declared = declares_noise(model, train, options)
-    closest = closest_fit(model, train, options, seed=seed, progress=progress)
+        return ErrorModel(None, model, model, None, {})
+    found = prepare(model, train, options, seed=seed, progress=progress)
+    plain = prepare_as_it_is(found, noise)
+    if found.likelihood is not None:
+        names = found.likelihood.segments.channel_names
+        share = dict.fromkeys(names, found.likelihood.share)
+    else:
+        closest = found.closest or closest_fit(model, train, options, seed=seed)
+        share = _share_of_residuals(model, train, options, closest)
+    return ErrorModel(plain, plain.model, found.model, found.noise, share)
+
+
+def prepare_as_it_is(found: Preparation, noise: Literal["auto", "model"]) -> Preparation:
+    """Returns a preparation whose model keeps its own noise, if that is what is wanted."""
+    if noise == "auto" or found.noise is None:
+        return found
+    return replace(found, model=found.plain_model, noise=None, noise_of_sensors=None)
+
+
+def _share_of_residuals(
+    model: Callable[..., Any], train: Rollouts, options: BindingOptions, closest: ClosestFit
+) -> dict[str, float]:
+    """Returns the share of independent measurements where initial states are taken as true."""
     replayed = replay(model, train, closest.parameters, options)
     observed = train.observation(replayed.inputs, channels=replayed.channel_names)
     residual = (replayed.trajectory[0] - observed).double().cpu()
     share = effective_share(residual, replayed.inputs.mask.cpu())
-    noisy = model if declared else with_noise(model, closest.noise)
-    return ErrorModel(
-        noisy if noise == "auto" else model,
-        noisy,
-        None if declared else closest.scale,
-        dict(zip(replayed.channel_names, share.tolist(), strict=True)),
-    )
+    return dict(zip(replayed.channel_names, share.tolist(), strict=True))
 
 
 def segment_log_likelihood(bound: BoundModel, z: Tensor, share: Mapping[str, float]) -> Tensor:
@@ -114,6 +128,8 @@ def segment_log_likelihood(bound: BoundModel, z: Tensor, share: Mapping[str, flo
     Raises:
         IntractableError: The model declares no noise, so there is no density.
     """
+    if bound.likelihood is not None:
+        return bound.likelihood.by_segment(z)
     readings = sum(o.value.numel() for o in bound.observations.values())
     chunk = max(1, MAX_READINGS_PER_CHUNK // max(1, readings))
     parts = [

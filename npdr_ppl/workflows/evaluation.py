@@ -33,11 +33,13 @@ class Replay:
         trajectory: Readings after each step, ``(n, S, K, C)``.
         inputs: The segments.
         channel_names: Names of the C measured channels.
+        units: Their units: the recording's, or where it has none, the simulator's.
     """
 
     trajectory: Tensor
     inputs: Inputs
     channel_names: tuple[str, ...]
+    units: tuple[str, ...]
 
     def series(self) -> list[Tensor]:
         """Returns the states before each step, one ``(n, T, C)`` per rollout."""
@@ -71,7 +73,13 @@ def replay(
     names = [sensor.name for sensor in box.simulator.sensors]
     measured = [channel for channel in names if channel in rollouts.channel_names]
     trajectory = prior.execute_at(parameters)[name][..., [names.index(c) for c in measured]]
-    return Replay(trajectory, inputs.select_channels(measured), tuple(measured))
+    recorded = dict(zip(rollouts.channel_names, rollouts.channel_units, strict=True))
+    units = tuple(
+        recorded[sensor.name] or sensor.unit
+        for sensor in box.simulator.sensors
+        if sensor.name in recorded
+    )
+    return Replay(trajectory, inputs.select_channels(measured), tuple(measured), units)
 
 
 def score(

@@ -3,20 +3,23 @@
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from npdr_ppl.engines.workers import collect_faults
 from npdr_ppl.inference.base import Backend
+from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.closest_fit import prepare
-from npdr_ppl.workflows.diagnostics import diagnose
+from npdr_ppl.workflows.diagnostics import Decision, diagnose
 from npdr_ppl.workflows.evaluation import score
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.posterior import Posterior
+from npdr_ppl.workflows.preparation import prepare
 from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.run_folder import engine_settings, write_json
 from npdr_ppl.workflows.units import parameter_units
@@ -34,8 +37,9 @@ def fit(
     *,
     out: Path | None = None,
     backend: str | Backend = "snpe-c",
-    rounds: int = 2,
-    num_simulations: int = 2_000,
+    rounds: int = 1,
+    extra_rounds: int = 2,
+    num_simulations: int = 1_000,
     seed: int = 0,
     options: BindingOptions | None = None,
     noise: Literal["auto", "model"] = "auto",
@@ -52,11 +56,12 @@ def fit(
             interrupted fit continues; nothing is written if ``None``.
         backend: The inference backend.
         rounds: Rounds of simulating and training.
+        extra_rounds: Rounds that the diagnosis may add where the estimator has not converged.
         num_simulations: Simulations of each round.
         seed: Seed of everything random.
         options: How the data are prepared.
         noise: ``"auto"`` gives a model without noise the scale of
-            :func:`~npdr_ppl.workflows.closest_fit.closest_fit`; ``"model"`` takes it as it is.
+            its closest fit; ``"model"`` takes it as it is.
         device: Where the backend trains.
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
@@ -74,32 +79,40 @@ def fit(
                 progress=report.stage("find the closest parameters"),
             )
         options = prepared.options
-        posterior = infer(
-            prepared.model,
-            train,
-            backend=backend,
-            rounds=rounds,
-            num_simulations=num_simulations,
-            seed=seed,
-            embedding=options.embedding,
-            segment_length=options.segment_length,
-            initial_state=options.initial_state,
-            precision=options.precision,
-            device=device,
-            checkpoint=None if out is None else out / "run",
-            progress=report,
-        )
-        step = report.stage("sample and judge")
         started = time.perf_counter()
-        with collect_faults() as after:
-            step(0.0, "most likely draw")
+        with ExitStack() as stack, collect_faults() as after:
+            folder = (
+                stack.enter_context(TemporaryDirectory(prefix="npdr-")) if out is None else out
+            )
+            method = backend_by_name(backend) if isinstance(backend, str) else backend
+            left = extra_rounds if method.is_sequential else 0
+            while True:
+                posterior = infer(
+                    prepared.model,
+                    train,
+                    backend=method,
+                    rounds=rounds,
+                    num_simulations=num_simulations,
+                    seed=seed,
+                    preparation=prepared,
+                    start=prepared.neighbourhood(),
+                    device=device,
+                    checkpoint=Path(folder) / "run",
+                    progress=report,
+                )
+                step = report.stage("sample and judge")
+                data = posterior.to_arviz(seed=seed)
+                diagnosis = diagnose(data, rounds_left=max(left, 1))
+                if diagnosis.decision is not Decision.MORE_ROUNDS or left == 0:
+                    break
+                rounds, left = rounds + 1, left - 1
+            step(0.5, "most likely draw")
             most_likely = posterior.most_likely(seed=seed)
-            step(0.1, "predictions")
-            data = posterior.to_arviz(seed=seed)
-            sampled = time.perf_counter() - started
+            spent = sum(posterior.provenance.seconds.values())
+            sampled = time.perf_counter() - started - spent
             step(0.8, "scores")
             evaluated = train if test is None else test
-            metrics = score(model, evaluated, most_likely, options)
+            metrics = score(prepared.model, evaluated, most_likely, options)
             step(1.0, "")
     # A resumed run knows the faults of its finished rounds from disk.
     faults = Counter(posterior.provenance.faults)
@@ -117,8 +130,10 @@ def fit(
             "evaluated_on": "fitted" if test is None else "held-out",
         },
         "noise": prepared.noise,
+        "preparation": prepared.to_dict() | {"sentence": prepared.sentence()},
+        "checks": posterior.checks(),
         "seconds": {**posterior.provenance.seconds, "sample": sampled},
-        "diagnosis": diagnose(data).to_dict(),
+        "diagnosis": diagnosis.to_dict(),
         "units": parameter_units(posterior),
     }
     if faults:

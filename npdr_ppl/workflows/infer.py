@@ -13,26 +13,32 @@ from torch import Tensor
 
 from npdr_ppl.embeddings import Embedding
 from npdr_ppl.engines.workers import collect_faults, report_progress
-from npdr_ppl.errors import BackendError, DataError, NpdrError
+from npdr_ppl.errors import BackendError, NpdrError
 from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
 from npdr_ppl.inference.mixture import Mixture
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import InitialState
-from npdr_ppl.workflows.binding import BindingOptions, BoundModel, Data, bind, problem_of
-from npdr_ppl.workflows.closest_fit import prepare
+from npdr_ppl.workflows.binding import (
+    MAX_READINGS_PER_CHUNK,
+    PLAIN_FEATURES,
+    BindingOptions,
+    BoundModel,
+    Data,
+    SegmentLength,
+    bind,
+    problem_of,
+)
+from npdr_ppl.workflows.estimator_check import check_estimator
 from npdr_ppl.workflows.posterior import Posterior, PosteriorBase, Provenance
+from npdr_ppl.workflows.preparation import Preparation, prepare
 from npdr_ppl.workflows.progress import Reporter, reporter
 from npdr_ppl.workflows.run_folder import RunFolder
 
 __all__ = ["infer", "run_round", "simulate_features"]
 
 _LOGGER = logging.getLogger(__name__)
-
-# Readings that one chunk of simulations may hold, 16 MiB in float64: larger arrays leave the cache
-# and are mapped afresh by the allocator every time, smaller ones pay the overhead of many calls.
-MAX_READINGS_PER_CHUNK = 2_000_000
 
 
 def infer(
@@ -43,13 +49,16 @@ def infer(
     rounds: int = 1,
     num_simulations: int = 1_000,
     seed: int = 0,
-    embedding: str | Embedding | None = "bayessim",
-    segment_length: int | None = None,
-    initial_state: InitialState = "estimated",
+    embedding: str | Embedding | None = "score",
+    segment_length: SegmentLength = "auto",
+    initial_state: InitialState = "uncertain",
+    noise: Literal["auto", "model"] = "auto",
     precision: Literal["float64", "float32"] = "float64",
     device: str | torch.device = "cpu",
     start: PosteriorBase | Density | None = None,
     checkpoint: str | PathLike[str] | None = None,
+    preparation: Preparation | None = None,
+    corrects: bool = True,
     progress: bool | Reporter | None = None,
 ) -> Posterior:
     """Infers the posterior over a model's domain parameters from measured data.
@@ -64,16 +73,24 @@ def infer(
         num_simulations: Simulations of each round.
         seed: Seed of everything random.
         embedding: Maps trajectories to features; see :mod:`npdr_ppl.embeddings`. ``"score"`` is
-            that of :func:`~npdr_ppl.workflows.closest_fit.score_embedding`.
-        segment_length: Steps between re-synchronisations; ``None`` for whole rollouts.
-        initial_state: State at a segment's start: ``"estimated"``, ``"recorded"`` or
-            ``"uncertain"``; see :class:`~npdr_ppl.workflows.binding.BindingOptions`.
+            that of :func:`~npdr_ppl.workflows.preparation.score_embedding`, made for the
+            recording.
+        segment_length: Steps between re-synchronisations: a number, ``"auto"``, or ``None`` for
+            whole rollouts.
+        initial_state: State at a segment's start: ``"uncertain"``, ``"estimated"`` or
+            ``"recorded"``; see :class:`~npdr_ppl.workflows.binding.BindingOptions`.
+        noise: ``"auto"`` gives a model without noise, where initial states are uncertain, that of
+            its closest fit; ``"model"`` takes it as it is.
         precision: Floating-point type of the simulation.
         device: Where trajectories are simulated and the backend trains.
         start: Posterior of the same model given other data, or another density over its
             reference coordinates. A backend that can correct for it simulates the prior in that
             region only; if the new posterior lies elsewhere it is not found.
         checkpoint: Folder to save every round in; an interrupted run continues from there.
+        preparation: What :func:`~npdr_ppl.workflows.preparation.prepare` made of the model and
+            the data, whose options then count instead of those given here.
+        corrects: Whether a learnt posterior that differs from what the simulator says is
+            corrected; see :mod:`npdr_ppl.workflows.estimator_check`.
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Returns:
@@ -103,11 +120,22 @@ def infer(
     if not method.uses_simulations:
         rounds = 1
     options = BindingOptions(embedding, segment_length, initial_state, precision)
-    if embedding == "score":
-        if not isinstance(data, Rollouts):
-            raise DataError("The embedding 'score' is for models whose only site has rollouts.")
-        options = prepare(model, data, options, noise="model", seed=seed).options
-    bound = bind(model, data, options, device)
+    if preparation is None and isinstance(data, Rollouts):
+        kept: Literal["auto", "model"] = noise if initial_state == "uncertain" else "model"
+        preparation = prepare(model, data, options, noise=kept, seed=seed)
+    if preparation is not None:
+        model, options = preparation.model, preparation.options
+    elif embedding == "score":
+        options = replace(options, embedding=PLAIN_FEATURES)
+    prepared = preparation if preparation is None or preparation.hypothesis else None
+    bound = bind(
+        model,
+        data,
+        options,
+        device,
+        starts=None if prepared is None else prepared.starts,
+        likelihood=None if prepared is None else prepared.likelihood,
+    )
     problem = problem_of(bound, device)
     states = [method.init(problem)]
     infos: list[RoundInfo] = []
@@ -115,6 +143,8 @@ def infer(
     store = None if checkpoint is None else RunFolder(Path(checkpoint))
     if store is not None:
         store.begin(bound, method, seed=seed, rounds=rounds, num_simulations=num_simulations)
+        if prepared is not None:
+            store.save_preparation(prepared)
         for index in store.rounds()[:rounds]:
             saved = store.load_round(index)
             states.append(method.restore(problem, saved.tensors, saved.values))
@@ -136,8 +166,18 @@ def infer(
             )  # fmt: skip
             if store is not None:
                 store.save_round(index, *method.tensors(state), infos, seconds)
-    provenance = Provenance(seed, num_simulations, tuple(infos), seconds)
-    return Posterior(bound, method, problem, states[1:], provenance)
+        provenance = Provenance(seed, num_simulations, tuple(infos), seconds)
+        learnt = Posterior(bound, method, problem, states[1:], provenance, preparation=prepared)
+        if bound.likelihood is None:
+            return learnt
+        report.stage("compare with the simulator")(0.0, "")
+        estimator, correction = check_estimator(
+            learnt.densities, bound.likelihood, seed=seed, corrects=corrects
+        )
+    posterior = learnt.corrected(estimator, correction)
+    if store is not None:
+        store.save_correction(correction, posterior.checks())
+    return posterior
 
 
 def run_round(

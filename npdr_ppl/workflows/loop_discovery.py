@@ -14,12 +14,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npdr_ppl.errors import DataError, NpdrError
+from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect, with_finer_steps
 from npdr_ppl.models.effects.registry import effect_class
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.discovery import DiscoveryOptions, discover
-from npdr_ppl.workflows.discovery.options import FEWEST_SEGMENTS, FEWEST_STEPS
 from npdr_ppl.workflows.loop_options import Model
 from npdr_ppl.workflows.progress import Step
 from npdr_ppl.workflows.run_folder import read_json
@@ -40,11 +39,14 @@ class Revision:
         model: The revised model; ``None`` where nothing is to be revised.
         reason: The finding in a sentence.
         parameters: Where the revised model fits best, by latent site.
+        experiment: What to record next where causes could not be told apart, as
+            ``discovery.json`` has it.
     """
 
     model: Model | None
     reason: str
     parameters: Mapping[str, Tensor] = field(default_factory=dict)
+    experiment: Mapping[str, Any] | None = None
 
 
 class LoopDiscovery:
@@ -74,7 +76,7 @@ class LoopDiscovery:
                 found = discover(
                     self.model,
                     rollouts,
-                    options=_fitting(self.options, rollouts),
+                    options=self.options,
                     report=_reports(progress),
                 )
             except NpdrError as error:
@@ -95,24 +97,14 @@ class LoopDiscovery:
             model = add_effect(model, own.get(name) or effect_class(row["effect"])(row["port"]))
         means = {name: row["mean"] for name, row in result["parameters"].items()}
         found = {name: torch.tensor(mean) for name, mean in means.items() if mean is not None}
-        return Revision(None if model is self.model else model, _sentence(result), found)
+        revised = None if model is self.model else model
+        return Revision(revised, _sentence(result), found, result.get("next_experiment"))
 
 
 def effect_names(model: Model) -> list[str]:
     """Returns the names of the effects that a model has beyond its own code."""
     attached = model.effects if isinstance(model, ModelWithEffects) else ()
     return [effect.name for effect, _ in attached]
-
-
-def _fitting(options: DiscoveryOptions, rollouts: Rollouts) -> DiscoveryOptions:
-    """Returns the options with segments short enough for rollouts that ended early."""
-    try:
-        options.binding(rollouts)
-    except DataError:
-        if options.segment_length is None:
-            half = sum(rollouts.lengths) // (2 * FEWEST_SEGMENTS)
-            return replace(options, segment_length=max(FEWEST_STEPS, half))
-    return options
 
 
 def _sentence(result: Mapping[str, Any]) -> str:

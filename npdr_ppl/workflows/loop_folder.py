@@ -4,7 +4,11 @@
     rollouts/rollout_<n>.nc           real rollouts, each with its journal ``.jsonl``
     policy_<k>.safetensors, .json     the policy that POLOPT number k came to, 0 being the prior's
     inference_<i>_<attempt>/          runs of inference, see :mod:`npdr_ppl.workflows.run_folder`
-    revision_<i>/                     what discovery found: revised_model.py, then discovery.json
+    policy_<k>_<d>.safetensors, .json tries of policy k: before another rollout, for the mean or
+                                      for the tail; policy k is the last or the better one
+    revision_<i>/, revision_<i>_<l>/  what discovery found: revised_model.py, then discovery.json;
+                                      look l of an iteration comes after a rollout that a check
+                                      of the new policy asked for
     iteration_<i>.json                the record of a finished iteration
     train.json                        the result so far
 
@@ -95,19 +99,28 @@ class LoopFolder:
         """Returns the folder of a run of inference."""
         return self.path / f"inference_{index}_{attempt}"
 
-    def revision(self, index: int) -> Path:
+    def revision(self, index: int, look: int = 0) -> Path:
         """Returns the folder of what was looked for in an iteration."""
-        return self.path / f"revision_{index}"
+        return self.path / f"revision_{_numbered(index, look or None)}"
 
-    def save_policy(self, number: int, parameters: Tensor, figures: Mapping[str, Any]) -> None:
-        """Saves a trained policy; the JSON goes last and makes it count."""
-        file = self.path / f"policy_{number}.json"
+    def save_policy(
+        self,
+        number: int,
+        parameters: Tensor,
+        figures: Mapping[str, Any],
+        *,
+        draft: int | None = None,
+    ) -> None:
+        """Saves a trained policy, or a draft; the JSON goes last and makes it count."""
+        file = self.path / f"policy_{_numbered(number, draft)}.json"
         save_tensors(file.with_suffix(".safetensors"), {"parameters": parameters})
         write_json(file, figures)
 
-    def policy(self, number: int) -> tuple[Tensor, dict[str, Any]] | None:
+    def policy(
+        self, number: int, draft: int | None = None
+    ) -> tuple[Tensor, dict[str, Any]] | None:
         """Returns parameters and figures of a trained policy, ``None`` before it is."""
-        file = self.path / f"policy_{number}.json"
+        file = self.path / f"policy_{_numbered(number, draft)}.json"
         if not file.exists():
             return None
         return load_tensors(file.with_suffix(".safetensors"))["parameters"], read_json(file)
@@ -124,6 +137,10 @@ class LoopFolder:
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Writes ``train.json``."""
         write_json(self.path / "train.json", result)
+
+
+def _numbered(number: int, part: int | None) -> str:
+    return f"{number}" if part is None else f"{number}_{part}"
 
 
 def _words(options: "LoopOptions") -> dict[str, Any]:

@@ -8,10 +8,10 @@ from torch import Tensor
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows.closest_fit import prepare
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.loop_options import LoopOptions, Model
 from npdr_ppl.workflows.posterior import Posterior
+from npdr_ppl.workflows.preparation import prepare
 from npdr_ppl.workflows.progress import Reporter
 
 __all__ = ["infer_posterior"]
@@ -52,15 +52,15 @@ def infer_posterior(
         rollouts,
         options.binding,
         noise=options.noise,
-        wants_neighbourhood=options.start == "closest fit" and backend.continues,
         near=near,
         seed=seed,
         progress=report.stage("find the closest parameters"),
     )
-    binding = prepared.options
     start = last if options.start == "posterior" and backend.continues else None
     if start is not None and _sites(start.prior) != _sites(prior):
         start = None  # the model was revised: the same place is something else
+    wants_fit = options.start == "closest fit" and backend.continues
+    near_fit = prepared.neighbourhood() if wants_fit else None
     return infer(
         prepared.model,
         rollouts,
@@ -68,11 +68,8 @@ def infer_posterior(
         rounds=rounds,
         num_simulations=options.num_simulations,
         seed=seed,
-        embedding=binding.embedding,
-        segment_length=binding.segment_length,
-        initial_state=binding.initial_state,
-        precision=binding.precision,
-        start=prepared.neighbourhood or start,
+        preparation=prepared,
+        start=near_fit or start,
         checkpoint=checkpoint,
         progress=report,
     )

@@ -13,6 +13,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.diagnostics import Thresholds
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
+from npdr_ppl.workflows.risk import MeanReturn, Risk, TailMean
 
 __all__ = ["NEW_ATTEMPTS", "SPREAD_WIDER", "Action", "LoopOptions", "Model", "Revise"]
 
@@ -51,7 +52,8 @@ class LoopOptions:
     Attributes:
         iterations: Iterations of the loop.
         rollouts: Real rollouts H of each iteration.
-        extra_rollouts: Real rollouts that diagnoses may ask for in the whole run.
+        extra_rollouts: Real rollouts that diagnoses, and checks before deploying, may ask for in
+            the whole run.
         rollouts_used: Whether inference sees all rollouts so far or the latest iteration's.
         backend: The inference backend; one with options of its own if it is no name.
         rounds: Rounds R of inference in each iteration; one for backends that are not sequential.
@@ -60,15 +62,28 @@ class LoopOptions:
         binding: How rollouts are prepared for inference.
         noise: ``"auto"`` gives a model without noise that of the closest fit's residuals;
             ``"model"`` takes it as it is.
-        start: Where inference starts: from the prior; in the neighbourhood of the closest fit; or
-            in later iterations, as in the paper, from the last posterior. Backends that cannot
-            start elsewhere start from the prior.
+        start: Where inference starts: from the prior; in the neighbourhood of the closest fit,
+            where initial states are uncertain; or in later iterations, as in the paper, from the
+            last posterior. Backends that cannot start elsewhere start from the prior.
         search: The policy search; one with options of its own if it is no name.
         search_iterations: Iterations of the policy search, each time.
         domains: Whether the policy is trained in draws of the posterior or at its most likely
             sample.
         num_domains: Domains that the policy is trained in.
         num_initial_states: Initial states in each.
+        risk: What the policy search maximises over the domains at first: their mean return, or the
+            mean of the worst.
+        least_success: Share of the posterior's draws, in simulation, in which a new policy must
+            succeed before it runs on the target; 0 checks nothing. Where it does not, another
+            rollout is recorded if one is left to ask for, otherwise the policy is trained for the
+            worst domains. The default is the share of successes that one would ask of the target,
+            which is one draw of the posterior if the model is right. It takes a task with a
+            threshold of success.
+        num_checked: Draws of the posterior in which a new policy is tried. With 200 the standard
+            error of a share of 0.9 is 0.02.
+        tail_share: Share of the domains, the worst ones, whose mean return is then maximised, in
+            (0, 1]. EPOpt (Rajeswaran et al. 2017) takes a tenth of 240; a fifth of the default 50
+            domains is as many as can be averaged.
         is_warm_start: Whether the search goes on from the last policy or begins anew.
         starts_from_prior: Whether the first policy is trained on the prior or taken as it comes.
         spread: Parameters of the domains are multiplied by numbers uniform in 1 ± ``spread``.
@@ -79,8 +94,10 @@ class LoopOptions:
             last, which no real rollout has tried yet. Where no measured return reached the
             task's threshold it is the last.
         follows_decisions: Whether diagnoses change what the loop does, or are logged only.
-        stop_return: Mean real return of an iteration at which an accepted posterior ends the
-            loop; ``None`` to use all iterations.
+        stop_return: Mean real return of an iteration that ends the loop; ``None`` to use all
+            iterations.
+        stops: What it takes besides that return: an accepted posterior, which is then at hand, or
+            nothing, which spares inference and training on a device that already does its task.
         thresholds: Limits behind the decisions.
         discovers: When discovery looks in all real rollouts so far for effects that the model
             lacks: in each iteration before anything is inferred, or after the posterior of the
@@ -108,6 +125,10 @@ class LoopOptions:
     domains: Literal["posterior", "most likely"] = "posterior"
     num_domains: int = 50
     num_initial_states: int = 4
+    risk: Risk = MeanReturn()
+    least_success: float = 0.9
+    num_checked: int = 200
+    tail_share: float = 0.2
     is_warm_start: bool = True
     starts_from_prior: bool = True
     spread: float = 0.1
@@ -116,6 +137,7 @@ class LoopOptions:
     deploys: Literal["best measured", "last"] = "best measured"
     follows_decisions: bool = True
     stop_return: float | None = None
+    stops: Literal["accepted posterior", "measured return"] = "accepted posterior"
     thresholds: Thresholds = field(default_factory=Thresholds)
     discovers: Literal["never", "before inference", "after diagnosis"] = "never"
     discovery: DiscoveryOptions = field(default_factory=DiscoveryOptions)
@@ -130,10 +152,18 @@ class LoopOptions:
             "iterations": 1, "rollouts": 1, "rounds": 1, "num_simulations": 10,
             "search_iterations": 1, "num_domains": 1, "num_initial_states": 1,
             "extra_rollouts": 0, "extra_rounds": 0, "spread": 0, "prior_share": 0,
+            "least_success": 0, "num_checked": 1,
         }  # fmt: skip
         for name, low in least.items():
             if not getattr(self, name) >= low:
                 raise ModelError(f"{name} must be at least {low}; got {getattr(self, name)}.")
-        for name in ("spread", "prior_share"):
+        for name in ("spread", "prior_share", "least_success"):
             if getattr(self, name) > 1:
                 raise ModelError(f"{name} must be at most 1; got {getattr(self, name)}.")
+        if not 0.0 < self.tail_share <= 1.0:
+            raise ModelError(f"tail_share must be above 0 and at most 1; got {self.tail_share}.")
+
+    @property
+    def tail(self) -> TailMean:
+        """What the policy search maximises where too few of the posterior's draws succeed."""
+        return TailMean(self.tail_share)

@@ -27,11 +27,11 @@ from npdr_ppl.errors import BackendError, NpdrError
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
-from npdr_ppl.metrics import c2st
+from npdr_ppl.metrics import c2st, check_c2st
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows.candidates import Candidate, requested
+from npdr_ppl.workflows.candidates import Candidate, folder_name, requested
 from npdr_ppl.workflows.infer import infer
 from npdr_ppl.workflows.posterior import Posterior
 from npdr_ppl.workflows.run_folder import write_json
@@ -88,7 +88,7 @@ def reproduce_pendulum(
     """Infers mass and length from one second and from eight, and compares with NUTS.
 
     Args:
-        out: Folder for ``pendulum.json``.
+        out: Folder for ``pendulum.json`` and the fits; those that it holds are not repeated.
         backends: Labels of :data:`METHODS`, or other backends; ``None`` for all methods whose
             backend there is, the others being noted as skipped.
         seed: Seed of everything random.
@@ -99,7 +99,10 @@ def reproduce_pendulum(
 
     Raises:
         BackendError: Every backend failed.
+        DataError: The folder holds fits with other settings.
+        DependencyError: What the posteriors are compared by is not installed.
     """
+    check_c2st()
     chosen, skipped = requested(backends, METHODS)
     out.mkdir(parents=True, exist_ok=True)
     ridges: dict[str, Ridge] = {}
@@ -110,7 +113,13 @@ def reproduce_pendulum(
         posteriors: dict[str, Posterior] = {}
         for label, candidate in chosen.items():
             try:
-                posteriors[label] = infer_mass_and_length(candidate, rollouts, seed, progress)
+                posteriors[label] = infer_mass_and_length(
+                    candidate,
+                    rollouts,
+                    seed,
+                    progress,
+                    checkpoint=out / folder_name(label) / folder_name(duration),
+                )
             except NpdrError as error:
                 failed[f"{label}, {duration}"] = str(error)
         if not posteriors:
@@ -143,9 +152,22 @@ def reproduce_pendulum(
 
 
 def infer_mass_and_length(
-    candidate: Candidate, rollouts: Rollouts, seed: int, progress: bool | None = None
+    candidate: Candidate,
+    rollouts: Rollouts,
+    seed: int,
+    progress: bool | None = None,
+    *,
+    checkpoint: Path | None = None,
 ) -> Posterior:
-    """Infers with the budget of all: in one round if the backend is not sequential."""
+    """Infers with the budget of all: in one round if the backend is not sequential.
+
+    Args:
+        candidate: The backend.
+        rollouts: The recording.
+        seed: Seed of everything random.
+        progress: Whether to show progress; ``None`` shows it on a terminal.
+        checkpoint: Folder for the rounds; those that it holds are not run again.
+    """
     rounds = ROUNDS if candidate.is_sequential else 1
     return infer(
         partial(pendulum, noise=NOISE),
@@ -155,7 +177,9 @@ def infer_mass_and_length(
         num_simulations=ROUNDS * NUM_SIMULATIONS // rounds,
         seed=seed,
         embedding=candidate.embedding or EMBEDDING,
+        segment_length=None,
         initial_state="recorded",
+        checkpoint=checkpoint,
         progress=progress,
     )
 

@@ -1,7 +1,7 @@
 """POLOPT of Algorithm 1: a policy search evaluated in many domains at once."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,18 +13,20 @@ from npdr_ppl.policies.search import PolicySearch, SearchState
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.workflows.control_task import ControlTask
 from npdr_ppl.workflows.domains import Domains
+from npdr_ppl.workflows.risk import MeanReturn, Risk
 
-__all__ = ["OptimisedPolicy", "mean_returns", "optimise_policy", "returns_of"]
+__all__ = ["OptimisedPolicy", "optimise_policy", "returns_of"]
 
 
 @dataclass(frozen=True)
 class OptimisedPolicy:
-    """What a policy search came to.
+    """What a policy search found.
 
     Attributes:
         parameters: Parameters of the policy to deploy, ``(P,)`` in float64.
         policy: The policy.
-        best_returns: Best mean return among the candidates of each iteration.
+        best_returns: Best objective among the candidates of each iteration: by default the mean
+            return over the domains.
         mean_return: Mean return of ``policy`` over the domains it was trained in.
         success_rate: Share of these episodes that succeeded; NaN without such a threshold.
     """
@@ -55,10 +57,12 @@ def optimise_policy(
     iterations: int,
     num_initial_states: int,
     seed: int,
+    risk: Risk | None = None,
+    internal_model: Mapping[str, float] | None = None,
     expected_calls: int | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> OptimisedPolicy:
-    """Searches for the policy with the greatest mean return over domains and initial states.
+    """Searches for the policy with the greatest return over domains and initial states.
 
     All candidates meet the same domains and, within an iteration, the same initial states, so
     that they are compared on equal terms.
@@ -71,28 +75,38 @@ def optimise_policy(
         iterations: Iterations of the search.
         num_initial_states: Initial states S of each iteration.
         seed: Seed of everything random.
+        risk: What makes one number of the returns in all domains; ``None`` for their mean.
+        internal_model: Parameters of the policies' own model in every domain, as on the target;
+            ``None`` for each domain's own.
         expected_calls: How many iterations of this size are to come, if more than ``iterations``.
         progress: Called with the fraction done and a short status.
     """
+    objective = risk or MeanReturn()
     state: SearchState = search.init(task.policy.with_parameters(start.to(task.policy.parameters)))
     best = []
     for iteration in range(iterations):
         stream = torch.Generator().manual_seed(derived_seed(seed, "policy search", iteration))
         candidates = search.ask(state, stream)
         starts = task.initial_states(num_initial_states, stream)
-        returns = mean_returns(
-            task, domains, candidates, starts, expected_calls=expected_calls or iterations
+        returns = returns_of(
+            task,
+            domains,
+            candidates,
+            starts,
+            internal_model=internal_model,
+            expected_calls=expected_calls or iterations,
         )
-        state = search.tell(state, candidates, returns)
-        best.append(float(returns.nan_to_num(-math.inf).max()))
+        values = objective(returns.double().mean(2))
+        state = search.tell(state, candidates, values)
+        best.append(float(values.max()))
         if progress is not None:
             progress((iteration + 1) / iterations, f"return {best[-1]:.0f}")
     # A search's own estimate, such as PoWER's mean, may never have been tried.
     finalists = torch.stack((search.parameters(state), state.best))
     stream = torch.Generator().manual_seed(derived_seed(seed, "policy evaluation"))
     starts = task.initial_states(num_initial_states, stream)
-    returns = returns_of(task, domains, finalists, starts).double().flatten(1)
-    winner = int(returns.mean(1).nan_to_num(-math.inf).argmax())
+    returns = returns_of(task, domains, finalists, starts, internal_model=internal_model).double()
+    winner = int(objective(returns.mean(2)).argmax())
     success = math.nan
     if task.success is not None:
         success = float((returns[winner] > task.success).double().mean())
@@ -112,6 +126,7 @@ def returns_of(
     candidates: Tensor,
     initial_states: Tensor,
     *,
+    internal_model: Mapping[str, float] | None = None,
     expected_calls: int = 1,
 ) -> Tensor:
     """Returns the return of every candidate in every domain, ``(P, D, S)``, in float32.
@@ -121,6 +136,8 @@ def returns_of(
         domains: The D domains.
         candidates: Policy parameters, ``(P, parameters)``.
         initial_states: True states at the start, ``(S, states)``.
+        internal_model: Parameters of the policies' own model in every domain; ``None`` for each
+            domain's own.
         expected_calls: How many calls of this size are to come.
     """
     policy = task.policy.with_parameters(candidates.float()[:, None, None])
@@ -132,19 +149,7 @@ def returns_of(
         task.num_steps,
         reward=task.reward,
         expected_calls=expected_calls,
+        internal_model=internal_model,
     )
     assert episodes.returns is not None
     return episodes.returns
-
-
-def mean_returns(
-    task: ControlTask,
-    domains: Domains,
-    candidates: Tensor,
-    initial_states: Tensor,
-    *,
-    expected_calls: int = 1,
-) -> Tensor:
-    """Returns the mean return of every candidate, ``(P,)`` float64; see :func:`returns_of`."""
-    returns = returns_of(task, domains, candidates, initial_states, expected_calls=expected_calls)
-    return returns.double().mean((1, 2))

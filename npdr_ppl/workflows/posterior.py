@@ -24,6 +24,9 @@ from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.randomness import seeded
 from npdr_ppl.workflows.binding import BindingOptions, BoundModel, bind, problem_of
+from npdr_ppl.workflows.checks import checks_of
+from npdr_ppl.workflows.estimator_check import Correction, EstimatorCheck
+from npdr_ppl.workflows.preparation import Preparation
 from npdr_ppl.workflows.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -96,6 +99,10 @@ class PosteriorBase(ABC):
     def prior(self) -> Prior:
         """The prior of the model."""
         return self.bound.prior
+
+    def checks(self) -> dict[str, Any]:
+        """Returns what is known of estimator and model by other means; empty if nothing is."""
+        return {}
 
     def sample(self, num_samples: int, *, seed: int = 0) -> dict[str, Tensor]:
         """Draws domain parameters.
@@ -234,6 +241,9 @@ class Posterior(PosteriorBase):
         states: The backend's state after each round known, the last one being this posterior's.
         densities: The members, in reference coordinates.
         provenance: How they came about.
+        preparation: What was done with the recording first, where that is known.
+        estimator: How the learnt posterior compares with the simulator, where that was checked.
+        correction: What took its place; ``None`` if it is the learnt one.
     """
 
     def __init__(
@@ -243,17 +253,35 @@ class Posterior(PosteriorBase):
         problem: Problem,
         states: Sequence[State],
         provenance: Provenance,
+        *,
+        preparation: Preparation | None = None,
+        estimator: EstimatorCheck | None = None,
+        correction: Correction | None = None,
+        checks: Mapping[str, Any] | None = None,
     ) -> None:
-        super().__init__(bound, backend.densities(problem, states[-1]))
+        if correction is None:
+            super().__init__(bound, backend.densities(problem, states[-1]))
+        else:
+            super().__init__(bound, correction.densities)
         self.backend = backend
         self.problem = problem
         self.states = tuple(states)
         self.provenance = provenance
+        self.preparation = preparation
+        self.estimator = estimator
+        self.correction = correction
+        self._checks = None if checks is None else dict(checks)
 
     @property
     def backend_name(self) -> str:
         """The backend's name."""
         return self.backend.name
+
+    def checks(self) -> dict[str, Any]:
+        """Returns what is known of estimator and model; see :mod:`npdr_ppl.workflows.checks`."""
+        if self._checks is None:
+            self._checks = checks_of(self.preparation, self.estimator)
+        return self._checks
 
     def sample_reference(self, num_samples: int, *, seed: int = 0) -> Tensor:
         """Draws ``num_samples`` of each member, ``(members, num_samples, d)``."""
@@ -281,6 +309,9 @@ class Posterior(PosteriorBase):
         )
         tensors, values = self.backend.tensors(self.states[-1])
         folder.save_round(rounds - 1, tensors, values, own.rounds, own.seconds)
+        if self.preparation is not None:
+            folder.save_preparation(self.preparation)
+        folder.save_correction(self.correction, self.checks())
 
     @classmethod
     def load(
@@ -311,14 +342,34 @@ class Posterior(PosteriorBase):
         options = BindingOptions(**description["binding"])
         if embedding is not None:
             options = replace(options, embedding=embedding)
-        bound = bind(model, folder.data(), options, device)
+        kept = folder.preparation()
+        if embedding is None and kept.score is not None:
+            options = replace(options, embedding=kept.score)
+        model = kept.apply(model)
+        bound = bind(model, folder.data(), options, device, starts=kept.starts)
         problem = problem_of(bound, device)
         method = backend_by_name(description["backend"], **description["options"])
         state = method.restore(problem, last.tensors, last.values)
         provenance = Provenance(
             description["seed"], description["num_simulations"], tuple(last.infos), last.seconds
         )
-        return cls(bound, method, problem, [state], provenance)
+        correction, checks = folder.correction(bound.prior)
+        return cls(
+            bound, method, problem, [state], provenance, correction=correction, checks=checks
+        )
+
+    def corrected(self, estimator: EstimatorCheck, correction: Correction | None) -> "Posterior":
+        """Returns the posterior as it is after the comparison with the simulator."""
+        return Posterior(
+            self.bound,
+            self.backend,
+            self.problem,
+            self.states,
+            self.provenance,
+            preparation=self.preparation,
+            estimator=estimator,
+            correction=correction,
+        )
 
     def after_round(self, index: int) -> "Posterior":
         """Returns the posterior as it was after round ``index``, counted from 0.

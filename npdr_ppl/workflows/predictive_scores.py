@@ -1,7 +1,7 @@
 """How well a posterior predicts recorded segments: elpd, CRPS and coverage."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,8 @@ from torch import Tensor
 from npdr_ppl import metrics
 from npdr_ppl.errors import IntractableError
 from npdr_ppl.randomness import seeded
-from npdr_ppl.workflows.binding import BoundModel
+from npdr_ppl.workflows.binding import BoundModel, Observation
+from npdr_ppl.workflows.draw_budget import affordable_draws, executed_in_parts
 from npdr_ppl.workflows.error_model import segment_log_likelihood
 from npdr_ppl.workflows.posterior import PosteriorBase
 
@@ -25,7 +26,8 @@ NUM_LIKELIHOOD_DRAWS = 1_000
 """Posterior draws that a segment's predictive density is averaged over."""
 
 NUM_PREDICTIVE_DRAWS = 200
-"""Posterior predictive trajectories behind CRPS and coverage; they are held in memory."""
+"""Posterior predictive trajectories behind CRPS and coverage; fewer where they are too large to be
+held in memory, see :mod:`npdr_ppl.workflows.draw_budget`."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,11 @@ def predictive_scores(
     else:
         elpd = predictive_elpd(likelihood) if is_held_out else loo_elpd(likelihood)
         draws = _effective_draws(likelihood)
+    num_readings = sum(o.value.numel() for o in bound.observations.values())
+    num_draws = affordable_draws(NUM_PREDICTIVE_DRAWS, num_readings)
     with seeded(seed, "predictive scores"):
-        predictive = bound.prior.execute(z[:NUM_PREDICTIVE_DRAWS])
+        parts = list(executed_in_parts(bound.prior, z[:num_draws], num_readings))
+    predictive = {name: [outputs[name] for _, outputs in parts] for name in parts[0][1]}
     crps, coverage, failed = _of_readings(bound, predictive)
     return PredictiveScores(elpd, draws, crps, coverage, failed)
 
@@ -131,35 +136,57 @@ def _effective_draws(log_likelihood: Tensor) -> float:
 
 
 def _of_readings(
-    bound: BoundModel, predictive: Mapping[str, Tensor]
+    bound: BoundModel, predictive: Mapping[str, Sequence[Tensor]]
 ) -> tuple[float, dict[float, float], int]:
-    """Returns mean scaled CRPS, coverage by level, and how many draws failed."""
+    """Returns mean scaled CRPS, coverage by level, and how many draws failed.
+
+    Args:
+        bound: The model and what it is judged by.
+        predictive: Simulations ``(n,) + plates + event`` by site, in parts.
+    """
     valid = torch.stack(
-        [output.reshape(len(output), -1).isfinite().all(1).cpu() for output in predictive.values()]
+        [
+            torch.cat([part.reshape(len(part), -1).isfinite().all(1).cpu() for part in parts])
+            for parts in predictive.values()
+        ]
     ).all(0)
     num_failed = int((~valid).sum())
     if not bool(valid.any()):
         return float("nan"), dict.fromkeys(LEVELS, float("nan")), num_failed
     scores, ranks = [], []
     for name, observation in bound.observations.items():
-        samples = predictive[name].double().cpu()[valid]
-        observed = observation.value.double().cpu()
-        if observation.inputs is None or observation.channels is None:
-            samples, observed = samples.reshape(len(samples), -1), observed.reshape(-1)
-            counted = torch.ones(observed.shape, dtype=torch.bool)
-            largest = observed.abs().amax()
-            scale = torch.where(largest > 0, largest, 1.0).expand(observed.shape)
-        else:
-            channels = list(observation.channels)
-            samples, observed = samples[..., channels], observed[..., channels]
-            counted = observation.inputs.mask.cpu()[..., None].expand(observed.shape)
-            largest = (observed * counted).abs().flatten(0, -2).amax(0)
-            scale = torch.where(largest > 0, largest, 1.0).expand(observed.shape)
-        scores.append((metrics.crps(samples, observed) / scale)[counted])
-        ranks.append(metrics.pit(samples, observed)[counted])
+        for column, observed, counted in _columns(observation):
+            samples = torch.cat(
+                [_column(part, column).double().cpu() for part in predictive[name]]
+            )
+            samples = samples[valid]
+            largest = (observed * counted).abs().amax()
+            scale = torch.where(largest > 0, largest, 1.0)
+            scores.append((metrics.crps(samples, observed) / scale)[counted])
+            ranks.append(metrics.pit(samples, observed)[counted])
     coverage = metrics.coverage(torch.cat(ranks), LEVELS)
     return (
         float(torch.cat(scores).mean()),
         dict(zip(LEVELS, coverage.tolist(), strict=True)),
         num_failed,
     )
+
+
+def _columns(observation: Observation) -> Iterator[tuple[int | None, Tensor, Tensor]]:
+    """Yields each measured channel's position, its readings, and which of them count.
+
+    One by one, because scores of an ensemble make several copies of it. A plain function's output
+    is one channel.
+    """
+    observed = observation.value.double().cpu()
+    if observation.inputs is None or observation.channels is None:
+        yield None, observed.reshape(-1), torch.ones(observed.numel(), dtype=torch.bool)
+        return
+    for column in observation.channels:
+        readings = observed[..., column]
+        yield column, readings, observation.inputs.mask.cpu().expand(readings.shape)
+
+
+def _column(output: Tensor, column: int | None) -> Tensor:
+    """Returns one channel of simulations, or all of a plain function's output in a row."""
+    return output.reshape(len(output), -1) if column is None else output[..., column]

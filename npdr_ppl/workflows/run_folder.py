@@ -3,6 +3,9 @@
     run.json                      backend, options, seeds, versions, the model's source,
                                   engines with their settings and the text of MJCF and URDF files
     data_<site>.nc                measured rollouts (or data.safetensors for plain observations)
+    preparation.json, .safetensors      noise, initial states and features made for the recording
+    checks.json, correction.safetensors what is known of estimator and model, and what took the
+                                        place of the learnt posterior where it was off
     round_<r>_simulations.safetensors   parameters z and features x of a round
     round_<r>.safetensors, round_<r>.json   the backend's state after that round
 
@@ -20,7 +23,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from pyro.poutine.messenger import Messenger
@@ -28,14 +31,27 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from npdr_ppl.embeddings.score import Score
 from npdr_ppl.errors import DataError
 from npdr_ppl.inference.base import Backend, RoundInfo
-from npdr_ppl.language.handlers import ModelWithEffects
+from npdr_ppl.language.handlers import (
+    ModelWithEffects,
+    ModelWithFinerSteps,
+    num_finer_steps,
+    with_finer_steps,
+    with_noise,
+)
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.language.wider_priors import ModelWithWiderPriors
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.atomic import replacing
 from npdr_ppl.workflows.binding import BoundModel
+from npdr_ppl.workflows.segment_starts import Starts
+
+if TYPE_CHECKING:
+    from npdr_ppl.workflows.estimator_check import Correction
+    from npdr_ppl.workflows.preparation import Preparation
 
 __all__ = [
     "RunFolder",
@@ -72,6 +88,29 @@ class SavedRound:
     values: dict[str, Any]
     infos: list[RoundInfo]
     seconds: dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedPreparation:
+    """What was done with a recording before anything was inferred.
+
+    Attributes:
+        starts: The segments' estimated initial states.
+        score: The features, where they were made for the recording.
+        noise: Estimated noise by sensor; ``None`` if the model kept its own.
+        num_finer_steps: How often the model's integration steps were refined.
+    """
+
+    starts: Starts | None = None
+    score: Score | None = None
+    noise: Mapping[str, float] | None = None
+    num_finer_steps: int = 0
+
+    def apply(self, model: Any) -> Any:
+        """Returns a model with the same noise and steps as that which was inferred."""
+        for _ in range(self.num_finer_steps):
+            model = with_finer_steps(model)
+        return model if self.noise is None else with_noise(model, self.noise)
 
 
 class RunFolder:
@@ -121,6 +160,63 @@ class RunFolder:
                 "engines": engine_settings(bound.prior),
             },
         )
+
+    def save_preparation(self, found: "Preparation") -> None:
+        """Saves what was done with the recording before anything was inferred."""
+        tensors = {}
+        if found.starts is not None:
+            for field in dataclasses.fields(found.starts):
+                tensors[f"starts_{field.name}"] = getattr(found.starts, field.name)
+        if isinstance(found.options.embedding, Score):
+            for field in dataclasses.fields(Score):
+                tensors[f"score_{field.name}"] = getattr(found.options.embedding, field.name)
+        save_tensors(self.path / "preparation.safetensors", tensors)
+        write_json(
+            self.path / "preparation.json",
+            {
+                "noise": found.noise_of_sensors,
+                "num_finer_steps": num_finer_steps(found.plain_model),
+            },
+        )
+
+    def preparation(self) -> "SavedPreparation":
+        """Returns what :meth:`save_preparation` wrote, or that nothing was done."""
+        file = self.path / "preparation.json"
+        if not file.exists():
+            return SavedPreparation()
+        record, tensors = read_json(file), load_tensors(self.path / "preparation.safetensors")
+
+        def part(prefix: str) -> dict[str, Tensor]:
+            chosen = {k: v for k, v in tensors.items() if k.startswith(prefix)}
+            return {name.removeprefix(prefix): value for name, value in chosen.items()}
+
+        starts, score = part("starts_"), part("score_")
+        return SavedPreparation(
+            Starts(**starts) if starts else None,
+            Score(**score) if score else None,
+            record["noise"],
+            int(record["num_finer_steps"]),
+        )
+
+    def save_correction(self, correction: "Correction | None", checks: Mapping[str, Any]) -> None:
+        """Saves what took a learnt posterior's place, and what is known of it."""
+        file = self.path / "correction.safetensors"
+        if correction is not None:
+            save_tensors(file, correction.tensors())
+        write_json(self.path / "checks.json", {"is_corrected": correction is not None, **checks})
+
+    def correction(self, prior: Prior) -> tuple["Correction | None", dict[str, Any]]:
+        """Returns what :meth:`save_correction` wrote; nothing if it was never called."""
+        from npdr_ppl.workflows.estimator_check import Correction
+
+        file = self.path / "checks.json"
+        if not file.exists():
+            return None, {}
+        checks = read_json(file)
+        if not checks.pop("is_corrected", False):
+            return None, checks
+        tensors = load_tensors(self.path / "correction.safetensors")
+        return Correction.of_tensors(prior, tensors), checks
 
     def rounds(self) -> list[int]:
         """Returns the complete rounds, in order."""
@@ -277,6 +373,8 @@ def source_text(model: Any) -> str:
     ):
         # Pyro's way to keep a model under a handler: both are arguments of the partial.
         return f"{source_text(model.args[-1])}\n# under {type(model.args[0]).__name__}"
+    if isinstance(model, ModelWithFinerSteps | ModelWithWiderPriors):
+        return f"{source_text(model.base)}\n# {model!r}"
     try:
         return inspect.getsource(model)
     except (OSError, TypeError):

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.workflows.segment_model import LEAST_SCALE, Linearisation, SegmentModel
+from npdr_ppl.workflows.segment_model import Linearisation, SegmentModel
+from npdr_ppl.workflows.solving import solve_or_zero
 
 __all__ = ["SegmentFit", "fit_segments"]
 
@@ -94,6 +95,7 @@ def fit_segments(
     *,
     offsets: Tensor | None = None,
     held: Tensor | None = None,
+    scale: Tensor | None = None,
     max_steps: int = 12,
     is_rough: bool = False,
 ) -> SegmentFit:
@@ -108,6 +110,8 @@ def fit_segments(
         z: Where to begin, ``(d,)``.
         offsets: Offsets of the initial states to begin with, ``(S, m)``; zero by default.
         held: Coordinates that stay where they are, a mask ``(d,)``; none by default.
+        scale: Standard deviation of each channel's errors, ``(C,)``, where that is known; that of
+            what is left by default.
         max_steps: Greatest number of steps, first until the scale is known, then at that scale.
         is_rough: Whether the first will do; enough to rank what differs much.
 
@@ -118,22 +122,26 @@ def fit_segments(
     if offsets is None:
         shape = segments.inputs.num_segments, segments.num_offsets
         offsets = torch.zeros(shape, dtype=torch.float64)
-    scale = segments.scale_of(z, offsets)
-    if not bool(scale.isfinite().all()):
+    present = segments.scale_of(z, offsets)
+    if not bool(present.isfinite().all()):
         raise DataError("The simulation fails at the parameters that the fit begins with.")
     held = torch.zeros(z.shape, dtype=torch.bool) if held is None else held
-    z, offsets, scale = _steps(segments, z, offsets, scale, held, max_steps, is_rough=True)
+    if scale is not None:
+        known = scale.double()
+        z, offsets, _ = _steps(segments, z, offsets, known, held, max_steps, is_rough=False)
+        return SegmentFit(z, offsets, known)
+    z, offsets, left = _steps(segments, z, offsets, present, held, max_steps, is_rough=True)
     if not is_rough:
-        z, offsets, scale = _steps(segments, z, offsets, scale, held, max_steps, is_rough=False)
-        freed = _freed(segments, z, offsets, scale)
+        z, offsets, left = _steps(segments, z, offsets, left, held, max_steps, is_rough=False)
+        freed = _freed(segments, z, offsets, left)
         if freed is not None:
-            z, offsets, scale = _steps(segments, z, freed, scale, held, max_steps, is_rough=False)
+            z, offsets, left = _steps(segments, z, freed, left, held, max_steps, is_rough=False)
         for _ in range(MOST_LEAPS):
-            better = _leap(segments, z, offsets, scale, held)
+            better = _leap(segments, z, offsets, left, held)
             if better is None:
                 break
-            z, offsets, scale = _steps(segments, *better, scale, held, max_steps, is_rough=False)
-    return SegmentFit(z, offsets, scale)
+            z, offsets, left = _steps(segments, *better, left, held, max_steps, is_rough=False)
+    return SegmentFit(z, offsets, left)
 
 
 def _freed(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor | None:
@@ -190,8 +198,11 @@ def _leap(
     if not now.is_finite:
         return None
     now = replace(now, by_parameters=now.by_parameters * ~held)
-    covariance = torch.linalg.inv(now.information() + torch.eye(len(z), dtype=torch.float64))
-    spread = torch.linalg.cholesky(covariance[leaping][:, leaping])
+    eye = torch.eye(len(z), dtype=torch.float64)
+    covariance, is_solved = solve_or_zero(now.information() + eye, eye)
+    spread, info = torch.linalg.cholesky_ex(covariance[leaping][:, leaping])
+    if not bool(is_solved) or bool(info):
+        return None
     following = torch.linalg.solve_triangular(spread, covariance[leaping], upper=False)
     generator = torch.Generator().manual_seed(0)
     shape = DIRECTIONS * num, num
@@ -265,7 +276,7 @@ def _steps(
             damping = min(max(damping * factors[best], LIMITS[0]), LIMITS[1])
             dampings = (dampings * torch.tensor(factors).double()[place]).clamp(*LIMITS)
             left = squares[best][place, every].sum(0) / segments.inputs.mask.sum()
-            present_scale = (scale * left.sqrt()).clamp_min(LEAST_SCALE)
+            present_scale = (scale * left.sqrt()).maximum(segments.least_scale)
             if is_rough:
                 before, scale = scale, present_scale
                 is_little = is_little and bool((scale > SETTLED * before).all())
@@ -303,6 +314,9 @@ def _step(
 ) -> tuple[Tensor, Tensor]:
     """Returns parameters after one damped Gauss-Newton step, and offsets to try with them.
 
+    A segment whose own system cannot be solved keeps its offsets, and the others are stepped as if
+    they were known. Where the parameters' system cannot be solved, the parameters stay.
+
     Args:
         now: Residuals and derivatives.
         z: Parameters, ``(d,)``.
@@ -325,7 +339,7 @@ def _step(
 
     # Each segment's offsets are eliminated: they meet no other segment's readings.
     parts = {
-        f: torch.linalg.solve(own + (1.0 + f * dampings)[:, None, None] * eye, sides)
+        f: solve_or_zero(own + (1.0 + f * dampings)[:, None, None] * eye, sides)[0]
         for f in factors
     }
     middle = parts[1.0]
@@ -333,7 +347,7 @@ def _step(
     gradient = (by_z.mT @ now.residual[..., None] - cross.mT @ middle[..., d:]).sum(0)[:, 0] - z
     curvature = hessian.diagonal().clamp_min(1.0)
     hessian = hessian + torch.diag(1.0 + damping * curvature)
-    change = torch.linalg.solve(hessian, gradient.masked_fill(held, 0.0))
+    change = solve_or_zero(hessian, gradient.masked_fill(held, 0.0)[:, None])[0][:, 0]
     change = change * min(1.0, LARGEST_STEP / float(change.abs().max().clamp_min(1e-12)))
     moved = (z + change).clamp(-MAX_COORDINATE, MAX_COORDINATE)
     begun = [offsets + part[..., d] - part[..., :d] @ (moved - z) for part in parts.values()]

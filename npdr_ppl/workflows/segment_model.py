@@ -10,6 +10,7 @@ the simulator stays a black box.
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from npdr_ppl.workflows.segment_starts import (
     estimate_starts,
     uncertain_components,
 )
+from npdr_ppl.workflows.solving import is_invertible, solve_or_zero
 
 __all__ = ["Linearisation", "SegmentModel"]
 
@@ -49,8 +51,13 @@ START_LIMIT = 4.5
 """How far from the prior's centre a fit may begin, in standard deviations: at the ends of a range
 a parameter hardly moves in reference coordinates."""
 
-LEAST_SCALE = 1e-9
-"""Of a channel's residuals, in its unit: a channel may be constant."""
+LEAST_SCALE = 1e-6
+"""Least scale of a channel's residuals as a share of its largest measurement. Files and
+simulations in single precision hold no more digits, and with less noise than that the initial
+states of a simulated, noise-free recording could not be integrated out in double precision."""
+
+SMALLEST = 1e-9
+"""The same of a channel that is zero throughout, in its unit."""
 
 
 @dataclass(frozen=True)
@@ -77,19 +84,45 @@ class Linearisation:
         parts = self.residual, self.by_parameters, self.by_starts
         return all(bool(part.square().sum().isfinite()) for part in parts)
 
+    @property
+    def is_regular(self) -> bool:
+        """Whether it is finite and the initial states of every segment can be integrated out.
+
+        They cannot where derivatives by the offsets are so large that 1 + Gᵀ G is singular to
+        working precision: there the simulation diverges beside the point.
+        """
+        return self.is_finite and bool(is_invertible(self._inner).all())
+
+    @property
+    def _inner(self) -> Tensor:
+        """1 + Gᵀ G, ``(S, m, m)``."""
+        eye = torch.eye(self.by_starts.shape[-1], dtype=torch.float64)
+        return self.by_starts.mT @ self.by_starts + eye
+
     def weights(self) -> Tensor:
         """Returns C⁻¹ J, ``(S, N, d)``, with the initial states integrated out.
 
         J is the derivative by the parameters and C = 1 + G Gᵀ the covariance of the residuals,
-        with the derivative G by the offsets, which are standard normal.
+        with the derivative G by the offsets, which are standard normal. Zero in segments where C
+        cannot be inverted, which say nothing about the parameters.
         """
-        return self.by_parameters - self.by_starts @ self.taken_back()
+        taken_back, is_solved = self._solved()
+        weights = self.by_parameters - self.by_starts @ taken_back
+        return torch.where(is_solved[:, None, None], weights, 0.0)
 
     def taken_back(self) -> Tensor:
-        """Returns how much of each parameter's change the offsets take back, ``(S, m, d)``."""
-        by_z, by_start = self.by_parameters, self.by_starts
-        inner = by_start.mT @ by_start + torch.eye(by_start.shape[-1], dtype=torch.float64)
-        return torch.linalg.solve(inner, by_start.mT @ by_z)
+        """Returns how much of each parameter's change the offsets take back, ``(S, m, d)``.
+
+        Zero in segments where that cannot be computed; see :attr:`is_regular`.
+        """
+        return self._solved()[0]
+
+    def _solved(self) -> tuple[Tensor, Tensor]:
+        """Returns what the offsets take back, and in which segments it was found, ``(S,)``."""
+        inner = self._inner
+        taken_back, is_solved = solve_or_zero(inner, self.by_starts.mT @ self.by_parameters)
+        is_solved &= is_invertible(inner)
+        return torch.where(is_solved[:, None, None], taken_back, 0.0), is_solved
 
     def information(self) -> Tensor:
         """Returns the Fisher information Jᵀ C⁻¹ J of the parameters, ``(d, d)``."""
@@ -171,6 +204,12 @@ class SegmentModel:
         self.starts = starts
         self.inputs = self._smoothed if starts is None else starts.put_into(self._smoothed)
         self._offsets = uncertain_components(self.inputs)
+
+    @cached_property
+    def least_scale(self) -> Tensor:
+        """Least scale of each channel's residuals, in its unit, ``(C,)``."""
+        largest = (self.observed * self.inputs.mask[..., None]).abs().amax((0, 1)).double()
+        return (LEAST_SCALE * largest).clamp_min(SMALLEST)
 
     @property
     def num_offsets(self) -> int:
@@ -265,7 +304,7 @@ class SegmentModel:
     def scale_of(self, z: Tensor, offsets: Tensor) -> Tensor:
         """Returns the root-mean-square residual per channel, ``(C,)``, at ``(d,)``, ``(S, m)``."""
         residual = self.observed - self.simulate(z[None], offsets[None])[0]
-        return self.root_mean_square(residual).clamp_min(LEAST_SCALE)
+        return self.root_mean_square(residual).maximum(self.least_scale)
 
     def linearise(
         self, z: Tensor, offsets: Tensor, scale: Tensor, *, is_rough: bool = False

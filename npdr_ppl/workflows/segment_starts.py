@@ -21,6 +21,7 @@ from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import cut
 from npdr_ppl.rollouts.states import estimate_departures
+from npdr_ppl.workflows.solving import is_invertible
 
 __all__ = ["Starts", "error_factors", "estimate_starts", "uncertain_components"]
 
@@ -232,7 +233,8 @@ def error_factors(residual: Tensor, by_starts: Tensor) -> Tensor:
     """Returns by how much the starts' errors are larger than was thought, by component, ``(m,)``.
 
     The likeliest standard deviations of the offsets (expectation maximisation; Dempster, Laird &
-    Rubin 1977), all else being as fitted.
+    Rubin 1977), all else being as fitted. Segments in which they cannot be computed, because the
+    simulation diverges, are left out.
 
     Args:
         residual: Whitened residuals with all offsets at zero, ``(S, N)``.
@@ -242,6 +244,11 @@ def error_factors(residual: Tensor, by_starts: Tensor) -> Tensor:
     score = (by_starts.mT @ residual[..., None])[..., 0]
     eye = torch.eye(by_starts.shape[-1], dtype=torch.float64)
     factors = torch.ones(by_starts.shape[-1], dtype=torch.float64)
+    # At the largest factors, where the unit matrix keeps least apart.
+    is_known = is_invertible(eye / FACTORS[1] ** 2 + information)
+    if not bool(is_known.any()):
+        return factors
+    information, score = information[is_known], score[is_known]
     for _ in range(ROUNDS):
         covariance = torch.linalg.inv(eye + factors[:, None] * information * factors)
         mean = (covariance @ (factors * score)[..., None])[..., 0]

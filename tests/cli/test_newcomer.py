@@ -133,7 +133,7 @@ def test_a_mistake_in_a_command(monkeypatch, capsys, tmp_path, words, sentence):
         (["fit", "pendulum"], "Missing option '--data'"),
         (
             ["fit", "pendulum", "--roundz", "3"],
-            "No such option: --roundz (Possible options: --out, --rounds).",
+            "No such option: --roundz (Possible options: --extra-rounds, --out, --rounds).",
         ),
         (
             ["fit", "pendulum", "--rounds", "many"],

@@ -85,6 +85,7 @@ def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
     code, text, err = run(monkeypatch, capsys, *words, "--iterations", 1, "--animate")
     assert code == 0, err
     assert "simulated return" in text and "decisions are only logged" in text
+    assert "deploy: The policy succeeds in" in text
     assert max(map(len, text.splitlines())) <= 100
     first = json.loads((out / "train.json").read_text())
     assert {"decision", "reason", "real_return", "sim_return"} <= set(first["iterations"][0])
@@ -115,11 +116,13 @@ def test_what_the_model_lacks_is_looked_for_where_that_is_asked_for(
     out = tmp_path / "run"
     code, _, err = run(
         monkeypatch, capsys, "train", "furuta", "--target", "furuta-random-7", "--task",
-        f"{rig}:short", "--out", out, "--iterations", 1, "--discover", *QUICK,
+        f"{rig}:short", "--out", out, "--iterations", 1, "--discover", "--least-success", 0.5,
+        "--tail-share", 0.3, *QUICK,
     )  # fmt: skip
     assert code == 0, err
     described = json.loads((out / "loop.json").read_text())["options"]
     assert described["discovers"] == "before inference"
+    assert (described["least_success"], described["tail_share"]) == (0.5, 0.3)
     # Sixty steps are too few for any effect to show.
     assert json.loads((out / "train.json").read_text())["iterations"][0]["effects"] == []
 

@@ -66,7 +66,9 @@ def test_absent_channels_do_not_count():
     z = torch.tensor([[0.1, -0.2], [0.5, 0.3]])
     values = {}
     for names, measured in rollouts.items():
-        bound = bind(partial(pendulum, noise=noise), measured, BindingOptions("all"))
+        bound = bind(
+            partial(pendulum, noise=noise), measured, BindingOptions("all", None, "estimated")
+        )
         log_likelihood = problem_of(bound).log_likelihood
         assert log_likelihood is not None
         values[names] = log_likelihood(z.requires_grad_())

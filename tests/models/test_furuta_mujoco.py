@@ -8,7 +8,7 @@ import torch
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import CoulombFriction, InputDelay, Tilt
+from npdr_ppl.models.effects import CoulombFriction, DeadZone, InputDelay, Tilt
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.furuta_mujoco import FurutaRig
 from npdr_ppl.policies.furuta_swing_up import FurutaSwingUp
@@ -70,13 +70,19 @@ def test_rig_without_effects_follows_the_equations(parameters):
             0.02,
         ),
         (
+            FurutaRig(voltage_dead_zone=0.4, encoder_counts=0),
+            (DeadZone("voltage"),),
+            {"voltage.dead_zone.width": 0.4},
+            1e-3,
+        ),
+        (
             FurutaRig(tilt=(0.05, -0.03), encoder_counts=0),
             (Tilt("gravity"),),
             {"gravity.tilt.roll": 0.05, "gravity.tilt.pitch": -0.03},
             1e-3,
         ),
     ],
-    ids=["dry friction", "delay", "tilt"],
+    ids=["dry friction", "delay", "dead zone", "tilt"],
 )
 def test_hidden_effects_are_those_of_the_catalogue(rig, effects, strengths, bound):
     recording = rig.run(wave, 250, initial_state=START)

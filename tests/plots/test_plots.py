@@ -1,8 +1,15 @@
 """Figures are drawn for every shape of posterior, and say what they show."""
 
-import numpy as np
-import pytest
+import dataclasses
 
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+import npdr_ppl as npdr
+from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.plots import (
     plot_bands,
     plot_bands_by_backend,
@@ -14,7 +21,11 @@ from npdr_ppl.plots import (
     plot_seconds,
     save_figure,
 )
+from npdr_ppl.plots.bands import nominal_line
 from npdr_ppl.plots.comparison_figures import most_informative
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.evaluation import replay
 
 rng = np.random.default_rng(0)
 PRIOR = {"mass": rng.uniform(0, 1, 500), "length": rng.uniform(1, 2, 500)}
@@ -50,6 +61,54 @@ def test_bands_have_every_channel():
     )  # fmt: skip
     assert [axis.get_ylabel() for axis in figure.axes] == ["x\n[m]", "y"]
     assert {"measured", "nominal", "posterior 90%", "posterior 50%"} == legend(figure)
+    # A line that is far off does not squeeze the recording.
+    figure = plot_bands(
+        time, measured, measured[None], channel_names=("x", "y"),
+        lines={"nominal": measured + 1e6},
+    )  # fmt: skip
+    assert figure.axes[0].get_ylim()[1] < 2
+
+
+def recorded(num_steps=60):
+    """A pendulum's swing in columns without units, as a CSV file has them."""
+    time = 0.02 * np.arange(num_steps + 1)
+    readings = np.stack([np.sin(3 * time), 3 * np.cos(3 * time)], -1)
+    return Rollouts.from_arrays(
+        readings=[readings], actions=[np.zeros((num_steps, 1))], time_step=0.02,
+        channel_names=("angle", "velocity"), action_names=("torque",),
+    )  # fmt: skip
+
+
+OPTIONS = BindingOptions(None, 20, "recorded", "float64")
+
+
+def test_the_nominal_line_is_the_simulators_own_prediction():
+    """Semi-implicit Euler of the zoo's pendulum: 1 kg, 1 m, from each segment's first reading."""
+    rollouts = recorded()
+    readings, expected = rollouts.readings[0], []
+    for step in range(60):
+        if step % 20 == 0:
+            angle, velocity = readings[step]
+        expected.append([angle, velocity])
+        velocity = velocity - 0.02 * 3.0 * 9.81 / 2.0 * np.sin(angle)
+        angle = angle + 0.02 * velocity
+    (line,) = nominal_line(pendulum, rollouts, OPTIONS).values()
+    np.testing.assert_allclose(line, expected, atol=1e-6)
+
+
+def test_a_model_without_nominal_parameters_has_no_such_line():
+    def other(inputs):
+        mass = pyro.sample("weight", dist.Uniform(0.3, 1.7))
+        return npdr.simulate("trajectory", Pendulum(), {"mass": mass}, inputs)
+
+    assert nominal_line(other, recorded(), OPTIONS) == {}
+
+
+def test_units_that_a_recording_lacks_are_the_simulators():
+    nominal = {"mass": torch.ones(1), "length": torch.ones(1)}
+    assert replay(pendulum, recorded(), nominal, OPTIONS).units == ("rad", "rad/s")
+    named = dataclasses.replace(recorded(), channel_units=("turns", ""))
+    assert replay(pendulum, named, nominal, OPTIONS).units == ("turns", "rad/s")
 
 
 def test_rounds_share_their_axes():
@@ -91,8 +150,10 @@ def test_bands_have_a_column_for_each_backend():
     draws[3, 10] = np.nan
     predictives = {"a": draws, "b": draws + 100.0, "c": np.full_like(draws, np.nan)}
     figure = plot_bands_by_backend(
-        time, measured, predictives, channel_names=("x", "y"), units=("m", "")
-    )
+        time, measured, predictives, channel_names=("x", "y"), units=("m", ""),
+        lines={"nominal": measured + 100.0}, resets=np.array([0.0, 0.5]),
+    )  # fmt: skip
+    assert legend(figure) == {"measured", "nominal", "posterior 90%", "posterior 50%"}
     assert [axis.get_title() for axis in figure.axes] == ["a", "b", "c", "", "", ""]
     assert [axis.get_ylabel() for axis in figure.axes] == ["x\n[m]", "", "", "y", "", ""]
     # Two bands; failed draws are left out, and where all failed there is nothing to draw.

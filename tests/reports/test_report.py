@@ -85,7 +85,8 @@ def test_training_shows_every_decision(runs, pages):
     iterations = json.loads((runs["train"] / "train.json").read_text())["iterations"]
     parts = [p for s in read_run(runs["train"]).sections for p in s.parts]
     decisions = next(part for part in parts if isinstance(part, FindingsPart))
-    assert len(decisions.findings) == sum(len(row["decisions"]) for row in iterations)
+    shown = sum(len(row["decisions"]) + len(row.get("checks", ())) for row in iterations)
+    assert len(decisions.findings) == shown
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Kills a run of the NPDR loop at random moments, resumes it, and compares what comes out.
 
-    python kill_runs.py FOLDER NUM_KILLS SEED [discover]
+    python kill_runs.py FOLDER NUM_KILLS SEED [discover | check]
 
 One process imports everything, also what a run imports on its way, and forks a child for every
 attempt, so that a hundred take minutes.
@@ -18,6 +18,7 @@ import signal
 import sys
 import time
 import traceback
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -35,16 +36,16 @@ from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.workflows.npdr_loop import train
 
 
-def import_what_a_run_needs(folder, seed, discovers):
+def import_what_a_run_needs(folder, seed, mode):
     """Imports what a run has imported in the end, so that its children need not."""
     names = folder.with_suffix(".modules")
-    finish(fork(folder, seed, discovers, names))
+    finish(fork(folder, seed, mode, names))
     for name in names.read_text().split():
         with contextlib.suppress(Exception):
             importlib.import_module(name)
 
 
-def fork(folder, seed, discovers, modules=None):
+def fork(folder, seed, mode, modules=None):
     """Starts the run, or goes on with it, in a process of its own."""
     child = os.fork()
     if child:
@@ -52,9 +53,13 @@ def fork(folder, seed, discovers, modules=None):
     try:
         folder.mkdir(parents=True, exist_ok=True)
         model, target, task, options = pendulum, HandmadePendulum, small_task(), small_options()
-        if discovers:
+        if mode == "discover":
             model, target = accurate_pendulum, DryPendulum
             task, options = swinging_task(), discovering_options()
+        if mode == "check":
+            # No policy succeeds, so the loop does all that a check can ask for.
+            task = replace(small_task(), success=1e9)
+            options = small_options(iterations=1, extra_rollouts=1, least_success=0.5)
         train(model, target(folder / "episodes.log"), task, options, out=folder / "run",
               seed=seed, progress=False)  # fmt: skip
         if modules is not None:
@@ -94,12 +99,12 @@ def written(folder):
 
 def main():
     root, num_kills, seed = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-    discovers = "discover" in sys.argv[4:]
+    mode = sys.argv[4] if len(sys.argv) > 4 else ""
     torch.set_num_threads(1)
     moments = random.Random(seed)
-    import_what_a_run_needs(root / "first", seed, discovers)
+    import_what_a_run_needs(root / "first", seed, mode)
     started = time.monotonic()
-    finish(fork(root / "undisturbed", seed, discovers))
+    finish(fork(root / "undisturbed", seed, mode))
     seconds = time.monotonic() - started
     expected = outcome(root / "undisturbed")
     planned = episodes(root / "undisturbed")
@@ -114,9 +119,9 @@ def main():
         # Short lives, so that a run is killed several times on its way; longer ones after each
         # kill, so that it comes to its end also where the machine has become slower since.
         # Discovery begins anew after a kill, so it needs lives that are longer than it is.
-        longest = (1.0 if discovers else 0.4) * seconds
+        longest = (1.0 if mode == "discover" else 0.4) * seconds
         while not is_done:
-            child = fork(folder, seed, discovers)
+            child = fork(folder, seed, mode)
             time.sleep(moments.uniform(0.0, longest))
             longest *= 1.1
             if kills < num_kills:

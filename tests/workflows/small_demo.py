@@ -23,6 +23,7 @@ OPTIONS = LoopOptions(
     search_iterations=1,
     num_domains=3,
     num_initial_states=1,
+    least_success=0.0,
     discovers="after diagnosis",
     discovery=DiscoveryOptions(effects=(FILTER, CoulombFriction("arm")), max_effects=1),
 )

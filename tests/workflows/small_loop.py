@@ -146,6 +146,8 @@ def small_options(**changed):
         "search_iterations": 2,
         "num_domains": 5,
         "num_initial_states": 2,
+        "least_success": 0.0,
+        "num_checked": 20,
     }
     return LoopOptions(**{**settings, **changed})
 

@@ -24,7 +24,7 @@ def test_the_filter_of_the_rates_is_found_on_the_rig(told):
     # A difference over a step of 2 ms lags by half of it more.
     expected = RIG.velocity_time_constant + 0.001
     assert effect["parameters"]["time_constant"]["mean"] == pytest.approx(expected, rel=0.1)
-    assert [d["decision"] for d in result["decisions"]][:1] == ["revise the model"]
+    assert "revise the model" in [d["decision"] for d in result["decisions"]]
     assert set(result["returns"]) == {"policy from the prior", "policy from the revised model"}
 
 

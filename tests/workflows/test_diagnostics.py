@@ -52,7 +52,7 @@ def test_members_that_disagree_want_more_rounds_and_the_prior_when_there_are_non
     found = npdr.diagnose(data, rounds_left=2)
     assert found.decision is Decision.MORE_ROUNDS
     assert "r-hat" in found.reason
-    found = npdr.diagnose(data)
+    found = npdr.diagnose(data, rounds_left=0)
     assert found.decision is Decision.WIDEN
     assert "no rounds are left" in found.reason
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect, num_finer_steps
 from npdr_ppl.models.effects import CoulombFriction, InputDelay
 from npdr_ppl.models.pendulum import pendulum
@@ -138,10 +139,10 @@ def test_segments_are_shorter_where_rollouts_ended_early():
         readings=np.zeros((1, 501, 2)), actions=np.zeros((1, 500, 1)),
         channel_names=("angle", "velocity"), action_names=("torque",), time_step=0.002,
     )  # fmt: skip
-    usual = DiscoveryOptions()
-    assert loop_discovery._fitting(usual, rollouts).segment_length == 31
-    chosen = DiscoveryOptions(segment_length=100)
-    assert loop_discovery._fitting(chosen, rollouts) is chosen
+    # Sixteen segments instead of five of 100 steps.
+    assert DiscoveryOptions().binding(rollouts).segment_length == 31
+    with pytest.raises(DataError, match="500 steps are too few for 8 segments of 100 steps"):
+        DiscoveryOptions(segment_length=100).binding(rollouts)
 
 
 def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):

@@ -198,6 +198,26 @@ def test_the_return_asked_for_ends_the_loop(tmp_path, monkeypatch):
     assert len(result.iterations) == 1
 
 
+def test_a_measured_return_may_be_enough_to_end_the_loop(tmp_path, monkeypatch):
+    asked = scripted(monkeypatch)
+    # Untrained, the policy lets the pendulum fall and earns 3; trained it holds it.
+    options = small_options(
+        iterations=3, starts_from_prior=False, search_iterations=4, num_simulations=300,
+        stop_return=20.0, stops="measured return",
+    )  # fmt: skip
+    result = run(tmp_path / "other", options)
+    assert [record["real_return"] > 20.0 for record in result.iterations] == [False, True]
+    last = result.iterations[-1]
+    assert last["decision"] == Decision.STOP and "what was asked for" in last["reason"]
+    assert actions(result, 1) == [Action.KEPT] and last["checks"] == []
+    assert len(asked) == 1  # nothing was inferred from its rollout
+    assert result.deployed == 1
+    assert not (tmp_path / "other/run/inference_1_0").exists()
+    again = run(tmp_path / "other", options)
+    assert again.to_dict() == result.to_dict()
+    assert again.posterior is not None and result.posterior is not None
+
+
 def test_decisions_may_be_logged_only(tmp_path, monkeypatch):
     scripted(monkeypatch, Decision.STOP, Decision.MORE_ROUNDS)
     result = run(tmp_path, small_options(follows_decisions=False))
@@ -256,7 +276,9 @@ def test_the_best_measured_policy_is_deployed(tmp_path):
 def test_inference_may_start_from_the_last_posterior_or_the_closest_fit(tmp_path):
     options = small_options(iterations=2, num_simulations=200, start="prior")
     anew = run(tmp_path / "anew", options)
-    run(tmp_path / "nearby", dataclasses.replace(options, start="closest fit"))
+    uncertain = dataclasses.replace(options.binding, initial_state="uncertain")
+    nearby = dataclasses.replace(options, start="closest fit", binding=uncertain)
+    run(tmp_path / "nearby", nearby)
     options = dataclasses.replace(options, start="posterior")
     onward = run(tmp_path / "onward", options)
     spreads = [

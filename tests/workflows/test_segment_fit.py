@@ -18,7 +18,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows import segment_fit
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.segment_fit import LEAST_GAIN, fit_segments
-from npdr_ppl.workflows.segment_model import SegmentModel
+from npdr_ppl.workflows.segment_model import Linearisation, SegmentModel
 
 OPTIONS = BindingOptions(None, 20, "uncertain", "float64")
 START = torch.tensor([0.5, -0.5], dtype=torch.float64)
@@ -137,6 +137,95 @@ def test_where_the_simulation_fails_is_said(segments, monkeypatch):
     )
     with pytest.raises(DataError, match="simulation fails at the parameters"):
         fit_segments(segments, START)
+
+
+def linearisation(*, diverges):
+    """Returns that of four linear segments; the simulation diverges along one or all of them."""
+    generator = torch.Generator().manual_seed(0)
+    residual, by_z, by_start = (
+        torch.randn(shape, generator=generator, dtype=torch.float64)
+        for shape in ((4, 30), (4, 30, 2), (4, 30, 2))
+    )
+    # What explodes does so alike along all columns: 1 + Gᵀ G is singular in double precision.
+    by_start[diverges] = 1e100
+    return Linearisation(residual, by_z, by_start)
+
+
+def step_from(now, *, is_alone=slice(None)):
+    """Returns the parameters and offsets after a step of some of the segments."""
+    now = Linearisation(*(getattr(now, f.name)[is_alone] for f in dataclasses.fields(now)))
+    num = len(now.residual)
+    dampings = torch.full((num,), 1e-2).double()
+    held = torch.zeros(2, dtype=torch.bool)
+    offsets = torch.zeros(num, 2, dtype=torch.float64)
+    return segment_fit._step(now, START, offsets, held, 1e-2, dampings, (0.1, 1.0, 10.0))
+
+
+def test_a_segment_whose_derivatives_explode_keeps_its_start_and_holds_up_no_other():
+    now = linearisation(diverges=[2])
+    assert now.is_finite and not now.is_regular
+    with pytest.raises(torch.linalg.LinAlgError):  # what a plain solver says
+        torch.linalg.solve(now.by_starts.mT @ now.by_starts + torch.eye(2), now.by_starts.mT)
+    moved, begun = step_from(now)
+    assert begun.shape == (3, 4, 2)
+    assert torch.equal(begun[:, 2], torch.zeros(3, 2).double())
+    assert bool((begun[:, [0, 1, 3]] != 0.0).all())
+    # The step is that of a recording whose third segment starts from a known state.
+    known = dataclasses.replace(now, by_starts=now.by_starts * (now.by_starts < 1e99))
+    expected, others = step_from(known)
+    torch.testing.assert_close(moved, expected)
+    torch.testing.assert_close(begun[:, [0, 1, 3]], others[:, [0, 1, 3]])
+
+
+def test_where_every_system_is_singular_no_step_is_taken():
+    now = linearisation(diverges=slice(None))
+    now = dataclasses.replace(now, by_parameters=torch.full_like(now.by_parameters, 1e100))
+    assert now.is_finite
+    moved, begun = step_from(now)
+    assert torch.equal(moved, START)
+    assert torch.equal(begun, torch.zeros_like(begun))
+
+
+def test_a_segment_whose_derivatives_explode_says_nothing_of_the_parameters():
+    now, others = linearisation(diverges=[2]), torch.tensor([0, 1, 3])
+    assert linearisation(diverges=[]).is_regular
+    rest = Linearisation(*(getattr(now, f.name)[others] for f in dataclasses.fields(now)))
+    torch.testing.assert_close(now.information(), rest.information())
+    torch.testing.assert_close(now.weights()[others], rest.weights())
+    assert not now.weights()[2].any() and not now.taken_back()[2].any()
+
+
+def test_a_fit_goes_on_where_derivatives_explode(segments, monkeypatch):
+    plain = fit_segments(segments, START)
+    linearise = segments.linearise
+
+    def explodes(z, offsets, scale, *, is_rough=False):
+        now = linearise(z, offsets, scale, is_rough=is_rough)
+        now.by_starts[3] = 1e100
+        return now
+
+    monkeypatch.setattr(segments, "linearise", explodes)
+    found = fit_segments(segments, START)
+    assert torch.equal(found.offsets[3], torch.zeros(segments.num_offsets).double())
+    assert (found.z - plain.z).abs().max() < 0.2
+
+
+def test_no_leap_is_taken_where_the_parameters_cannot_be_told(segments, monkeypatch):
+    linearise = segments.linearise
+
+    def explodes(z, offsets, scale, *, is_rough=False):
+        now = linearise(z, offsets, scale, is_rough=is_rough)
+        return dataclasses.replace(
+            now,
+            by_parameters=torch.full_like(now.by_parameters, 1e100),
+            by_starts=torch.zeros_like(now.by_starts),
+        )
+
+    fit = fit_segments(segments, START)
+    monkeypatch.setattr(segments, "linearise", explodes)
+    every = torch.ones(2, dtype=torch.bool)
+    monkeypatch.setattr(SegmentModel, "dented_coordinates", every)
+    assert segment_fit._leap(segments, fit.z, fit.offsets, fit.scale, ~every) is None
 
 
 def test_equal_fits_from_equal_starts(segments):

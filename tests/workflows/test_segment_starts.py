@@ -52,6 +52,18 @@ def test_errors_are_scaled_to_what_the_offsets_show():
     torch.testing.assert_close(error_factors(residual, by_starts), true, rtol=0.15, atol=0.0)
 
 
+def test_segments_whose_simulation_explodes_have_no_say_in_the_errors():
+    generator = torch.Generator().manual_seed(0)
+    by_starts = torch.randn(50, 20, 2, generator=generator).double()
+    residual = 3.0 * torch.randn(50, 20, generator=generator).double()
+    plain = error_factors(residual[1:], by_starts[1:])
+    by_starts[0] = 1e100  # 1 + Gᵀ G is singular in double precision
+    torch.testing.assert_close(error_factors(residual, by_starts), plain)
+    torch.testing.assert_close(
+        error_factors(residual[:1], by_starts[:1]), torch.ones(2, dtype=torch.float64)
+    )
+
+
 @pytest.mark.parametrize("name", ["pendulum", "emps"])
 def test_starts_along_a_fit_are_as_far_off_as_they_say_and_command_changes_do_not_bias_them(name):
     rig = RIGS[name]

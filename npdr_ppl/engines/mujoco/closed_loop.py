@@ -24,7 +24,7 @@ def roll_out(simulator: "MujocoSimulator", request: EpisodeRequest) -> Episodes:
     request = replace(request, parameters=given)
     policy, domain, shape = request.batch(simulator, torch.float64, torch.device("cpu"))
     flat = flatten(given, shape)
-    constants = flatten(policy.constants(domain), shape)
+    constants = flatten(policy.constants(request.believed(domain)), shape)
     states = flatten(request.initial_states.double().unbind(-1), shape, expand=True)
     with quiet():
         middle = torch.tensor(0.5 * num_steps * step, dtype=torch.float64)

@@ -22,7 +22,12 @@ def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Ef
         candidates = tuple(e for e in options.effects if e.name not in hypothesis.names)
     else:
         candidates = irreducible(candidate_effects(hypothesis.simulator), hypothesis.names)
-    return tuple(effect for effect in candidates if not effect.is_noise)
+    simulator, time_step = hypothesis.simulator, hypothesis.segments.inputs.time_step
+    return tuple(
+        effect.at_rate(simulator.port(effect.port), time_step)
+        for effect in candidates
+        if not effect.is_noise
+    )
 
 
 def variants_of(

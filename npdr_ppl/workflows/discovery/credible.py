@@ -1,10 +1,4 @@
-"""How sure the parameters of a hypothesis are.
-
-A normal approximation with a robust covariance is drawn from, evenly, and each draw is weighed by
-how the misfit there differs from the parabola's: where the simulation is linear in the parameters
-all weights are one, and along a ridge that bends, as that of a weak spring whose rest is far away,
-draws that leave it have none.
-"""
+"""How sure the parameters of a hypothesis are: draws of its posterior, and their summaries."""
 
 import math
 from collections.abc import Mapping
@@ -13,29 +7,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npdr_ppl.inference.importance import longest_step, systematic
+from npdr_ppl.inference.importance import systematic
 from npdr_ppl.randomness import derived_seed
-from npdr_ppl.workflows.discovery.chance import block_sums
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
-from npdr_ppl.workflows.discovery.projection import Projection
-from npdr_ppl.workflows.segment_fit import MAX_COORDINATE
+from npdr_ppl.workflows.posterior_sampling import sample_posterior
 
 __all__ = ["Draws", "Estimate", "estimates", "posterior_draws"]
-
-NUM_PROPOSALS = 256
-"""Draws of the normal approximation, each a simulation of the recording. A power of two, for
-Sobol's sequence; evenly spread they say as much as some thousand random ones."""
-
-LEAST_EFFECTIVE = 0.125
-"""Share of the draws, those that could be simulated, that are to be worth an independent one."""
 
 COPIES = 16
 BANDWIDTH = 0.3
 """Each draw is smeared over so many places, by so many standard deviations, before an interval is
 read off: the shortest one of bare draws lies where they happen to be dense."""
-
-LEAST_LEFT = 0.1
-"""Least share of the information that is taken to be left without a block."""
 
 MASS = 0.94
 """Of the interval of highest density."""
@@ -91,77 +73,35 @@ class Draws:
         return self.z[systematic(self.weights.log(), num)]
 
 
-def posterior_draws(hypothesis: Hypothesis, *, seed: int, num: int = NUM_PROPOSALS) -> Draws:
+def posterior_draws(hypothesis: Hypothesis, *, seed: int) -> Draws:
     """Returns draws of the posterior along the recording.
 
-    Importance sampling, tempered where hardly any draw would count (Koblents & Míguez 2015). What
-    the misfit adds to the parabola counts by as much as the robust covariance is wider than that
-    of independent readings.
+    By adaptive importance sampling; see :mod:`npdr_ppl.workflows.posterior_sampling`.
 
     Args:
         hypothesis: The fitted model.
         seed: Seed of the draws.
-        num: How many, a power of two.
+
+    Raises:
+        DataError: Simulations fail beside the fit.
     """
-    projection, centre = Projection(hypothesis), hypothesis.fit.z
-    covariance = _robust_covariance(projection)
-    sobol = torch.quasirandom.SobolEngine(len(centre), scramble=True, seed=seed)
-    even = sobol.draw(num, dtype=torch.float64).clamp(1e-6, 1.0 - 1e-6)
-    normal = torch.special.ndtri(even)
-    # Fits go no further either, and beyond a prior's tail is infinity.
-    z = centre + normal @ torch.linalg.cholesky(covariance).mT
-    z = z.clamp(-MAX_COORDINATE, MAX_COORDINATE)
-    moved = z - centre
-    curvature = projection.parameter_information_by_segment.sum(0)
-    parabola = projection.misfit + torch.einsum("ni,ij,nj->n", moved, curvature, moved)
-    beyond = projection.misfit_at(z) - parabola
-    share = min(1.0, len(centre) / float((curvature * covariance).sum().clamp_min(1e-12)))
-    log_weights = (-0.5 * share * beyond).nan_to_num(-math.inf, -math.inf, -math.inf)
-    exponent = longest_step(log_weights, 1.0, LEAST_EFFECTIVE)
-    return Draws(z, (exponent * log_weights).softmax(0))
-
-
-def _robust_covariance(projection: Projection) -> Tensor:
-    """Returns the covariance of the posterior's normal approximation, ``(d, d)``.
-
-    The robust one, H⁻¹ V H⁻¹ with V from how the blocks' scores scatter (Huber
-    1967; White 1982; Müller 2013 for posteriors), which holds when readings within a block are
-    correlated or the scale is wrong. Each block's score is what it would be had the block not been
-    fitted (the jackknife, CR3 of Bell & McCaffrey 2002): few blocks may carry most of what is
-    known. No parameter is taken to be surer than Laplace's approximation has it.
-    """
-    information = projection.parameter_information
-    d = len(information)
-    eye = torch.eye(d, dtype=torch.float64)
-    scores = block_sums(projection.parameter_scores)
-    parts = block_sums(projection.parameter_information_by_segment.flatten(1)).unflatten(1, (d, d))
-    inverse = torch.linalg.inv(information)
-    left = eye - parts @ inverse
-    # A block that alone determines a direction cannot be left out of it.
-    values, vectors = torch.linalg.eig(left)
-    values = torch.complex(values.real.clamp_min(LEAST_LEFT), values.imag)
-    freed = vectors @ (
-        torch.linalg.solve(vectors, scores[..., None].to(vectors)) / values[..., None]
-    )
-    scatter = freed.real[..., 0].mT @ freed.real[..., 0]
-    robust = inverse @ (scatter + eye) @ inverse
-    wider = (inverse.diagonal() / robust.diagonal()).clamp_min(1.0).sqrt()
-    covariance = wider[:, None] * robust * wider
-    return 0.5 * (covariance + covariance.mT) + 1e-12 * eye
+    own_seed = derived_seed(seed, "discovery", "posterior")
+    found = sample_posterior(hypothesis.likelihood, seed=own_seed)
+    counts = found.weights > 0.0  # what could not be simulated may lie anywhere
+    return Draws(found.z[counts], found.weights[counts])
 
 
 def estimates(
-    hypothesis: Hypothesis, units: Mapping[str, str], *, seed: int
+    hypothesis: Hypothesis, draws: Draws, units: Mapping[str, str]
 ) -> dict[str, Estimate]:
     """Returns every scalar parameter's estimate, by site.
 
     Args:
         hypothesis: The fitted model.
+        draws: Draws of its posterior.
         units: The parameters' units.
-        seed: Seed of the draws.
     """
-    own_seed = derived_seed(seed, "discovery", "estimates")
-    draws = posterior_draws(hypothesis, seed=own_seed).smoothed()
+    draws = draws.smoothed()
     values = hypothesis.segments.prior.to_parameters(draws.z)
     result = {}
     for name, value in values.items():

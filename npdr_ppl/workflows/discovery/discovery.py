@@ -1,18 +1,19 @@
 """Discovery: is something wrong, where, what is it, and does adding it help?"""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
 from torch import Tensor
+from torch.distributions import Distribution
 
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.counts import counts
-from npdr_ppl.workflows.discovery.credible import Estimate, estimates
+from npdr_ppl.workflows.discovery.credible import Draws, Estimate, estimates, posterior_draws
 from npdr_ppl.workflows.discovery.data_checks import data_problems, recording_problems
 from npdr_ppl.workflows.discovery.equivalents import equivalents
 from npdr_ppl.workflows.discovery.evidence import SURVIVES
@@ -20,6 +21,7 @@ from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.limits import limits
 from npdr_ppl.workflows.discovery.next_experiment import NextExperiment, next_experiment
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
+from npdr_ppl.workflows.discovery.prior_ends import PriorEnd, beyond
 from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.proof import Gap, prove
 from npdr_ppl.workflows.discovery.residual_map import Spot, worst_windows
@@ -96,6 +98,7 @@ class Investigation:
         self.seconds: dict[str, float] = {}
         self._binding = self.options.binding(rollouts)
         self._searcher = Searcher(model, rollouts, self.options, report)
+        self._drawn: list[tuple[Hypothesis, Draws]] = []
 
     @cached_property
     def given(self) -> Hypothesis:
@@ -121,10 +124,25 @@ class Investigation:
 
     @cached_property
     def start(self) -> Hypothesis:
-        """The same in finer steps, where the model's own are too coarse."""
+        """The same in finer steps and with wider priors, where the model's own do not suffice."""
+        return self._start[0]
+
+    @cached_property
+    def _start(self) -> tuple[Hypothesis, Mapping[str, Distribution]]:
+        """The fit that the search begins with, and the priors that the model has itself."""
         given = self.given
         with _timed(self.seconds, "choose steps"):
-            return self._searcher.with_finer_steps(given)
+            found = self._searcher.with_finer_steps(given)
+            priors = found.segments.prior.distributions
+            return self._searcher.with_wider_priors(found), priors
+
+    @cached_property
+    def narrow_priors(self) -> tuple[PriorEnd, ...]:
+        """The priors outside which the parameters of the final fit lie."""
+        final = self.search.final
+        if not self._searcher.are_priors_widened:
+            return ()
+        return beyond(self._start[1], final)
 
     @cached_property
     def problems(self) -> tuple[str, ...]:
@@ -173,15 +191,34 @@ class Investigation:
                 result.append(tuple(dict.fromkeys(names)))
         return result
 
+    def _draws(self, hypothesis: Hypothesis) -> Draws:
+        """Returns draws of a hypothesis's posterior."""
+        for known, draws in self._drawn:
+            if known is hypothesis:
+                return draws
+        with _timed(self.seconds, f"posterior {len(self._drawn) + 1}"):
+            draws = posterior_draws(hypothesis, seed=self.options.seed)
+        self._drawn.append((hypothesis, draws))
+        return draws
+
     @cached_property
     def gap(self) -> dict[str, Gap]:
         """Metrics on the held-out recording; empty without one."""
         if self.holdout is None:
             return {}
         given, final = self.given, self.search.final
+        draws_before, draws_after = self._draws(given), self._draws(final)
         with _timed(self.seconds, "prove"):
             binding = _like(self._binding, self.rollouts, self.holdout)
-            return prove(given, final, self.holdout, binding, seed=self.options.seed)
+            return prove(
+                given,
+                final,
+                self.holdout,
+                binding,
+                draws_before=draws_before,
+                draws_after=draws_after,
+                seed=self.options.seed,
+            )
 
     def _advice(self, name: str) -> NextExperiment | None:
         """Returns the experiment that would tell the likeliest in an effect's place apart."""
@@ -201,12 +238,14 @@ class Investigation:
         search = self.search
         final = search.final
         unexplained = _unexplained(search)
-        every = estimates(final, _units(final), seed=self.options.seed)
+        every = estimates(final, self._draws(final), _units(final))
         effects = [
             _finding(added, search, every, at_edge)
             for added, at_edge in zip(search.added, self._at_edge, strict=True)
         ]
         verdict, reason = _judge(search, effects, self.problems, unexplained, self.options)
+        if self.narrow_priors and not self.problems:
+            reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"
         gap = self.gap
@@ -218,6 +257,7 @@ class Investigation:
             verdict=verdict,
             reason=reason,
             problems=self.problems,
+            narrow_priors=self.narrow_priors,
             alarm=self.first.alarm,
             remainder=search.rounds[-1].alarm,
             unexplained=unexplained,
@@ -231,6 +271,8 @@ class Investigation:
             model=search.rounds[0].hypothesis.model,
             revised=final.model,
             parameters=every,
+            draws_before=self._draws(self.start),
+            draws_after=self._draws(final),
             counts=counts(final, self.rollouts),
             search=search,
             options=self.options,
@@ -357,8 +399,9 @@ def _most_doubtful(effects: list[Finding], options: DiscoveryOptions) -> Finding
 
 def _like(binding: BindingOptions, rollouts: Rollouts, holdout: Rollouts) -> BindingOptions:
     """Returns segments of the same duration at the held-out recording's rate."""
-    assert binding.segment_length is not None
-    steps = round(binding.segment_length * rollouts.time_step / holdout.time_step)
+    length = binding.steps(rollouts)
+    assert length is not None
+    steps = round(length * rollouts.time_step / holdout.time_step)
     return BindingOptions(None, max(2, steps), binding.initial_state, binding.precision)
 
 

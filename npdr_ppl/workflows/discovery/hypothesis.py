@@ -17,6 +17,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.arviz_export import effective_share
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.segment_fit import SegmentFit, fit_segments
+from npdr_ppl.workflows.segment_likelihood import SegmentLikelihood
 from npdr_ppl.workflows.segment_model import Linearisation, SegmentModel
 from npdr_ppl.workflows.segment_starts import Starts
 
@@ -71,7 +72,7 @@ class Hypothesis:
     @property
     def can_be_linearised(self) -> bool:
         """Whether the simulation succeeds at the fit and everywhere beside it."""
-        return self._linearised.is_finite
+        return self._linearised.is_regular
 
     @property
     def linearisation(self) -> Linearisation:
@@ -104,6 +105,17 @@ class Hypothesis:
         mask = self.segments.inputs.mask
         return float(
             effective_share(residual.unflatten(-1, (-1, len(self.fit.scale))), mask).mean()
+        )
+
+    @cached_property
+    def likelihood(self) -> SegmentLikelihood:
+        """The recording's likelihood with the noise that the fit leaves.
+
+        Raises:
+            DataError: Simulations fail beside the fit.
+        """
+        return SegmentLikelihood(
+            self.segments, self.fit, self.linearisation, self.share, is_noise_declared=False
         )
 
     def losses(self, scale: Tensor) -> Tensor:

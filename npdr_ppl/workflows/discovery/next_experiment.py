@@ -23,7 +23,7 @@ from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.segment_fit import SegmentFit
 from npdr_ppl.workflows.segment_model import SegmentModel
 
-__all__ = ["NextExperiment", "next_experiment"]
+__all__ = ["NextExperiment", "excitation_commands", "next_experiment"]
 
 SECONDS = 4.0
 
@@ -78,7 +78,7 @@ def next_experiment(
         classes: Equivalence classes of the effects in question.
     """
     largest = np.max([np.abs(actions).max(0) for actions in rollouts.actions], axis=0)
-    shapes = _excitations(rollouts.time_step)
+    shapes = excitation_commands(rollouts.time_step)
     commands = SAFE_SHARE * largest * np.stack(list(shapes.values()))[..., None]
     made = [_made(survivor, rollouts, commands) for survivor in survivors]
     works = np.all([np.isfinite(readings).all((1, 2)) for readings in made], axis=0)
@@ -102,7 +102,7 @@ def next_experiment(
     )
 
 
-def _excitations(time_step: float) -> dict[str, NDArray[np.float64]]:
+def excitation_commands(time_step: float) -> dict[str, NDArray[np.float64]]:
     """Returns commands between −1 and 1, ``(T,)`` each."""
     t = np.arange(round(SECONDS / time_step)) * time_step
     levels = np.array([0.5, -0.25, 1.0, -0.75, 0.25, -1.0, 0.75, -0.5])

@@ -6,18 +6,14 @@ from typing import Literal
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows.binding import BindingOptions
+from npdr_ppl.workflows.binding import (
+    FEWEST_SEGMENTS,
+    FEWEST_STEPS,
+    BindingOptions,
+    default_segment_length,
+)
 
 __all__ = ["DiscoveryOptions"]
-
-SEGMENT_SECONDS = 0.2
-"""Length of a segment: long against delays and lags, short against the time in which an unstable
-motion forgets where it started."""
-
-FEWEST_STEPS, MOST_STEPS = 20, 200
-
-FEWEST_SEGMENTS = 8
-"""With fewer there is nothing to tell an effect from chance by."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +21,8 @@ class DiscoveryOptions:
     """How discovery searches.
 
     Attributes:
-        segment_length: Steps between re-synchronisations; ``None`` for ``SEGMENT_SECONDS``.
+        segment_length: Steps between re-synchronisations; ``None`` for
+            :func:`~npdr_ppl.workflows.binding.default_segment_length`.
         effects: The effects to search; ``None`` for every effect of the catalogue at every port
             where it makes sense.
         max_effects: Greatest number of effects to add.
@@ -64,13 +61,12 @@ class DiscoveryOptions:
         Raises:
             DataError: The recording is too short.
         """
-        length = self.segment_length
-        if length is None:
-            length = round(SEGMENT_SECONDS / rollouts.time_step)
-            length = max(FEWEST_STEPS, min(MOST_STEPS, length))
-        if sum(rollouts.lengths) < FEWEST_SEGMENTS * length:
+        length, fewest = self.segment_length, self.segment_length
+        if length is None or fewest is None:
+            length, fewest = default_segment_length(rollouts), FEWEST_STEPS
+        if sum(rollouts.lengths) < FEWEST_SEGMENTS * fewest:
             raise DataError(
                 f"{sum(rollouts.lengths)} steps are too few for {FEWEST_SEGMENTS} segments of "
-                f"{length} steps; record more, or choose a shorter segment_length."
+                f"{fewest} steps; record more, or choose a shorter segment_length."
             )
         return BindingOptions(None, length, "uncertain", self.precision)

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.workflows.binding import MAX_READINGS_PER_CHUNK
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
-from npdr_ppl.workflows.infer import MAX_READINGS_PER_CHUNK
 
 __all__ = ["Projection", "Scores", "loss_without"]
 

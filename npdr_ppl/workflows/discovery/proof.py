@@ -6,20 +6,18 @@ import torch
 from torch import Tensor
 
 from npdr_ppl import metrics
-from npdr_ppl.randomness import derived_seed, seeded
+from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts, stitch
 from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.discovery.credible import posterior_draws
+from npdr_ppl.workflows.discovery.credible import Draws
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.segment_model import SegmentModel
+from npdr_ppl.workflows.segment_starts import error_factors
 
 __all__ = ["Gap", "prove"]
 
 NUM_DRAWS = 40
 """Posterior predictive trajectories."""
-
-NUM_PROPOSALS = 64
-"""Draws of the posterior that they are taken from, each a simulation of the fitted recording."""
 
 LEVEL = 0.9
 """Probability of the predictive interval whose coverage is reported."""
@@ -32,8 +30,9 @@ class Gap:
     Attributes:
         before: With the model as it was, refitted.
         after: With the revised model.
-        noise_floor: What a model without error would have, because readings and initial states
-            have errors; ``None`` for a metric that has no floor.
+        noise_floor: What the revised model would leave of a recording of its own, because
+            measurements and initial states have errors; ``None`` for a metric that has no floor.
+            Another model may leave a little less by chance.
     """
 
     before: float
@@ -63,6 +62,8 @@ def prove(
     rollouts: Rollouts,
     options: BindingOptions,
     *,
+    draws_before: Draws,
+    draws_after: Draws,
     seed: int,
 ) -> dict[str, Gap]:
     """Compares two fitted models on rollouts that neither was fitted to.
@@ -72,11 +73,13 @@ def prove(
         after: The revised model.
         rollouts: The held-out recording, of another excitation where there is one.
         options: Its segments.
+        draws_before: Draws of the posterior of the model as it was.
+        draws_after: Draws of the posterior of the revised model.
         seed: Seed of the predictive draws.
     """
     with seeded(seed, "discovery", "proof"):
-        drawn = _draws(after, seed)
-        old = _Scores.of(before, _draws(before, seed), rollouts, options)
+        drawn = draws_after.resampled(NUM_DRAWS)
+        old = _Scores.of(before, draws_before.resampled(NUM_DRAWS), rollouts, options)
         new = _Scores.of(after, drawn, rollouts, options)
         floor = _floor(after, drawn, rollouts, options)
     return {
@@ -114,13 +117,17 @@ def _floor(
 ) -> dict[str, float]:
     """Returns the metrics of a recording that the model itself might have made.
 
-    From initial states off by the smoother's errors, with readings off by their noise, scored
-    against the prediction from the smoother's estimate.
+    From initial states as far off as they turn out to be along the recording, with measurements
+    off by their noise, scored against the prediction from the smoother's estimate.
     """
     segments = SegmentModel(hypothesis.model, rollouts, options)
-    z = hypothesis.fit.z[None]
-    centre = segments.simulate(z, _no_offsets(segments, 1))[0].double()
-    made = segments.simulate(z, torch.randn(_no_offsets(segments, 1).shape).double())[0].double()
+    z, unmoved = hypothesis.fit.z[None], _no_offsets(segments, 1)
+    centre = segments.simulate(z, unmoved)[0].double()
+    offsets = torch.randn(unmoved.shape).double()
+    now = segments.linearise(z[0], unmoved[0], hypothesis.fit.scale, is_rough=True)
+    if now.is_finite:
+        offsets = offsets * error_factors(now.residual, now.by_starts)
+    made = segments.simulate(z, offsets)[0].double()
     made = (
         made + reading_noise(rollouts, segments.channel_names) * torch.randn(made.shape).double()
     )
@@ -151,12 +158,6 @@ def reading_noise(rollouts: Rollouts, channels: tuple[str, ...]) -> Tensor:
 def _no_offsets(segments: SegmentModel, num: int) -> Tensor:
     shape = num, segments.inputs.num_segments, segments.num_offsets
     return torch.zeros(shape, dtype=torch.float64)
-
-
-def _draws(hypothesis: Hypothesis, seed: int) -> Tensor:
-    """Returns parameters of the posterior, ``(NUM_DRAWS, d)``."""
-    own_seed = derived_seed(seed, "discovery", "proof")
-    return posterior_draws(hypothesis, seed=own_seed, num=NUM_PROPOSALS).resampled(NUM_DRAWS)
 
 
 def _predictive(hypothesis: Hypothesis, drawn: Tensor, segments: SegmentModel) -> Tensor:

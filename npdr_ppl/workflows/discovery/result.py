@@ -13,9 +13,10 @@ from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.rollouts.atomic import replacing
 from npdr_ppl.workflows.discovery.alarm import Alarm
 from npdr_ppl.workflows.discovery.counts import Count
-from npdr_ppl.workflows.discovery.credible import Estimate
+from npdr_ppl.workflows.discovery.credible import Draws, Estimate
 from npdr_ppl.workflows.discovery.next_experiment import NextExperiment
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
+from npdr_ppl.workflows.discovery.prior_ends import PriorEnd
 from npdr_ppl.workflows.discovery.proof import Gap
 from npdr_ppl.workflows.discovery.residual_map import Spot
 from npdr_ppl.workflows.discovery.revised_model import revised_source
@@ -75,6 +76,8 @@ class Discovery:
         verdict: What the recording says of the model.
         reason: The verdict in a sentence.
         problems: What is wrong with the recording itself; nothing is named then.
+        narrow_priors: Priors outside which the revised model's parameters lie; the search was made
+            with wider ones.
         alarm: Whether the model as it was and the recording disagree.
         remainder: The same for the revised model.
         unexplained: Share of the misfit that the revised model leaves and something could explain.
@@ -89,6 +92,8 @@ class Discovery:
         model: The model as it was.
         revised: The model with the effects.
         parameters: All parameters' estimates in the revised model, by site.
+        draws_before: Draws of the posterior of the model that the search began with.
+        draws_after: Draws of the posterior of the revised model.
         counts: Channels that are read in whole counts, as an encoder's, and what rounding makes
             of what the revised model leaves there.
         search: How it was found.
@@ -99,6 +104,7 @@ class Discovery:
     verdict: Verdict
     reason: str
     problems: tuple[str, ...]
+    narrow_priors: tuple[PriorEnd, ...]
     alarm: Alarm
     remainder: Alarm
     unexplained: float
@@ -112,6 +118,8 @@ class Discovery:
     model: Callable[..., Any]
     revised: Callable[..., Any]
     parameters: dict[str, Estimate]
+    draws_before: Draws
+    draws_after: Draws
     counts: dict[str, Count]
     search: Search
     options: DiscoveryOptions
@@ -123,6 +131,7 @@ class Discovery:
             "verdict": self.verdict,
             "reason": self.reason,
             "data_problems": list(self.problems),
+            "priors_too_narrow": [str(end) for end in self.narrow_priors],
             "alarm": {"p_value": self.alarm.p_value, "fired": self.alarm.fired},
             "remainder": {
                 "p_value": self.remainder.p_value,

@@ -12,6 +12,7 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps, num_finer_steps
+from npdr_ppl.language.wider_priors import ModelWithWiderPriors
 
 __all__ = ["revised_source"]
 
@@ -35,17 +36,23 @@ def revised_source(
     present = [e for e, _ in model.effects] if isinstance(model, ModelWithEffects) else []
     every = [*present, *effects]
     num_finer = num_finer_steps(base)
-    while isinstance(base, ModelWithFinerSteps):
+    wider: list[str] = []
+    while isinstance(base, ModelWithFinerSteps | ModelWithWiderPriors):
+        if isinstance(base, ModelWithWiderPriors):
+            wider.append(f"{FUNCTION} = with_wider_priors({FUNCTION}, {list(base.names)!r})")
         base = base.base
     head, name = _base(base)
     imports = sorted({f"from {type(e).__module__} import {type(e).__name__}" for e in every})
     handlers = [*(["add_effect"] if every else []), *(["with_finer_steps"] if num_finer else [])]
+    handlers += ["with_wider_priors"] if wider else []
     if handlers:
         imports = [f"from npdr_ppl import {', '.join(handlers)}", *imports]
     if any(effect.given_priors for effect in every):
         imports = ["import pyro.distributions", "", *imports]
     lines = [head.rstrip(), "", "", *imports, "", f"{FUNCTION} = {name}"]
     lines += [f"{FUNCTION} = with_finer_steps({FUNCTION})"] * num_finer
+    if wider:
+        lines += ["# These priors ended before the recording's parameters.", *reversed(wider)]
     for effect in every:
         lines += _added(effect)
     lines += ["", "# Where the model came closest to the recording."]

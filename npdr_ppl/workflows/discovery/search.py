@@ -6,15 +6,16 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from npdr_ppl.language.effects import Effect
-from npdr_ppl.language.handlers import with_finer_steps
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.discovery.alarm import Alarm, sound_alarm
+from npdr_ppl.workflows.discovery.base_fit import fit_base, in_finer_steps
 from npdr_ppl.workflows.discovery.candidates import candidates_at, variants_of
 from npdr_ppl.workflows.discovery.evidence import SURVIVES, closest, weigh
-from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis, with_effects
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model
 from npdr_ppl.workflows.discovery.latent_force import Responses, responses
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
+from npdr_ppl.workflows.discovery.prior_ends import widen_where_it_helps
 from npdr_ppl.workflows.discovery.projection import Projection, loss_without
 from npdr_ppl.workflows.discovery.rivals import (
     Added,
@@ -27,18 +28,12 @@ from npdr_ppl.workflows.discovery.rivals import (
 from npdr_ppl.workflows.discovery.screening import Screened, screen
 from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.workflows.discovery.trials import PLAINLY, Trials
-from npdr_ppl.workflows.segment_model import SegmentModel
 
 __all__ = ["Round", "Search", "Searcher", "explained"]
 
 LEAST_SHARE = 1e-4
 """Share of what was explained below which what is left is not looked into and no effect is added:
 where a large effect was missing, integrators and the laws' own details differ by as much."""
-
-NOTICEABLE = 5.0
-"""Distance by which steps of a higher order move all readings together, in standard deviations of
-what a fit leaves, from which they are taken unless the recording speaks against them: effects
-would be found that make up for it. Refitted parameters make up for four fifths of a distance."""
 
 PRIOR_OF_ANY = 0.5
 """Prior probability that anything of the catalogue is missing."""
@@ -92,10 +87,12 @@ class Searcher:
         rollouts: The recording.
         options: How to search.
         report: Called with a sentence at each step.
+        binding: Its segments; those of the options by default.
 
     Attributes:
         model: The model in question, in finer steps once its own have turned out too coarse.
         are_steps_coarse: Whether they have.
+        are_priors_widened: Whether some of its priors ended too early and were widened.
     """
 
     def __init__(
@@ -104,12 +101,16 @@ class Searcher:
         rollouts: Rollouts,
         options: DiscoveryOptions,
         report: Callable[[str], None] = lambda _: None,
+        *,
+        binding: BindingOptions | None = None,
     ) -> None:
         self.model = model
         self.rollouts = rollouts
         self.options = options
-        self.binding: BindingOptions = options.binding(rollouts)
+        self.binding: BindingOptions = binding or options.binding(rollouts)
         self.are_steps_coarse = False
+        self.are_priors_widened = False
+        self._last: Round | None = None
         self._report = report
 
     @property
@@ -118,50 +119,41 @@ class Searcher:
         return Trials(self.model, self.rollouts, self.binding)
 
     def fit_base(self) -> Hypothesis:
-        """Fits the model as it is.
-
-        Raises:
-            DataError: The simulation fails at the start of the fit or beside its end, or the data
-                do not fit the model.
-        """
+        """Fits the model as it is; see :func:`~npdr_ppl.workflows.discovery.base_fit.fit_base`."""
         self._report("fitting the model as it is")
-        fitted = fit_hypothesis(self.model, self.rollouts, self.binding)
-        found = self.trials.with_own_starts(fitted)
-        _ = found.linearisation  # all that follows needs it
-        return found
+        return fit_base(self.model, self.rollouts, self.binding, seed=self.options.seed)
 
     def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
-        """Returns the hypothesis in finer steps, where its own err noticeably; else as it is.
+        """Returns a hypothesis in finer steps where its own are too coarse; else as it is.
 
-        The error of coarse steps would be found as a delay. A recording that was itself made in
-        coarse steps is left to them. All later hypotheses are in the steps of what is returned.
+        All later hypotheses are in the steps of what is returned.
 
         Args:
             current: A fitted hypothesis.
         """
-        while current.simulator.with_finer_steps() is not None:
-            coarse, self.model = self.model, with_finer_steps(self.model)
-            finer = None
-            if self._step_error(current) > NOTICEABLE:
-                finer = self.trials.refitted(current)
-            if finer is None or _speaks_for(current, finer) > self.options.confidence:
-                self.model = coarse
-                break
-            self._report("the model's steps are too coarse for this recording: finer ones")
-            self.are_steps_coarse = True
-            current = self.trials.with_own_starts(finer)
-        return current
+        found = in_finer_steps(
+            current, self.model, self.rollouts, self.binding, report=self._report
+        )
+        self.model = found.model
+        self.are_steps_coarse = self.are_steps_coarse or found.are_steps_coarse
+        return found.hypothesis
 
-    def _step_error(self, current: Hypothesis) -> float:
-        """Returns how far the readings are from a hypothesis's in the steps of the model now.
+    def with_wider_priors(self, current: Hypothesis) -> Hypothesis:
+        """Returns a hypothesis with wider priors where its own end too early; else as it is.
 
-        In standard deviations of what the hypothesis leaves.
+        No effect is to be named that a wider prior explains as well: all later hypotheses have the
+        priors of what is returned.
+
+        Args:
+            current: A fitted hypothesis.
         """
-        fit, model = current.fit, with_effects(self.model, current.effects)
-        finer = SegmentModel(model, self.rollouts, self.binding, current.segments.starts)
-        here = fit.z[None], fit.offsets[None]
-        difference = finer.simulate(*here) - current.segments.simulate(*here)
-        return float(finer.whitened(difference[0], fit.scale).norm().nan_to_num(math.inf))
+        found = widen_where_it_helps(self.model, current, self.rollouts, self.binding)
+        if found is None:
+            return current
+        self._report(f"{found.ends[0]}")
+        self.model, self.are_priors_widened = found.model, True
+        # What the narrow prior left had hidden how coarse the steps are.
+        return self.with_finer_steps(found.hypothesis)
 
     def run(self, first: Round, *, max_effects: int) -> Search:
         """Adds effects until no alarm fires, nothing helps, or there are enough.
@@ -204,7 +196,9 @@ class Searcher:
         return Search(rounds, current, added, removed, trials)
 
     def look(self, hypothesis: Hypothesis) -> Round:
-        """Screens all candidates at a fitted hypothesis."""
+        """Screens all candidates at a fitted hypothesis; the last one asked for is kept."""
+        if self._last is not None and self._last.hypothesis is hypothesis:
+            return self._last
         projection = Projection(hypothesis)
         found = responses(hypothesis)
         candidates = candidates_at(hypothesis, self.options)
@@ -216,7 +210,8 @@ class Searcher:
         alarm = sound_alarm(projection, plain, ranking, found, sensors, self.options, looks)
         best = ", ".join(s.name for s in ranking[:3]) or "none"
         self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
-        return Round(hypothesis, alarm, ranking, found)
+        self._last = Round(hypothesis, alarm, ranking, found)
+        return self._last
 
     def _extended(
         self, current: Hypothesis, now: Round

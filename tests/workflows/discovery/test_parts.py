@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import runpy
 import sys
 import threading
@@ -250,8 +251,25 @@ def test_the_same_seed_finds_the_same():
 def test_degrees_from_which_simulations_fail_are_told_in_a_sentence(place, seed):
     spoilt = places("cart_pole", "bad_data", seed)[place]
     case = make_case("cart_pole", "bad_data", spoilt, seed=seed)
-    with pytest.raises(DataError, match=r"^Simulations fail .* rad; are these degrees\?$"):
-        npdr.discover(case.model, case.fit)
+    # Where some fit succeeds the recording is refused by its verdict, elsewhere by an error.
+    try:
+        found = npdr.discover(case.model, case.fit)
+    except DataError as error:
+        told = str(error)
+    else:
+        assert found.verdict == "unknown"
+        assert found.effects == []
+        told = found.reason
+    assert re.search(r"rad; are these degrees\?$", told)
+
+
+def test_a_fit_beside_which_a_segment_explodes_is_refused(quiet):
+    exploding = quiet.linearisation.by_starts.clone()
+    exploding[0] = 1e100  # finite, and so are its squares; 1 + Gᵀ G is singular
+    beside = replace(quiet)
+    vars(beside)["_linearised"] = replace(quiet.linearisation, by_starts=exploding)
+    with pytest.raises(DataError, match="Simulations fail right beside the model's closest fit"):
+        Projection(beside)
 
 
 def test_numbers_of_rollouts_are_no_rollouts():

@@ -1,0 +1,66 @@
+"""Recordings of a driven pendulum by an integrator of their own, for defaults to be tried on.
+
+Runge-Kutta steps of 1 ms in NumPy; nothing of the package's engines is used.
+"""
+
+import numpy as np
+
+from npdr_ppl.rollouts import Rollouts
+
+TRUTH = {"mass": 1.1, "length": 0.9}
+"""kg and m."""
+
+NOISE = {"angle": 0.002, "velocity": 0.01}
+"""Standard deviations of the measurements, rad and rad/s."""
+
+TIME_STEP, SUBSTEPS = 0.02, 20
+
+
+def swinging(*, rollouts=3, steps=250, friction=0.0, seed=0):
+    """Returns rollouts of the pendulum under three sines of torque.
+
+    Args:
+        rollouts: Their number.
+        steps: Samples of each, 20 ms apart.
+        friction: Dry friction at the hinge, N m.
+        seed: Seed of torques, initial states and noise.
+    """
+    generator = np.random.default_rng(seed)
+    readings, actions = [], []
+    for _ in range(rollouts):
+        state = np.array([generator.uniform(-1.0, 1.0), 0.0])
+        rates, phases = generator.uniform(0.2, 1.5, 3), generator.uniform(0.0, 2.0 * np.pi, 3)
+        time = np.arange(steps) * TIME_STEP
+        torque = 0.7 * np.sin(2.0 * np.pi * rates[:, None] * time + phases[:, None]).sum(0)
+        states = [state]
+        for command in torque:
+            for _ in range(SUBSTEPS):
+                state = _step(state, command, friction, TIME_STEP / SUBSTEPS)
+            states.append(state)
+        noise = generator.standard_normal((steps + 1, 2)) * [NOISE["angle"], NOISE["velocity"]]
+        readings.append(np.array(states) + noise)
+        actions.append(torque[:, None])
+    return Rollouts.from_arrays(
+        readings=readings,
+        actions=actions,
+        channel_names=("angle", "velocity"),
+        action_names=("torque",),
+        time_step=TIME_STEP,
+    )
+
+
+def _rate(state, torque, friction):
+    angle, velocity = state
+    mass, length = TRUTH["mass"], TRUTH["length"]
+    # A steep slope in place of the jump; at these torques the pendulum never sticks for long.
+    resisting = friction * np.tanh(velocity / 0.005)
+    force = torque - 0.5 * mass * 9.81 * length * np.sin(angle) - resisting
+    return np.array([velocity, force / (mass * length**2 / 3.0)])
+
+
+def _step(state, torque, friction, size):
+    first = _rate(state, torque, friction)
+    second = _rate(state + 0.5 * size * first, torque, friction)
+    third = _rate(state + 0.5 * size * second, torque, friction)
+    fourth = _rate(state + size * third, torque, friction)
+    return state + size / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)

@@ -1,0 +1,56 @@
+"""What discovery says is closed is measured on the held-out recording, and on nothing else."""
+
+import numpy as np
+import pytest
+from hidden_rigs import make_case
+
+import npdr_ppl as npdr
+from npdr_ppl.models.effects import QuadraticDrag
+
+DISTURBANCE = 0.5
+"""Standard deviation of what is added to held-out velocities, rad/s: fifty times their noise."""
+
+
+def disturbed(rollouts):
+    """Returns rollouts whose velocities have white noise added."""
+    rng = np.random.default_rng(0)
+    readings = [
+        r + DISTURBANCE * rng.standard_normal(r.shape) * [0.0, 1.0] for r in rollouts.readings
+    ]
+    return npdr.Rollouts.from_arrays(
+        readings=readings, actions=rollouts.actions, channel_names=rollouts.channel_names,
+        action_names=rollouts.action_names, time_step=rollouts.time_step,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def proofs():
+    """The same search with held-out rollouts as they were recorded, and with disturbed ones."""
+    place = ("hinge", "quadratic_drag")
+    case = make_case("pendulum", "one", (place,), strength=1.0, seed=2001)
+    assert case.holdout.channel_names == ("angle", "velocity")
+    options = npdr.DiscoveryOptions(effects=(QuadraticDrag("hinge"),), max_effects=1)
+    return [
+        npdr.discover(case.model, case.fit, holdout=holdout, options=options)
+        for holdout in (case.holdout, disturbed(case.holdout))
+    ]
+
+
+def test_the_proof_is_of_the_held_out_rollouts(proofs):
+    clean, noisy = (proof.gap for proof in proofs)
+    assert clean["rmse"].closed > 0.5 and 0.8 < clean["coverage"].after <= 1.0
+    for metric in ("rmse", "dtw", "crps"):
+        # Noise that no model can follow is far more than the effect and the readings' own noise.
+        assert noisy[metric].after > 3.0 * clean[metric].after
+        assert noisy[metric].before > 3.0 * clean[metric].before
+        # Without an error in the model it would be as large.
+        assert noisy[metric].noise_floor > 3.0 * clean[metric].noise_floor
+    # Half the readings are velocities, of which next to none is within the predicted interval.
+    assert noisy["coverage"].after == pytest.approx(clean["coverage"].after / 2, abs=0.1)
+
+
+def test_held_out_rollouts_have_no_say_in_what_is_found(proofs):
+    clean, noisy = proofs
+    assert [f.to_dict() for f in clean.effects] == [f.to_dict() for f in noisy.effects]
+    assert (clean.verdict, clean.reason) == (noisy.verdict, noisy.reason)
+    assert clean.parameters == noisy.parameters
