@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +14,9 @@ from torch import Tensor
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.rollouts import arrays, checks, collection, indices, segments
+from npdr_ppl.rollouts import arrays, checks, collection, indices, segments, states
 from npdr_ppl.rollouts.arrays import Array
+from npdr_ppl.rollouts.states import StateEstimate
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -366,6 +368,20 @@ class Rollouts:
             history=history,
             dtype=dtype,
         )
+
+    @cached_property
+    def estimates(self) -> dict[tuple[tuple[int, int, int], ...], StateEstimate]:
+        """Estimated states at the starts of segments, by the segments, as far as they were made.
+
+        Smoothing costs as much as hundreds of simulations, and every model of a recording starts
+        from the same states.
+        """
+        return {}
+
+    @cached_property
+    def rate_changes(self) -> Array:
+        """By how much each channel's rate changes in a time step, root mean square, ``(C,)``."""
+        return states.rate_changes(self.readings, self.time_step)
 
     def observation(
         self, inputs: Inputs | int | None = None, channels: Sequence[str] | None = None

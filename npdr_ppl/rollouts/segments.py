@@ -194,7 +194,14 @@ def _layout(lengths: Sequence[int], segment_length: int | None) -> list[tuple[in
 
 
 def _estimated(rollouts: "Rollouts", layout: Sequence[tuple[int, int, int]]) -> StateEstimate:
-    """Returns the estimate at the segments' starts, ``(S, C)``."""
+    """Returns the estimate at the segments' starts, ``(S, C)``; made once per recording."""
+    known, key = rollouts.estimates, tuple(layout)
+    if key not in known:
+        known[key] = _estimate(rollouts, layout)
+    return known[key]
+
+
+def _estimate(rollouts: "Rollouts", layout: Sequence[tuple[int, int, int]]) -> StateEstimate:
     parts = []
     for index, readings in enumerate(rollouts.readings):
         starts = np.array([start for rollout, start, _ in layout if rollout == index])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["StateEstimate", "estimate_departures", "estimate_states"]
+__all__ = ["StateEstimate", "estimate_departures", "estimate_states", "rate_changes"]
 
 Array = NDArray[np.float64]
 
@@ -20,6 +20,9 @@ HALF_WIDTHS = (2, 3, 4, 5, 7, 9, 12, 16, 21, 28, 37, 49, 65, 86, 114, 151, 200)
 NEIGHBOURS = (-2, -1, 0, 1, 2)
 """Where else the window is chosen, in samples: the median of the choices is taken, so that one
 chance disagreement between small windows does not stop the growth."""
+
+RATE_SAMPLES = 200
+"""Steps of each rollout at which the change of a rate is looked at."""
 
 CONFIDENCE = 2.0
 """Half-width of the compared confidence intervals, in standard errors."""
@@ -122,6 +125,21 @@ def estimate_departures(
     return StateEstimate(value, rate / time_step, value_error, rate_error / time_step)
 
 
+def rate_changes(readings: Sequence[Array], time_step: float) -> Array:
+    """Returns by how much each channel's rate changes in a time step, root mean square, ``(C,)``.
+
+    Args:
+        readings: One ``(T + 1, C)`` per rollout, constant sampling, in the channels' units.
+        time_step: Seconds between rows.
+    """
+    changes = []
+    for rows in readings:
+        steps = np.linspace(0, len(rows) - 2, RATE_SAMPLES).astype(np.int64)
+        now, then = (estimate_states(rows, at, time_step).rates for at in (steps, steps + 1))
+        changes.append(np.square(then - now))
+    return np.sqrt(np.concatenate(changes).mean(0))
+
+
 def _adaptive(
     readings: Array, steps: NDArray[np.int64], noises: Array, num_changes: NDArray[np.int64]
 ) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
@@ -185,7 +203,8 @@ def _fit(
     return fit, error
 
 
-@functools.lru_cache(maxsize=1024)
+# One-sided windows near a recording's ends have extents of their own, some 1700 in all.
+@functools.lru_cache(maxsize=4096)
 def _weights(before: int, after: int) -> Array:
     """Returns the weights ``(2, before + after + 1)`` of a window for value and rate per row."""
     offsets = np.arange(-before, after + 1, dtype=np.float64)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,7 +23,6 @@ from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.states import estimate_states
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.segment_starts import (
     Starts,
@@ -39,9 +37,6 @@ __all__ = ["Linearisation", "SegmentModel"]
 PARAMETER_STEP = 1e-2
 """Half the width of finite differences, in standard deviations of the prior: more than what
 single precision and dry friction blur."""
-
-RATE_SAMPLES = 200
-"""Steps of each rollout at which the change of a rate is looked at."""
 
 START_STEP = 0.1
 """Half the width of finite differences of initial states, in standard deviations of the smoother's
@@ -368,13 +363,7 @@ def _with_lagging_rates(inputs: Inputs, rollouts: Rollouts, lag: float) -> Input
     """
     if lag == 0.0 or inputs.initial_rate_errors is None:
         return inputs
-    changes = []
-    for readings in rollouts.readings:
-        steps = np.linspace(0, len(readings) - 2, RATE_SAMPLES).astype(np.int64)
-        now, then = (
-            estimate_states(readings, at, rollouts.time_step).rates for at in (steps, steps + 1)
-        )
-        changes.append(np.square(then - now))
-    change = np.sqrt(np.concatenate(changes).mean(0))
     errors = inputs.initial_rate_errors
-    return replace(inputs, initial_rate_errors=errors.hypot(errors.new_tensor(lag * change)))
+    return replace(
+        inputs, initial_rate_errors=errors.hypot(errors.new_tensor(lag * rollouts.rate_changes))
+    )
