@@ -32,7 +32,7 @@ TOLERANCE = 0.05
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "members-1": {"members": 1},
-    "members-3": {"members": 3},
+    "members-2": {"members": 2},
     "members-5": {"members": 5},
     "members-8": {"members": 8},
     "decay": {"weight_decay": 0.1},

@@ -25,6 +25,7 @@ __all__ = [
     "refit_regression",
     "residual_factor",
     "ridge_regression",
+    "whiten_unseen",
 ]
 
 MAX_KNOTS = 65
@@ -198,6 +199,28 @@ def refit_regression(preconditioner: Preconditioner, z: Tensor, x: Tensor) -> Pr
     gain, offset, residuals = ridge_regression(preconditioner.features(x), z)
     factor = residual_factor(residuals, z)
     return replace(preconditioner, gain=gain, offset=offset, factor=factor)
+
+
+def whiten_unseen(preconditioner: Preconditioner, z: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Whitens the simulations a preconditioner was fitted to as if it had not seen them.
+
+    A regression's residuals are smaller at the simulations it was fitted to, by the more the fewer
+    simulations there are for each feature; an estimator trained on those would be too narrow
+    everywhere else. These are the leave-one-out residuals.
+
+    Args:
+        preconditioner: What :func:`fit_preconditioner` made of these simulations.
+        z: Parameters, ``(n, d)``.
+        x: Features, ``(n, F)``, or raw arrays.
+
+    Returns:
+        Whitened parameters ``(n, d)`` and standardised features of x's shape.
+    """
+    f = preconditioner.features(x)
+    if not len(preconditioner.scores):
+        return preconditioner.whiten(z, f), f
+    _, _, residuals = ridge_regression(f.cpu(), z.cpu())
+    return preconditioner.spread(residuals.to(z.device)), f
 
 
 def _centre_and_scale(x: Tensor) -> Tensor:

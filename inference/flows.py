@@ -21,6 +21,7 @@ from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.conditioned_flow import conditioned
 from npdr_ppl.inference.embedding_network import build_embedding
 from npdr_ppl.inference.features import Preconditioner
+from npdr_ppl.inference.flow_base import FlowBase
 from npdr_ppl.randomness import seeded
 
 __all__ = [
@@ -41,6 +42,8 @@ Network = TypeVar("Network", bound=nn.Module)
 INITIAL_SCALE = 0.01
 """Factor on the last layer's initial weights: a flow starts near the identity, that is, at the
 preconditioner's linear-Gaussian posterior, and is never trained to a worse place than that."""
+
+STANDARD_NORMAL = FlowBase()
 
 CHUNK = 4_096
 """Rows sampled or evaluated at once. Intermediate values of many more leave the cache, which costs
@@ -155,13 +158,8 @@ class FlowNetwork(nn.Module):
 
     def log_prob(self, u: Tensor, context: Tensor) -> Tensor:
         """Returns log q(u | f), ``(n,)``, given h(f), ``(n, num_features)``."""
-        return _log_prob(self.transform(context), u)
-
-
-def _log_prob(transform: Any, u: Tensor) -> Tensor:
-    """Returns log N(T(u); 0, I) + log |det dT/du|."""
-    base, log_det = transform.call_and_ladj(u)
-    return log_det - 0.5 * (base**2 + math.log(2 * math.pi)).sum(-1)
+        base, log_det = self.transform(context).call_and_ladj(u)
+        return log_det - 0.5 * (base**2 + math.log(2 * math.pi)).sum(-1)
 
 
 def _univariate(flow: str, transforms: int, bins: int) -> Sequence[Any]:
@@ -242,11 +240,17 @@ class FlowDensity(Density):
         network: A trained network, on the CPU or a GPU.
         preconditioner: What was fitted before training, on the same device.
         observation: Observation x_o, ``(F,)`` or a raw array, on the same device.
+        base: The flow's base density.
     """
 
     def __init__(
-        self, network: FlowNetwork, preconditioner: Preconditioner, observation: Tensor
+        self,
+        network: FlowNetwork,
+        preconditioner: Preconditioner,
+        observation: Tensor,
+        base: FlowBase = STANDARD_NORMAL,
     ) -> None:
+        self._base = base
         self._preconditioner = preconditioner
         self._features = preconditioner.features(observation[None])
         with torch.no_grad():
@@ -258,7 +262,7 @@ class FlowDensity(Density):
         chunks: list[Tensor] = []
         drawn, redraws = 0, 0
         while drawn < num_samples:
-            base = torch.randn(min(CHUNK, num_samples - drawn), d).to(device)
+            base = self._base.sample(min(CHUNK, num_samples - drawn), d).to(device)
             with torch.no_grad():
                 u = self._transform.inv(base)
                 z = self._preconditioner.unwhiten(u, self._features)
@@ -277,5 +281,6 @@ class FlowDensity(Density):
 
     def _log_prob(self, z: Tensor) -> Tensor:
         u = self._preconditioner.whiten(z.to(self._features.device), self._features)
-        log_q = _log_prob(self._transform, u)
+        base, log_det = self._transform.call_and_ladj(u)
+        log_q = log_det + self._base.log_prob((base**2).sum(-1), u.shape[-1])
         return (log_q + self._preconditioner.log_det).to(z.device)

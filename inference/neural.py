@@ -18,7 +18,14 @@ from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
 from npdr_ppl.inference.checks import check_problem, check_restored, finite_rows
 from npdr_ppl.inference.features import Preconditioner, fit_preconditioner
-from npdr_ppl.inference.training import Loss, TrainingOptions, train
+from npdr_ppl.inference.training import (
+    Evaluator,
+    Loss,
+    TrainingOptions,
+    in_turn,
+    train,
+    vectorised,
+)
 
 __all__ = ["NeuralBackend", "NeuralState", "Simulations"]
 
@@ -92,6 +99,9 @@ class NeuralBackend(Backend):
 
     preconditioner_type: ClassVar[type[Preconditioner]] = Preconditioner
     """What :meth:`_precondition` returns."""
+
+    shares_held_out: ClassVar[bool] = False
+    """Whether all members hold out the same simulations rather than each its own."""
 
     members: int = 2
     epochs: int = 30
@@ -172,6 +182,10 @@ class NeuralBackend(Backend):
         """
         return self._networks(problem)
 
+    def _evaluator(self, problem: Problem) -> Evaluator:
+        """Returns how all networks are evaluated at once; embedding networks are in turn."""
+        return vectorised if problem.build_network is None else in_turn
+
     @abstractmethod
     def _loss(
         self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
@@ -183,6 +197,25 @@ class NeuralBackend(Backend):
     ) -> Loss | None:
         """Returns the objective at held-out rows where :meth:`_loss` is random, else ``None``."""
         return None
+
+    def _calibration(
+        self,
+        problem: Problem,
+        preconditioner: Preconditioner,
+        simulations: Simulations,
+        weights: Mapping[str, Tensor],
+        held_out: Tensor,
+    ) -> dict[str, Tensor]:
+        """Returns what is fitted after training and kept with the weights: nothing.
+
+        Args:
+            problem: The problem.
+            preconditioner: That of the round.
+            simulations: What the round trained on.
+            weights: The trained networks' parameters and buffers.
+            held_out: Numbers of the simulations each member held out, ``(members, n)``.
+        """
+        return {}
 
     def _training_rows(self, problem: Problem, state: NeuralState) -> Tensor:
         """Returns which of the earlier rounds' simulations to train on, ``(n,)``."""
@@ -241,13 +274,15 @@ class NeuralBackend(Backend):
                 averaging=self.averaging,
                 validation_fraction=self.validation_fraction,
                 patience=self.patience,
+                shares_held_out=self.shares_held_out,
             ),
             device,
-            is_vectorised=problem.build_network is None,
+            evaluator=self._evaluator(problem),
             progress=progress,
             validation_loss=self._validation_loss(problem, preconditioner.to(device), rows),
         )
         weights = {name: value.cpu() for name, value in fit.weights.items()}
+        weights |= self._calibration(problem, preconditioner, rows, weights, fit.held_out.cpu())
         info = RoundInfo(
             num_simulations,
             num_failed,

@@ -15,12 +15,25 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from npdr_ppl.errors import BackendError
 
-__all__ = ["Fit", "LogProb", "Loss", "TrainingOptions", "train"]
+__all__ = [
+    "Evaluator",
+    "Fit",
+    "LogProb",
+    "Loss",
+    "TrainingOptions",
+    "in_turn",
+    "train",
+    "vectorised",
+]
 
 LogProb = Callable[[Tensor, Tensor], Tensor]
 """Log densities of all members, of u's leading shape: takes whitened parameters u,
 ``(members, n, d)`` or, several for each context, ``(members, n, atoms, d)``, and features f,
 ``(members, n, ...)``."""
+
+Evaluator = Callable[[nn.Module, dict[str, Tensor], dict[str, Tensor]], LogProb]
+"""Makes the log densities of all members from one of their networks and their stacked parameters
+and buffers by name, each ``(members, ...)``."""
 
 Loss = Callable[[LogProb, Tensor], Tensor]
 """Losses of the rows numbered by the second argument, ``(members, n)`` to ``(members, n)``. Rows
@@ -41,7 +54,8 @@ class TrainingOptions:
         weight_decay: Decoupled weight decay (Loshchilov & Hutter 2019).
         averaging: Decay of the running average of the weights, which is what is validated and
             kept; 0 keeps the last weights instead.
-        validation_fraction: Fraction of the rows held out, different ones for every member.
+        validation_fraction: Fraction of the rows held out.
+        shares_held_out: Whether all members hold out the same rows rather than each its own.
         patience: Epochs without improvement after which training stops; fewer, but at least
             :data:`MIN_PATIENCE`, while the best epoch is an early one, so that little is spent
             where the preconditioner has left nothing to learn.
@@ -54,6 +68,7 @@ class TrainingOptions:
     averaging: float
     validation_fraction: float
     patience: int
+    shares_held_out: bool = False
 
 
 @dataclass(frozen=True)
@@ -65,12 +80,14 @@ class Fit:
         validation: Best mean validation objective of every member, ``(members,)``.
         best_epochs: Epoch it was reached at, ``(members,)``; 0 is before the first step.
         epochs: Epochs trained.
+        held_out: Numbers of the rows that each member held out, ``(members, n)``.
     """
 
     weights: dict[str, Tensor]
     validation: Tensor
     best_epochs: Tensor
     epochs: int
+    held_out: Tensor
 
 
 MIN_BATCHES, MIN_BATCH_SIZE = 16, 32
@@ -108,11 +125,11 @@ def train(
     num_rows: int,
     options: TrainingOptions,
     device: torch.device,
-    is_vectorised: bool = True,
+    evaluator: Evaluator | None = None,
     progress: Callable[[float, str], None] | None = None,
     validation_loss: Loss | None = None,
 ) -> Fit:
-    """Trains an ensemble; every member has its own held-out rows and mini-batches.
+    """Trains an ensemble; every member has its own mini-batches.
 
     Draws from torch's global stream on the CPU, whatever the device.
 
@@ -122,8 +139,7 @@ def train(
         num_rows: Rows of the data.
         options: How to train.
         device: Where the data are.
-        is_vectorised: Whether the networks consist of operations that vmap knows; otherwise the
-            members are evaluated in turn.
+        evaluator: How all members are evaluated at once; :func:`vectorised` if ``None``.
         progress: Called after every epoch with the fraction done and a short status.
         validation_loss: The objective at held-out rows, where it is another one: the best epoch
             is found by it, and it must not be random.
@@ -131,8 +147,7 @@ def train(
     members = len(networks)
     networks = [network.to(device).train() for network in networks]
     parameters, buffers = stack_module_state(list(networks))
-    log_prob = _vectorised if is_vectorised else _in_turn
-    evaluate = log_prob(networks[0], parameters, buffers)
+    evaluate = (evaluator or vectorised)(networks[0], parameters, buffers)
     weights = [w for w in parameters.values()]
     optimizer = torch.optim.AdamW(
         weights,
@@ -146,7 +161,8 @@ def train(
     best_value = torch.full((members,), -math.inf, device=device)
     best_epochs = torch.zeros(members, dtype=torch.long, device=device)
 
-    rows = torch.stack([torch.randperm(num_rows) for _ in range(members)]).to(device)
+    orders = [torch.randperm(num_rows) for _ in range(1 if options.shares_held_out else members)]
+    rows = torch.stack(orders).expand(members, -1).to(device)
     num_held_out = max(1, round(options.validation_fraction * num_rows))
     held_out, rows = rows[:, :num_held_out], rows[:, num_held_out:]
     batch_size = max(MIN_BATCH_SIZE, rows.shape[1] // MIN_BATCHES)
@@ -190,10 +206,12 @@ def train(
     if not best_value.isfinite().all():
         raise BackendError("Training diverged: the validation objective was never finite.")
     trained = dict(zip(parameters, best, strict=True)) | buffers
-    return Fit({k: v.detach() for k, v in trained.items()}, best_value, best_epochs, epoch)
+    return Fit(
+        {k: v.detach() for k, v in trained.items()}, best_value, best_epochs, epoch, held_out
+    )
 
 
-def _vectorised(
+def vectorised(
     network: nn.Module, parameters: dict[str, Tensor], buffers: dict[str, Tensor]
 ) -> LogProb:
     """Returns the log densities of all members as one call."""
@@ -205,7 +223,7 @@ def _vectorised(
     return lambda u, f: stacked(parameters, buffers, u, f)
 
 
-def _in_turn(
+def in_turn(
     network: nn.Module, parameters: dict[str, Tensor], buffers: dict[str, Tensor]
 ) -> LogProb:
     """Returns the log densities of all members as one call per member."""
