@@ -11,8 +11,9 @@ import pytest
 from npdr_ppl.cli import show
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import CoulombFriction, InputDelay, SensorLowPass
+from npdr_ppl.models.furuta import furuta
 from npdr_ppl.plots.missing_effect_figures import write_missing_effect_figures
-from npdr_ppl.workflows.discovery import DiscoveryOptions
+from npdr_ppl.workflows.discovery import DiscoveryOptions, discover
 from npdr_ppl.workflows.missing_effect import (
     CHIRP,
     SWING_UP,
@@ -71,6 +72,19 @@ def test_filter_delay_and_friction_are_found_and_help_on_another_excitation(
         part, chirps[[0]], tmp_path, holdout=(2, 3), options=OPTIONS, progress=False
     )
     assert again is None and read == json.loads((tmp_path / "missing-effect.json").read_text())
+
+
+@pytest.mark.slow
+def test_filter_and_delay_are_found_among_the_whole_catalogue(recordings):
+    swing_ups, _ = recordings
+    options = DiscoveryOptions(max_effects=2, precision="float32")
+    found = discover(furuta, swing_ups[[0, 1]], options=options)
+    assert [f.effect.name for f in found.effects] == [
+        f"{FILTER}.sensor_low_pass",
+        "voltage.input_delay",
+    ]
+    assert found.effects[0].probability > 0.9
+    assert len(found.ranking) > 30
 
 
 def test_recordings_are_a_folder_or_the_file_of_swing_ups(recordings, tmp_path):

@@ -185,6 +185,19 @@ def test_a_law_that_may_as_well_be_its_limit_is_not_named(hidden, strength, inst
     assert f"explains it with {shape} where hardly any device has it" in found.reason
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("rig", "port"), [("furuta", "arm"), ("cart_pole", "rail")])
+def test_friction_of_one_of_two_joints_among_the_whole_catalogue(rig, port):
+    place = (port, "coulomb_friction")
+    case, found = discover(rig, "one", (place,), max_effects=1, num_rollouts=1)
+    assert found.verdict == "named", found.reason
+    (finding,) = found.effects
+    assert finding.effect.name == f"{port}.coulomb_friction" and finding.probability > 0.9
+    assert found.gap["rmse"].closed > 0.8
+    (true,) = case.truth
+    assert covers(finding, "magnitude", true.parameters["magnitude"])
+
+
 def test_a_law_whose_shape_shows_is_named():
     # The same law as above, where the recording does tell it from a constant.
     _, found = discover("pendulum", "one", (("hinge", "periodic_disturbance"),), max_effects=1)
