@@ -128,7 +128,7 @@ def sample_posterior(
     """
     prior = likelihood.segments.prior
     space = RidgeCoordinates.of(likelihood, seed=seed)
-    own = [heavy_tailed(torch.zeros_like(space.deviation), torch.diag(space.deviation.square()))]
+    own = [heavy_tailed(*space.moments())]
     shares: list[int] = []
     learnt = list(proposals)
     z, w, target = (torch.empty(0) for _ in range(3))

@@ -6,15 +6,21 @@ narrower. Even a slight bend of the sheet defeats a normal approximation. With w
 and stiff coordinates b of the prior-whitened information, b = g(a) is traced by Newton steps with
 the Jacobian of the closest fit (the chord method), fitted by a polynomial, and subtracted. The
 shear (a, b) → (a, b − g(a)) keeps volumes, so densities need no correction for it.
+
+How far the ridge reaches is not to be seen from the closest fit: where it bends, the curvature
+there makes it look short. The traced points themselves tell: they are weighted by their density
+over that of the points tried, and the next are spread as these say (adaptive importance sampling
+along the ridge), until they say the same again.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
 import torch
 from torch import Tensor
 
+from npdr_ppl.inference.importance import longest_step
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.randomness import seeded
 from npdr_ppl.workflows.sampling_coordinates import SamplingCoordinates
@@ -22,18 +28,22 @@ from npdr_ppl.workflows.segment_likelihood import SegmentLikelihood
 
 __all__ = ["RidgeCoordinates"]
 
-STIFF = 30.0
-"""Information in units of the prior's from which a direction counts as stiff: its posterior is
-then narrower than 0.18 prior standard deviations."""
+FEWEST_POINTS, POINTS_PER_TERM = 96, 6
+"""Points at which a ridge is traced, and how many for each term of a quadratic in its weak
+coordinates; each costs a simulation of the recording per chord step."""
 
-POINTS = 256
-"""Points at which a ridge is traced, each a simulation of the recording per chord step."""
+CHORD_STEPS, MORE_STEPS = 5, 3
+"""Chord steps to each point, at first and where a polynomial already says about where it is."""
 
-CHORD_STEPS = 5
-"""Chord steps to each of them."""
+ROUNDS = 5
+"""Times that a ridge is traced at most."""
 
-REACH = 1.3
-"""How far weak coordinates of these points are spread, in posterior standard deviations."""
+REACH = 1.5
+"""How far weak coordinates of these points are spread, in standard deviations."""
+
+EVEN_SHARE = 0.3
+"""Effective share of the traced points from which they are spread as the ridge is; with less the
+weights are tempered, and the next points go on from where these lead."""
 
 FARTHEST = 1.0
 """Greatest chord step along a stiff direction, in prior standard deviations."""
@@ -55,6 +65,9 @@ class RidgeCoordinates:
         num_weak: How many of w are weak; they come first.
         coefficients: Polynomial g in the weak ones, ``(terms, d − num_weak)``.
         degree: Its degree, 0 where there is no bend to trace.
+        weak_mean: Mean of the posterior's weak coordinates, as far as tracing tells,
+            ``(num_weak,)``.
+        weak_covariance: Their covariance, ``(num_weak, num_weak)``.
     """
 
     space: SamplingCoordinates
@@ -64,6 +77,8 @@ class RidgeCoordinates:
     num_weak: int
     coefficients: Tensor
     degree: int
+    weak_mean: Tensor
+    weak_covariance: Tensor
 
     @classmethod
     def of(cls, likelihood: SegmentLikelihood, *, seed: int) -> "RidgeCoordinates":
@@ -75,7 +90,9 @@ class RidgeCoordinates:
         scaled = likelihood.information() * (spread / slope)[:, None] * (spread / slope)
         information, vectors = torch.linalg.eigh(0.5 * (scaled + scaled.mT))
         information = information.clamp_min(0.0)
-        num_weak = int((information < STIFF).sum())
+        # A direction of width δ bends by about δ², in units of the prior; it is weak where that
+        # shows in the stiffest one.
+        num_weak = int((information**2 < information[-1]).sum())
         straight = cls(
             space,
             space.from_reference(z[None])[0],
@@ -84,6 +101,8 @@ class RidgeCoordinates:
             num_weak,
             torch.zeros(1, len(z) - num_weak, dtype=torch.float64),
             0,
+            torch.zeros(num_weak, dtype=torch.float64),
+            torch.diag(1.0 / (1.0 + information[:num_weak])),
         )
         if num_weak in (0, len(z)):
             return straight
@@ -97,6 +116,8 @@ class RidgeCoordinates:
             "information": self.information,
             "coefficients": self.coefficients,
             "shape": torch.tensor([self.num_weak, self.degree]),
+            "weak_mean": self.weak_mean,
+            "weak_covariance": self.weak_covariance,
         }
 
     @classmethod
@@ -111,12 +132,17 @@ class RidgeCoordinates:
             int(num_weak),
             tensors["coefficients"],
             int(degree),
+            tensors["weak_mean"],
+            tensors["weak_covariance"],
         )
 
-    @property
-    def deviation(self) -> Tensor:
-        """Standard deviations of w in Laplace's approximation, ``(d,)``."""
-        return (1.0 + self.information).rsqrt()
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """Returns about which mean ``(d,)`` and covariance ``(d, d)`` the posterior has in w."""
+        k, d = self.num_weak, len(self.centre)
+        mean = torch.zeros(d, dtype=torch.float64)
+        covariance = torch.diag(1.0 / (1.0 + self.information))
+        mean[:k], covariance[:k, :k] = self.weak_mean, self.weak_covariance
+        return mean, covariance
 
     def from_reference(self, z: Tensor) -> Tensor:
         """Maps reference coordinates ``(n, d)`` to w."""
@@ -143,44 +169,79 @@ class RidgeCoordinates:
         self, likelihood: SegmentLikelihood, slope: Tensor, seed: int
     ) -> "RidgeCoordinates":
         """Returns the coordinates with the polynomial that the ridge follows."""
+        k, found = self.num_weak, self
+        number = max(FEWEST_POINTS, POINTS_PER_TERM * _num_terms(k, 2))
+        for round_ in range(ROUNDS):
+            with seeded(seed, "ridge", round_):
+                drawn = torch.randn(number, k, dtype=torch.float64)
+            factor = REACH * torch.linalg.cholesky(found.weak_covariance)
+            weak = found.weak_mean + drawn @ factor.mT
+            steps = CHORD_STEPS if round_ == 0 else MORE_STEPS
+            w, log_density = found._followed(likelihood, weak, slope, steps)
+            log_weights = log_density + 0.5 * drawn.square().sum(-1)
+            if int(log_weights.isfinite().sum()) < number // 2:
+                break
+            found = found._bent_through(w, log_density)
+            exponent = longest_step(log_weights, 1.0, EVEN_SHARE)
+            weights = (exponent * log_weights).nan_to_num(-torch.inf).softmax(0)
+            mean = weights @ weak
+            away = weak - mean
+            covariance = (weights[:, None] * away).mT @ away
+            grown = torch.linalg.eigvals(torch.linalg.solve(found.weak_covariance, covariance))
+            found = replace(found, weak_mean=mean, weak_covariance=covariance)
+            # Spread as before, and all of one weight: there is no more to find.
+            if exponent == 1.0 and float(grown.real.max()) < REACH:
+                break
+        return found
+
+    def _followed(
+        self, likelihood: SegmentLikelihood, weak: Tensor, slope: Tensor, steps: int
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the points of a ridge above weak coordinates ``(n, k)``.
+
+        Returns:
+            The points without the bend, ``(n, d)``, and their log densities up to a constant,
+            ``(n,)``; minus infinity for those that were not found.
+        """
         k, d = self.num_weak, len(self.centre)
-        with seeded(seed, "ridge"):
-            weak = REACH * self.deviation[:k] * torch.randn(POINTS, k, dtype=torch.float64)
-        w = torch.cat((weak, torch.zeros(POINTS, d - k, dtype=torch.float64)), dim=-1)
-        z, inside = self.to_reference(w)
-        w, z, inside = w[inside], z[inside], inside[inside]
+        straight = replace(self, coefficients=torch.zeros(1, d - k).double(), degree=0)
         by_w = self.basis / slope[:, None]  # ∂z/∂w at the closest fit
         stiff = self.information[k:] + 1.0
-        squares = torch.full((len(w),), torch.inf, dtype=torch.float64)
-        best = w.clone()
-        for _ in range(CHORD_STEPS):
-            if not len(w):
-                return self
+        w = torch.cat((weak, self._bend(weak)), dim=-1)
+        best, value = w.clone(), torch.full((len(w),), -torch.inf, dtype=torch.float64)
+        prior = likelihood.segments.prior
+        for _ in range(steps + 1):
+            z, inside = straight.to_reference(w)
             # Beyond the support nothing can be simulated: there the point has no score.
-            score = torch.full_like(w, torch.nan)
-            value = torch.full((len(w),), torch.inf, dtype=torch.float64)
+            score, density = torch.full_like(w, torch.nan), torch.full_like(value, -torch.inf)
             if bool(inside.any()):
-                score[inside], value[inside] = likelihood.scores(z[inside])
-            is_better = value < squares
-            best[is_better], squares[is_better] = w[is_better], value[is_better]
+                at = z[inside]
+                score[inside], misfit = likelihood.scores(at)
+                density[inside] = (
+                    prior.log_prob(at).double() - 0.5 * misfit - straight.log_jacobian(at)
+                )
+            is_better = density > value
+            best[is_better], value[is_better] = w[is_better], density[is_better]
             # The prior's own pull is that of a normal one of the same variance.
             step = ((score @ by_w)[:, k:] - w[:, k:]) / stiff
             w = w.clone()
             w[:, k:] += step.nan_to_num(0.0).clamp(-FARTHEST, FARTHEST)
-            z, inside = self.to_reference(w)
-        near = squares.argsort()[: int(KEPT * len(squares))]
-        near = near[squares[near].isfinite()]
+        return best, value
+
+    def _bent_through(self, w: Tensor, log_density: Tensor) -> "RidgeCoordinates":
+        """Returns the coordinates with a polynomial through points of the ridge, ``(n, d)``."""
+        k = self.num_weak
+        near = log_density.argsort(descending=True)[: int(KEPT * len(w))]
+        near = near[log_density[near].isfinite()]
         degree = next((p for p in (3, 2, 1) if 4 * _num_terms(k, p) <= len(near)), 0)
         if degree == 0:
             return self
         # Points off the ridge by more than others say less of where it is.
-        excess = squares[near] - squares[near].min()
-        weight = (1.0 + excess / excess.median().clamp_min(1.0)).rsqrt()
-        terms = _monomials(best[near, :k], degree)
-        found = torch.linalg.lstsq(weight[:, None] * terms, weight[:, None] * best[near, k:])
-        return RidgeCoordinates(
-            self.space, self.centre, self.basis, self.information, k, found.solution, degree
-        )
+        excess = log_density[near].max() - log_density[near]
+        weight = (1.0 + excess / excess.median().clamp_min(0.5)).rsqrt()
+        terms = _monomials(w[near, :k], degree)
+        found = torch.linalg.lstsq(weight[:, None] * terms, weight[:, None] * w[near, k:])
+        return replace(self, coefficients=found.solution, degree=degree)
 
 
 def _num_terms(number: int, degree: int) -> int:
