@@ -35,13 +35,29 @@ coordinates; each costs a simulation of the recording per chord step."""
 CHORD_STEPS, MORE_STEPS = 5, 3
 """Chord steps to each point, at first and where a polynomial already says about where it is."""
 
-ROUNDS = 5
+TRIED = 20
+"""How many times as many points are drawn, of which those on the priors' support are kept."""
+
+FEWEST_FOUND = 0.3
+"""Share of the points that chord steps must find for the ridge to be followed any further."""
+
+ROUNDS = 8
 """Times that a ridge is traced at most."""
 
-REACH = 1.5
+CLOSE = 1.0
+"""Log density that the median point may gain by chord steps from where the polynomial has it: the
+polynomial is then within the posterior's own width."""
+
+MOST_DEGREE, POINTS_PER_COEFFICIENT = 6, 3
+"""Greatest degree of the polynomial, and least number of points for each of its terms."""
+
+REACH = 2.0
 """How far weak coordinates of these points are spread, in standard deviations."""
 
-EVEN_SHARE = 0.3
+GROWS = 1.3
+"""Ratio of variances from one tracing to the next from which a ridge may reach farther still."""
+
+EVEN_SHARE = 0.1
 """Effective share of the traced points from which they are spread as the ridge is; with less the
 weights are tempered, and the next points go on from where these lead."""
 
@@ -169,19 +185,25 @@ class RidgeCoordinates:
         self, likelihood: SegmentLikelihood, slope: Tensor, seed: int
     ) -> "RidgeCoordinates":
         """Returns the coordinates with the polynomial that the ridge follows."""
-        k, found = self.num_weak, self
+        k, d, found = self.num_weak, len(self.centre), self
         number = max(FEWEST_POINTS, POINTS_PER_TERM * _num_terms(k, 2))
+        points, values = torch.empty(0, d).double(), torch.empty(0).double()
         for round_ in range(ROUNDS):
-            with seeded(seed, "ridge", round_):
-                drawn = torch.randn(number, k, dtype=torch.float64)
             factor = REACH * torch.linalg.cholesky(found.weak_covariance)
+            with seeded(seed, "ridge", round_):
+                drawn = torch.randn(TRIED * number, k, dtype=torch.float64)
             weak = found.weak_mean + drawn @ factor.mT
+            _, inside = found.to_reference(torch.cat((weak, weak.new_zeros(len(weak), d - k)), -1))
+            drawn, weak = drawn[inside][:number], weak[inside][:number]
             steps = CHORD_STEPS if round_ == 0 else MORE_STEPS
-            w, log_density = found._followed(likelihood, weak, slope, steps)
-            log_weights = log_density + 0.5 * drawn.square().sum(-1)
-            if int(log_weights.isfinite().sum()) < number // 2:
+            w, predicted, log_density = found._followed(likelihood, weak, slope, steps)
+            is_found = log_density.isfinite()
+            if float(is_found.double().mean()) < FEWEST_FOUND:
                 break
-            found = found._bent_through(w, log_density)
+            missed = (log_density - predicted)[is_found].median()
+            points, values = torch.cat((points, w)), torch.cat((values, log_density))
+            found = found._bent_through(points, values)
+            log_weights = log_density + 0.5 * drawn.square().sum(-1)
             exponent = longest_step(log_weights, 1.0, EVEN_SHARE)
             weights = (exponent * log_weights).nan_to_num(-torch.inf).softmax(0)
             mean = weights @ weak
@@ -189,19 +211,20 @@ class RidgeCoordinates:
             covariance = (weights[:, None] * away).mT @ away
             grown = torch.linalg.eigvals(torch.linalg.solve(found.weak_covariance, covariance))
             found = replace(found, weak_mean=mean, weak_covariance=covariance)
-            # Spread as before, and all of one weight: there is no more to find.
-            if exponent == 1.0 and float(grown.real.max()) < REACH:
+            # Where it was expected and spread as before: there is no more to find.
+            if missed < CLOSE and exponent == 1.0 and float(grown.real.max()) < GROWS:
                 break
         return found
 
     def _followed(
         self, likelihood: SegmentLikelihood, weak: Tensor, slope: Tensor, steps: int
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the points of a ridge above weak coordinates ``(n, k)``.
 
         Returns:
-            The points without the bend, ``(n, d)``, and their log densities up to a constant,
-            ``(n,)``; minus infinity for those that were not found.
+            The points without the bend, ``(n, d)``; log densities up to a constant where the
+            polynomial has them, ``(n,)``, and at the points; minus infinity for those that were
+            not found.
         """
         k, d = self.num_weak, len(self.centre)
         straight = replace(self, coefficients=torch.zeros(1, d - k).double(), degree=0)
@@ -209,8 +232,8 @@ class RidgeCoordinates:
         stiff = self.information[k:] + 1.0
         w = torch.cat((weak, self._bend(weak)), dim=-1)
         best, value = w.clone(), torch.full((len(w),), -torch.inf, dtype=torch.float64)
-        prior = likelihood.segments.prior
-        for _ in range(steps + 1):
+        predicted, prior = value, likelihood.segments.prior
+        for step in range(steps + 1):
             z, inside = straight.to_reference(w)
             # Beyond the support nothing can be simulated: there the point has no score.
             score, density = torch.full_like(w, torch.nan), torch.full_like(value, -torch.inf)
@@ -219,29 +242,42 @@ class RidgeCoordinates:
                 score[inside], misfit = likelihood.scores(at)
                 density[inside] = (
                     prior.log_prob(at).double() - 0.5 * misfit - straight.log_jacobian(at)
-                )
+                ).nan_to_num(-torch.inf, -torch.inf, -torch.inf)
+            if step == 0:
+                predicted = density
             is_better = density > value
             best[is_better], value[is_better] = w[is_better], density[is_better]
             # The prior's own pull is that of a normal one of the same variance.
-            step = ((score @ by_w)[:, k:] - w[:, k:]) / stiff
+            change = ((score @ by_w)[:, k:] - w[:, k:]) / stiff
             w = w.clone()
-            w[:, k:] += step.nan_to_num(0.0).clamp(-FARTHEST, FARTHEST)
-        return best, value
+            w[:, k:] += change.nan_to_num(0.0).clamp(-FARTHEST, FARTHEST)
+        return best, predicted, value
 
     def _bent_through(self, w: Tensor, log_density: Tensor) -> "RidgeCoordinates":
-        """Returns the coordinates with a polynomial through points of the ridge, ``(n, d)``."""
+        """Returns the coordinates with a polynomial through points of the ridge, ``(n, d)``.
+
+        Its degree is that of least leave-one-out error in standard deviations of the posterior.
+        """
         k = self.num_weak
         near = log_density.argsort(descending=True)[: int(KEPT * len(w))]
         near = near[log_density[near].isfinite()]
-        degree = next((p for p in (3, 2, 1) if 4 * _num_terms(k, p) <= len(near)), 0)
-        if degree == 0:
-            return self
         # Points off the ridge by more than others say less of where it is.
         excess = log_density[near].max() - log_density[near]
-        weight = (1.0 + excess / excess.median().clamp_min(0.5)).rsqrt()
-        terms = _monomials(w[near, :k], degree)
-        found = torch.linalg.lstsq(weight[:, None] * terms, weight[:, None] * w[near, k:])
-        return replace(self, coefficients=found.solution, degree=degree)
+        weight = (1.0 + excess / excess.median().clamp_min(0.5)).rsqrt()[:, None]
+        wanted = weight * w[near, k:]
+        least, found = torch.inf, self
+        for degree in range(1, MOST_DEGREE + 1):
+            if POINTS_PER_COEFFICIENT * _num_terms(k, degree) > len(near):
+                break
+            q, r = torch.linalg.qr(weight * _monomials(w[near, :k], degree))
+            leverage = q.square().sum(-1, keepdim=True).clamp(max=0.999)
+            left_out = (wanted - q @ (q.mT @ wanted)) / (1.0 - leverage)
+            error = float((left_out.square() @ (self.information[k:] + 1.0)).mean())
+            if error < least:
+                least = error
+                coefficients = torch.linalg.solve_triangular(r, q.mT @ wanted, upper=True)
+                found = replace(self, coefficients=coefficients, degree=degree)
+        return found
 
 
 def _num_terms(number: int, degree: int) -> int:
