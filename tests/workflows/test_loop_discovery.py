@@ -179,10 +179,10 @@ def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
 def test_a_run_that_discovers_survives_kills(tmp_path):
     driver = Path(__file__).with_name("kill_runs.py")
     found = subprocess.run(
-        [sys.executable, str(driver), str(tmp_path), "5", "0", "discover"],
+        [sys.executable, str(driver), str(tmp_path), "3", "0", "discover"],
         capture_output=True,
         text=True,
         timeout=900,
     )
     assert found.returncode == 0, found.stdout + found.stderr
-    assert json.loads(found.stdout.splitlines()[-1])["kills"] == 5
+    assert json.loads(found.stdout.splitlines()[-1])["kills"] == 3
