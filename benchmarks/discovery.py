@@ -294,7 +294,7 @@ def true_model_errors(case: Case, found: npdr.Discovery) -> dict[str, float] | N
         true,
         case.holdout,
         options.binding(case.holdout),
-        draws_before=found.draws_before,
+        draws_before=posterior_draws(given, seed=options.seed),
         draws_after=posterior_draws(true, seed=options.seed),
         seed=options.seed,
     )

@@ -13,7 +13,7 @@ from npdr_ppl.plots.residual_map import plot_residual_map
 from npdr_ppl.plots.theme import save_figure
 from npdr_ppl.randomness import seeded
 from npdr_ppl.workflows.discovery import Discovery, Investigation
-from npdr_ppl.workflows.discovery.credible import Draws
+from npdr_ppl.workflows.discovery.credible import Draws, posterior_draws
 from npdr_ppl.workflows.discovery.folder import STAGES, Stage
 from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.notebook import short_name
@@ -48,10 +48,11 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
         figures["separation"] = plot_separation(matrix, discovery.separation_names)
     seed = discovery.options.seed
     units = {name: estimate.unit for name, estimate in discovery.parameters.items()}
-    prior, draws = _draws(start, discovery.draws_before, seed)
+    drawn = discovery.draws if after is None else posterior_draws(start, seed=seed)
+    prior, draws = _draws(start, drawn, seed)
     posteriors = {BEFORE: draws}
     if after is not None:
-        wide, narrow = _draws(after, discovery.draws_after, seed)
+        wide, narrow = _draws(after, discovery.draws, seed)
         # First, so that it has the colour that it has in the other figures.
         posteriors = {AFTER: {name: narrow[name] for name in draws}, **posteriors}
         new = [name for name in narrow if name not in draws]

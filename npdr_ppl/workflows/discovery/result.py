@@ -92,8 +92,7 @@ class Discovery:
         model: The model as it was.
         revised: The model with the effects.
         parameters: All parameters' estimates in the revised model, by site.
-        draws_before: Draws of the posterior of the model that the search began with.
-        draws_after: Draws of the posterior of the revised model.
+        draws: Draws of the revised model's posterior.
         counts: Channels that are read in whole counts, as an encoder's, and what rounding makes
             of what the revised model leaves there.
         search: How it was found.
@@ -118,8 +117,7 @@ class Discovery:
     model: Callable[..., Any]
     revised: Callable[..., Any]
     parameters: dict[str, Estimate]
-    draws_before: Draws
-    draws_after: Draws
+    draws: Draws
     counts: dict[str, Count]
     search: Search
     options: DiscoveryOptions
