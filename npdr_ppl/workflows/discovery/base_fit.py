@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
@@ -17,7 +18,13 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.closest_fit import ITERATIONS_BEFORE_STEPS, search_prior
 from npdr_ppl.workflows.discovery.evidence import closest, weigh
-from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, Model, fit_hypothesis, with_effects
+from npdr_ppl.workflows.discovery.hypothesis import (
+    EDGE,
+    Hypothesis,
+    Model,
+    fit_hypothesis,
+    with_effects,
+)
 from npdr_ppl.workflows.discovery.trials import Trials
 from npdr_ppl.workflows.progress import Step
 from npdr_ppl.workflows.segment_model import SegmentModel
@@ -31,6 +38,10 @@ would be found that make up for it. Refitted parameters make up for four fifths 
 
 CONFIDENCE = 0.9
 """Probability above which a recording is taken to be made in coarse steps itself."""
+
+
+ATTEMPTS = 4
+"""Times that a fit is made once more from inside the priors, each time from where the last led."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +96,49 @@ def fit_base(
     fitted = fit_hypothesis(
         model, rollouts, binding, start=best.parameters, offsets=best.fit.offsets
     )
+    fitted = _off_the_ends(fitted, model, rollouts, binding)
     found = Trials(model, rollouts, binding).with_own_starts(fitted)
     _ = found.linearisation  # all that follows needs it
     return found
+
+
+def _off_the_ends(
+    fitted: Hypothesis, model: Model, rollouts: Rollouts, binding: BindingOptions
+) -> Hypothesis:
+    """Returns a fit that has not slid to a prior's end along what the recording does not show.
+
+    Steps along a flat direction lead anywhere, and at an end a parameter hardly moves in reference
+    coordinates. Such a fit is made once more from inside; the one of greater posterior density is
+    kept.
+    """
+    for _ in range(ATTEMPTS):
+        z = fitted.fit.z
+        is_at_end = z.abs() > EDGE
+        if not bool(is_at_end.any()):
+            break
+        inside = torch.where(is_at_end, z.sign(), z)
+        start = fitted.segments.prior.to_parameters(inside[None])
+        try:
+            other = fit_hypothesis(
+                model,
+                rollouts,
+                binding,
+                effects=fitted.effects,
+                start={name: value[0] for name, value in start.items()},
+                offsets=fitted.fit.offsets,
+                starts=fitted.segments.starts,
+            )
+        except DataError:
+            break
+        if _loss(other, fitted.fit.scale) >= _loss(fitted, fitted.fit.scale):
+            break
+        fitted = other
+    return fitted
+
+
+def _loss(hypothesis: Hypothesis, scale: Tensor) -> float:
+    """Returns minus the log density of a fit, up to a constant, for noise of a scale ``(C,)``."""
+    return float(hypothesis.losses(scale).sum() + 0.5 * hypothesis.fit.z.square().sum())
 
 
 def in_finer_steps(
@@ -117,6 +168,8 @@ def in_finer_steps(
         finer = None
         if _step_error(current, finer_model, rollouts, binding) > NOTICEABLE:
             finer = trials.refitted(current)
+            if finer is not None:
+                finer = _off_the_ends(finer, finer_model, rollouts, binding)
         if finer is None or weigh([current, finer], [0.0, 0.0], seed=0)[0] > CONFIDENCE:
             break
         report("the model's steps are too coarse for this recording: finer ones")
