@@ -195,6 +195,8 @@ class RidgeCoordinates:
             weak = found.weak_mean + drawn @ factor.mT
             _, inside = found.to_reference(torch.cat((weak, weak.new_zeros(len(weak), d - k)), -1))
             drawn, weak = drawn[inside][:number], weak[inside][:number]
+            if not len(weak):
+                break
             steps = CHORD_STEPS if round_ == 0 else MORE_STEPS
             w, predicted, log_density = found._followed(likelihood, weak, slope, steps)
             is_found = log_density.isfinite()
@@ -208,7 +210,8 @@ class RidgeCoordinates:
             weights = (exponent * log_weights).nan_to_num(-torch.inf).softmax(0)
             mean = weights @ weak
             away = weak - mean
-            covariance = (weights[:, None] * away).mT @ away
+            # The little that is added keeps a direction in which few points have weight.
+            covariance = (weights[:, None] * away).mT @ away + 1e-6 * found.weak_covariance
             grown = torch.linalg.eigvals(torch.linalg.solve(found.weak_covariance, covariance))
             found = replace(found, weak_mean=mean, weak_covariance=covariance)
             # Where it was expected and spread as before: there is no more to find.
@@ -273,9 +276,9 @@ class RidgeCoordinates:
             leverage = q.square().sum(-1, keepdim=True).clamp(max=0.999)
             left_out = (wanted - q @ (q.mT @ wanted)) / (1.0 - leverage)
             error = float((left_out.square() @ (self.information[k:] + 1.0)).mean())
-            if error < least:
+            coefficients = torch.linalg.solve_triangular(r, q.mT @ wanted, upper=True)
+            if error < least and bool(coefficients.isfinite().all()):
                 least = error
-                coefficients = torch.linalg.solve_triangular(r, q.mT @ wanted, upper=True)
                 found = replace(self, coefficients=coefficients, degree=degree)
         return found
 
