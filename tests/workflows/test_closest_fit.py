@@ -15,6 +15,8 @@ from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions, bind
 from npdr_ppl.workflows.closest_fit import closest_fit
+from npdr_ppl.workflows.discovery.base_fit import off_the_ends
+from npdr_ppl.workflows.discovery.hypothesis import EDGE, fit_hypothesis
 from npdr_ppl.workflows.preparation import prepare
 from npdr_ppl.workflows.segment_fit import fit_segments
 from npdr_ppl.workflows.segment_model import SegmentModel
@@ -144,3 +146,15 @@ def test_certain_initial_states_are_not_shifted(rollouts):
     assert segments.num_offsets == 0
     found = fit_segments(segments, torch.zeros(3))
     assert found.offsets.shape == (20, 0)
+
+
+def test_a_fit_at_the_end_of_a_prior_is_made_once_more_from_inside(rollouts):
+    binding = BindingOptions(None, 40, "uncertain")
+    end = {"mass": torch.tensor(1.6999), "length": torch.tensor(0.85)}
+    stuck = fit_hypothesis(model, rollouts, binding, start=end, max_steps=0)
+    assert float(stuck.fit.z.abs().max()) > EDGE
+    freed = off_the_ends(stuck, model, rollouts, binding)
+    assert float(freed.fit.z.abs().max()) < EDGE
+    assert float(freed.parameters["mass"]) == pytest.approx(MASS, rel=0.02)
+    # A fit that is not at an end is left as it is.
+    assert off_the_ends(freed, model, rollouts, binding) is freed

@@ -29,7 +29,7 @@ from npdr_ppl.workflows.discovery.trials import Trials
 from npdr_ppl.workflows.progress import Step
 from npdr_ppl.workflows.segment_model import SegmentModel
 
-__all__ = ["CONFIDENCE", "BaseFit", "fit_base", "in_finer_steps"]
+__all__ = ["CONFIDENCE", "BaseFit", "fit_base", "in_finer_steps", "off_the_ends"]
 
 NOTICEABLE = 5.0
 """Distance by which steps of a higher order move all readings together, in standard deviations of
@@ -96,13 +96,13 @@ def fit_base(
     fitted = fit_hypothesis(
         model, rollouts, binding, start=best.parameters, offsets=best.fit.offsets
     )
-    fitted = _off_the_ends(fitted, model, rollouts, binding)
+    fitted = off_the_ends(fitted, model, rollouts, binding)
     found = Trials(model, rollouts, binding).with_own_starts(fitted)
     _ = found.linearisation  # all that follows needs it
     return found
 
 
-def _off_the_ends(
+def off_the_ends(
     fitted: Hypothesis, model: Model, rollouts: Rollouts, binding: BindingOptions
 ) -> Hypothesis:
     """Returns a fit that has not slid to a prior's end along what the recording does not show.
@@ -110,6 +110,12 @@ def _off_the_ends(
     Steps along a flat direction lead anywhere, and at an end a parameter hardly moves in reference
     coordinates. Such a fit is made once more from inside; the one of greater posterior density is
     kept.
+
+    Args:
+        fitted: The fit.
+        model: The model without the effects of the fit.
+        rollouts: The recording.
+        binding: Its segments.
     """
     for _ in range(ATTEMPTS):
         z = fitted.fit.z
@@ -169,7 +175,7 @@ def in_finer_steps(
         if _step_error(current, finer_model, rollouts, binding) > NOTICEABLE:
             finer = trials.refitted(current)
             if finer is not None:
-                finer = _off_the_ends(finer, finer_model, rollouts, binding)
+                finer = off_the_ends(finer, finer_model, rollouts, binding)
         if finer is None or weigh([current, finer], [0.0, 0.0], seed=0)[0] > CONFIDENCE:
             break
         report("the model's steps are too coarse for this recording: finer ones")
