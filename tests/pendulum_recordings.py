@@ -1,10 +1,14 @@
-"""Recordings of a driven pendulum by an integrator of their own, for defaults to be tried on.
+"""Recordings of a driven pendulum by an integrator of their own, and a model with a ridge.
 
 Runge-Kutta steps of 1 ms in NumPy; nothing of the package's engines is used.
 """
 
 import numpy as np
+import pyro
+import pyro.distributions as dist
 
+import npdr_ppl as npdr
+from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.rollouts import Rollouts
 
 TRUTH = {"mass": 1.1, "length": 0.9}
@@ -47,6 +51,15 @@ def swinging(*, rollouts=3, steps=250, friction=0.0, seed=0):
         action_names=("torque",),
         time_step=TIME_STEP,
     )
+
+
+def product(inputs):
+    """A pendulum of whose mass a recording shows only the product of density and volume."""
+    density = pyro.sample("density", dist.Uniform(0.5, 2.0))
+    volume = pyro.sample("volume", dist.Uniform(0.5, 2.0))
+    length = pyro.sample("length", dist.Uniform(0.3, 1.7))
+    parameters = {"mass": density * volume, "length": length}
+    return npdr.simulate("trajectory", Pendulum(), parameters, inputs)
 
 
 def _rate(state, torque, friction):

@@ -111,7 +111,7 @@ def fit_segments(
         offsets: Offsets of the initial states to begin with, ``(S, m)``; zero by default.
         held: Coordinates that stay where they are, a mask ``(d,)``; none by default.
         scale: Standard deviation of each channel's errors, ``(C,)``, where that is known; that of
-            what is left by default.
+            the fit's residuals by default.
         max_steps: Greatest number of steps, first until the scale is known, then at that scale.
         is_rough: Whether the first will do; enough to rank what differs much.
 

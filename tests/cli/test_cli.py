@@ -11,19 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from npdr_ppl.cli import main as cli
 from npdr_ppl.rollouts import Rollouts
+from tests.cli.command_line import run
 
 RECORDING = Path(__file__).parents[3] / "shared/data/quanser_qube/swing_up_500hz_5s.csv"
-
-
-def run(monkeypatch, capsys, *words):
-    """Runs the command line in this process; returns exit code, output and error text."""
-    monkeypatch.setattr(sys, "argv", ["npdr", *map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    out, err = capsys.readouterr()
-    return stop.value.code or 0, out, err
 
 
 @pytest.fixture

@@ -7,24 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from npdr_ppl.cli import main as cli
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.furuta_targets import furuta_target
 from npdr_ppl.policies.furuta_swing_up import FurutaSwingUp
 from npdr_ppl.workflows import rig_study, table2
 from npdr_ppl.workflows.control_task import control_task
+from tests.cli.command_line import run
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
 from small_rig_study import NUM_STEPS, tiny_options  # noqa: E402
-
-
-def run(monkeypatch, capsys, *words):
-    """Runs the command line in this process; returns exit code, output and error text."""
-    monkeypatch.setattr(sys, "argv", ["npdr", *map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    out, err = capsys.readouterr()
-    return stop.value.code or 0, out, err
 
 
 @pytest.fixture

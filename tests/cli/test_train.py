@@ -1,12 +1,10 @@
 """`npdr train`: what it writes, how it continues, and one sentence for bad input."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 
-from npdr_ppl.cli import main as cli
 from npdr_ppl.cli.resolve import (
     resolve_backend,
     resolve_effects,
@@ -17,6 +15,7 @@ from npdr_ppl.cli.resolve import (
 from npdr_ppl.errors import ModelError, NpdrError
 from npdr_ppl.models.furuta import furuta
 from npdr_ppl.rollouts import Rollouts
+from tests.cli.command_line import run
 
 RIG = """
 import dataclasses
@@ -48,15 +47,6 @@ QUICK = [
     "--backend", "snpe-c(transforms=1, hidden=(8,), epochs=2, members=2)",
     "--search", "power(population=3)", "--search-iterations", 1, "--domains", 3,
 ]  # fmt: skip
-
-
-def run(monkeypatch, capsys, *words):
-    """Runs the command line in this process; returns exit code, output and error text."""
-    monkeypatch.setattr(sys, "argv", ["npdr", *map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    out, err = capsys.readouterr()
-    return stop.value.code or 0, out, err
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.workflows.arviz_module import from_netcdf, to_netcdf
 from npdr_ppl.workflows.diagnostics import Decision, Thresholds
 from npdr_ppl.workflows.fit import fit
-from tests.pendulum_recordings import TRUTH, swinging
+from tests.pendulum_recordings import TRUTH, product, swinging
 
 
 @pytest.fixture(scope="module")
@@ -96,13 +96,6 @@ def test_a_parameter_that_does_nothing_asks_for_another_rollout(clean, quick):
 
 
 def test_parameters_of_one_product_ask_for_another_excitation(clean, quick):
-    def product(inputs):
-        density = pyro.sample("density", dist.Uniform(0.5, 2.0))
-        volume = pyro.sample("volume", dist.Uniform(0.5, 2.0))
-        length = pyro.sample("length", dist.Uniform(0.3, 1.7))
-        parameters = {"mass": density * volume, "length": length}
-        return npdr.simulate("trajectory", Pendulum(), parameters, inputs)
-
     posterior = infer(product, clean, quick)
     draws = posterior.sample(500)
     # A thin ridge: the product is known fifty times better than its factors.

@@ -1,27 +1,16 @@
 """Weighted draws agree with integration on a grid, and their coordinates with their densities."""
 
-import pyro
-import pyro.distributions as dist
 import pytest
 import torch
 
-import npdr_ppl as npdr
 from npdr_ppl.inference.gaussian_mixture import GaussianMixture
-from npdr_ppl.models.pendulum import Pendulum, pendulum
+from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.workflows.binding import BindingOptions
 from npdr_ppl.workflows.estimator_check import check_estimator
 from npdr_ppl.workflows.posterior_sampling import sample_posterior
 from npdr_ppl.workflows.preparation import prepare
 from npdr_ppl.workflows.ridges import RidgeCoordinates
-from tests.pendulum_recordings import swinging
-
-
-def product(inputs):
-    density = pyro.sample("density", dist.Uniform(0.5, 2.0))
-    volume = pyro.sample("volume", dist.Uniform(0.5, 2.0))
-    length = pyro.sample("length", dist.Uniform(0.3, 1.7))
-    parameters = {"mass": density * volume, "length": length}
-    return npdr.simulate("trajectory", Pendulum(), parameters, inputs)
+from tests.pendulum_recordings import product, swinging
 
 
 @pytest.fixture(scope="module")

@@ -135,7 +135,7 @@ def test_what_a_folder_holds_is_not_run_again(tmp_path, monkeypatch):
     again = run([0, 1, 2])
     assert again["furuta-hard"][1].sim_return == -1.0
     assert len(again["furuta-hard"]) == 3
-    # What was lost is run again, and comes to the same.
+    # A run that was lost is made again, with the same result.
     assert again["furuta-easy"][0] == first["furuta-easy"][0]
     assert tuple(again["furuta-hard"][1].returns) == first["furuta-hard"][1].returns
 

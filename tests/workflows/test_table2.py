@@ -50,7 +50,7 @@ def table(recording, tmp_path_factory):
 def test_methods_are_judged_on_the_rollouts_that_were_held_out(recording, table):
     comparison, result, _ = table
     figures = comparison.rows[METHOD].figures
-    # Rollouts are told by their noise: only those that were held out have more than a model can
+    # Noise marks the rollouts: only those that were held out have more than a model can
     # follow.
     options = BindingOptions("all/50", SEGMENT_LENGTH, "recorded", "float64")
     fitted = recording[[i for i in range(4) if i not in HELD_OUT]]
