@@ -195,6 +195,18 @@ class SegmentModel:
             return None
         return starts.scaled(segments.inputs, error_factors(now.residual, now.by_starts))
 
+    def some(self, index: Tensor) -> "SegmentModel":
+        """Returns the model along some of the segments.
+
+        Args:
+            index: Their indices.
+        """
+        part = copy.copy(self)
+        part.inputs = self.inputs.segments(index)
+        part.observed = self.observed[index]
+        part._offsets = uncertain_components(part.inputs)
+        return part
+
     def _start_from(self, starts: Starts | None) -> None:
         self.starts = starts
         self.inputs = self._smoothed if starts is None else starts.put_into(self._smoothed)
