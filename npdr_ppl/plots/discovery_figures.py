@@ -88,7 +88,7 @@ def write_stage_figures(investigation: Investigation, stage: Stage, out: Path) -
         figures["ranking"] = plot_ranking(first.ranking)
         if first.ranking:
             names = [candidate.name for candidate in first.ranking]
-            matrix = investigation.separation.numpy()
+            matrix = first.separation.numpy()
             figures["separation"] = plot_separation(matrix, names[: len(matrix)])
     return [save_figure(f, out / f"{name}.png") for name, f in figures.items() if f is not None]
 

@@ -31,7 +31,7 @@ ITERATIONS_BEFORE_STEPS = 3
 
 SEARCHED = 24
 """Most segments along which the search simulates: a valley shows in a part of a recording. Chosen
-on the benchmark's tuning recordings, where fits that begin from it end as if all were simulated."""
+on the benchmark's tuning recordings, where fits end as if it simulated all of them."""
 
 NEGLIGIBLE = 1e-9
 """Standard deviation that no unit makes large."""

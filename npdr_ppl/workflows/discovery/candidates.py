@@ -1,5 +1,6 @@
 """The candidates at a hypothesis: which effects may be added, and what each would change."""
 
+from collections.abc import Iterator, Mapping
 from functools import partial
 
 from npdr_ppl.language.effects import Effect
@@ -14,6 +15,10 @@ from npdr_ppl.workflows.discovery.sensitivities import Variant, sensitivities
 from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_side
 
 __all__ = ["candidates_at", "variants_of"]
+
+PARTS = 4
+"""Parts of the candidates that each process takes one after another; their changes are held until
+they have been looked at."""
 
 
 def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Effect, ...]:
@@ -32,8 +37,8 @@ def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Ef
 
 def variants_of(
     candidates: tuple[Effect, ...], projection: Projection, found: Responses
-) -> list[Variant]:
-    """Returns the candidates in all their shapes and sizes, waves at the strongest frequency too.
+) -> Iterator[Variant]:
+    """Yields the candidates in all their shapes and sizes, waves at the strongest frequency too.
 
     Args:
         candidates: The effects.
@@ -46,12 +51,17 @@ def variants_of(
         for effect in candidates
         if effect.wave and effect.port in found.by_port
     }
-    # Dealt out in turn, so that each process gets effects of every kind.
     number = num_processes(hypothesis.simulator)
-    parts = [candidates[k::number] for k in range(number)]
-    function = partial(sensitivities, hypothesis, hints=hints)
-    variants: list[Variant] = []
-    for part in side_by_side(function, parts, number):
-        variants += part
-    order = {effect.name: place for place, effect in enumerate(candidates)}
-    return sorted(variants, key=lambda variant: order[variant.effect.name])
+    if number == 1:
+        yield from sensitivities(hypothesis, candidates, hints)
+        return
+    # Every part holds effects of every kind.
+    parts = [candidates[k :: PARTS * number] for k in range(PARTS * number)]
+    for part in side_by_side(partial(_listed, hypothesis, hints=hints), parts, number):
+        yield from part
+
+
+def _listed(
+    hypothesis: Hypothesis, effects: tuple[Effect, ...], hints: Mapping[str, Mapping[str, float]]
+) -> list[Variant]:
+    return list(sensitivities(hypothesis, effects, hints))

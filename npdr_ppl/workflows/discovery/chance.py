@@ -16,7 +16,7 @@ candidate, fitted to the deal, leaves.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ the cube of their number."""
 
 MOST_NUMBERS = 1_000_000
 """Numbers of candidates' changes looked at together, which with their tables fit a processor's
-caches."""
+caches; at least one candidate's."""
 
 
 def block_sums(by_segment: Tensor) -> Tensor:
@@ -87,26 +87,32 @@ class LargestStatistic:
             check_invariants=True,
         ).coalesce()
 
-    def p_values(self, groups: Sequence[Tensor]) -> list[float]:
+    def p_values(self, groups: Iterable[Tensor]) -> list[float]:
         """Returns each candidate's p-value among all of them.
 
         Args:
-            groups: Changes of each candidate, ``(S, N, k)``.
+            groups: Changes of each candidate, ``(S, N, k)``; a few are held at a time.
         """
-        if not groups:
+        rows: dict[int, Tensor] = {}
+        waiting: dict[int, list[tuple[int, Tensor]]] = {}
+        for place, group in enumerate(groups):
+            alike = waiting.setdefault(group.shape[-1], [])
+            alike.append((place, group))
+            if len(alike) * group.numel() >= MOST_NUMBERS:
+                rows |= self._rows(waiting.pop(group.shape[-1]))
+        for alike in waiting.values():
+            rows |= self._rows(alike)
+        if not rows:
             return []
-        rows: list[Tensor | None] = [None] * len(groups)
-        for size in {group.shape[-1] for group in groups}:
-            alike = [i for i, group in enumerate(groups) if group.shape[-1] == size]
-            together = max(1, MOST_NUMBERS // groups[alike[0]].numel())
-            for first in range(0, len(alike), together):
-                chosen = alike[first : first + together]
-                found = self._tails(torch.stack([groups[i] for i in chosen], dim=-2))
-                for i, row in zip(chosen, found, strict=True):
-                    rows[i] = row
-        tails = torch.stack([row for row in rows if row is not None])
+        tails = torch.stack([rows[place] for place in range(len(rows))])
         largest = tails.amax(0)
         return (largest >= tails[:, :1] - 1e-12).double().mean(1).tolist()
+
+    def _rows(self, alike: list[tuple[int, Tensor]]) -> dict[int, Tensor]:
+        """Returns :meth:`_tails` of candidates of as many strengths, by place."""
+        places, groups = zip(*alike, strict=True)
+        found = self._tails(torch.stack(groups, dim=-2))
+        return dict(zip(places, found, strict=True))
 
     def _tails(self, columns: Tensor) -> Tensor:
         """Returns minus the log tail of each candidate's statistic in every deal, ``(P, draws)``.

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
-from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.errors import DataError, ModelError
@@ -22,13 +21,11 @@ from npdr_ppl.workflows.discovery.limits import limits
 from npdr_ppl.workflows.discovery.next_experiment import NextExperiment, next_experiment
 from npdr_ppl.workflows.discovery.options import DiscoveryOptions
 from npdr_ppl.workflows.discovery.prior_ends import PriorEnd, beyond
-from npdr_ppl.workflows.discovery.projection import Projection
 from npdr_ppl.workflows.discovery.proof import Gap, prove
 from npdr_ppl.workflows.discovery.residual_map import Spot, worst_windows
 from npdr_ppl.workflows.discovery.result import Discovery, Finding, Verdict
 from npdr_ppl.workflows.discovery.rivals import Added
-from npdr_ppl.workflows.discovery.search import Round, Search, Searcher, explained
-from npdr_ppl.workflows.discovery.separation import separation_matrix
+from npdr_ppl.workflows.discovery.search import LEADING, Round, Search, Searcher, explained
 from npdr_ppl.workflows.discovery.trials import PLAINLY
 from npdr_ppl.workflows.segment_model import SegmentModel
 
@@ -51,9 +48,6 @@ COARSE = (
     "The model's integration steps are too coarse for this recording; the revised model takes "
     "finer ones."
 )
-
-LEADING = 10
-"""Candidates in the separation matrix."""
 
 
 class Investigation:
@@ -164,11 +158,6 @@ class Investigation:
             return self._searcher.look(start)
 
     @cached_property
-    def separation(self) -> Tensor:
-        """Distance between the leading candidates once parameters are refitted, ``(n, n)``."""
-        return separation_matrix(Projection(self.start), self.first.ranking[:LEADING])
-
-    @cached_property
     def search(self) -> Search:
         """The effects that were missing; none are looked for in a recording with problems."""
         problems, first = self.problems, self.first
@@ -264,7 +253,7 @@ class Investigation:
             where=self.where,
             effects=effects,
             ranking=self.first.ranking,
-            separation=self.separation,
+            separation=self.first.separation,
             separation_names=tuple(c.name for c in self.first.ranking[:LEADING]),
             gap=gap,
             next_experiment=advice,

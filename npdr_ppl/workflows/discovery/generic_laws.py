@@ -8,13 +8,16 @@ after every change of speed.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from npdr_ppl.language.channels import Channel
+from npdr_ppl.workflows.discovery.chance import MOST_NUMBERS
+from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 from npdr_ppl.workflows.discovery.latent_force import Responses
 from npdr_ppl.workflows.discovery.projection import Projection
 
@@ -54,11 +57,17 @@ class GenericLaw:
 
     Attributes:
         name: What it is, e.g. ``"arm: arm_velocity²"``.
-        change: What it would change in the whitened readings, ``(S, N, k)``.
+        make: Returns what it would change. Hundreds of laws of a long recording do not fit into
+            memory together.
     """
 
     name: str
-    change: Tensor
+    make: Callable[[], Tensor]
+
+    @property
+    def change(self) -> Tensor:
+        """What it would change in the whitened readings, ``(S, N, k)``; made anew each time."""
+        return self.make()
 
 
 def generic_laws(found: Responses, sensors: Sequence[Channel] = ()) -> list[GenericLaw]:
@@ -70,7 +79,7 @@ def generic_laws(found: Responses, sensors: Sequence[Channel] = ()) -> list[Gene
     """
     values = _dictionary(found, {sensor.name for sensor in sensors if sensor.unit == "rad"})
     return [
-        GenericLaw(f"{port}: {name}", (change * value[:, None, :]).sum(-1, keepdim=True))
+        GenericLaw(f"{port}: {name}", partial(torch.matmul, change, value[..., None]))
         for port, change in found.by_port.items()
         for name, value in values.items()
     ]
@@ -84,7 +93,10 @@ def wave_laws(found: Responses) -> dict[str, list[GenericLaw]]:
     """
     return {
         port: [
-            GenericLaw(f"{port}: wave of {frequency:.3g} Hz", change @ _wave(found, frequency))
+            GenericLaw(
+                f"{port}: wave of {frequency:.3g} Hz",
+                partial(torch.matmul, change, _wave(found, frequency)),
+            )
             for frequency in _frequencies(found).tolist()
         ]
         for port, change in found.by_port.items()
@@ -117,7 +129,10 @@ def ripple_laws(found: Responses, sensors: Sequence[Channel]) -> list[GenericLaw
             ripple = torch.stack((phase.sin(), phase.cos()), dim=-1)
             name = f"ripple of {j * math.pi / extent:.3g} 1/{position.unit} in {position.name}"
             laws += [
-                GenericLaw(f"{port}: {text}{name}", change @ (factor[..., None] * ripple))
+                GenericLaw(
+                    f"{port}: {text}{name}",
+                    partial(torch.matmul, change, factor[..., None] * ripple),
+                )
                 for port, change in found.by_port.items()
                 for text, factor in factors.items()
             ]
@@ -139,11 +154,16 @@ def reading_laws(projection: Projection) -> list[GenericLaw]:
     for c, sensor in enumerate(segments.measured):
         x = simulated[..., c]
         for name, value in _of_one(sensor.name, x, sensor.unit == "rad").items():
-            error = torch.zeros_like(simulated)
-            error[..., c] = value - value[:, :1]
-            change = segments.whitened(error, hypothesis.fit.scale)
-            laws.append(GenericLaw(f"{sensor.name}: error of {name}", change[..., None]))
+            make = partial(_error_of, hypothesis, c, value - value[:, :1])
+            laws.append(GenericLaw(f"{sensor.name}: error of {name}", make))
     return laws
+
+
+def _error_of(hypothesis: Hypothesis, channel: int, error: Tensor) -> Tensor:
+    """Returns an error of one channel, ``(S, K)``, in the whitened readings, ``(S, N, 1)``."""
+    errors = torch.zeros_like(hypothesis.segments.observed)
+    errors[..., channel] = error
+    return hypothesis.segments.whitened(errors, hypothesis.fit.scale)[..., None]
 
 
 def ringing_laws(projection: Projection) -> list[GenericLaw]:
@@ -157,8 +177,6 @@ def ringing_laws(projection: Projection) -> list[GenericLaw]:
     """
     hypothesis, segments = projection.hypothesis, projection.hypothesis.segments
     simulated = (segments.observed - hypothesis.difference).double()
-    steps = torch.arange(simulated.shape[1])
-    ages = (steps[:, None] - steps).clamp_min(0)
     laws = []
     for name, position, rate in _motions(segments.measured):
         moving = simulated[..., position if rate is None else rate]
@@ -166,22 +184,39 @@ def ringing_laws(projection: Projection) -> list[GenericLaw]:
             moving = moving.diff(dim=1, prepend=moving[:, :1])
         kick = moving.diff(dim=1, prepend=moving[:, :1])
         for periods in torch.logspace(math.log10(SLOWEST_RING), math.log10(0.5), RINGS).tolist():
-            angle = 2.0 * math.pi * periods
-            decay = complex(-RING_DAMPING, math.sqrt(1.0 - RING_DAMPING**2)) * angle
-            after = torch.exp(decay * ages).tril()
-            swing = kick.to(after.dtype) @ after.mT  # of the rate, (S, K)
-            changed = torch.zeros((*simulated.shape, 2), dtype=torch.float64)
-            if rate is not None:
-                changed[..., rate, :] = torch.view_as_real(swing)
-            if position is not None:
-                h = 1.0 if rate is None else segments.inputs.time_step
-                changed[..., position, :] = torch.view_as_real(swing * h / decay)
-            change = torch.stack(
-                [segments.whitened(c, hypothesis.fit.scale) for c in changed.unbind(-1)], dim=-1
-            )
+            make = partial(_rung, hypothesis, kick, position, rate, periods)
             frequency = periods / segments.inputs.time_step
-            laws.append(GenericLaw(f"{name}: ringing at {frequency:.3g} Hz", change))
+            laws.append(GenericLaw(f"{name}: ringing at {frequency:.3g} Hz", make))
     return laws
+
+
+def _rung(
+    hypothesis: Hypothesis, kick: Tensor, position: int | None, rate: int | None, periods: float
+) -> Tensor:
+    """Returns what rings after kicks, ``(S, K)``, in the whitened readings, ``(S, N, 2)``.
+
+    Args:
+        hypothesis: The fitted model.
+        kick: Changes of speed.
+        position: Column of the position that rings, if it is measured.
+        rate: Column of its velocity, if that is measured.
+        periods: Periods per time step.
+    """
+    segments = hypothesis.segments
+    steps = torch.arange(kick.shape[1])
+    ages = (steps[:, None] - steps).clamp_min(0)
+    angle = 2.0 * math.pi * periods
+    decay = complex(-RING_DAMPING, math.sqrt(1.0 - RING_DAMPING**2)) * angle
+    after = torch.exp(decay * ages).tril()
+    swing = kick.to(after.dtype) @ after.mT  # of the rate, (S, K)
+    changed = torch.zeros((*segments.observed.shape, 2), dtype=torch.float64)
+    if rate is not None:
+        changed[..., rate, :] = torch.view_as_real(swing)
+    if position is not None:
+        h = 1.0 if rate is None else segments.inputs.time_step
+        changed[..., position, :] = torch.view_as_real(swing * h / decay)
+    scale = hypothesis.fit.scale
+    return torch.stack([segments.whitened(c, scale) for c in changed.unbind(-1)], dim=-1)
 
 
 def _motions(measured: Sequence[Channel]) -> list[tuple[str, int | None, int | None]]:
@@ -208,7 +243,7 @@ def strongest_frequency(projection: Projection, found: Responses, port: str) -> 
     frequencies = _frequencies(found)
     change = found.by_port[port]
     gains: list[float] = []
-    for chunk in frequencies.split(20):
+    for chunk in frequencies.split(max(1, MOST_NUMBERS // (2 * change[..., 0].numel()))):
         waves = torch.cat([_wave(found, frequency) for frequency in chunk.tolist()], dim=-1)
         scores = projection.scores(change @ waves)
         gains += [scores.gain(slice(2 * k, 2 * k + 2)) for k in range(len(chunk))]

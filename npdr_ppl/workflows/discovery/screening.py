@@ -6,8 +6,8 @@ states, reduce the misfit. Whether that is more than chance can do is for
 """
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torch import Tensor
 from npdr_ppl.workflows.discovery.projection import Projection, Scores
 from npdr_ppl.workflows.discovery.sensitivities import Variant
 
-__all__ = ["Screened", "screen"]
+__all__ = ["Screened", "Screening", "screen"]
 
 DETECTABLE = 5.0
 """Separation from which an effect shows among a hundred candidates."""
@@ -48,24 +48,33 @@ class Screened:
         """Name of the effect."""
         return self.variant.effect.name
 
+    def without_change(self) -> "Screened":
+        """Returns the same without what it changes along the recording, which takes memory."""
+        nothing = self.variant.change.new_zeros(0)
+        return replace(self, variant=replace(self.variant, change=nothing))
 
-def screen(projection: Projection, variants: Sequence[Variant]) -> list[Screened]:
-    """Ranks candidates by their linear gain, the best shape and size of each effect.
+
+class Screening:
+    """Ranks candidates, seen one after another, by their linear gain.
 
     Args:
         projection: The fitted hypothesis.
-        variants: The candidates' sensitivities.
     """
-    best: dict[str, Screened] = {}
-    for variant in variants:
-        scores = projection.scores(variant.change)
+
+    def __init__(self, projection: Projection) -> None:
+        self._projection = projection
+        self._best: dict[str, Screened] = {}
+
+    def add(self, variant: Variant) -> None:
+        """Keeps a candidate if no other shape or size of the same effect gains more."""
+        scores = self._projection.scores(variant.change)
         sizes, gain = _within_limits(scores, variant)
         if gain <= 0.0:
-            continue
+            return
         name = variant.effect.name
-        if name not in best or gain > best[name].gain:
+        if name not in self._best or gain > self._best[name].gain:
             separation = float(sizes @ scores.information @ sizes) ** 0.5
-            best[name] = Screened(
+            self._best[name] = Screened(
                 variant,
                 sizes,
                 gain,
@@ -73,7 +82,23 @@ def screen(projection: Projection, variants: Sequence[Variant]) -> list[Screened
                 float(scores.absorbed.max()),
                 _minimum_detectable(scores, variant),
             )
-    return sorted(best.values(), key=lambda s: -s.gain)
+
+    def ranking(self) -> list[Screened]:
+        """Returns the best shape and size of each effect, that of the greatest gain first."""
+        return sorted(self._best.values(), key=lambda s: (-s.gain, s.name))
+
+
+def screen(projection: Projection, variants: Iterable[Variant]) -> list[Screened]:
+    """Returns the best shape and size of each effect, that of the greatest linear gain first.
+
+    Args:
+        projection: The fitted hypothesis.
+        variants: The candidates' sensitivities.
+    """
+    screening = Screening(projection)
+    for variant in variants:
+        screening.add(variant)
+    return screening.ranking()
 
 
 def _within_limits(scores: Scores, variant: Variant) -> tuple[Tensor, float]:

@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+from torch import Tensor
+
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions
@@ -25,7 +27,8 @@ from npdr_ppl.workflows.discovery.rivals import (
     tried_before,
     weigh_rivals,
 )
-from npdr_ppl.workflows.discovery.screening import Screened, screen
+from npdr_ppl.workflows.discovery.screening import Screened
+from npdr_ppl.workflows.discovery.separation import separation_matrix
 from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.workflows.discovery.trials import PLAINLY, Trials
 
@@ -34,6 +37,9 @@ __all__ = ["Round", "Search", "Searcher", "explained"]
 LEAST_SHARE = 1e-4
 """Share of what was explained below which what is left is not looked into and no effect is added:
 where a large effect was missing, integrators and the laws' own details differ by as much."""
+
+LEADING = 10
+"""Candidates whose distances from each other are computed."""
 
 PRIOR_OF_ANY = 0.5
 """Prior probability that anything of the catalogue is missing."""
@@ -47,6 +53,7 @@ class Round:
         hypothesis: The model as it was, fitted.
         alarm: Whether something was missing then.
         ranking: The candidates by linear gain.
+        separation: How far the leading ones are apart; see :mod:`separation`.
         responses: What pulses of force at the joints would change.
         weights: Probability of each candidate fitted in full, by name; ``""`` for none.
         trials: The model with each of them, by name.
@@ -55,6 +62,7 @@ class Round:
     hypothesis: Hypothesis
     alarm: Alarm
     ranking: list[Screened]
+    separation: Tensor
     responses: Responses
     weights: dict[str, float] = field(default_factory=dict)
     trials: dict[str, Hypothesis] = field(default_factory=dict)
@@ -203,14 +211,14 @@ class Searcher:
         found = responses(hypothesis)
         candidates = candidates_at(hypothesis, self.options)
         variants = variants_of(candidates, projection, found)
-        ranking = screen(projection, variants)
         sensors = hypothesis.simulator.sensors
-        plain = [variant for variant in variants if not variant.is_hinted]
         looks = len(hypothesis.effects)
-        alarm = sound_alarm(projection, plain, ranking, found, sensors, self.options, looks)
+        alarm, ranking = sound_alarm(projection, variants, found, sensors, self.options, looks)
+        separation = separation_matrix(projection, ranking[:LEADING])
+        ranking = [candidate.without_change() for candidate in ranking]
         best = ", ".join(s.name for s in ranking[:3]) or "none"
         self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
-        self._last = Round(hypothesis, alarm, ranking, found)
+        self._last = Round(hypothesis, alarm, ranking, separation, found)
         return self._last
 
     def _extended(

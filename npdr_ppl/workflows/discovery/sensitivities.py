@@ -88,10 +88,11 @@ def sensitivities(
     hypothesis: Hypothesis,
     effects: tuple[Effect, ...],
     hints: Mapping[str, Mapping[str, float]] | None = None,
-) -> list[Variant]:
-    """Returns what each effect would change, in each shape and size.
+) -> Iterator[Variant]:
+    """Yields what each effect would change, in each shape and size.
 
-    Effects whose simulation fails are left out.
+    Effects are simulated some at a time, so that memory does not grow with their number; those
+    whose simulation fails are left out.
 
     Args:
         hypothesis: Where the effects are to be added.
@@ -110,7 +111,6 @@ def sensitivities(
         probes.append(
             _probe(effect, segments.inputs, box.simulator, (hints or {}).get(effect.name))
         )
-    result = []
     for group in _groups(probes, box.simulator, segments.inputs.num_segments):
         changed = box.simulator.with_effects(*(probe.effect for probe in group))
         starts = fit.offsets[None].expand(sum(len(probe.runs) for probe in group), -1, -1)
@@ -119,8 +119,7 @@ def sensitivities(
         for probe, rows in zip(
             group, differences.split([len(probe.runs) for probe in group]), strict=True
         ):
-            result += _variants(probe, rows)
-    return result
+            yield from _variants(probe, rows)
 
 
 @dataclass(frozen=True)

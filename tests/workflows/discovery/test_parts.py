@@ -30,7 +30,7 @@ from npdr_ppl.models.effects import (
     candidate_effects,
 )
 from npdr_ppl.models.pendulum import Pendulum, pendulum
-from npdr_ppl.workflows.discovery.alarm import RINGING_SHARE, gains_of
+from npdr_ppl.workflows.discovery.alarm import RINGING_SHARE
 from npdr_ppl.workflows.discovery.chance import LargestStatistic
 from npdr_ppl.workflows.discovery.credible import Estimate
 from npdr_ppl.workflows.discovery.equivalents import equivalents, irreducible
@@ -128,7 +128,7 @@ def test_what_rings_is_heard_at_its_frequency(quiet):
     def heard(projection):
         laws = ringing_laws(projection)
         values = LargestStatistic(projection, seed=0).p_values([law.change for law in laws])
-        gains = [gain for _, gain in gains_of(projection, laws)]
+        gains = [projection.scores(law.change).gain(slice(None)) for law in laws]
         return min(values), laws[gains.index(max(gains))].name
 
     from_which_on = RINGING_SHARE * npdr.DiscoveryOptions().false_alarm_rate
@@ -302,9 +302,9 @@ def test_what_is_lost_without_an_effect_is_known_without_a_fit(dragged):
 
 def test_effects_that_are_simulated_together_do_what_each_does_alone(quiet, monkeypatch):
     effects = candidate_effects(quiet.simulator)
-    together = sensitivities(quiet, effects)
+    together = list(sensitivities(quiet, effects))
     monkeypatch.setattr("npdr_ppl.workflows.discovery.sensitivities.MOST_TOGETHER", 0)
-    alone = sensitivities(quiet, effects)
+    alone = list(sensitivities(quiet, effects))
     by_name = {variant.effect.name: [] for variant in alone}
     for variant in alone:
         by_name[variant.effect.name].append(variant.change)
