@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import with_noise
@@ -142,7 +143,10 @@ class SegmentModel:
         channel_names: Their names.
         observed: What was measured, ``(S, K, C)``.
         starts: What the segments start from, where that was given.
+        width: Steps whose whitened readings are averaged; see :meth:`averaged`.
     """
+
+    width = 1
 
     def __init__(
         self,
@@ -206,6 +210,20 @@ class SegmentModel:
         part.observed = self.observed[index]
         part._offsets = uncertain_components(part.inputs)
         return part
+
+    def averaged(self, most: int, fewest: int) -> "SegmentModel":
+        """Returns the model with fewer whitened readings, where a recording has very many.
+
+        Averages over neighbouring steps, times the root of their number: white noise keeps its
+        unit variance, and what changes slowly keeps its distance from it.
+
+        Args:
+            most: Readings that are few enough; more are left where segments are short.
+            fewest: Averages that a segment keeps at least.
+        """
+        part = copy.copy(self)
+        part.width = min(self.observed.numel() // most, self.inputs.num_steps // fewest)
+        return part if part.width > 1 else self
 
     def _start_from(self, starts: Starts | None) -> None:
         self.starts = starts
@@ -301,7 +319,14 @@ class SegmentModel:
 
     def whitened(self, difference: Tensor, scale: Tensor) -> Tensor:
         """Returns a difference of readings ``(…, S, K, C)`` in scales, as :meth:`residuals`."""
-        return (difference.double() * self.inputs.mask[..., None] / scale).flatten(-2)
+        # One product: of a long recording every copy takes a hundred megabytes.
+        whitened = difference.double() * (self.inputs.mask[..., None] / scale)
+        if self.width > 1:
+            missing = -self.inputs.num_steps % self.width
+            steps = pad(whitened, (0, 0, 0, missing)).unflatten(-2, (-1, self.width))
+            counts = pad(self.inputs.mask.double(), (0, missing)).unflatten(-1, (-1, self.width))
+            whitened = steps.sum(-2) / counts.sum(-1).clamp_min(1.0).sqrt()[..., None]
+        return whitened.flatten(-2)
 
     def root_mean_square(self, difference: Tensor) -> Tensor:
         """Returns the size of a difference of readings ``(S, K, C)`` per channel, ``(C,)``."""

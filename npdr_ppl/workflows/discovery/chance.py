@@ -16,7 +16,7 @@ candidate, fitted to the deal, leaves.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import torch
@@ -93,26 +93,14 @@ class LargestStatistic:
         Args:
             groups: Changes of each candidate, ``(S, N, k)``; a few are held at a time.
         """
-        rows: dict[int, Tensor] = {}
-        waiting: dict[int, list[tuple[int, Tensor]]] = {}
-        for place, group in enumerate(groups):
-            alike = waiting.setdefault(group.shape[-1], [])
-            alike.append((place, group))
-            if len(alike) * group.numel() >= MOST_NUMBERS:
-                rows |= self._rows(waiting.pop(group.shape[-1]))
-        for alike in waiting.values():
-            rows |= self._rows(alike)
-        if not rows:
-            return []
-        tails = torch.stack([rows[place] for place in range(len(rows))])
-        largest = tails.amax(0)
-        return (largest >= tails[:, :1] - 1e-12).double().mean(1).tolist()
-
-    def _rows(self, alike: list[tuple[int, Tensor]]) -> dict[int, Tensor]:
-        """Returns :meth:`_tails` of candidates of as many strengths, by place."""
-        places, groups = zip(*alike, strict=True)
-        found = self._tails(torch.stack(groups, dim=-2))
-        return dict(zip(places, found, strict=True))
+        observed: dict[int, float] = {}
+        largest = torch.zeros(len(self._deals), dtype=torch.float64)
+        for places, alike in _in_batches(groups):
+            tails = self._tails(torch.stack(alike, dim=-2))
+            largest = largest.maximum(tails.amax(0))
+            observed |= dict(zip(places, tails[:, 0].tolist(), strict=True))
+        own = torch.tensor([observed[place] for place in range(len(observed))]).double()
+        return (largest >= own[:, None] - 1e-12).double().mean(1).tolist()
 
     def _tails(self, columns: Tensor) -> Tensor:
         """Returns minus the log tail of each candidate's statistic in every deal, ``(P, draws)``.
@@ -158,6 +146,19 @@ class LargestStatistic:
     def _joined(self, by_segment: Tensor) -> Tensor:
         """Joins neighbouring segments, ``(S, N, P)`` to ``(blocks, N', P)``."""
         return by_segment.unflatten(0, (self._blocks, -1)).flatten(1, 2)
+
+
+def _in_batches(groups: Iterable[Tensor]) -> Iterator[tuple[list[int], list[Tensor]]]:
+    """Yields places and changes of candidates of as many strengths, some at a time."""
+    waiting: dict[int, tuple[list[int], list[Tensor]]] = {}
+    for place, group in enumerate(groups):
+        size = group.shape[-1]
+        places, alike = waiting.setdefault(size, ([], []))
+        places.append(place)
+        alike.append(group)
+        if len(alike) * group.numel() >= MOST_NUMBERS:
+            yield waiting.pop(size)
+    yield from waiting.values()
 
 
 def _derangements(draws: int, size: int, generator: torch.Generator) -> Tensor:

@@ -95,7 +95,7 @@ def wave_laws(found: Responses) -> dict[str, list[GenericLaw]]:
         port: [
             GenericLaw(
                 f"{port}: wave of {frequency:.3g} Hz",
-                partial(torch.matmul, change, _wave(found, frequency)),
+                partial(_waved, change, found, frequency),
             )
             for frequency in _frequencies(found).tolist()
         ]
@@ -125,18 +125,27 @@ def ripple_laws(found: Responses, sensors: Sequence[Channel]) -> list[GenericLaw
             direction = _sign(found.channels[velocities[position.name]])
             factors["direction times "] = direction
         for j in range(1, RIPPLES + 1):
-            phase = (j * math.pi / extent) * (x - x.mean())
-            ripple = torch.stack((phase.sin(), phase.cos()), dim=-1)
-            name = f"ripple of {j * math.pi / extent:.3g} 1/{position.unit} in {position.name}"
+            number = j * math.pi / extent
+            name = f"ripple of {number:.3g} 1/{position.unit} in {position.name}"
             laws += [
                 GenericLaw(
                     f"{port}: {text}{name}",
-                    partial(torch.matmul, change, factor[..., None] * ripple),
+                    partial(_rippled, change, factor, x, number),
                 )
                 for port, change in found.by_port.items()
                 for text, factor in factors.items()
             ]
     return laws
+
+
+def _waved(change: Tensor, found: Responses, frequency: float) -> Tensor:
+    return change @ _wave(found, frequency)
+
+
+def _rippled(change: Tensor, factor: Tensor, x: Tensor, number: float) -> Tensor:
+    """Returns what a factor times a ripple over x, both ``(S, pulses)``, would change."""
+    phase = number * (x - x.mean())
+    return change @ (factor[..., None] * torch.stack((phase.sin(), phase.cos()), dim=-1))
 
 
 def reading_laws(projection: Projection) -> list[GenericLaw]:

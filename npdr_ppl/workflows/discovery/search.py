@@ -41,6 +41,13 @@ where a large effect was missing, integrators and the laws' own details differ b
 LEADING = 10
 """Candidates whose distances from each other are computed."""
 
+MOST_READINGS = 100_000
+"""Readings of which candidates and laws are looked at one by one: ten thousand columns of as many
+take a minute. Of more, neighbours are averaged; the recordings of the benchmarks have fewer."""
+
+FEWEST_AVERAGES = 40
+"""Averages that a segment keeps: four for each pulse of force."""
+
 PRIOR_OF_ANY = 0.5
 """Prior probability that anything of the catalogue is missing."""
 
@@ -51,6 +58,7 @@ class Round:
 
     Attributes:
         hypothesis: The model as it was, fitted.
+        seen: The same with averages of a very long recording's readings, as it was looked at.
         alarm: Whether something was missing then.
         ranking: The candidates by linear gain.
         separation: How far the leading ones are apart; see :mod:`separation`.
@@ -60,6 +68,7 @@ class Round:
     """
 
     hypothesis: Hypothesis
+    seen: Hypothesis
     alarm: Alarm
     ranking: list[Screened]
     separation: Tensor
@@ -207,8 +216,10 @@ class Searcher:
         """Screens all candidates at a fitted hypothesis; the last one asked for is kept."""
         if self._last is not None and self._last.hypothesis is hypothesis:
             return self._last
-        projection = Projection(hypothesis)
-        found = responses(hypothesis)
+        segments = hypothesis.segments.averaged(MOST_READINGS, FEWEST_AVERAGES)
+        seen = replace(hypothesis, segments=segments)
+        projection = Projection(seen)
+        found = responses(seen)
         candidates = candidates_at(hypothesis, self.options)
         variants = variants_of(candidates, projection, found)
         sensors = hypothesis.simulator.sensors
@@ -218,7 +229,7 @@ class Searcher:
         ranking = [candidate.without_change() for candidate in ranking]
         best = ", ".join(s.name for s in ranking[:3]) or "none"
         self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
-        self._last = Round(hypothesis, alarm, ranking, separation, found)
+        self._last = Round(hypothesis, seen, alarm, ranking, separation, found)
         return self._last
 
     def _extended(

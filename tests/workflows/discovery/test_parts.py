@@ -300,6 +300,21 @@ def test_what_is_lost_without_an_effect_is_known_without_a_fit(dragged):
     assert loss_without(fitted, drag) == pytest.approx(lost, rel=0.1)
 
 
+def test_averages_of_neighbours_keep_noise_white_and_slow_changes_apart(quiet):
+    segments = quiet.segments
+    steps = segments.inputs.num_steps
+    averaged = segments.averaged(segments.observed.numel() // 3, steps // 3)
+    assert averaged.width == 3
+    scale = torch.ones(segments.observed.shape[-1], dtype=torch.float64)
+    torch.manual_seed(0)
+    noise = torch.randn(segments.observed.shape, dtype=torch.float64)
+    assert averaged.whitened(noise, scale).std() == pytest.approx(1.0, abs=0.05)
+    slow = torch.linspace(1.0, 2.0, steps, dtype=torch.float64)[:, None].expand_as(noise)
+    distance = averaged.whitened(slow, scale).norm() / segments.whitened(slow, scale).norm()
+    assert 0.97 < float(distance) <= 1.0
+    assert segments.averaged(segments.observed.numel(), 1) is segments
+
+
 def test_effects_that_are_simulated_together_do_what_each_does_alone(quiet, monkeypatch):
     effects = candidate_effects(quiet.simulator)
     together = list(sensitivities(quiet, effects))
