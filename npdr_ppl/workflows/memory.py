@@ -1,4 +1,4 @@
-"""How much memory a stretch of work takes, sampled from the side."""
+"""Memory: how much a stretch of work takes, sampled from the side, and what is given back."""
 
 import ctypes
 import gc
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["MemoryUse", "sampled_memory"]
+__all__ = ["MemoryUse", "give_back", "sampled_memory"]
 
 INTERVAL = 0.02
 """Seconds between two samples."""
@@ -37,7 +37,8 @@ def sampled_memory() -> Iterator[MemoryUse]:
     back to the system where the C library can; libraries loaded at first use still count for
     whoever uses them first.
     """
-    _give_back()
+    gc.collect()
+    give_back()
     use = MemoryUse()
     before = _resident()
     if before is None:
@@ -60,9 +61,11 @@ def sampled_memory() -> Iterator[MemoryUse]:
         thread.join()
 
 
-def _give_back() -> None:
-    """Gives freed memory back to the system, where the C library (glibc) can."""
-    gc.collect()
+def give_back() -> None:
+    """Gives freed memory back to the system, where the C library (glibc) can.
+
+    It keeps freed arrays of some megabytes, in pieces that larger ones do not fit into.
+    """
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
 

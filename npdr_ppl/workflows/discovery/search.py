@@ -31,6 +31,7 @@ from npdr_ppl.workflows.discovery.screening import Screened
 from npdr_ppl.workflows.discovery.separation import separation_matrix
 from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.workflows.discovery.trials import PLAINLY, Trials
+from npdr_ppl.workflows.memory import give_back
 
 __all__ = ["Round", "Search", "Searcher", "explained"]
 
@@ -216,6 +217,7 @@ class Searcher:
         """Screens all candidates at a fitted hypothesis; the last one asked for is kept."""
         if self._last is not None and self._last.hypothesis is hypothesis:
             return self._last
+        give_back()
         segments = hypothesis.segments.averaged(MOST_READINGS, FEWEST_AVERAGES)
         seen = replace(hypothesis, segments=segments)
         projection = Projection(seen)
