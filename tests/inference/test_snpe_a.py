@@ -40,13 +40,13 @@ def test_three_rounds_recover_a_narrow_posterior_far_from_the_priors_mean(propos
     # prior's volume wide, whose posterior would be a third narrower without the correction.
     problem = make_problem(2, torch.tensor([2.0, -1.5]))
     method = backend("snpe-a", proposals=proposals, components=3, members=1)
-    q = posterior(method, problem, lambda z: z + 0.1 * torch.randn_like(z), 3, 2000)
+    q = posterior(method, problem, lambda z: z + 0.1 * torch.randn_like(z), 3, 1000)
     n = 10_000
     with seeded(1):
         z = q.sample(n)
     exact = problem.observation / 1.01
     sd = (0.01 / 1.01) ** 0.5
-    # 4.5 standard errors and a tenth of a standard deviation for learning from 2000 simulations.
+    # 4.5 standard errors and a tenth of a standard deviation for learning from 1000 simulations.
     assert ((z.mean(0) - exact).abs() < sd * (4.5 / n**0.5 + 0.1)).all()
     limit = sd**2 * (4.5 * (2 / n) ** 0.5 + 0.2)
     assert ((z.T.cov() - sd**2 * torch.eye(2)).abs() < limit).all()

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 import npdr_ppl as npdr
 from npdr_ppl.errors import IntractableError
+from npdr_ppl.inference.registry import backend
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.workflows.binding import BindingOptions, bind
@@ -126,7 +127,8 @@ def test_a_score_posterior_covers_the_truth(rollouts):
         prepare(model, rollouts, UNCERTAIN).model,
         rollouts,
         rounds=3,
-        num_simulations=600,
+        num_simulations=300,
+        backend=backend("snpe-c", members=1),
         embedding="score",
         segment_length=40,
         initial_state="uncertain",

@@ -26,6 +26,12 @@ def clean():
     return swinging()
 
 
+@pytest.fixture(scope="module")
+def found(clean, quick):
+    """The posterior of a model that lacks nothing."""
+    return infer(pendulum, clean, quick)
+
+
 def infer(model, rollouts, quick, **options):
     return npdr.infer(
         model, rollouts, backend=quick, num_simulations=200, progress=False, **options
@@ -39,23 +45,22 @@ def inside(posterior, name, value, mass=0.999):
     return low < value < high
 
 
-def test_defaults_find_the_truth_and_accept(clean, quick):
-    posterior = infer(pendulum, clean, quick)
+def test_defaults_find_the_truth_and_accept(found):
     for name, value in TRUTH.items():
-        assert inside(posterior, name, value)
+        assert inside(found, name, value)
         # The simulator's own steps of 20 ms would bias both by several per cent.
-        assert posterior.sample(500)[name].mean() == pytest.approx(value, rel=0.01)
-    diagnosis = npdr.diagnose(posterior.to_arviz())
+        assert found.sample(500)[name].mean() == pytest.approx(value, rel=0.01)
+    diagnosis = npdr.diagnose(found.to_arviz())
     assert diagnosis.decision is Decision.ACCEPT, diagnosis.reason
-    assert posterior.preparation.are_steps_coarse
-    assert "uncertain initial states" in posterior.preparation.sentence()
+    assert found.preparation.are_steps_coarse
+    assert "uncertain initial states" in found.preparation.sentence()
 
 
-def test_discovery_agrees_that_nothing_is_missing(clean, quick):
-    found = npdr.discover(pendulum, clean)
-    assert found.verdict == "none", found.reason
-    checks = infer(pendulum, clean, quick).checks()
-    assert checks["model"]["p_value"] == found.alarm.p_value
+def test_discovery_agrees_that_nothing_is_missing(clean, found):
+    discovery = npdr.discover(pendulum, clean)
+    assert discovery.verdict == "none", discovery.reason
+    checks = found.checks()
+    assert checks["model"]["p_value"] == discovery.alarm.p_value
     assert checks["priors"] == []
 
 
@@ -129,31 +134,30 @@ def test_a_fit_spends_the_rounds_that_it_has_left(clean, quick, monkeypatch):
     assert len(posterior.provenance.rounds) == 2
 
 
-def test_checks_travel_with_the_exported_posterior(clean, quick, tmp_path):
-    posterior = infer(pendulum, clean, quick)
-    data = posterior.to_arviz()
+def test_checks_travel_with_the_exported_posterior(found, tmp_path):
+    data = found.to_arviz()
     to_netcdf(data, tmp_path / "posterior.nc")
     again = npdr.diagnose(from_netcdf(tmp_path / "posterior.nc"))
     assert again.to_dict() == npdr.diagnose(data).to_dict()
 
 
-def test_a_corrected_posterior_is_kept_on_disk(clean, quick, tmp_path):
-    posterior = infer(pendulum, clean, quick)
-    assert posterior.correction is not None
-    posterior.save(tmp_path)
+def test_a_corrected_posterior_is_kept_on_disk(found, tmp_path):
+    assert found.correction is not None
+    found.save(tmp_path)
     loaded = npdr.Posterior.load(tmp_path, pendulum)
-    for name, value in posterior.sample(50).items():
+    for name, value in found.sample(50).items():
         assert torch.equal(loaded.sample(50)[name], value)
-    assert loaded.checks() == posterior.checks()
+    assert loaded.checks() == found.checks()
 
 
 @pytest.mark.slow
-def test_nuts_integrates_initial_states_out(clean, quick):
+def test_nuts_integrates_initial_states_out(quick):
+    short = swinging(rollouts=1, steps=100)
     exact = npdr.infer(
-        pendulum, clean, backend=backend("nuts", chains=1, num_samples=50, warmup=30),
+        pendulum, short, backend=backend("nuts", chains=1, num_samples=50, warmup=30),
         progress=False,
     )  # fmt: skip
-    other = infer(pendulum, clean, quick)
+    other = infer(pendulum, short, quick)
     for name in TRUTH:
         one, two = exact.sample(50)[name], other.sample(2_000)[name]
         # Standard errors of both, and of 50 draws that are not independent.

@@ -11,6 +11,7 @@ from pyro.infer.autoguide import AutoNormal
 
 import npdr_ppl as npdr
 from npdr_ppl.errors import BackendError, ModelError
+from npdr_ppl.inference.registry import backend
 from npdr_ppl.randomness import seeded
 
 NOISE = 0.4
@@ -33,11 +34,17 @@ def series():
             return npdr.simulate("x", sensor, {"gain": gain})
 
 
-@pytest.fixture(scope="module", params=["nle", "nre"])
+LEARNERS = {
+    # One flow is enough of a Gaussian, and samplers call it thousands of times.
+    "nle": backend("nle", transforms=1, hidden=(32,)),
+    "nre": backend("nre"),
+}
+
+
+@pytest.fixture(scope="module", params=LEARNERS)
 def learnt(request):
-    return npdr.infer(
-        one, torch.zeros(2), backend=request.param, num_simulations=3000, progress=False
-    )
+    learner = LEARNERS[request.param]
+    return npdr.infer(one, torch.zeros(2), backend=learner, num_simulations=3000, progress=False)
 
 
 @pytest.fixture(scope="module")
