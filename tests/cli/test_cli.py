@@ -136,7 +136,7 @@ def test_compare_writes_what_the_documentation_promises(monkeypatch, capsys, tmp
 @pytest.mark.slow
 def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path, recording):
     words = [
-        "fit", "pendulum", "--data", recording, "--rounds", 3, "--simulations", 300,
+        "fit", "pendulum", "--data", recording, "--rounds", 2, "--simulations", 100,
         "--segment-length", 25, "--embedding", "all/5", "--quiet", "--out",
     ]  # fmt: skip
     killed = tmp_path / "killed"

@@ -138,7 +138,7 @@ def test_ctrl_c_leaves_a_run_that_continues(recording, tmp_path):
     out = tmp_path / "fit"
     words = small_fit(recording, out)
     words = [w if w != "abc" else "snpe-c" for w in map(str, words)]
-    words[words.index("--simulations") + 1] = "2000"
+    words[words.index("--simulations") + 1] = "500"
     process = subprocess.Popen(
         [*NPDR, *words],
         stderr=subprocess.PIPE,
