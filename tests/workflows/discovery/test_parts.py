@@ -237,7 +237,8 @@ def test_an_infinite_estimate_is_null_in_json():
 def test_the_same_seed_finds_the_same():
     place = ("hinge", "quadratic_drag")
     case = make_case("pendulum", "one", (place,), strength=0.3, seed=2001)
-    options = npdr.DiscoveryOptions(effects=(QuadraticDrag("hinge"), CoulombFriction("hinge")))
+    effects = (QuadraticDrag("hinge"), CoulombFriction("hinge"))
+    options = npdr.DiscoveryOptions(effects=effects, max_effects=1)
     first, second = (npdr.discover(case.model, case.fit, options=options) for _ in range(2))
     assert first.effects[0].to_dict() == second.effects[0].to_dict()
     assert first.alarm == second.alarm
@@ -372,11 +373,11 @@ def test_every_effect_gets_its_own_rivals(dragged):
 
 def test_two_processes_find_what_one_finds(dragged):
     case, _ = dragged
-    effects = (QuadraticDrag("hinge"), CoulombFriction("hinge"), InputDelay("torque"))
+    effects = (QuadraticDrag("hinge"), CoulombFriction("hinge"))
     options = npdr.DiscoveryOptions(effects=effects, max_effects=1)
-    alone = npdr.discover(case.model, case.fit, options=options)
+    alone = npdr.discover(case.model, case.fit[[0]], options=options)
     with npdr.workers("loky", 2) as used:
-        together = npdr.discover(case.model, case.fit, options=options)
+        together = npdr.discover(case.model, case.fit[[0]], options=options)
     assert used.is_used
     kinds = [{k: v for k, v in d.to_dict().items() if k != "seconds"} for d in (alone, together)]
     assert kinds[0] == kinds[1]
