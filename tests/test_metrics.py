@@ -105,6 +105,14 @@ def test_dtw_of_equal_and_delayed_series():
     assert metrics.dtw([late], [series]).item() < 0.3 * pointwise
 
 
+def test_dtw_of_a_long_series_is_close_and_takes_little_memory(monkeypatch):
+    time = torch.linspace(0, 6, 600)[:, None]
+    series, late = torch.sin(time), 1.1 * torch.sin(time - 0.3)
+    exact = metrics.dtw([late], [series]).item()
+    monkeypatch.setattr(metrics, "MOST_ALIGNED", 200)
+    assert metrics.dtw([late], [series]).item() == pytest.approx(exact, rel=0.03)
+
+
 def test_failed_simulations_score_nan():
     measured = [torch.ones(5, 2)]
     simulated = torch.zeros(2, 5, 2)

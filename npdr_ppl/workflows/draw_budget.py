@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from torch import Tensor
 
 from npdr_ppl.language.prior import Prior
+from npdr_ppl.workflows.memory import give_back
 
 __all__ = ["BUDGET", "affordable_draws", "executed_in_parts"]
 
@@ -14,8 +15,9 @@ BUDGET = 256 * 2**20
 LEAST_DRAWS = 20
 """Draws that are kept however long the recording is: fewer have no quantiles to speak of."""
 
-PER_PART = 16_000_000
-"""Readings that are simulated at once, 128 MB in double precision; engines make copies of them."""
+PER_PART = 4_000_000
+"""Readings that are simulated at once, 32 MB in double precision; engines and statistics make
+copies of them."""
 
 BYTES = 8
 """Bytes of a reading in double precision, in which most is computed."""
@@ -47,5 +49,7 @@ def executed_in_parts(
     Yields:
         Points and the sites' outputs at them.
     """
+    give_back()
     for part in z.split(max(1, PER_PART // max(1, num_readings))):
         yield part, prior.execute(part)
+    give_back()
