@@ -99,7 +99,8 @@ def dtw(
     pattern ``symmetric2``, ``open_end=True``, the distance cumulative, not normalised.
 
     Memory grows with the square of the length, so of series longer than ``MOST_ALIGNED`` steps
-    every k-th is aligned and the distance multiplied by k.
+    every k-th is aligned and the distance multiplied by k. That is somewhat larger, as there
+    are fewer ways to align.
 
     Args:
         simulated: One ``(..., T, C)`` per rollout.

@@ -105,12 +105,12 @@ def test_dtw_of_equal_and_delayed_series():
     assert metrics.dtw([late], [series]).item() < 0.3 * pointwise
 
 
-def test_dtw_of_a_long_series_is_close_and_takes_little_memory(monkeypatch):
+def test_dtw_of_a_long_series_is_that_of_every_third_step_and_a_little_larger(monkeypatch):
     time = torch.linspace(0, 6, 600)[:, None]
     series, late = torch.sin(time), 1.1 * torch.sin(time - 0.3)
     exact = metrics.dtw([late], [series]).item()
     monkeypatch.setattr(metrics, "MOST_ALIGNED", 200)
-    assert metrics.dtw([late], [series]).item() == pytest.approx(exact, rel=0.03)
+    assert exact < metrics.dtw([late], [series]).item() < 1.25 * exact
 
 
 def test_failed_simulations_score_nan():
