@@ -172,15 +172,15 @@ def test_random_simulators_follow_the_seed_and_nothing_else():
     class Noisy(Cart):
         is_deterministic = False
 
-    def returns(executor, **options):
+    def returns():
         torch.manual_seed(3)
-        with npdr.workers(executor, **options):
-            starts = torch.zeros(6, 2).double()
-            return Noisy().roll_out({}, feedback(), starts, 5, reward=near_zero).returns
+        starts = torch.zeros(6, 2).double()
+        return Noisy().roll_out({}, feedback(), starts, 5, reward=near_zero).returns
 
-    first = returns("serial")
+    first = returns()
     assert len(first.unique()) == 6
-    assert torch.equal(first, returns("threads", num_workers=2, chunk_size=1))
+    with npdr.workers("threads", num_workers=2, chunk_size=1):
+        assert torch.equal(first, returns())
 
 
 def test_a_lost_episode_is_nan_and_costs_no_other():
