@@ -18,6 +18,9 @@ from pool_tasks import Noise  # noqa: E402
 
 RATES = FaultRates(crash=0.05, hang=0.06, nan=0.05)
 
+NUM_DRAWS = 20
+"""Of which three hang, one crashes and one is NaN."""
+
 
 @contextmanager
 def dask_cluster():
@@ -54,7 +57,10 @@ CLUSTERS = {"dask": dask_cluster, "ray": ray_cluster}
 @pytest.mark.parametrize("executor", CLUSTERS)
 def test_a_cluster_returns_what_one_process_does_and_outlives_the_pool(executor):
     expected = np.array(
-        [np.random.default_rng(derived_seed(7, "draw", i)).normal(i, size=3) for i in range(60)]
+        [
+            np.random.default_rng(derived_seed(7, "draw", i)).normal(i, size=3)
+            for i in range(NUM_DRAWS)
+        ]
     )
     with CLUSTERS[executor]() as address:
         for options in (
@@ -62,8 +68,8 @@ def test_a_cluster_returns_what_one_process_does_and_outlives_the_pool(executor)
             WorkerOptions(executor, address=address, time_limit=2.0),
         ):
             with Pool(options) as pool:
-                outcome = pool.run(Faulty(Noise(), RATES), range(60), seed=7)
-                again = pool.run(Noise(), range(60), seed=7)
+                outcome = pool.run(Faulty(Noise(), RATES), range(NUM_DRAWS), seed=7)
+                again = pool.run(Noise(), range(NUM_DRAWS), seed=7)
             np.testing.assert_array_equal(np.array(outcome.values), expected)
             np.testing.assert_array_equal(np.array(again.values), expected)
             counts = outcome.faults.counts()
