@@ -1,3 +1,4 @@
+import gc
 import os
 
 import pytest
@@ -19,10 +20,21 @@ settings.register_profile("explore", max_examples=2_000)
 settings.load_profile("explore" if os.environ.get("NPDR_EXPLORE") else "repeatable")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def spared_collections():
+    """Takes what is there to stay, libraries and kernels, out of garbage collections.
+
+    A process that has run hundreds of tests holds millions of objects, and code that frees
+    memory on purpose would look through all of them every time.
+    """
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture
 def short_kernels(monkeypatch):
-    """Compiles loops of three time steps, however long they are to run."""
-    monkeypatch.setattr(compilation, "_STEPS_PER_CALL", (3,))
+    """Compiles loops of two time steps, however long they are to run."""
+    monkeypatch.setattr(compilation, "_STEPS_PER_CALL", (2,))
     compilation._compile.cache_clear()
     yield
     compilation._compile.cache_clear()

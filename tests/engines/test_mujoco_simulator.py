@@ -422,7 +422,7 @@ def test_inference_end_to_end():
         damping = pyro.sample("damping", dist.Uniform(0.0, 0.2))
         return npdr.simulate("trajectory", simulator, {"hand": hand, "damping": damping}, inputs)
 
-    inputs = random_inputs(simulator, num_segments=1, num_steps=200, past=0)
+    inputs = random_inputs(simulator, num_segments=1, num_steps=120, past=0)
     truth = {"hand": value(0.6), "damping": value(0.08)}
     states = torch.cat((inputs.initial_values, simulator.simulate(truth, inputs)[0]))
     rollouts = npdr.Rollouts(
@@ -432,7 +432,7 @@ def test_inference_end_to_end():
         action_names=inputs.action_names,
         time_step=0.002,
     )
-    posterior = npdr.infer(model, rollouts, backend="abc", num_simulations=400, seed=0)
+    posterior = npdr.infer(model, rollouts, backend="abc", num_simulations=300, seed=0)
     draws = posterior.sample(200)
     assert draws["hand"].mean() == pytest.approx(0.6, abs=0.1)
     assert draws["hand"].std() < 0.2
