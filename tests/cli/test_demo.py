@@ -1,39 +1,90 @@
-"""`npdr demo`: what it prints and writes."""
+"""`npdr demo`, small: what it prints and writes, and the report on it."""
 
+import contextlib
 import functools
+import io
 import json
 import sys
 
 import pytest
 
 from npdr_ppl.cli import main as cli
+from npdr_ppl.reports import read_run, write_report
 from npdr_ppl.workflows import demo
-from tests.workflows.small_demo import NUM_STEPS, OPTIONS
+from tests.workflows.small_demo import FILTER, NUM_STEPS, OPTIONS
+
+SMALL = functools.partial(demo.run_demo, options=OPTIONS, num_steps=NUM_STEPS)
 
 
-def run(monkeypatch, capsys, *words):
+def run(*words):
     """Runs the command line in this process; returns exit code, output and error text."""
-    small = functools.partial(demo.run_demo, options=OPTIONS, num_steps=NUM_STEPS)
-    with monkeypatch.context() as context:
-        context.setattr(demo, "run_demo", small)
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        pytest.MonkeyPatch.context() as context,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        context.setattr(demo, "run_demo", SMALL)
         context.setattr(sys, "argv", ["npdr", "demo", *map(str, words)])
         with pytest.raises(SystemExit) as stop:
             cli.main()
-    out, err = capsys.readouterr()
-    return stop.value.code or 0, out, err
+    return stop.value.code or 0, out.getvalue(), err.getvalue()
 
 
-def test_the_story_is_printed_written_and_told_again(monkeypatch, capsys, tmp_path):
-    out = tmp_path / "demo"
-    code, text, err = run(monkeypatch, capsys, "--out", out)
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """The folder of a story told once for all tests, and what was printed."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    code, text, err = run("--out", out)
     assert code == 0, err
+    return out, text
+
+
+def test_the_story_is_printed_and_written(told):
+    out, text = told
     for words in ("policy from the prior earns", "revise the model", "sensor_low_pass at"):
         assert words in text
     assert max(map(len, text.splitlines())) <= 100
     for name in ("demo.json", "train.json", "report.html", "learning_curve.png", "rollouts.png"):
         assert (out / name).stat().st_size > 500
+
+
+def test_the_filter_of_the_rates_is_found_on_the_rig(told):
+    out, _ = told
+    result = json.loads((out / "demo.json").read_text())
+    (effect,) = result["effects"]
+    assert (effect["port"], effect["effect"]) == (FILTER.port, "sensor_low_pass")
+    # A difference over a step of 2 ms lags by half of it more.
+    expected = demo.RIG.velocity_time_constant + 0.001
+    assert effect["parameters"]["time_constant"]["mean"] == pytest.approx(expected, rel=0.1)
+    assert "revise the model" in [d["decision"] for d in result["decisions"]]
+    assert set(result["returns"]) == {"policy from the prior", "policy from the revised model"}
+
+
+def test_told_again_it_is_the_same_story(told):
+    out, _ = told
     first = json.loads((out / "demo.json").read_text())
+    trained = json.loads((out / "train.json").read_text())
     # The same command again runs nothing again.
-    code, text, _ = run(monkeypatch, capsys, "--out", out, "--json", "--quiet")
+    code, text, _ = run("--out", out, "--json", "--quiet")
     assert code == 0
     assert json.loads(text)["returns"] == first["returns"]
+    again = SMALL(out, progress=False)
+    assert json.loads(json.dumps(again.result)) | {"cpu_seconds": first["cpu_seconds"]} == first
+    assert json.loads(json.dumps(again.training.to_dict())) == trained
+
+
+def test_the_report_tells_it(told):
+    out, _ = told
+    titles = [section.title for section in read_run(out).sections]
+    assert titles[0] == "Returns on the rig"
+    assert {"Effects", "Revised model", "The rig in truth", "Decisions"} <= set(titles)
+    text = write_report(out).read_text()
+    returns = json.loads((out / "demo.json").read_text())["returns"]
+    assert f"{returns['policy from the prior']:.0f}" in text
+    assert "sensor_low_pass" in text
+
+
+def test_the_story_begins_with_the_prior_and_has_room_for_another_rollout():
+    assert demo.DEMO_OPTIONS.starts_from_prior and demo.DEMO_OPTIONS.extra_rollouts == 1
+    assert demo.DEMO_OPTIONS.discovers == "after diagnosis"

@@ -25,5 +25,5 @@ OPTIONS = LoopOptions(
     num_initial_states=1,
     least_success=0.0,
     discovers="after diagnosis",
-    discovery=DiscoveryOptions(effects=(FILTER, CoulombFriction("arm")), max_effects=1),
+    discovery=DiscoveryOptions(50, (FILTER, CoulombFriction("arm")), max_effects=1),
 )
