@@ -15,7 +15,7 @@ import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.inference.registry import backend
-from npdr_ppl.models.effects import CoulombFriction, InputDelay, SensorLowPass
+from npdr_ppl.models.effects import CoulombFriction, InputDelay
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.linear import Linear
 from npdr_ppl.policies.search_registry import policy_search
@@ -153,8 +153,8 @@ def small_options(**changed):
 
 
 def discovering_options(when="before inference", **changed):
-    """Looks for one of three effects in segments of 0.2 s."""
-    few = (CoulombFriction("hinge"), InputDelay("torque"), SensorLowPass("velocity"))
+    """Looks for one of two effects in segments of 0.2 s."""
+    few = (CoulombFriction("hinge"), InputDelay("torque"))
     discovery = DiscoveryOptions(segment_length=10, effects=few, max_effects=1)
     settings = {"iterations": 1, "discovers": when, "discovery": discovery}
     return small_options(**{**settings, **changed})

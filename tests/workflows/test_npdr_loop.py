@@ -316,18 +316,18 @@ def test_bad_options_and_channels_are_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_no_rollout_is_lost_or_repeated_when_a_run_is_killed_a_hundred_times(tmp_path):
+def test_no_rollout_is_lost_or_repeated_when_a_run_is_killed_thirty_times(tmp_path):
     driver = Path(__file__).with_name("kill_runs.py")
     found = subprocess.run(
-        [sys.executable, str(driver), str(tmp_path), "100", "0"],
+        [sys.executable, str(driver), str(tmp_path), "30", "0"],
         capture_output=True,
         text=True,
         timeout=900,
     )
     assert found.returncode == 0, found.stdout + found.stderr
     summary = json.loads(found.stdout.splitlines()[-1])
-    assert summary["kills"] == 100
+    assert summary["kills"] == 30
     assert summary["stages"] >= 5, "the kills all met the run at the same few places"
-    assert summary["unwritten"] <= 2, "the target hardly ever wrote its episodes down"
+    assert summary["unwritten"] <= 1, "the target hardly ever wrote its episodes down"
     undisturbed = Rollouts.from_netcdf(tmp_path / "undisturbed/run/rollouts/rollout_000.nc")
     assert len(undisturbed) == 1
