@@ -178,11 +178,12 @@ def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
 @pytest.mark.slow
 def test_a_run_that_discovers_survives_kills(tmp_path):
     driver = Path(__file__).with_name("kill_runs.py")
+    # Of this seed's moments one is early in the search, the other near the end of the run.
     found = subprocess.run(
-        [sys.executable, str(driver), str(tmp_path), "3", "0", "discover"],
+        [sys.executable, str(driver), str(tmp_path), "2", "1", "discover"],
         capture_output=True,
         text=True,
         timeout=900,
     )
     assert found.returncode == 0, found.stdout + found.stderr
-    assert json.loads(found.stdout.splitlines()[-1])["kills"] == 3
+    assert json.loads(found.stdout.splitlines()[-1])["kills"] == 2
