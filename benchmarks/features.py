@@ -34,7 +34,7 @@ from npdr_ppl.workflows.preparation import Preparation, prepare  # noqa: E402
 
 FEATURES = ("score", "all/10", "all~10", "bayessim", "gru/10")
 
-AS_WIDE = 5.0
+TIMES_AS_WIDE = 5.0
 """How many times as wide as Laplace's approximation the density is that parameters are drawn
 from: enough for useless features to show, near enough for 1000 simulations to resolve."""
 
@@ -47,9 +47,9 @@ def judge(prepared: Preparation, features: str, seed: int) -> dict[str, Any]:
     assert prepared.likelihood is not None
     started = time.process_time()
     information = prepared.likelihood.information()
-    known, directions = torch.linalg.eigh(information + torch.eye(len(information)))
-    deviations = known.rsqrt()
-    around = (AS_WIDE * deviations).clamp_max(WIDEST)
+    precisions, directions = torch.linalg.eigh(information + torch.eye(len(information)))
+    deviations = precisions.rsqrt()
+    around = (TIMES_AS_WIDE * deviations).clamp_max(WIDEST)
     covariance = directions * around.square() @ directions.mT
     one, centre = torch.ones(1, dtype=torch.float64), prepared.likelihood.fit.z[None]
     posterior = npdr.infer(
@@ -62,7 +62,7 @@ def judge(prepared: Preparation, features: str, seed: int) -> dict[str, Any]:
         progress=False,
     )
     draws = posterior.sample_reference(2_000, seed=seed).double().flatten(0, -2) @ directions
-    ratio = (draws.std(0) / deviations)[AS_WIDE * deviations <= WIDEST]
+    ratio = (draws.std(0) / deviations)[TIMES_AS_WIDE * deviations <= WIDEST]
     return {
         "directions": len(ratio),
         "times_as_wide": float(ratio.log().mean().exp()),

@@ -36,8 +36,9 @@ SHORT_TRAINING = [
 TABLE2 = ["--backend", "bayesian-linear-regression"]
 """The quickest column; the nominal one stands beside it."""
 
-IGNORED = ("seconds", "version", "path", "folder", "file", "time", "command", "created", "memory")
-"""Parts of the keys of values that may differ from run to run."""
+IGNORED = {"seconds", "version", "versions", "path", "folder", "file", "command", "created"}
+IGNORED |= {"cpu_seconds", "peak_memory", "memory", "platform", "provenance", "out", "data"}
+"""Keys of values that may differ from run to run."""
 
 
 def commands(recordings: Path, data: Path) -> dict[str, list[str]]:
@@ -80,9 +81,9 @@ def write_recordings(folder: Path) -> None:
         case.fit.to_csv(folder / f"{name}.csv")
 
 
-def run_all(out: Path, recordings: Path, data: Path, only: set[str]) -> None:
-    """Runs the commands, and notes what each took."""
-    seconds = {}
+def run_all(out: Path, recordings: Path, data: Path, only: set[str]) -> int:
+    """Runs the commands, notes what each took, and returns how many failed."""
+    seconds, failed = {}, 0
     for name, words in commands(recordings, data).items():
         if only and name not in only:
             continue
@@ -97,15 +98,17 @@ def run_all(out: Path, recordings: Path, data: Path, only: set[str]) -> None:
         seconds[name] = round(time.perf_counter() - started, 1)
         print(f"{name}: exit code {done.returncode}, {seconds[name]} s", flush=True)
         if done.returncode:
+            failed += 1
             print(done.stderr, file=sys.stderr)
     (out / "wall_clock.txt").write_text(json.dumps(seconds, indent=2))
+    return failed
 
 
 def leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
     """Yields every value of nested dictionaries and lists with the keys that lead to it."""
     if isinstance(value, dict):
         for key, part in value.items():
-            if not any(word in key.lower() for word in IGNORED):
+            if key not in IGNORED:
                 yield from leaves(part, f"{place}/{key}")
     elif isinstance(value, list):
         for index, part in enumerate(value):
@@ -117,6 +120,8 @@ def leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
 def are_equal(one: Any, other: Any) -> bool:
     """Returns whether two values are the same up to rounding in the last digits."""
     if isinstance(one, float) and isinstance(other, float):
+        if math.isnan(one) and math.isnan(other):
+            return True
         return math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-12)
     return one == other
 
@@ -124,6 +129,13 @@ def are_equal(one: Any, other: Any) -> bool:
 def compare(before: Path, after: Path, renamed: dict[str, str]) -> int:
     """Prints every difference and returns their number."""
     differences = 0
+    known = {
+        renamed.get(n, n) for n in (str(p.relative_to(before)) for p in before.rglob("*.json"))
+    }
+    for path in sorted(after.rglob("*.json")):
+        if str(path.relative_to(after)) not in known:
+            print(f"{path.relative_to(after)}: new")
+            differences += 1
     for path in sorted(before.rglob("*.json")):
         name = path.relative_to(before)
         other = after / renamed.get(str(name), str(name))
@@ -158,12 +170,13 @@ def main() -> int:
     if chosen.compare:
         renamed = json.loads(chosen.renamed.read_text()) if chosen.renamed else {}
         return min(1, compare(*chosen.compare, renamed))
+    if chosen.data is None:
+        parser.error("--data is needed to run the commands")
     recordings = (chosen.recordings or chosen.out) / "recordings"
     if chosen.recordings is None:
         write_recordings(recordings)
     out, only = chosen.out.resolve(), {name for name in chosen.only.split(",") if name}
-    run_all(out, recordings.resolve(), chosen.data.resolve(), only)
-    return 0
+    return min(1, run_all(out, recordings.resolve(), chosen.data.resolve(), only))
 
 
 if __name__ == "__main__":

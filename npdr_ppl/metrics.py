@@ -99,8 +99,8 @@ def dtw(
     pattern ``symmetric2``, ``open_end=True``, the distance cumulative, not normalised.
 
     Memory grows with the square of the length, so of series longer than ``MOST_ALIGNED`` steps
-    every k-th is aligned and the distance multiplied by k. That is somewhat larger, as there
-    are fewer ways to align.
+    every k-th is aligned and the distance multiplied by k: an approximation, not to be compared
+    with distances of shorter series.
 
     Args:
         simulated: One ``(..., T, C)`` per rollout.
@@ -124,14 +124,12 @@ def dtw(
     result = []
     for x, y in zip(simulated, measured, strict=True):
         scale = _scale(y).double().cpu()
-        stride = -(-len(y) // MOST_ALIGNED)
-        query = (y.double().cpu() / scale).numpy()[::stride]
+        query = (y.double().cpu() / scale).numpy()
         batch = (x.detach().double().cpu() / scale).reshape(-1, *x.shape[-2:]).numpy()
-        batch = batch[:, ::stride]
         if open_end == "simulated":
-            values = [stride * _open_end_dtw(query, reference) for reference in batch]
+            values = [_open_end_dtw(query, reference) for reference in batch]
         else:
-            values = [stride * _open_end_dtw(reference, query) for reference in batch]
+            values = [_open_end_dtw(reference, query) for reference in batch]
         result.append(torch.tensor(values, dtype=torch.float64).reshape(x.shape[:-2]))
     return torch.stack(result, dim=-1)
 
@@ -140,8 +138,11 @@ def _open_end_dtw(query: NDArray[np.float64], reference: NDArray[np.float64]) ->
     """Aligns one query ``(n, C)`` with one reference ``(m, C)``."""
     if not (np.isfinite(reference).all() and np.isfinite(query).all()):
         return math.nan
-    aligned = _dtw_python().dtw(query, reference, open_end=True, distance_only=True)
-    return float(aligned.distance)
+    stride = -(-max(len(query), len(reference)) // MOST_ALIGNED)
+    aligned = _dtw_python().dtw(
+        query[::stride], reference[::stride], open_end=True, distance_only=True
+    )
+    return stride * float(aligned.distance)
 
 
 @cache

@@ -121,7 +121,7 @@ def _binned(x: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
 
 
 def _forces(now: Round) -> dict[str, LatentForce]:
-    found = latent_force(Projection(now.seen), now.responses)
+    found = latent_force(Projection(now.averaged), now.responses)
     return {force.port: force for force in found}
 
 

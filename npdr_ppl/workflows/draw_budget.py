@@ -5,11 +5,11 @@ from collections.abc import Iterator, Mapping
 from torch import Tensor
 
 from npdr_ppl.language.prior import Prior
-from npdr_ppl.workflows.memory import give_back
+from npdr_ppl.workflows.memory import release_freed_memory
 
 __all__ = ["BUDGET", "affordable_draws", "executed_in_parts"]
 
-BUDGET = 256 * 2**20
+BUDGET = 128 * 2**20
 """Bytes of trajectories that are kept at once, at most. Statistics make several copies of them."""
 
 LEAST_DRAWS = 20
@@ -49,7 +49,7 @@ def executed_in_parts(
     Yields:
         Points and the sites' outputs at them.
     """
-    give_back()
+    release_freed_memory()
     for part in z.split(max(1, PER_PART // max(1, num_readings))):
         yield part, prior.execute(part)
-    give_back()
+    release_freed_memory()

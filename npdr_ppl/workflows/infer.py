@@ -31,7 +31,7 @@ from npdr_ppl.workflows.binding import (
     problem_of,
 )
 from npdr_ppl.workflows.estimator_check import check_estimator
-from npdr_ppl.workflows.memory import give_back
+from npdr_ppl.workflows.memory import release_freed_memory
 from npdr_ppl.workflows.posterior import Posterior, PosteriorBase, Provenance
 from npdr_ppl.workflows.preparation import Preparation, prepare
 from npdr_ppl.workflows.progress import Reporter, reporter
@@ -41,8 +41,8 @@ __all__ = ["infer", "run_round", "simulate_features"]
 
 _LOGGER = logging.getLogger(__name__)
 
-CHUNKS_KEPT = 16
-"""Chunks of simulations after which memory that was freed is given back to the system."""
+CHUNKS_BETWEEN_RELEASES = 16
+"""Chunks of simulations after which freed memory is returned to the operating system."""
 
 
 def infer(
@@ -279,8 +279,8 @@ def simulate_features(
         with seeded(seed, "simulate", purpose, start), report_progress(within):
             features.append(bound.features(bound.prior.execute(part)).float().cpu())
         step(min(1.0, (start + chunk) / len(z)), f"{start + len(part)} simulations")
-        if (start // chunk) % CHUNKS_KEPT == CHUNKS_KEPT - 1:
-            give_back()
+        if (start // chunk) % CHUNKS_BETWEEN_RELEASES == CHUNKS_BETWEEN_RELEASES - 1:
+            release_freed_memory()
     result = torch.cat(features)
     if not bool(torch.isfinite(result).flatten(1).all(1).any()):
         raise NpdrError(

@@ -1,4 +1,4 @@
-"""Memory: how much a stretch of work takes, sampled from the side, and what is given back."""
+"""Measures the memory that a block of code takes, and releases freed memory."""
 
 import ctypes
 import gc
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["MemoryUse", "give_back", "sampled_memory"]
+__all__ = ["MemoryUse", "release_freed_memory", "sampled_memory"]
 
 INTERVAL = 0.02
 """Seconds between two samples."""
@@ -38,7 +38,7 @@ def sampled_memory() -> Iterator[MemoryUse]:
     whoever uses them first.
     """
     gc.collect()
-    give_back()
+    release_freed_memory()
     use = MemoryUse()
     before = _resident()
     if before is None:
@@ -61,10 +61,11 @@ def sampled_memory() -> Iterator[MemoryUse]:
         thread.join()
 
 
-def give_back() -> None:
-    """Gives freed memory back to the system, where the C library (glibc) can.
+def release_freed_memory() -> None:
+    """Returns freed memory to the operating system; does nothing where there is no glibc.
 
-    It keeps freed arrays of some megabytes, in pieces that larger ones do not fit into.
+    Otherwise glibc keeps freed blocks that are too small for the next large array, and the process
+    grows.
     """
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -143,10 +143,10 @@ class SegmentModel:
         channel_names: Their names.
         observed: What was measured, ``(S, K, C)``.
         starts: What the segments start from, where that was given.
-        width: Steps whose whitened readings are averaged; see :meth:`averaged`.
+        steps_per_average: Steps whose whitened readings are averaged; see :meth:`averaged`.
     """
 
-    width = 1
+    steps_per_average = 1
 
     def __init__(
         self,
@@ -199,31 +199,34 @@ class SegmentModel:
             return None
         return starts.scaled(segments.inputs, error_factors(now.residual, now.by_starts))
 
-    def some(self, index: Tensor) -> "SegmentModel":
+    def along(self, index: Tensor) -> "SegmentModel":
         """Returns the model along some of the segments.
 
         Args:
             index: Their indices.
         """
         part = copy.copy(self)
-        part.inputs = self.inputs.segments(index)
+        part.__dict__.pop("least_scale", None)
         part.observed = self.observed[index]
-        part._offsets = uncertain_components(part.inputs)
+        part._smoothed = self._smoothed.segments(index)
+        part._start_from(None if self.starts is None else self.starts.segments(index))
         return part
 
     def averaged(self, most: int, fewest: int) -> "SegmentModel":
         """Returns the model with fewer whitened readings, where a recording has very many.
 
-        Averages over neighbouring steps, times the root of their number: white noise keeps its
-        unit variance, and what changes slowly keeps its distance from it.
+        Each average of w steps is multiplied by √w. White noise then keeps unit variance, and slow
+        changes stay as detectable as before; what is faster than the average is lost.
 
         Args:
             most: Readings that are few enough; more are left where segments are short.
-            fewest: Averages that a segment keeps at least.
+            fewest: Averages that a segment keeps at least; those of less than twice as many steps
+                stay as they are.
         """
+        readings = int(self.inputs.mask.sum()) * len(self.measured)
         part = copy.copy(self)
-        part.width = min(self.observed.numel() // most, self.inputs.num_steps // fewest)
-        return part if part.width > 1 else self
+        part.steps_per_average = min(-(-readings // most), self.inputs.num_steps // fewest)
+        return part if part.steps_per_average > 1 else self
 
     def _start_from(self, starts: Starts | None) -> None:
         self.starts = starts
@@ -308,7 +311,9 @@ class SegmentModel:
         return simulated.expand(*num, *self.observed.shape)
 
     def residuals(self, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
-        """Returns whitened residuals, ``(n, S, K · C)`` float64, zero where nothing was measured.
+        """Returns whitened residuals, ``(n, S, N)`` float64, zero where nothing was measured.
+
+        N is K · C, or ⌈K / w⌉ · C where w steps are averaged.
 
         Args:
             z: Parameters, ``(n, d)``.
@@ -321,10 +326,11 @@ class SegmentModel:
         """Returns a difference of readings ``(…, S, K, C)`` in scales, as :meth:`residuals`."""
         # One product: of a long recording every copy takes a hundred megabytes.
         whitened = difference.double() * (self.inputs.mask[..., None] / scale)
-        if self.width > 1:
-            missing = -self.inputs.num_steps % self.width
-            steps = pad(whitened, (0, 0, 0, missing)).unflatten(-2, (-1, self.width))
-            counts = pad(self.inputs.mask.double(), (0, missing)).unflatten(-1, (-1, self.width))
+        width = self.steps_per_average
+        if width > 1:
+            missing = -self.inputs.num_steps % width
+            steps = pad(whitened, (0, 0, 0, missing)).unflatten(-2, (-1, width))
+            counts = pad(self.inputs.mask.double(), (0, missing)).unflatten(-1, (-1, width))
             whitened = steps.sum(-2) / counts.sum(-1).clamp_min(1.0).sqrt()[..., None]
         return whitened.flatten(-2)
 

@@ -72,6 +72,10 @@ class Starts:
             errors[name][:, column] *= factor
         return Starts(self.values, self.rates, errors["initial_values"], errors["initial_rates"])
 
+    def segments(self, index: Tensor) -> "Starts":
+        """Returns what some of the segments start from."""
+        return Starts(*(getattr(self, field.name)[index] for field in fields(self)))
+
     def replaced(self, rows: Tensor, new: "Starts", where: Tensor) -> "Starts":
         """Returns the same with others in some rows, where a mask says so.
 

@@ -79,8 +79,8 @@ def sound_alarm(
     generic = generic_laws(found, sensors) + reading_laws(projection)
     waves = wave_laws(found)
     listed = [wave for port in waves.values() for wave in port] + ripple_laws(found, sensors)
-    # Each kind is a search of its own: a hundred laws that no one believes in must not make the
-    # catalogue's harder to hear.
+    # Each kind is tested separately, so that many implausible laws do not hide an effect of the
+    # catalogue.
     values: dict[str, float] = {}
     screening = Screening(projection)
     effects: list[Effect] = []
@@ -104,9 +104,9 @@ def sound_alarm(
     moments = forces_at_moments(projection, found)
     for moment in moments:
         values[moment.name] = min(1.0, len(moments) * moment.p_value / MOMENT_SHARE)
-    # Segments stand out by chance, and what they stand out by is no gain before it is heard.
-    heard = [moment for moment in moments if values[moment.name] <= options.false_alarm_rate]
-    gains |= {moment.name: moment.gain for moment in heard}
+    # Some segments stand out by chance: their gain counts only where that is unlikely.
+    unlikely = [moment for moment in moments if values[moment.name] <= options.false_alarm_rate]
+    gains |= {moment.name: moment.gain for moment in unlikely}
     if not values:
         return Alarm(1.0, False, "", 0.0, {}), ranking
     p_value = min(values.values())
@@ -115,7 +115,7 @@ def sound_alarm(
         p_value,
         # Every effect that was added is one more look.
         p_value <= options.false_alarm_rate / (1 + num_looks),
-        max(loudest, key=lambda name: gains.get(name, 0.0)),
+        min(loudest, key=lambda name: (-gains.get(name, 0.0), name)),
         max(gains.values(), default=0.0),
         values,
     )

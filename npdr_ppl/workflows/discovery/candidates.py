@@ -1,6 +1,7 @@
 """The candidates at a hypothesis: which effects may be added, and what each would change."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 
 from npdr_ppl.language.effects import Effect
@@ -16,9 +17,9 @@ from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_sid
 
 __all__ = ["candidates_at", "variants_of"]
 
-PARTS = 4
-"""Parts of the candidates that each process takes one after another; their changes are held until
-they have been looked at."""
+PARTS_PER_PROCESS = 4
+"""Parts of the candidates that each process takes one after another: the changes of a part are in
+memory together."""
 
 
 def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Effect, ...]:
@@ -56,8 +57,10 @@ def variants_of(
         yield from sensitivities(hypothesis, candidates, hints)
         return
     # Every part holds effects of every kind.
-    parts = [candidates[k :: PARTS * number] for k in range(PARTS * number)]
-    for part in side_by_side(partial(_listed, hypothesis, hints=hints), parts, number):
+    num_parts = min(len(candidates), PARTS_PER_PROCESS * number)
+    parts = [candidates[k::num_parts] for k in range(num_parts)]
+    bare = replace(hypothesis)  # without what it has computed, which need not travel
+    for part in side_by_side(partial(_listed, bare, hints=hints), parts, number):
         yield from part
 
 

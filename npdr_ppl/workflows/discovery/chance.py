@@ -99,7 +99,9 @@ class LargestStatistic:
             tails = self._tails(torch.stack(alike, dim=-2))
             largest = largest.maximum(tails.amax(0))
             observed |= dict(zip(places, tails[:, 0].tolist(), strict=True))
-        own = torch.tensor([observed[place] for place in range(len(observed))]).double()
+        own = torch.tensor(
+            [observed[place] for place in range(len(observed))], dtype=torch.float64
+        )
         return (largest >= own[:, None] - 1e-12).double().mean(1).tolist()
 
     def _tails(self, columns: Tensor) -> Tensor:
@@ -156,7 +158,7 @@ def _in_batches(groups: Iterable[Tensor]) -> Iterator[tuple[list[int], list[Tens
         places, alike = waiting.setdefault(size, ([], []))
         places.append(place)
         alike.append(group)
-        if len(alike) * group.numel() >= MOST_NUMBERS:
+        if (len(alike) + 1) * group.numel() > MOST_NUMBERS:
             yield waiting.pop(size)
     yield from waiting.values()
 

@@ -57,8 +57,8 @@ class GenericLaw:
 
     Attributes:
         name: What it is, e.g. ``"arm: arm_velocity²"``.
-        make: Returns what it would change. Hundreds of laws of a long recording do not fit into
-            memory together.
+        make: Returns the change. It is computed on demand, because the changes of hundreds of
+            laws of a long recording do not fit into memory together.
     """
 
     name: str
@@ -170,7 +170,7 @@ def reading_laws(projection: Projection) -> list[GenericLaw]:
 
 def _error_of(hypothesis: Hypothesis, channel: int, error: Tensor) -> Tensor:
     """Returns an error of one channel, ``(S, K)``, in the whitened readings, ``(S, N, 1)``."""
-    errors = torch.zeros_like(hypothesis.segments.observed)
+    errors = torch.zeros_like(hypothesis.segments.observed, dtype=torch.float64)
     errors[..., channel] = error
     return hypothesis.segments.whitened(errors, hypothesis.fit.scale)[..., None]
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +26,14 @@ __all__ = ["Hypothesis", "fit_hypothesis", "with_effects"]
 LEAST_PENALISED = -1.0
 """Coordinate below which the prior no longer speaks against a hypothesis: that an effect is small
 is no reason to doubt it, and half-normal priors have zero strength at minus infinity."""
+
+MOST_READINGS = 100_000
+"""Number of readings above which neighbouring ones are averaged before candidates are tested: ten
+thousand candidate columns of as many readings take a minute. The benchmarks' recordings have
+fewer."""
+
+FEWEST_AVERAGES = 40
+"""Fewest averages per segment: four for each of its ten pulses of force."""
 
 EDGE = 3.0
 """Coordinate beyond which a prior hardly goes: three standard deviations of a normal one."""
@@ -69,6 +77,14 @@ class Hypothesis:
     def _linearised(self) -> Linearisation:
         return self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
 
+    def averaged(self) -> "Hypothesis":
+        """Returns the same with averages of neighbouring readings, where there are very many.
+
+        For a :class:`Projection` only: a likelihood counts all readings.
+        """
+        segments = self.segments.averaged(MOST_READINGS, FEWEST_AVERAGES)
+        return self if segments is self.segments else replace(self, segments=segments)
+
     @property
     def can_be_linearised(self) -> bool:
         """Whether the simulation succeeds at the fit and everywhere beside it."""
@@ -101,6 +117,7 @@ class Hypothesis:
     @cached_property
     def share(self) -> float:
         """Share of the readings that are worth an independent one."""
+        assert self.segments.steps_per_average == 1
         residual = self.segments.whitened(self.difference, self.fit.scale)
         mask = self.segments.inputs.mask
         return float(

@@ -87,8 +87,9 @@ def find_rivals(
     if without is None:
         return None
     candidates = tuple(e for e in candidates_at(without, options) if e.name != effect.name)
-    projection = Projection(without)
-    ranking = screen(projection, variants_of(candidates, projection, responses(without)))
+    averaged = without.averaged()
+    projection = Projection(averaged)
+    ranking = screen(projection, variants_of(candidates, projection, responses(averaged)))
     tried = {effect.name: current} | trials.extended(without, ranking)
     tried = trials.converged(tried, done=effect.name)
     others = {name: h for name, h in tried.items() if name != effect.name}

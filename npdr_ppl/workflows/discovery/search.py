@@ -31,23 +31,16 @@ from npdr_ppl.workflows.discovery.screening import Screened
 from npdr_ppl.workflows.discovery.separation import separation_matrix
 from npdr_ppl.workflows.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.workflows.discovery.trials import PLAINLY, Trials
-from npdr_ppl.workflows.memory import give_back
+from npdr_ppl.workflows.memory import release_freed_memory
 
 __all__ = ["Round", "Search", "Searcher", "explained"]
 
 LEAST_SHARE = 1e-4
-"""Share of what was explained below which what is left is not looked into and no effect is added:
-where a large effect was missing, integrators and the laws' own details differ by as much."""
+"""Stop when the unexplained misfit is below this fraction of the explained misfit: where a large
+effect was missing, integrators and the laws' own details differ by as much."""
 
 LEADING = 10
 """Candidates whose distances from each other are computed."""
-
-MOST_READINGS = 100_000
-"""Readings of which candidates and laws are looked at one by one: ten thousand columns of as many
-take a minute. Of more, neighbours are averaged; the recordings of the benchmarks have fewer."""
-
-FEWEST_AVERAGES = 40
-"""Averages that a segment keeps: four for each pulse of force."""
 
 PRIOR_OF_ANY = 0.5
 """Prior probability that anything of the catalogue is missing."""
@@ -59,7 +52,7 @@ class Round:
 
     Attributes:
         hypothesis: The model as it was, fitted.
-        seen: The same with averages of a very long recording's readings, as it was looked at.
+        averaged: The same, with averages of a very long recording's readings.
         alarm: Whether something was missing then.
         ranking: The candidates by linear gain.
         separation: How far the leading ones are apart; see :mod:`separation`.
@@ -69,7 +62,7 @@ class Round:
     """
 
     hypothesis: Hypothesis
-    seen: Hypothesis
+    averaged: Hypothesis
     alarm: Alarm
     ranking: list[Screened]
     separation: Tensor
@@ -217,11 +210,10 @@ class Searcher:
         """Screens all candidates at a fitted hypothesis; the last one asked for is kept."""
         if self._last is not None and self._last.hypothesis is hypothesis:
             return self._last
-        give_back()
-        segments = hypothesis.segments.averaged(MOST_READINGS, FEWEST_AVERAGES)
-        seen = replace(hypothesis, segments=segments)
-        projection = Projection(seen)
-        found = responses(seen)
+        release_freed_memory()
+        averaged = hypothesis.averaged()
+        projection = Projection(averaged)
+        found = responses(averaged)
         candidates = candidates_at(hypothesis, self.options)
         variants = variants_of(candidates, projection, found)
         sensors = hypothesis.simulator.sensors
@@ -229,9 +221,16 @@ class Searcher:
         alarm, ranking = sound_alarm(projection, variants, found, sensors, self.options, looks)
         separation = separation_matrix(projection, ranking[:LEADING])
         ranking = [candidate.without_change() for candidate in ranking]
+        width = averaged.segments.steps_per_average
+        if width > 1:
+            fastest = 0.5 / (width * hypothesis.segments.inputs.time_step)
+            self._report(
+                f"a long recording: means of {width} steps were searched, in which nothing above "
+                f"{fastest:.3g} Hz shows"
+            )
         best = ", ".join(s.name for s in ranking[:3]) or "none"
         self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
-        self._last = Round(hypothesis, seen, alarm, ranking, separation, found)
+        self._last = Round(hypothesis, averaged, alarm, ranking, separation, found)
         return self._last
 
     def _extended(

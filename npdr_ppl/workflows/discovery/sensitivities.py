@@ -36,6 +36,10 @@ RESONANT_SIZES = tuple(0.05 * NEXT**k for k in range(40))
 BITES = 0.7
 """Where in the commands' range a limit is tried first."""
 
+ROUNDING = 100.0
+"""Rounding errors of the largest reading below which a change is none: what an effect leaves that
+changes nothing, such as an encoder's bias where no force depends on its position."""
+
 SMALL = 0.05
 """Size of one that is smooth: small enough for the linear term to rule."""
 
@@ -111,6 +115,8 @@ def sensitivities(
         probes.append(
             _probe(effect, segments.inputs, box.simulator, (hints or {}).get(effect.name))
         )
+    largest = float(segments.whitened(base, fit.scale).abs().max())
+    rounding = ROUNDING * torch.finfo(base.dtype).eps * largest
     for group in _groups(probes, box.simulator, segments.inputs.num_segments):
         changed = box.simulator.with_effects(*(probe.effect for probe in group))
         starts = fit.offsets[None].expand(sum(len(probe.runs) for probe in group), -1, -1)
@@ -119,7 +125,7 @@ def sensitivities(
         for probe, rows in zip(
             group, differences.split([len(probe.runs) for probe in group]), strict=True
         ):
-            yield from _variants(probe, rows)
+            yield from _variants(probe, rows, rounding)
 
 
 @dataclass(frozen=True)
@@ -210,15 +216,18 @@ def _side_by_side(group: list[_Probe]) -> dict[str, Tensor]:
     return result
 
 
-def _variants(probe: _Probe, rows: Tensor) -> list[Variant]:
-    """Returns what an effect changes, of what its runs changed in the whitened readings."""
+def _variants(probe: _Probe, rows: Tensor, rounding: float) -> list[Variant]:
+    """Returns what an effect changes, of what its runs changed in the whitened readings.
+
+    Changes up to a rounding error are none.
+    """
     strengths, nominal = probe.strengths, probe.nominal
     result = []
     parts = rows.split(len(strengths))
     for (values, is_hinted, size), part in zip(probe.cases, parts, strict=True):
-        difference = part / size
-        if not bool(difference.isfinite().all()) or float(difference.abs().max()) == 0.0:
+        if not bool(part.isfinite().all()) or float(part.abs().max()) <= rounding:
             continue
+        difference = part / size
         full = torch.tensor([values[n] for n in strengths], dtype=torch.float64)
         lower, upper, deviation = _limits(probe.priors, strengths, nominal, full)
         if probe.effect.is_resonant:

@@ -23,6 +23,7 @@ from npdr_ppl.models.effects import (
     Bias,
     Cogging,
     CoulombFriction,
+    EncoderBias,
     InputDelay,
     QuadraticDrag,
     SupplySag,
@@ -83,6 +84,24 @@ def test_sensitivities_are_derivatives(quiet):
     expected = ((moved - base).double() / fit.scale).flatten(-2) / 0.01
     difference = (variant.change[..., 0] - expected).norm() / expected.norm()
     assert difference < 0.02
+
+
+def test_an_effect_that_changes_nothing_but_the_last_digits_is_no_candidate():
+    case = make_case("emps", "null", seed=2001)
+    fitted = fit_hypothesis(case.model, case.fit, npdr.DiscoveryOptions().binding(case.fit))
+    # No force of this drive depends on where it is.
+    assert not list(sensitivities(fitted, (EncoderBias("position"),)))
+    assert list(sensitivities(fitted, (CoulombFriction("carriage"),)))
+
+
+def test_no_p_value_is_smaller_than_one_in_all_draws(dragged):
+    _, hypothesis = dragged
+    generator = torch.Generator().manual_seed(0)
+    shape = (*hypothesis.linearisation.residual.shape, 1)
+    found = LargestStatistic(Projection(hypothesis), seed=0, draws=100)
+    for _ in range(20):
+        (value,) = found.p_values([torch.randn(shape, generator=generator).double()])
+        assert value >= 1 / 100
 
 
 def test_chance_gives_uniform_p_values(quiet):
@@ -305,7 +324,7 @@ def test_averages_of_neighbours_keep_noise_white_and_slow_changes_apart(quiet):
     segments = quiet.segments
     steps = segments.inputs.num_steps
     averaged = segments.averaged(segments.observed.numel() // 3, steps // 3)
-    assert averaged.width == 3
+    assert averaged.steps_per_average == 3
     scale = torch.ones(segments.observed.shape[-1], dtype=torch.float64)
     torch.manual_seed(0)
     noise = torch.randn(segments.observed.shape, dtype=torch.float64)
