@@ -30,7 +30,7 @@ ITERATIONS_BEFORE_STEPS = 3
 """Iterations where Gauss-Newton steps go on from there."""
 
 MOST_SEGMENTS_SEARCHED = 24
-"""Most segments that the search simulates. On the benchmark's tuning recordings the fits end at the
+"""Most segments that the search simulates. On the benchmark's tuning recordings fits end at the
 same parameters as with all segments."""
 
 NEGLIGIBLE = 1e-9
