@@ -198,7 +198,7 @@ def loo(data: Data, *, var_name: str | None = None) -> Loo:
         var_name: Variable of that group; needed if it has several.
     """
     with _quiet_loo():
-        found = _az.loo(data, pointwise=True, var_name=var_name)
+        found = _az.loo(_judged_draws(data), pointwise=True, var_name=var_name)
     names = ("elpd", "p", "elpd_i") if HAS_DATATREE else ("elpd_loo", "p_loo", "loo_i")
     elpd, p, elpd_i = (getattr(found, name) for name in names)
     elpd_i = np.asarray(elpd_i)
@@ -219,14 +219,15 @@ def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.Da
         and warning: whether a Pareto k is too large to trust the row.
     """
     names: dict[str, Any] = {"var_name": var_name, "method": "stacking"}
+    judged = {name: _judged_draws(data) for name, data in models.items()}
     with _quiet_loo():
         # ArviZ 0.23 calls pandas in ways that pandas 3 deprecates.
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="arviz")
         if HAS_DATATREE:
-            table = _az.compare(dict(models), round_to="none", **names)
+            table = _az.compare(judged, round_to="none", **names)
             table["warning"] = table["diag_elpd"].fillna("").ne("")
         else:
-            table = _az.compare(dict(models), ic="loo", scale="log", **names)
+            table = _az.compare(judged, ic="loo", scale="log", **names)
             table = table.rename(columns={"elpd_loo": "elpd", "p_loo": "p"})
             table["elpd_diff"] = 0.0 - table["elpd_diff"]
     n = loo(next(iter(models.values())), var_name=var_name).elpd_i.size
@@ -237,6 +238,20 @@ def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.Da
             table[column] *= np.sqrt(n / (n - 1))
     columns = ("rank", "elpd", "p", "elpd_diff", "weight", "se", "dse", "warning")
     return pd.DataFrame({column: table[column] for column in columns})
+
+
+def _judged_draws(data: Data) -> Data:
+    """Returns the draws that have log likelihoods, which may be the first ones only.
+
+    ArviZ divides the effective sample size of the whole posterior by the number of log
+    likelihoods. With more draws than those it would fit the tails of the weights to a few of them.
+    """
+    likelihood, posterior = group(data, "log_likelihood"), group(data, "posterior")
+    kept = {
+        "posterior": posterior.isel(draw=slice(0, likelihood.sizes["draw"])),
+        "log_likelihood": likelihood,
+    }
+    return xr.DataTree.from_dict(kept) if HAS_DATATREE else _az.InferenceData(**kept)
 
 
 def to_netcdf(data: Data, path: str | PathLike[str]) -> None:

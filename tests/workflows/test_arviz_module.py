@@ -122,6 +122,18 @@ def test_summary_is_unrounded():
     assert table.loc["mu", ["hdi_lb", "hdi_ub"]].to_numpy() == pytest.approx(bounds)
 
 
+def test_draws_without_log_likelihoods_have_no_say_in_cross_validation():
+    data = normal_mean()
+    few = {name: group(data, name) for name in ("posterior", "log_likelihood")}
+    likelihood = few["log_likelihood"].isel(draw=slice(0, 50))["x"].values
+    mu = few["posterior"]["mu"].values
+    some = from_dict({"posterior": {"mu": mu[:, :50]}, "log_likelihood": {"x": likelihood}})
+    every = from_dict({"posterior": {"mu": mu}, "log_likelihood": {"x": likelihood}})
+    assert loo(every).pareto_k == pytest.approx(loo(some).pareto_k)
+    table, other = compare({"a": every, "b": every}), compare({"a": some, "b": some})
+    assert table["elpd"].to_numpy() == pytest.approx(other["elpd"].to_numpy())
+
+
 def test_cross_validation_has_its_closed_form():
     found = loo(normal_mean())
     exact = exact_elpd()
