@@ -344,7 +344,7 @@ class _Reading:
             return None
         return (
             Decision.NEW_ROLLOUT,
-            f"The posterior hangs on few segments ({share:.0%} of them have a Pareto k above "
+            f"The posterior depends on few segments ({share:.0%} of them have a Pareto k above "
             f"{self.limits.pareto_k}): record another rollout.",
         )
 
