@@ -103,6 +103,13 @@ def test_a_posterior_that_is_right_is_kept_and_one_that_is_off_is_corrected(like
     torch.manual_seed(0)
     draws = torch.cat([density.sample(1_000).double() for density in correction.densities])
     assert bool(((draws.mean(0) - mean).abs() < 0.3 * sd).all())
+    # A few draws far away are enough to spoil leave-one-out weights.
+    far = GaussianMixture.from_moments(
+        torch.tensor([0.95, 0.05]).double(),
+        mean.expand(2, -1),
+        torch.stack((covariance, 100.0 * covariance)),
+    )
+    assert check_estimator([far], likelihood, seed=0, corrects=True)[1] is not None
     # Left as it is where correcting is not wanted, and told.
     check, correction = check_estimator([off], likelihood, seed=0, corrects=False)
     assert correction is None
