@@ -20,8 +20,8 @@ import pyro.distributions as dist
 import torch
 
 import npdr_ppl as npdr
-from npdr_ppl.workflows.arviz_module import to_netcdf
-from npdr_ppl.workflows.diagnostics import Diagnosis
+from npdr_ppl.arviz_module import to_netcdf
+from npdr_ppl.posterior.diagnostics import Diagnosis
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "quick_start.md"
 

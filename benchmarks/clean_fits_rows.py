@@ -12,9 +12,9 @@ import torch
 import xarray as xr
 
 from npdr_ppl.cli.resolve import resolve_model
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.evaluation import score
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.evaluation import score
 
 __all__ = [
     "discovery_figures",
@@ -150,11 +150,11 @@ def error_figures(
     }
 
 
-def preparation(out: Path) -> BindingOptions:
+def preparation(out: Path) -> DataOptions:
     """Returns how a fit prepared its data, as far as it has written that down."""
-    known = {field.name for field in fields(BindingOptions)} - {"embedding"}
+    known = {field.name for field in fields(DataOptions)} - {"embedding"}
     recorded: dict[str, Any] = {}
     run = out / "run" / "run.json"
     if run.exists():
         recorded = json.loads(run.read_text()).get("binding", {})
-    return BindingOptions(**{name: value for name, value in recorded.items() if name in known})
+    return DataOptions(**{name: value for name, value in recorded.items() if name in known})

@@ -29,16 +29,16 @@ from hidden_rigs import RIGS, Case, Place, make_case, places
 from sparse_regression import sparse_choice
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery.data_checks import recording_problems
+from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis
+from npdr_ppl.discovery.proof.held_out_gap import prove
+from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
+from npdr_ppl.discovery.screening.candidate_effects import candidates_at
+from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.search.search import Searcher
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
-from npdr_ppl.workflows.discovery.candidates import candidates_at
-from npdr_ppl.workflows.discovery.credible import posterior_draws
-from npdr_ppl.workflows.discovery.data_checks import recording_problems
-from npdr_ppl.workflows.discovery.hypothesis import Hypothesis, fit_hypothesis
-from npdr_ppl.workflows.discovery.projection import Projection
-from npdr_ppl.workflows.discovery.proof import prove
-from npdr_ppl.workflows.discovery.search import Searcher
-from npdr_ppl.workflows.segment_model import SegmentModel
+from npdr_ppl.preparation.segment_model import SegmentModel
 
 SEEDS = {"tune": range(100), "test": range(1000, 1100)}
 """Seeds of both parts."""

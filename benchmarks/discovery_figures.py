@@ -17,7 +17,7 @@ from discovery_rows import (
 from discovery_table import Rate
 from matplotlib.figure import Figure
 
-from npdr_ppl.displays.theme import COLORS, save_figure, theme
+from npdr_ppl.drawing.theme import COLORS, save_figure, theme
 
 __all__ = [
     "Bin",

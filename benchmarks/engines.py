@@ -26,7 +26,7 @@ import workers
 import npdr_ppl as npdr
 from npdr_ppl.engines.bullet.client import connect
 from npdr_ppl.engines.gymnasium import Attribute
-from npdr_ppl.engines.pooled import Segment
+from npdr_ppl.engines.pooled.pool_simulator import Segment
 from npdr_ppl.models.effects import CoulombFriction
 from npdr_ppl.models.pendulum import Pendulum
 

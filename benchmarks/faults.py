@@ -30,14 +30,14 @@ from npdr_ppl.cli.resolve import resolve_model
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.mini_golf import mini_golf
+from npdr_ppl.reproduction import mini_golf_fit
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows import mini_golf_fit
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "engines"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from bullet_models import PendulumModel, pendulum_urdf  # noqa: E402
-from faulty import FaultRates  # noqa: E402
-from faulty_simulator import FaultMessenger  # noqa: E402
+from tests.helpers.bullet_models import PendulumModel, pendulum_urdf  # noqa: E402
+from tests.helpers.faulty import FaultRates  # noqa: E402
+from tests.helpers.faulty_simulator import FaultMessenger  # noqa: E402
 
 FLOOR = 0.05
 """Share of a posterior standard deviation below which a difference is of no interest."""

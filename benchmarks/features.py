@@ -28,9 +28,9 @@ from clean_fits_subjects import HOLDOUT, recorded  # noqa: E402
 
 import npdr_ppl as npdr  # noqa: E402
 from npdr_ppl.cli.resolve import resolve_model  # noqa: E402
-from npdr_ppl.inference.gaussian_mixture import GaussianMixture  # noqa: E402
-from npdr_ppl.workflows.binding import BindingOptions  # noqa: E402
-from npdr_ppl.workflows.preparation import Preparation, prepare  # noqa: E402
+from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture  # noqa: E402
+from npdr_ppl.posterior.prepare import Preparation, prepare  # noqa: E402
+from npdr_ppl.preparation.data_options import DataOptions
 
 FEATURES = ("score", "all/10", "all~10", "bayessim", "gru/10")
 
@@ -94,7 +94,7 @@ def main() -> None:
                 continue
             recording = recorded(subject, seed)
             assert recording.rollouts is not None
-            options = BindingOptions("score", "auto", "uncertain", "float64")
+            options = DataOptions("score", "auto", "uncertain", "float64")
             prepared = prepare(
                 resolve_model(recording.model), recording.rollouts[:HOLDOUT], options, seed=seed
             )

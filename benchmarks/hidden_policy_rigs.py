@@ -27,11 +27,11 @@ from pathlib import Path
 import torch
 from policy_loop import DISCOVER, SUCCESS, changed
 
+from npdr_ppl.loop.control_task import control_task
+from npdr_ppl.loop.loop_options import LoopOptions
 from npdr_ppl.models.furuta_hidden_rigs import HIDDEN, hidden_rig
 from npdr_ppl.models.furuta_targets import furuta_target
-from npdr_ppl.workflows.control_task import control_task
-from npdr_ppl.workflows.loop_options import LoopOptions
-from npdr_ppl.workflows.rig_study import METHODS, Outcome, run_method
+from npdr_ppl.reproduction.rig_study import METHODS, Outcome, run_method
 
 WITH, WITHOUT = "npdr with discovery", "npdr"
 

@@ -10,14 +10,14 @@ import argparse
 
 import torch
 
+from npdr_ppl.loop.control_task import control_task
+from npdr_ppl.loop.real_rollouts import RealRollouts
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.furuta_targets import furuta_target
+from npdr_ppl.posterior.prepare import prepare
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.reproduction.rig_study import furuta_with_effects
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.control_task import control_task
-from npdr_ppl.workflows.preparation import prepare
-from npdr_ppl.workflows.real_rollouts import RealRollouts
-from npdr_ppl.workflows.rig_study import furuta_with_effects
 
 GAINS = (
     (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
@@ -56,7 +56,7 @@ def main() -> None:
     for rig in arguments.rigs.split(","):
         rollouts = record(rig)
         for start in ("recorded", "estimated", "uncertain"):
-            options = BindingOptions("bayessim", arguments.segment_length, start, "float32")
+            options = DataOptions("bayessim", arguments.segment_length, start, "float32")
             noise = prepare(model, rollouts, options).noise
             assert noise is not None  # the model declares none
             arm, pole = (1e3 * noise[name] for name in ("arm_angle", "pole_angle"))

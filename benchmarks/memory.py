@@ -28,8 +28,8 @@ import torch
 from torch import Tensor
 
 import npdr_ppl as npdr
-from npdr_ppl.engines.integrators import Components
-from npdr_ppl.engines.ode import Forces, ODESimulator
+from npdr_ppl.engines.common.integrators import Components
+from npdr_ppl.engines.ode.simulator import Forces, ODESimulator
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.inputs import Inputs
 

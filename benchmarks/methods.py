@@ -14,7 +14,7 @@ from tasks import Task
 from torch import Tensor
 
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.mixture import Mixture
+from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 from npdr_ppl.inference.registry import backend, backends
 
 __all__ = ["PEERS", "Fit", "Sampler", "default_methods", "find_method"]

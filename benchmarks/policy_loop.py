@@ -20,8 +20,8 @@ from pathlib import Path
 
 import torch
 
-from npdr_ppl.workflows.loop_options import LoopOptions
-from npdr_ppl.workflows.rig_study import METHODS, study, summarise
+from npdr_ppl.loop.loop_options import LoopOptions
+from npdr_ppl.reproduction.rig_study import METHODS, study, summarise
 
 SUCCESS = 1_400.0
 

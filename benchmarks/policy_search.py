@@ -40,13 +40,13 @@ from simulation import (
     torch_loop,
 )
 
+from npdr_ppl.loop.control_task import control_task
+from npdr_ppl.loop.domains import Domains
+from npdr_ppl.loop.loop_options import LoopOptions
+from npdr_ppl.loop.policy_optimisation import optimise_policy
 from npdr_ppl.models.effects import CoulombFriction, SensorLowPass
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.policies.search_registry import policy_search
-from npdr_ppl.workflows.control_task import control_task
-from npdr_ppl.workflows.domains import Domains
-from npdr_ppl.workflows.loop_options import LoopOptions
-from npdr_ppl.workflows.policy_optimisation import optimise_policy
 
 DEFAULT = "constant-acceleration"
 EFFECTS = (

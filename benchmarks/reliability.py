@@ -14,7 +14,7 @@ from methods import standard_normal_problem
 from tasks import DATA, TASKS, load_reference
 
 from npdr_ppl.errors import NpdrError
-from npdr_ppl.inference.mixture import Mixture
+from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 from npdr_ppl.inference.registry import backend
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Port
 from npdr_ppl.language.inputs import Inputs
@@ -22,7 +23,6 @@ from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.models.effects import Bias
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.differentiation import Smoothing, cutoffs, differentiate, thin
-from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 
 __all__ = ["Motion", "ResidualForces", "residual_forces"]
 

@@ -65,7 +65,7 @@ def fit_pendulum(size: int, name: str, options: dict[str, Any]) -> dict[str, Any
     import npdr_ppl as npdr
     from npdr_ppl.inference.registry import backend
     from npdr_ppl.models.pendulum import pendulum
-    from npdr_ppl.workflows.pendulum_ridge import record
+    from npdr_ppl.reproduction.pendulum_ridge import record
 
     posterior = npdr.infer(
         partial(pendulum, noise=NOISE),

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from residual_forces import Array, ResidualForces, residual_forces
 
+from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.models.effects import Cogging
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows.discovery.hypothesis import Hypothesis
 
 __all__ = [
     "SparseChoice",

@@ -36,7 +36,7 @@ import torch
 
 from npdr_ppl.engines.bullet import BulletSettings, BulletSimulator, Command, Sensor
 from npdr_ppl.engines.bullet.client import connect
-from npdr_ppl.engines.pooled import Segment
+from npdr_ppl.engines.pooled.pool_simulator import Segment
 from npdr_ppl.engines.workers import Draw, Pool, Task, WorkerOptions
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.prior import Prior

@@ -16,12 +16,12 @@ import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from npdr_ppl.displays.theme import theme
+from npdr_ppl.drawing.theme import theme
 from npdr_ppl.models.furuta import Furuta, furuta
-from npdr_ppl.workflows.binding import BindingOptions
-from npdr_ppl.workflows.evaluation import replay
-from npdr_ppl.workflows.missing_effect import load_recordings
-from npdr_ppl.workflows.table2 import SEGMENT_LENGTH
+from npdr_ppl.preparation.binding import DataOptions
+from npdr_ppl.preparation.evaluation import replay
+from npdr_ppl.reproduction.missing_effect import load_recordings
+from npdr_ppl.reproduction.table2 import SEGMENT_LENGTH
 
 INK, FAINT, BEFORE, AFTER = "#1f2328", "#8c959f", "#d1610a", "#0a7bc4"
 ON_DARK = {INK: "#e6edf3", FAINT: "#7d8590", BEFORE: "#f08a3c", AFTER: "#58a6ff"}
@@ -53,7 +53,7 @@ def main(data, search, out):
 
 def simulated(model, rollout, values):
     """Returns what a model reports along a rollout, ``(T, C)``, and the names of the channels."""
-    options = BindingOptions(None, SEGMENT_LENGTH, "estimated", "float64")
+    options = DataOptions(None, SEGMENT_LENGTH, "estimated", "float64")
     parameters = {n: torch.tensor([v], dtype=torch.float64) for n, v in values.items()}
     found = replay(model, rollout, parameters, options)
     return found.series()[0][0].double().numpy()

@@ -18,8 +18,8 @@ Parameters of every round come from the prior, and a later round only adds simul
 importance weights are needed, none can degenerate, and the accepted ones get nearer.
 
 Distances are Euclidean in the normal scores of the features, see
-:mod:`npdr_ppl.inference.features`: a scale as robust as the median absolute deviation, and
-bounded.
+:mod:`npdr_ppl.inference.parts.training.preconditioning`: a scale as robust as the median absolute
+deviation, and bounded.
 """
 
 import math
@@ -33,8 +33,12 @@ from torch import Tensor
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
-from npdr_ppl.inference.checks import check_problem, check_restored, finite_rows
-from npdr_ppl.inference.features import Preconditioner, fit_preconditioner
+from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
+from npdr_ppl.inference.parts.training.simulation_checks import (
+    check_problem,
+    check_restored,
+    finite_rows,
+)
 
 __all__ = ["ABC", "ABCState", "KernelDensity"]
 

@@ -2,10 +2,10 @@
 
 The equations of motion of a mechanism are linear in base parameters β, which regression on
 recorded motion and commands finds at once; Muratore et al. (2021) compare with it in Table 2. The
-conjugate posterior over β (:mod:`npdr_ppl.inference.conjugate`) knows nothing of what is
-plausible: among its draws are negative dampings, masses off the prior's support and worse. They
-are counted and left out, so that the posterior over the parameters is, with the free coordinates
-z_f that β does not tell (a motor's constants, say),
+conjugate posterior over β (:mod:`npdr_ppl.inference.parts.samplers.conjugate`) knows nothing of
+what is plausible: among its draws are negative dampings, masses off the prior's support and worse.
+They are counted and left out, so that the posterior over the parameters is, with the free
+coordinates z_f that β does not tell (a motor's constants, say),
 
     q(z) ∝ p(z_f) · t(β(z)) |∂β/∂z_β|   on the plausible set,
 
@@ -27,9 +27,9 @@ from torch import Tensor
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
-from npdr_ppl.inference.checks import check_problem, finite_rows
-from npdr_ppl.inference.conjugate import StudentT, linear_posterior
-from npdr_ppl.inference.regression import LinearRegression
+from npdr_ppl.inference.parts.samplers.conjugate import StudentT, linear_posterior
+from npdr_ppl.inference.parts.samplers.linear_problem import LinearRegression
+from npdr_ppl.inference.parts.training.simulation_checks import check_problem, finite_rows
 from npdr_ppl.rollouts.differentiation import Smoothing
 
 __all__ = ["BayesianLinearRegression", "LinearRegressionState", "RegressionDensity"]
@@ -107,7 +107,7 @@ class BayesianLinearRegression(Backend):
         if problem.regression is None:
             raise BackendError(
                 f"{self.name} needs a model with one simulator that declares inverse_dynamics "
-                "(npdr_ppl.language.inverse_dynamics); this one has none."
+                "(npdr_ppl.language.linear_dynamics); this one has none."
             )
         return LinearRegressionState(round=0, posterior=None, plausible=math.nan)
 

@@ -21,13 +21,13 @@ and for small sigma the paper's loss with t uniform is, term by term, the loss
 
     E || v(y_phi, phi, f) - cos(phi) u_1 + sin(phi) u_0 ||^2
 
-with phi uniform: the factor r^2 between the two errors cancels dphi/dt. What is gained is that
-the target has one scale at all times, and that a zero velocity is right wherever u_1 given f is
-N(0, I) - which the preconditioner, see :mod:`npdr_ppl.inference.features`, makes it for
-linear-Gaussian problems. A network that starts at zero starts at that posterior, and the solver's
-steps are spent on what is not Gaussian.
+with phi uniform: the factor r^2 between the two errors cancels dphi/dt. What is gained is that the
+target has one scale at all times, and that a zero velocity is right wherever u_1 given f is N(0,
+I) - which the preconditioner, see :mod:`npdr_ppl.inference.parts.training.preconditioning`, makes
+it for linear-Gaussian problems. A network that starts at zero starts at that posterior, and the
+solver's steps are spent on what is not Gaussian.
 
-Sequential rounds use truncated proposals, see :mod:`npdr_ppl.inference.truncated`.
+Sequential rounds use truncated proposals, see :mod:`npdr_ppl.inference.parts.training.truncated`.
 """
 
 from dataclasses import dataclass
@@ -38,13 +38,13 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem, State
-from npdr_ppl.inference.embedding_network import build_embedding
-from npdr_ppl.inference.features import Preconditioner
-from npdr_ppl.inference.flows import load_member
-from npdr_ppl.inference.neural import Simulations
-from npdr_ppl.inference.training import LogProb, Loss
-from npdr_ppl.inference.truncated import TruncatedBackend
-from npdr_ppl.inference.velocity import VelocityDensity, VelocityNetwork, end_angle
+from npdr_ppl.inference.parts.flows.flows import load_member
+from npdr_ppl.inference.parts.flows.velocity import VelocityDensity, VelocityNetwork, end_angle
+from npdr_ppl.inference.parts.training.embedding_network import build_embedding
+from npdr_ppl.inference.parts.training.neural import Simulations
+from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
+from npdr_ppl.inference.parts.training.training import LogProb, Loss
+from npdr_ppl.inference.parts.training.truncated import TruncatedBackend
 from npdr_ppl.randomness import seeded
 
 __all__ = ["FMPE", "flow_matching_loss"]
@@ -65,7 +65,8 @@ class FMPE(TruncatedBackend):
             of the preconditioned parameters.
         steps: Steps of the solver.
 
-    The other options are those of :class:`~npdr_ppl.inference.truncated.TruncatedBackend`.
+    The other options are those of
+    :class:`~npdr_ppl.inference.parts.training.truncated.TruncatedBackend`.
     """
 
     name: ClassVar[str] = "fmpe"

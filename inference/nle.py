@@ -24,15 +24,24 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Problem, State
-from npdr_ppl.inference.features import Preconditioner
-from npdr_ppl.inference.flows import FLOWS, Flow, FlowNetwork, build_networks, load_member
-from npdr_ppl.inference.likelihood import LearnedLogLikelihood, LikelihoodBackend
-from npdr_ppl.inference.likelihood_features import (
+from npdr_ppl.inference.parts.flows.flows import (
+    FLOWS,
+    Flow,
+    FlowNetwork,
+    build_networks,
+    load_member,
+)
+from npdr_ppl.inference.parts.training.likelihood_backend import (
+    LearnedLogLikelihood,
+    LikelihoodBackend,
+)
+from npdr_ppl.inference.parts.training.likelihood_preconditioning import (
     LikelihoodPreconditioner,
     fit_likelihood_preconditioner,
 )
-from npdr_ppl.inference.neural import NeuralState, Simulations
-from npdr_ppl.inference.training import Loss
+from npdr_ppl.inference.parts.training.neural import NeuralState, Simulations
+from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
+from npdr_ppl.inference.parts.training.training import Loss
 
 __all__ = ["NLE"]
 
@@ -44,7 +53,7 @@ class NLE(LikelihoodBackend):
     """Neural likelihood estimation; see the module's text for the method.
 
     Args:
-        flow: Kind of flow, see :class:`~npdr_ppl.inference.flows.FlowNetwork`.
+        flow: Kind of flow, see :class:`~npdr_ppl.inference.parts.flows.flows.FlowNetwork`.
         transforms: Transforms of a flow.
         hidden: Widths of the hidden layers of each transform's conditioner.
         bins: Bins of a spline.
@@ -54,7 +63,8 @@ class NLE(LikelihoodBackend):
             and what it does there is learnt badly; choose the second where a posterior, a
             hierarchical one above all, reaches the ends of uniform ranges.
 
-    The other options are those of :class:`~npdr_ppl.inference.neural.NeuralBackend`.
+    The other options are those of
+    :class:`~npdr_ppl.inference.parts.training.neural.NeuralBackend`.
     """
 
     name: ClassVar[str] = "nle"

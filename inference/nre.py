@@ -33,10 +33,13 @@ import torch
 from torch import Tensor, nn
 
 from npdr_ppl.inference.base import Problem, State
-from npdr_ppl.inference.features import Preconditioner, fit_preconditioner
-from npdr_ppl.inference.likelihood import LearnedLogLikelihood, LikelihoodBackend
-from npdr_ppl.inference.neural import NeuralState, Simulations
-from npdr_ppl.inference.training import LogProb, Loss
+from npdr_ppl.inference.parts.training.likelihood_backend import (
+    LearnedLogLikelihood,
+    LikelihoodBackend,
+)
+from npdr_ppl.inference.parts.training.neural import NeuralState, Simulations
+from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
+from npdr_ppl.inference.parts.training.training import LogProb, Loss
 from npdr_ppl.randomness import seeded
 
 __all__ = ["NRE", "RatioNetwork", "RatioPreconditioner", "contrastive_loss"]
@@ -134,7 +137,8 @@ class NRE(LikelihoodBackend):
         num_atoms: Parameters K that a simulation is shown.
         gamma: Odds of the right one being among them.
 
-    The other options are those of :class:`~npdr_ppl.inference.neural.NeuralBackend`.
+    The other options are those of
+    :class:`~npdr_ppl.inference.parts.training.neural.NeuralBackend`.
     """
 
     name: ClassVar[str] = "nre"

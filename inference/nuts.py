@@ -19,8 +19,12 @@ from torch import Tensor
 
 from npdr_ppl.errors import BackendError, ShapeError
 from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
-from npdr_ppl.inference.checks import check_problem, finite_rows
-from npdr_ppl.inference.tempering import LogDensity, UnnormalisedDensity, tempered_particles
+from npdr_ppl.inference.parts.samplers.tempering import (
+    LogDensity,
+    UnnormalisedDensity,
+    tempered_particles,
+)
+from npdr_ppl.inference.parts.training.simulation_checks import check_problem, finite_rows
 
 __all__ = ["NUTS", "NUTSState"]
 

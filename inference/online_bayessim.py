@@ -8,7 +8,8 @@ network is trained further on them. Here a round
 1. draws from the present posterior, the prior at first,
 2. goes on from the networks of the round before, for few epochs, with the
    first round's preconditioner, without which their weights would lose their meaning,
-3. corrects for the proposals as :mod:`npdr_ppl.inference.mixture_backend` describes; by keeping
+3. corrects for the proposals as :mod:`npdr_ppl.inference.parts.mixtures.mixture_backend`
+describes; by keeping
    the earlier simulations, each with its own proposal, we depart from the paper.
 
 The controller is not this file's business; ``continues`` tells a loop that has one to go on from
@@ -21,9 +22,9 @@ from typing import ClassVar
 
 from npdr_ppl.inference.base import Problem
 from npdr_ppl.inference.bayessim import BayesSim
-from npdr_ppl.inference.features import Preconditioner, fit_preconditioner
-from npdr_ppl.inference.mixture_density import MixtureDensityNetwork
-from npdr_ppl.inference.neural import NeuralState, Simulations
+from npdr_ppl.inference.parts.mixtures.mixture_density import MixtureDensityNetwork
+from npdr_ppl.inference.parts.training.neural import NeuralState, Simulations
+from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
 
 __all__ = ["OnlineBayesSim"]
 

@@ -14,9 +14,9 @@ conditional density estimation*, https://arxiv.org/abs/1605.06376. Each round r
 The prior is N(0, I), so that the quotient of Gaussians is known for every model. The division
 takes place inside the likelihood rather than after training, which makes it exact and proper
 whatever the network, and lets all rounds' simulations count: see
-:mod:`npdr_ppl.inference.mixture_backend`, also for how this differs from the paper. It is the
-form in which Greenberg et al. (2019, https://arxiv.org/abs/1905.07488) train mixtures without
-atoms.
+:mod:`npdr_ppl.inference.parts.mixtures.mixture_backend`, also for how this differs from the paper.
+It is the form in which Greenberg et al. (2019, https://arxiv.org/abs/1905.07488) train mixtures
+without atoms.
 """
 
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ from typing import ClassVar
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.mixture_backend import MixtureBackend
-from npdr_ppl.inference.neural import NeuralState
+from npdr_ppl.inference.parts.mixtures.mixture_backend import MixtureBackend
+from npdr_ppl.inference.parts.training.neural import NeuralState
 
 __all__ = ["SNPEA"]
 
@@ -34,7 +34,8 @@ __all__ = ["SNPEA"]
 class SNPEA(MixtureBackend):
     """Sequential neural posterior estimation, SNPE-A; see the module's text for the method.
 
-    The options are those of :class:`~npdr_ppl.inference.mixture_backend.MixtureBackend`.
+    The options are those of
+    :class:`~npdr_ppl.inference.parts.mixtures.mixture_backend.MixtureBackend`.
     """
 
     name: ClassVar[str] = "snpe-a"

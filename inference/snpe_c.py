@@ -14,7 +14,7 @@ Two kinds of proposals do that:
 * ``"truncated"`` (Deistler et al. 2022, https://arxiv.org/abs/2210.04815): the prior restricted to
   the region that holds all but a fraction epsilon of the present posterior's mass, where plain
   maximum likelihood, max sum_n log q(z_n | x_n), needs no correction; see
-  :mod:`npdr_ppl.inference.truncated`.
+  :mod:`npdr_ppl.inference.parts.training.truncated`.
 * ``"atomic"`` (Greenberg et al. 2019, Eqs. 4 and 6): the present posterior itself. A row's
   parameters z_n must be told from M - 1 others of the batch,
 
@@ -23,9 +23,10 @@ Two kinds of proposals do that:
   with the prior p; rows from the prior also enter by plain maximum likelihood (the combined loss
   of their Appendix A.3), which ties down q where the proposals never go.
 
-The flows are trained on preconditioned data, see :mod:`npdr_ppl.inference.features`, all members
-in one pass, see :mod:`npdr_ppl.inference.stacked_flow`. All hold out the same simulations, to
-which their common base is fitted afterwards, see :mod:`npdr_ppl.inference.flow_base`.
+The flows are trained on preconditioned data, see
+:mod:`npdr_ppl.inference.parts.training.preconditioning`, all members in one pass, see
+:mod:`npdr_ppl.inference.parts.flows.stacked_flow`. All hold out the same simulations, to which
+their common base is fitted afterwards, see :mod:`npdr_ppl.inference.parts.flows.flow_base`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -37,9 +38,8 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem, State
-from npdr_ppl.inference.features import Preconditioner, whiten_unseen
-from npdr_ppl.inference.flow_base import FlowBase, fit_base
-from npdr_ppl.inference.flows import (
+from npdr_ppl.inference.parts.flows.flow_base import FlowBase, fit_base
+from npdr_ppl.inference.parts.flows.flows import (
     FLOWS,
     Flow,
     FlowDensity,
@@ -47,11 +47,12 @@ from npdr_ppl.inference.flows import (
     build_networks,
     load_member,
 )
-from npdr_ppl.inference.mixture import Mixture
-from npdr_ppl.inference.neural import NeuralBackend, NeuralState, Simulations
-from npdr_ppl.inference.stacked_flow import stacked_log_prob
-from npdr_ppl.inference.training import Evaluator, LogProb, Loss
-from npdr_ppl.inference.truncated import TruncatedBackend
+from npdr_ppl.inference.parts.flows.stacked_flow import stacked_log_prob
+from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
+from npdr_ppl.inference.parts.training.neural import NeuralBackend, NeuralState, Simulations
+from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, whiten_unseen
+from npdr_ppl.inference.parts.training.training import Evaluator, LogProb, Loss
+from npdr_ppl.inference.parts.training.truncated import TruncatedBackend
 
 __all__ = ["SNPEC", "atomic_loss"]
 
@@ -69,16 +70,17 @@ class SNPEC(TruncatedBackend):
     """Sequential neural posterior estimation, SNPE-C; see the module's text for the method.
 
     Args:
-        flow: Kind of flow, see :class:`~npdr_ppl.inference.flows.FlowNetwork`.
+        flow: Kind of flow, see :class:`~npdr_ppl.inference.parts.flows.flows.FlowNetwork`.
         transforms: Transforms of a flow.
         hidden: Widths of the hidden layers of each transform's conditioner.
         bins: Bins of a spline.
         proposals: ``"truncated"`` or ``"atomic"``.
         num_atoms: Atoms M of the atomic loss.
         calibrates: Whether the flows' base is fitted to the held-out simulations, see
-            :mod:`npdr_ppl.inference.flow_base`.
+            :mod:`npdr_ppl.inference.parts.flows.flow_base`.
 
-    The other options are those of :class:`~npdr_ppl.inference.truncated.TruncatedBackend`.
+    The other options are those of
+    :class:`~npdr_ppl.inference.parts.training.truncated.TruncatedBackend`.
     """
 
     name: ClassVar[str] = "snpe-c"

@@ -9,11 +9,11 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.integrators import Components
-from npdr_ppl.engines.ode import Forces, ODESimulator
+from npdr_ppl.engines.common.integrators import Components
+from npdr_ppl.engines.ode.simulator import Forces, ODESimulator
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.language.inverse_dynamics import BaseParameter, InverseDynamics, Motion
+from npdr_ppl.language.linear_dynamics import BaseParameter, InverseDynamics, Motion
 from npdr_ppl.language.noise import Noise
 from npdr_ppl.language.sites import simulate
 from npdr_ppl.models.gravity import downward

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from npdr_ppl.language.inverse_dynamics import BaseParameter, InverseDynamics, Motion
+from npdr_ppl.language.linear_dynamics import BaseParameter, InverseDynamics, Motion
 
 __all__ = ["FurutaInverseDynamics"]
 

@@ -45,6 +45,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from npdr_ppl.discovery import Discovery, DiscoveryOptions, discover
     from npdr_ppl.engines.gymnasium import GymnasiumSimulator
     from npdr_ppl.engines.mujoco import MujocoSimulator
     from npdr_ppl.engines.workers import workers
@@ -61,46 +62,45 @@ if TYPE_CHECKING:
     from npdr_ppl.language.simulator import Simulator
     from npdr_ppl.language.sites import simulate
     from npdr_ppl.language.wider_priors import with_wider_priors
+    from npdr_ppl.loop.loop_options import LoopOptions
+    from npdr_ppl.loop.npdr_loop import Training, train
+    from npdr_ppl.posterior.calibration.calibrate import calibrate
+    from npdr_ppl.posterior.calibration.calibration_result import Calibration
+    from npdr_ppl.posterior.comparison.compare import compare
+    from npdr_ppl.posterior.diagnostics import diagnose
+    from npdr_ppl.posterior.infer import infer
+    from npdr_ppl.posterior.learned_likelihood import with_likelihood
+    from npdr_ppl.posterior.posterior import Posterior
     from npdr_ppl.rollouts import Rollouts
-    from npdr_ppl.workflows.calibration import calibrate
-    from npdr_ppl.workflows.calibration_result import Calibration
-    from npdr_ppl.workflows.compare import compare
-    from npdr_ppl.workflows.diagnostics import diagnose
-    from npdr_ppl.workflows.discovery import Discovery, DiscoveryOptions, discover
-    from npdr_ppl.workflows.infer import infer
-    from npdr_ppl.workflows.learned_likelihood import with_likelihood
-    from npdr_ppl.workflows.loop_options import LoopOptions
-    from npdr_ppl.workflows.npdr_loop import Training, train
-    from npdr_ppl.workflows.posterior import Posterior
 
 # Loaded when first used, so that importing the package stays quick.
 _HOMES = {
-    "Calibration": "workflows.calibration_result",
+    "Calibration": "posterior.calibration.calibration_result",
     "Channel": "language.channels",
-    "Discovery": "workflows.discovery",
-    "DiscoveryOptions": "workflows.discovery",
+    "Discovery": "discovery",
+    "DiscoveryOptions": "discovery",
     "Effect": "language.effects",
     "GymnasiumSimulator": "engines.gymnasium",
     "Inputs": "language.inputs",
-    "LoopOptions": "workflows.loop_options",
+    "LoopOptions": "loop.loop_options",
     "MujocoSimulator": "engines.mujoco",
     "NpdrError": "errors",
     "Parameter": "language.channels",
     "Port": "language.channels",
-    "Posterior": "workflows.posterior",
+    "Posterior": "posterior.posterior",
     "Rollouts": "rollouts",
     "Simulator": "language.simulator",
-    "Training": "workflows.npdr_loop",
+    "Training": "loop.npdr_loop",
     "add_effect": "language.handlers",
-    "calibrate": "workflows.calibration",
-    "compare": "workflows.compare",
-    "diagnose": "workflows.diagnostics",
-    "discover": "workflows.discovery",
-    "infer": "workflows.infer",
+    "calibrate": "posterior.calibration.calibrate",
+    "compare": "posterior.comparison.compare",
+    "diagnose": "posterior.diagnostics",
+    "discover": "discovery",
+    "infer": "posterior.infer",
     "remove_effect": "language.handlers",
     "simulate": "language.sites",
-    "train": "workflows.npdr_loop",
-    "with_likelihood": "workflows.learned_likelihood",
+    "train": "loop.npdr_loop",
+    "with_likelihood": "posterior.learned_likelihood",
     "with_finer_steps": "language.handlers",
     "with_wider_priors": "language.wider_priors",
     "with_noise": "language.handlers",

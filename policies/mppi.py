@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.episodes import Reward
+from npdr_ppl.engines.common.episodes import Reward
 from npdr_ppl.errors import ModelError, ShapeError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator

@@ -1,11 +1,22 @@
 import gc
+import math
 import os
 
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 from hypothesis import settings
 
-from npdr_ppl.engines import compilation
+import npdr_ppl as npdr
+from npdr_ppl.engines.common import compilation
+from npdr_ppl.inference.registry import backend
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.models.pendulum import pendulum
+from npdr_ppl.rollouts import Rollouts
+
+NOISE = {"angle": 0.05, "velocity": 0.2}
 
 # A worker per core: torch's own threads would only get in each other's way.
 torch.set_num_threads(int(os.environ.get("NPDR_NUM_THREADS", "1")))
@@ -38,3 +49,54 @@ def short_kernels(monkeypatch):
     compilation._compile.cache_clear()
     yield
     compilation._compile.cache_clear()
+
+
+@pytest.fixture
+def quick():
+    """A backend that trains in a second."""
+    return backend("snpe-c", transforms=1, hidden=(32,), epochs=15, members=2)
+
+
+@pytest.fixture
+def linear():
+    """theta ~ N(0, 1), x | theta ~ N(theta, 0.5²) in two dimensions, and an observation."""
+
+    def model():
+        theta = pyro.sample("theta", dist.Normal(0.0, 1.0).expand([2]).to_event(1))
+        npdr.simulate("x", lambda theta: theta, {"theta": theta}, noise=0.5)
+
+    return model, torch.tensor([0.8, -0.4])
+
+
+def _noisy_pendulum(inputs):
+    return pendulum(inputs, noise=NOISE)
+
+
+@pytest.fixture
+def noisy_pendulum():
+    """The zoo's pendulum with noisy sensors."""
+    return _noisy_pendulum
+
+
+@pytest.fixture
+def recording():
+    """Two noisy rollouts of the nominal pendulum under a sinusoidal torque."""
+    torque = 4.5 * torch.sin(2 * math.pi * 0.02 * torch.arange(100, dtype=torch.float64))[:, None]
+    inputs = Inputs.single(
+        torque,
+        torch.zeros(2),
+        action_names=("torque",),
+        state_names=("angle", "velocity"),
+        time_step=0.02,
+    )
+    nominal = {"mass": torch.ones(2), "length": torch.ones(2)}
+    torch.manual_seed(0)
+    trajectories = Prior(_noisy_pendulum, (inputs,)).execute_at(nominal)["trajectory"][:, 0]
+    start = torch.zeros(1, 2, dtype=torch.float64)
+    return Rollouts.from_arrays(
+        readings=[torch.cat([start, t]).numpy() for t in trajectories],
+        actions=[torque.numpy()] * 2,
+        channel_names=("angle", "velocity"),
+        action_names=("torque",),
+        time_step=0.02,
+    )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.engines.pooled import PooledSimulator, Segment
+from npdr_ppl.engines.pooled.pool_simulator import PooledSimulator, Segment
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.inputs import Inputs

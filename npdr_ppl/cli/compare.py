@@ -94,11 +94,11 @@ def compare(
         resolve_rollouts,
     )
     from npdr_ppl.cli.show import show_comparison
-    from npdr_ppl.plots.comparison_figures import write_comparison_figures
-    from npdr_ppl.workflows.binding import BindingOptions
-    from npdr_ppl.workflows.candidates import candidates, split_candidates
-    from npdr_ppl.workflows.compare import compare as run_compare
-    from npdr_ppl.workflows.progress import reporter
+    from npdr_ppl.display.plots.comparison_figures import write_comparison_figures
+    from npdr_ppl.posterior.comparison.compare import compare as run_compare
+    from npdr_ppl.posterior.comparison.compared_backends import candidates, split_candidates
+    from npdr_ppl.preparation.data_options import DataOptions
+    from npdr_ppl.progress import reporter
 
     device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
@@ -117,7 +117,7 @@ def compare(
             rounds=rounds,
             num_simulations=simulations,
             seed=seed,
-            options=BindingOptions(
+            options=DataOptions(
                 embedding,
                 resolve_segment_length(segment_length),
                 initial_state.value,

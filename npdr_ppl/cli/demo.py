@@ -28,11 +28,11 @@ def demo(
     from rich.console import Console
 
     from npdr_ppl.cli.show import show_demo
+    from npdr_ppl.display.plots.training_figures import write_training_figures
+    from npdr_ppl.display.reports import write_report
     from npdr_ppl.engines.workers import workers
-    from npdr_ppl.plots.training_figures import write_training_figures
-    from npdr_ppl.reports import write_report
-    from npdr_ppl.workflows.demo import run_demo
-    from npdr_ppl.workflows.progress import reporter
+    from npdr_ppl.progress import reporter
+    from npdr_ppl.reproduction.demo import run_demo
 
     # Batches are small here: a second thread makes training a fourth slower, and the search of
     # discovery has its processes.

@@ -90,10 +90,13 @@ def discover(
         resolve_model,
     )
     from npdr_ppl.cli.show import show_discovery
-    from npdr_ppl.plots.discovery_figures import write_discovery_figures, write_stage_figures
-    from npdr_ppl.workflows.discovery import DiscoveryOptions, Investigation
-    from npdr_ppl.workflows.discovery.folder import DiscoveryFolder, findings_until
-    from npdr_ppl.workflows.discovery.progress import sentences
+    from npdr_ppl.discovery import DiscoveryOptions, Investigation
+    from npdr_ppl.discovery.discovery_folder import DiscoveryFolder, findings_until
+    from npdr_ppl.discovery.search_progress import sentences
+    from npdr_ppl.display.plots.discovery_figures import (
+        write_discovery_figures,
+        write_stage_figures,
+    )
 
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_holdout(data, holdout, holdout_data)

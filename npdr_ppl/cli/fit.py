@@ -114,10 +114,10 @@ def fit(
         resolve_rollouts,
     )
     from npdr_ppl.cli.show import show_fit
-    from npdr_ppl.plots.fit_figures import write_fit_figures
-    from npdr_ppl.workflows.binding import BindingOptions
-    from npdr_ppl.workflows.fit import fit as run_fit
-    from npdr_ppl.workflows.progress import reporter
+    from npdr_ppl.display.plots.fit_figures import write_fit_figures
+    from npdr_ppl.posterior.fit import fit as run_fit
+    from npdr_ppl.preparation.data_options import DataOptions
+    from npdr_ppl.progress import reporter
 
     device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
@@ -137,7 +137,7 @@ def fit(
             extra_rounds=extra_rounds,
             num_simulations=simulations,
             seed=seed,
-            options=BindingOptions(
+            options=DataOptions(
                 embedding,
                 resolve_segment_length(segment_length),
                 initial_state.value,

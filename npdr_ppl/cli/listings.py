@@ -91,7 +91,7 @@ def tasks(as_json: AsJson = False) -> None:
 
     Example: npdr tasks
     """
-    from npdr_ppl.workflows.control_task import control_task, control_tasks
+    from npdr_ppl.loop.control_task import control_task, control_tasks
 
     rows = []
     for name in control_tasks():

@@ -27,7 +27,7 @@ def report(
 
     Example: npdr report fit --out fit.html
     """
-    from npdr_ppl.reports import write_report
+    from npdr_ppl.display.reports import write_report
 
     path = write_report(run, out)
     if as_json:

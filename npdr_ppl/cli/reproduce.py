@@ -72,22 +72,22 @@ def reproduce(
         return
     from npdr_ppl.cli.show import show_rows
     from npdr_ppl.errors import DataError
-    from npdr_ppl.workflows.candidates import split_candidates
+    from npdr_ppl.posterior.comparison.compared_backends import split_candidates
 
     progress = False if quiet else None
     out = out / experiment.value
     chosen = split_candidates(backends) if backends else None
     with resumable(f"the same command again continues the experiment in {out}."):
         if experiment is Experiment.PENDULUM:
-            from npdr_ppl.plots.pendulum import write_pendulum_figures
-            from npdr_ppl.workflows.pendulum_ridge import reproduce_pendulum
+            from npdr_ppl.display.plots.pendulum import write_pendulum_figures
+            from npdr_ppl.reproduction.pendulum_ridge import reproduce_pendulum
 
             ridges, result = reproduce_pendulum(out, backends=chosen, seed=seed, progress=progress)
             write_pendulum_figures(ridges, out)
         elif experiment is Experiment.MINI_GOLF:
-            from npdr_ppl.plots.mini_golf import write_mini_golf_figures
+            from npdr_ppl.display.plots.mini_golf import write_mini_golf_figures
+            from npdr_ppl.reproduction.mini_golf_table import reproduce_mini_golf
             from npdr_ppl.rollouts import Rollouts
-            from npdr_ppl.workflows.mini_golf_table import reproduce_mini_golf
 
             if data is None:
                 raise DataError("mini-golf needs the paper's recordings: pass --data FILE.")
@@ -104,10 +104,10 @@ def reproduce(
                 {label: p[-1] for label, p in posteriors.items()}, out, seed=seed
             )
         else:
+            from npdr_ppl.display.plots.comparison_figures import write_comparison_figures
             from npdr_ppl.models.furuta import furuta
-            from npdr_ppl.plots.comparison_figures import write_comparison_figures
+            from npdr_ppl.reproduction.table2 import add_returns, reproduce_table2
             from npdr_ppl.rollouts import Rollouts
-            from npdr_ppl.workflows.table2 import add_returns, reproduce_table2
 
             if data is None:
                 raise DataError("table2 needs the paper's recordings: pass --data FILE.")
@@ -134,12 +134,12 @@ def _reproduce_missing_effect(
     data: Path | None, out: Path, seed: int, as_json: bool, quiet: bool
 ) -> None:
     from npdr_ppl.cli.show import show_missing_effect
+    from npdr_ppl.discovery import DiscoveryOptions
+    from npdr_ppl.display.plots.missing_effect_figures import write_missing_effect_figures
     from npdr_ppl.engines.workers import workers
     from npdr_ppl.errors import DataError
-    from npdr_ppl.plots.missing_effect_figures import write_missing_effect_figures
-    from npdr_ppl.workflows.discovery import DiscoveryOptions
-    from npdr_ppl.workflows.missing_effect import load_recordings, reproduce_missing_effect
-    from npdr_ppl.workflows.run_folder import read_json
+    from npdr_ppl.reproduction.missing_effect import load_recordings, reproduce_missing_effect
+    from npdr_ppl.run_files import read_json
 
     if data is None:
         raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")

@@ -14,9 +14,9 @@ from npdr_ppl.errors import BackendError, DataError, ModelError, NpdrError
 if TYPE_CHECKING:
     from npdr_ppl.inference.base import Backend
     from npdr_ppl.language.effects import Effect
+    from npdr_ppl.loop.control_task import ControlTask
     from npdr_ppl.policies.search import PolicySearch
     from npdr_ppl.targets.base import TargetDomain
-    from npdr_ppl.workflows.control_task import ControlTask
 
 __all__ = [
     "named_effects",
@@ -269,7 +269,7 @@ def resolve_task(word: str, model: str) -> "ControlTask":
     Raises:
         ModelError: There is no such task, or the model has none of its own.
     """
-    from npdr_ppl.workflows.control_task import ControlTask, control_task, control_tasks
+    from npdr_ppl.loop.control_task import ControlTask, control_task, control_tasks
 
     if _is_function(word):
         return _returned_by(word, ControlTask)
@@ -310,7 +310,7 @@ def resolve_search(word: str) -> "str | PolicySearch[Any]":
 
 def _method(word: str, make: Callable[..., T]) -> str | T:
     """Makes what a word with options in parentheses names; without options, only checks it."""
-    from npdr_ppl.workflows.candidates import name_and_options
+    from npdr_ppl.posterior.comparison.compared_backends import name_and_options
 
     name, options = name_and_options(word)
     try:

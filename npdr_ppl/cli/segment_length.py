@@ -7,7 +7,7 @@ import typer
 from npdr_ppl.errors import DataError
 
 if TYPE_CHECKING:
-    from npdr_ppl.workflows.binding import SegmentLength
+    from npdr_ppl.preparation.data_options import SegmentLength
 
 __all__ = ["SegmentLengthOption", "resolve_segment_length"]
 

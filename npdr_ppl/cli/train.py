@@ -178,13 +178,13 @@ def train(
         resolve_task,
     )
     from npdr_ppl.cli.show import show_training
+    from npdr_ppl.display.plots.furuta_animation import check_animated, write_furuta_animation
+    from npdr_ppl.display.plots.training_figures import last_rollout, write_training_figures
     from npdr_ppl.errors import DataError
-    from npdr_ppl.plots.furuta_animation import check_animated, write_furuta_animation
-    from npdr_ppl.plots.training_figures import last_rollout, write_training_figures
-    from npdr_ppl.workflows.binding import BindingOptions
-    from npdr_ppl.workflows.loop_options import LoopOptions
-    from npdr_ppl.workflows.npdr_loop import train as run_train
-    from npdr_ppl.workflows.progress import reporter
+    from npdr_ppl.loop.loop_options import LoopOptions
+    from npdr_ppl.loop.npdr_loop import train as run_train
+    from npdr_ppl.preparation.data_options import DataOptions
+    from npdr_ppl.progress import reporter
 
     _check_folder(out, resume)
     chosen = resolve_effects(resolve_model(model), effect or [])
@@ -203,7 +203,7 @@ def train(
         backend=resolve_backend(backend),
         rounds=rounds,
         num_simulations=simulations,
-        binding=BindingOptions(embedding, segment_length or None, initial_state.value, "float32"),
+        binding=DataOptions(embedding, segment_length or None, initial_state.value, "float32"),
         search=resolve_search(search),
         search_iterations=search_iterations,
         num_domains=domains,

@@ -12,7 +12,7 @@ from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port, find_port
 from npdr_ppl.language.effects import Effect, ParameterEffect
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.language.inverse_dynamics import InverseDynamics
+from npdr_ppl.language.linear_dynamics import InverseDynamics
 
 __all__ = ["Simulator"]
 

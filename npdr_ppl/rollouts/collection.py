@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import segments
 from npdr_ppl.rollouts.arrays import Array
-
-if TYPE_CHECKING:
-    from npdr_ppl.rollouts.container import Rollouts
+from npdr_ppl.rollouts.recording import Recording
 
 __all__ = ["are_equal", "joined", "picked", "stacked", "summary", "with_channels"]
+
+Episodes = TypeVar("Episodes", bound=Recording)
 
 COLUMNS = ("channel_names", "action_names", "channel_units", "action_units")
 """Fields that say which columns there are."""
 
 
-def stacked(rollouts: "Rollouts") -> tuple[Array, Array, NDArray[np.bool_]]:
+def stacked(rollouts: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Returns readings, actions and mask of all rollouts; see :meth:`Rollouts.stacked`."""
     longest, num = max(rollouts.lengths), len(rollouts)
     readings = np.zeros((num, longest + 1, len(rollouts.channel_names)))
@@ -34,7 +34,7 @@ def stacked(rollouts: "Rollouts") -> tuple[Array, Array, NDArray[np.bool_]]:
     return readings, actions, mask
 
 
-def picked(rollouts: "Rollouts", chosen: Sequence[int]) -> "Rollouts":
+def picked(rollouts: Episodes, chosen: Sequence[int]) -> Episodes:
     """Returns the rollouts of these indices, in this order."""
     rewards = rollouts.rewards
     return replace(
@@ -46,7 +46,7 @@ def picked(rollouts: "Rollouts", chosen: Sequence[int]) -> "Rollouts":
     )
 
 
-def with_channels(rollouts: "Rollouts", channels: Sequence[str]) -> "Rollouts":
+def with_channels(rollouts: Episodes, channels: Sequence[str]) -> Episodes:
     """Returns the rollouts with only these channels, in this order."""
     columns = segments.columns_of(channels, rollouts.channel_names)
     return replace(
@@ -57,7 +57,7 @@ def with_channels(rollouts: "Rollouts", channels: Sequence[str]) -> "Rollouts":
     )
 
 
-def are_equal(one: "Rollouts", other: "Rollouts") -> bool:
+def are_equal(one: Recording, other: Recording) -> bool:
     """Returns whether two sets of rollouts have the same columns and the same values."""
     return (
         all(getattr(one, field) == getattr(other, field) for field in COLUMNS)
@@ -77,7 +77,7 @@ def are_equal(one: "Rollouts", other: "Rollouts") -> bool:
     )
 
 
-def joined(parts: Sequence["Rollouts"]) -> "Rollouts":
+def joined(parts: Sequence[Episodes]) -> Episodes:
     """Returns the rollouts of several sets, one set after the other.
 
     Args:
@@ -110,7 +110,7 @@ def joined(parts: Sequence["Rollouts"]) -> "Rollouts":
     )
 
 
-def summary(rollouts: "Rollouts") -> str:
+def summary(rollouts: Recording) -> str:
     """Returns size, time step and columns in one line."""
     low, high = min(rollouts.lengths), max(rollouts.lengths)
     steps = f"{low}" if low == high else f"{low}–{high}"

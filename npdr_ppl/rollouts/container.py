@@ -1,22 +1,25 @@
 """Rollouts: an immutable set of recorded or simulated episodes."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, fields
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.rollouts import arrays, checks, collection, indices, segments, states
+from npdr_ppl.rollouts import (
+    collection,
+    indices,
+    segments,
+    simulator_checks,
+)
 from npdr_ppl.rollouts.arrays import Array
-from npdr_ppl.rollouts.states import StateEstimate
+from npdr_ppl.rollouts.recording import Recording
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -27,109 +30,21 @@ Path = str | PathLike[str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Rollouts:
+class Rollouts(Recording):
     """R recorded or simulated episodes with the same columns and the same time step.
 
-    Episodes may differ in length: T below is the number of steps of one of them. The readings
-    need not be the whole state, e.g. a position without its velocity.
-
-    Attributes:
-        readings: What the sensors reported before each step and after the last, one
-            ``(T + 1, C)`` per rollout, in ``channel_units``.
-        actions: Commands, each held for one step, one ``(T, A)`` per rollout, in ``action_units``.
-        channel_names: Names of the C channels.
-        action_names: Names of the A actions.
-        time_step: Seconds between readings.
-        rewards: Rewards of the steps, one ``(T,)`` per rollout, or ``None``.
-        time: Time stamps in s, one ``(T + 1,)`` per rollout; ``k·time_step`` if not given.
-        channel_units: Units of the channels, ``""`` where unknown.
-        action_units: Units of the actions, ``""`` where unknown.
-
-    Raises:
-        DataError: Columns are named wrongly, shapes do not fit each other, values are not finite,
-            or the sampling is not constant.
+    The fields and what is checked of them are those of :class:`Recording`.
     """
-
-    readings: tuple[Array, ...]
-    actions: tuple[Array, ...]
-    channel_names: tuple[str, ...]
-    action_names: tuple[str, ...]
-    time_step: float
-    rewards: tuple[Array, ...] | None = None
-    time: tuple[Array, ...] = ()
-    channel_units: tuple[str, ...] = ()
-    action_units: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Copies the arrays, makes them read-only and checks them."""
-        freeze = object.__setattr__
-        for field in ("channel_names", "action_names", "channel_units", "action_units"):
-            freeze(self, field, tuple(getattr(self, field)))
-        arrays.check_columns(self)
-        freeze(self, "time_step", float(self.time_step))
-        if not self.time:
-            lengths = (len(values) for values in self.readings)
-            freeze(self, "time", tuple(self.time_step * np.arange(n) for n in lengths))
-        for field in ("readings", "actions", "time", "rewards"):
-            values = getattr(self, field)
-            freeze(self, field, values and tuple(arrays.frozen(v) for v in values))
-        freeze(self, "channel_units", self.channel_units or ("",) * len(self.channel_names))
-        freeze(self, "action_units", self.action_units or ("",) * len(self.action_names))
-        arrays.check_arrays(self)
 
     # -- Construction ------------------------------------------------------------------------
 
     @classmethod
-    def from_arrays(
-        cls,
-        readings: ArrayLike | Tensor | Sequence[Any],
-        actions: ArrayLike | Tensor | Sequence[Any] | None = None,
-        *,
-        channel_names: Sequence[str],
-        action_names: Sequence[str] = (),
-        time_step: float | None = None,
-        rewards: ArrayLike | Tensor | Sequence[Any] | None = None,
-        time: ArrayLike | Tensor | Sequence[Any] | None = None,
-        channel_units: Sequence[str] = (),
-        action_units: Sequence[str] = (),
-    ) -> "Rollouts":
-        """Makes rollouts of arrays or tensors.
-
-        Args:
-            readings: ``(R, T + 1, C)``, or a list of ``(T + 1, C)`` of different lengths.
-            actions: ``(R, T, A)`` or a list of ``(T, A)``; ``None`` where nothing is commanded.
-            channel_names: Names of the C channels.
-            action_names: Names of the A actions.
-            time_step: Seconds between readings; may be left out where ``time`` is given.
-            rewards: ``(R, T)`` or a list of ``(T,)``.
-            time: Time stamps in s, ``(R, T + 1)`` or a list of ``(T + 1,)``.
-            channel_units: Units of the channels.
-            action_units: Units of the actions.
-
-        Raises:
-            DataError: The arrays do not fit each other or are not valid data.
-        """
-        values = arrays.as_arrays(readings, "readings")
-        times = () if time is None else arrays.as_arrays(time, "time")
-        if time_step is None:
-            if not times or min(len(t) for t in times) < 2:
-                raise DataError("give a time step or time stamps of at least two readings.")
-            time_step = checks.canonical_time_step(times)
-        if actions is None:
-            commands = tuple(np.zeros((max(len(v) - 1, 0), 0)) for v in values)
-        else:
-            commands = arrays.as_arrays(actions, "actions")
-        return cls(
-            readings=values,
-            actions=commands,
-            channel_names=tuple(channel_names),
-            action_names=tuple(action_names),
-            time_step=time_step,
-            rewards=None if rewards is None else arrays.as_arrays(rewards, "rewards"),
-            time=times,
-            channel_units=tuple(channel_units),
-            action_units=tuple(action_units),
-        )
+    def of(cls, recording: Recording) -> "Rollouts":
+        """Returns a recording as rollouts, without copying its arrays."""
+        rollouts = object.__new__(cls)
+        for field in fields(Recording):
+            object.__setattr__(rollouts, field.name, getattr(recording, field.name))
+        return rollouts
 
     @classmethod
     def from_csv(cls, path: Path, *, actions: Sequence[str] | None = None) -> "Rollouts":
@@ -146,37 +61,37 @@ class Rollouts:
         Raises:
             DataError: The file cannot be read; the message says why in one sentence.
         """
-        from npdr_ppl.rollouts.csv_files import read_csv
+        from npdr_ppl.rollouts.io.csv_files import read_csv
 
-        return read_csv(path, actions)
+        return cls.of(read_csv(path, actions))
 
     @classmethod
     def from_parquet(cls, path: Path, *, actions: Sequence[str] | None = None) -> "Rollouts":
         """Reads a Parquet file with the columns of :meth:`from_csv`."""
-        from npdr_ppl.rollouts.files import read_parquet
+        from npdr_ppl.rollouts.io.file_formats import read_parquet
 
-        return read_parquet(path, actions)
+        return cls.of(read_parquet(path, actions))
 
     @classmethod
     def from_npz(cls, path: Path) -> "Rollouts":
         """Reads a file written by :meth:`to_npz`; nothing is unpickled."""
-        from npdr_ppl.rollouts.files import read_npz
+        from npdr_ppl.rollouts.io.file_formats import read_npz
 
-        return read_npz(path)
+        return cls.of(read_npz(path))
 
     @classmethod
     def from_netcdf(cls, path: Path) -> "Rollouts":
         """Reads a NetCDF4 file written by :meth:`to_netcdf`."""
-        from npdr_ppl.rollouts.files import read_netcdf
+        from npdr_ppl.rollouts.io.file_formats import read_netcdf
 
-        return read_netcdf(path)
+        return cls.of(read_netcdf(path))
 
     @classmethod
     def from_xarray(cls, dataset: "xr.Dataset") -> "Rollouts":
         """Converts a data set laid out as by :meth:`to_xarray`."""
-        from npdr_ppl.rollouts.files import from_xarray
+        from npdr_ppl.rollouts.io.file_formats import from_xarray
 
-        return from_xarray(dataset)
+        return cls.of(from_xarray(dataset))
 
     @classmethod
     def load(cls, path: Path) -> "Rollouts":
@@ -185,33 +100,33 @@ class Rollouts:
         Raises:
             DataError: The suffix is unknown or the file cannot be read.
         """
-        from npdr_ppl.rollouts.files import load
+        from npdr_ppl.rollouts.io.file_formats import load
 
-        return load(path)
+        return cls.of(load(path))
 
     # -- Export ------------------------------------------------------------------------------
 
     def to_csv(self, path: Path) -> None:
         """Writes the CSV layout of :meth:`from_csv`; numbers keep every bit, units are lost."""
-        from npdr_ppl.rollouts.csv_files import write_csv
+        from npdr_ppl.rollouts.io.csv_files import write_csv
 
         write_csv(self, path)
 
     def to_parquet(self, path: Path) -> None:
         """Writes the columns of the CSV layout, with units in the file's metadata."""
-        from npdr_ppl.rollouts.files import write_parquet
+        from npdr_ppl.rollouts.io.file_formats import write_parquet
 
         write_parquet(self, path)
 
     def to_npz(self, path: Path) -> None:
         """Writes zero-padded arrays ``(R, T + 1, C)`` and so on, with names, units and lengths."""
-        from npdr_ppl.rollouts.files import write_npz
+        from npdr_ppl.rollouts.io.file_formats import write_npz
 
         write_npz(self, path)
 
     def to_netcdf(self, path: Path) -> None:
         """Writes the data set of :meth:`to_xarray` as NetCDF4."""
-        from npdr_ppl.rollouts.files import write_netcdf
+        from npdr_ppl.rollouts.io.file_formats import write_netcdf
 
         write_netcdf(self, path)
 
@@ -221,7 +136,7 @@ class Rollouts:
         Each variable has the attributes ``kind`` (``channel``, ``action`` or ``reward``) and
         ``units``; ``num_steps`` holds the length of each rollout.
         """
-        from npdr_ppl.rollouts.files import to_xarray
+        from npdr_ppl.rollouts.io.file_formats import to_xarray
 
         return to_xarray(self)
 
@@ -234,14 +149,6 @@ class Rollouts:
         return collection.stacked(self)
 
     # -- As a collection ---------------------------------------------------------------------
-
-    @property
-    def lengths(self) -> tuple[int, ...]:
-        """Number of steps T of each rollout."""
-        return tuple(len(actions) for actions in self.actions)
-
-    def __len__(self) -> int:
-        return len(self.readings)
 
     def __iter__(self) -> Iterator["Rollouts"]:
         return (self[index] for index in range(len(self)))
@@ -261,7 +168,7 @@ class Rollouts:
         return collection.summary(self)
 
     def _repr_html_(self) -> str:
-        from npdr_ppl.rollouts.notebook import rollouts_html
+        from npdr_ppl.rollouts.rollouts_view import rollouts_html
 
         return rollouts_html(self)
 
@@ -274,7 +181,7 @@ class Rollouts:
         Returns:
             The axes, ``(channels + actions,)``.
         """
-        from npdr_ppl.rollouts.notebook import plot_rollouts
+        from npdr_ppl.rollouts.rollouts_view import plot_rollouts
 
         return plot_rollouts(self, axes)
 
@@ -333,10 +240,10 @@ class Rollouts:
         Raises:
             DataError: Something is wrong; the message says what in one sentence.
         """
-        checks.check_duplicates(self)
+        simulator_checks.check_duplicates(self)
         if channels or actions:
-            checks.check_channels(self, channels, actions, allow_extra=allow_extra)
-            checks.check_units(self, (*channels, *actions))
+            simulator_checks.check_channels(self, channels, actions, allow_extra=allow_extra)
+            simulator_checks.check_units(self, (*channels, *actions))
 
     def inputs(
         self,
@@ -368,20 +275,6 @@ class Rollouts:
             history=history,
             dtype=dtype,
         )
-
-    @cached_property
-    def estimates(self) -> dict[tuple[tuple[int, int, int], ...], StateEstimate]:
-        """Estimated states at the starts of segments, by the segments, as far as they were made.
-
-        Smoothing costs as much as hundreds of simulations, and every model of a recording starts
-        from the same states.
-        """
-        return {}
-
-    @cached_property
-    def rate_changes(self) -> Array:
-        """By how much each channel's rate changes in a time step, root mean square, ``(C,)``."""
-        return states.rate_changes(self.readings, self.time_step)
 
     def observation(
         self, inputs: Inputs | int | None = None, channels: Sequence[str] | None = None

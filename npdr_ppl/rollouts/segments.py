@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -11,10 +11,8 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError, ShapeError
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.rollouts.recording import Recording
 from npdr_ppl.rollouts.states import StateEstimate, estimate_states
-
-if TYPE_CHECKING:
-    from npdr_ppl.rollouts.container import Rollouts
 
 __all__ = [
     "DEFAULT_HISTORY",
@@ -51,7 +49,7 @@ def columns_of(wanted: Sequence[str], names: Sequence[str]) -> list[int]:
 
 
 def inputs(
-    rollouts: "Rollouts",
+    rollouts: Recording,
     *,
     segment_length: int | None,
     initial_state: InitialState,
@@ -71,7 +69,7 @@ def inputs(
 
 
 def cut(
-    rollouts: "Rollouts",
+    rollouts: Recording,
     layout: Sequence[tuple[int, int, int]],
     *,
     initial_state: InitialState,
@@ -121,7 +119,7 @@ def cut(
 
 
 def observation(
-    rollouts: "Rollouts", inputs: Inputs | int | None, channels: Sequence[str] | None
+    rollouts: Recording, inputs: Inputs | int | None, channels: Sequence[str] | None
 ) -> Tensor:
     """Returns the readings after each step; see :meth:`Rollouts.observation`."""
     names = rollouts.channel_names if channels is None else tuple(channels)
@@ -193,7 +191,7 @@ def _layout(lengths: Sequence[int], segment_length: int | None) -> list[tuple[in
     ]
 
 
-def _estimated(rollouts: "Rollouts", layout: Sequence[tuple[int, int, int]]) -> StateEstimate:
+def _estimated(rollouts: Recording, layout: Sequence[tuple[int, int, int]]) -> StateEstimate:
     """Returns the estimate at the segments' starts, ``(S, C)``; made once per recording."""
     known, key = rollouts.estimates, tuple(layout)
     if key not in known:
@@ -201,7 +199,7 @@ def _estimated(rollouts: "Rollouts", layout: Sequence[tuple[int, int, int]]) -> 
     return known[key]
 
 
-def _estimate(rollouts: "Rollouts", layout: Sequence[tuple[int, int, int]]) -> StateEstimate:
+def _estimate(rollouts: Recording, layout: Sequence[tuple[int, int, int]]) -> StateEstimate:
     parts = []
     for index, readings in enumerate(rollouts.readings):
         starts = np.array([start for rollout, start, _ in layout if rollout == index])

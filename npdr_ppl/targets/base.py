@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from npdr_ppl.errors import NpdrError, ShapeError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.checks import MAX_MAGNITUDE
+from npdr_ppl.rollouts.rollout_checks import MAX_MAGNITUDE
 
 __all__ = ["Array", "Controller", "TargetDomain", "TargetError", "end_episode", "partial_rollout"]
 

@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from npdr_ppl.errors import ModelError
-from npdr_ppl.language.channels import Channel
-from npdr_ppl.language.environments import (
+from npdr_ppl.engines.gymnasium.environments import (
     box_channels,
     limited_channels,
     load_gymnasium,
     make_environment,
 )
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.channels import Channel
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.targets.base import Array, Controller, TargetDomain, end_episode

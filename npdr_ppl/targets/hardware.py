@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.checks import MAX_MAGNITUDE, MAX_STEP_JITTER
+from npdr_ppl.rollouts.rollout_checks import MAX_MAGNITUDE, MAX_STEP_JITTER
 from npdr_ppl.targets.base import Array, Controller, TargetDomain, TargetError, end_episode
 from npdr_ppl.targets.watchdog import Watchdog
 

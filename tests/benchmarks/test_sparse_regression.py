@@ -10,7 +10,7 @@ from residual_forces import residual_forces
 from sparse_regression import least_squares, select, sparse_choice
 
 import npdr_ppl as npdr
-from npdr_ppl.workflows.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.hypothesis import fit_hypothesis
 
 
 def fitted(case):

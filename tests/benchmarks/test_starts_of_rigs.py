@@ -5,7 +5,7 @@ import pytest
 from hidden_rigs import RIGS
 
 from npdr_ppl.rollouts.states import estimate_states
-from tests.rig_recordings import recording_of
+from tests.helpers.rig_recordings import recording_of
 
 
 @pytest.mark.parametrize("name", ["pendulum", "emps", "cart_pole", "furuta"])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from npdr_ppl.rollouts import Rollouts
-from tests.cli.command_line import run
+from tests.helpers.command_line import run
 
 RECORDING = Path(__file__).parents[3] / "shared/data/quanser_qube/swing_up_500hz_5s.csv"
 
@@ -206,7 +206,7 @@ def test_listings(monkeypatch, capsys, command):
 
 @pytest.mark.skipif(not RECORDING.exists(), reason=f"the recordings {RECORDING} are absent")
 def test_table2_has_both_columns_beside_the_papers(monkeypatch, capsys, tmp_path):
-    from npdr_ppl.workflows import table2
+    from npdr_ppl.reproduction import table2
 
     # Two rounds of few simulations: the machinery, not the figure; see docs/reproduction.md.
     monkeypatch.setattr(table2, "ROUNDS", 1)

@@ -8,10 +8,10 @@ import pytest
 
 from npdr_ppl.cli import names
 from npdr_ppl.inference.registry import backends
+from npdr_ppl.loop.control_task import control_tasks
 from npdr_ppl.models import targets, zoo
 from npdr_ppl.models.effects import effects
 from npdr_ppl.policies.search_registry import policy_searches
-from npdr_ppl.workflows.control_task import control_tasks
 
 
 def completed(*words):

@@ -9,9 +9,9 @@ import sys
 import pytest
 
 from npdr_ppl.cli import main as cli
-from npdr_ppl.reports import read_run, write_report
-from npdr_ppl.workflows import demo
-from tests.workflows.small_demo import FILTER, NUM_STEPS, OPTIONS
+from npdr_ppl.display.reports import read_run, write_report
+from npdr_ppl.reproduction import demo
+from tests.helpers.small_demo import FILTER, NUM_STEPS, OPTIONS
 
 SMALL = functools.partial(demo.run_demo, options=OPTIONS, num_steps=NUM_STEPS)
 

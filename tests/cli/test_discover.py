@@ -12,8 +12,8 @@ from rich.console import Console
 from npdr_ppl.cli import discover, show
 from npdr_ppl.cli import main as cli
 from npdr_ppl.cli.resolve import resolve_holdout, resolve_model
-from npdr_ppl.workflows.discovery import DiscoveryOptions, Investigation
-from tests.cli.discovery_recording import CANDIDATES, FRICTION, MISSING, pendulum_recording
+from npdr_ppl.discovery import DiscoveryOptions, Investigation
+from tests.helpers.discovery_recording import CANDIDATES, FRICTION, MISSING, pendulum_recording
 
 NAMES = {
     "alarm", "where", "verdict", "effects", "ranking", "gap", "next_experiment", "data_problems",

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import typer
 
+from npdr_ppl import progress
 from npdr_ppl.cli.main import app, main
 from npdr_ppl.cli.manners import INTERRUPTED, resumable
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.workflows import progress
 
 NPDR = [sys.executable, "-m", "npdr_ppl.cli"]
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]

@@ -3,19 +3,16 @@
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
+from npdr_ppl.loop.control_task import control_task
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.furuta_targets import furuta_target
 from npdr_ppl.policies.furuta_swing_up import FurutaSwingUp
-from npdr_ppl.workflows import rig_study, table2
-from npdr_ppl.workflows.control_task import control_task
-from tests.cli.command_line import run
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
-from small_rig_study import NUM_STEPS, tiny_options  # noqa: E402
+from npdr_ppl.reproduction import rig_study, table2
+from tests.helpers.command_line import run
+from tests.helpers.small_rig_study import NUM_STEPS, tiny_options
 
 
 @pytest.fixture

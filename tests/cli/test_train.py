@@ -15,12 +15,12 @@ from npdr_ppl.cli.resolve import (
 from npdr_ppl.errors import ModelError, NpdrError
 from npdr_ppl.models.furuta import furuta
 from npdr_ppl.rollouts import Rollouts
-from tests.cli.command_line import run
+from tests.helpers.command_line import run
 
 RIG = """
 import dataclasses
 from npdr_ppl.models.furuta_targets import furuta_target
-from npdr_ppl.workflows.control_task import control_task
+from npdr_ppl.loop.control_task import control_task
 
 class Stuck:
     pass

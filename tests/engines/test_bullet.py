@@ -1,9 +1,7 @@
 """BulletSimulator: an independent engine for the zoo's pendulum, and scenes made by code."""
 
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,12 +15,15 @@ from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import candidate_effects, effects
 from npdr_ppl.models.effects.friction import CoulombFriction, ViscousFriction
 from npdr_ppl.models.pendulum import Pendulum
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from bullet_models import SENSORS, Drop, PendulumModel, bullet_pendulum, pendulum_urdf  # noqa: E402
-from faulty import FaultRates  # noqa: E402
-from faulty_simulator import FaultMessenger  # noqa: E402
+from tests.helpers.bullet_models import (
+    SENSORS,
+    Drop,
+    PendulumModel,
+    bullet_pendulum,
+    pendulum_urdf,
+)
+from tests.helpers.faulty import FaultRates
+from tests.helpers.faulty_simulator import FaultMessenger
 
 STEPS = 100
 TIME_STEP = 0.02

@@ -1,8 +1,6 @@
 """The pool on real clusters of two workers, started and ended here: Dask's and Ray's."""
 
-import sys
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +8,8 @@ import pytest
 from npdr_ppl.engines.workers import Pool, WorkerOptions
 from npdr_ppl.errors import SimulationError
 from npdr_ppl.randomness import derived_seed
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from faulty import FaultRates, Faulty  # noqa: E402
-from pool_tasks import Noise  # noqa: E402
+from tests.helpers.faulty import FaultRates, Faulty
+from tests.helpers.pool_tasks import Noise
 
 RATES = FaultRates(crash=0.05, hang=0.06, nan=0.05)
 

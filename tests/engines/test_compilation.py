@@ -8,8 +8,8 @@ import sys
 import pytest
 import torch
 
-from npdr_ppl.engines import compilation
-from npdr_ppl.engines.compilation import (
+from npdr_ppl.engines.common import compilation
+from npdr_ppl.engines.common.compilation import (
     has_compiler,
     is_worthwhile,
     signature,
@@ -164,7 +164,7 @@ def test_what_cannot_be_traced_runs_eagerly_and_says_so_once(run, eager_to_compi
 REFUSAL = """
 import logging, sys
 import torch
-from npdr_ppl.engines import compilation
+from npdr_ppl.engines.common import compilation
 from npdr_ppl.errors import CompilationError
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.linear import Linear

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from npdr_ppl.engines.integrators import INTEGRATORS, integrator
+from npdr_ppl.engines.common.integrators import INTEGRATORS, integrator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.furuta import Furuta

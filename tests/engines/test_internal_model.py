@@ -1,8 +1,5 @@
 """Policies whose own model is the same in every domain, as on a device that nobody knows."""
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 
@@ -11,10 +8,8 @@ from npdr_ppl.models.furuta import Furuta, SwingUpReward
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.base import Policy, PolicyParameter
 from npdr_ppl.policies.furuta_swing_up import FurutaSwingUp
-
-sys.path.insert(0, str(Path(__file__).parent))
-from bullet_models import bullet_pendulum, pendulum_urdf  # noqa: E402
-from mujoco_files import furuta_in_mujoco  # noqa: E402
+from tests.helpers.bullet_models import bullet_pendulum, pendulum_urdf
+from tests.helpers.mujoco_files import furuta_in_mujoco
 
 STATES = torch.tensor([[0.0, 0.1, 0.0, 0.0], [0.02, -0.05, 0.0, 0.1]], dtype=torch.float64)
 LENGTHS = torch.tensor([[0.11], [0.14], [0.16]], dtype=torch.float64)

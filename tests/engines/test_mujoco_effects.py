@@ -1,8 +1,5 @@
 """Effects in MuJoCo: nothing at zero strength, and the engine's own laws otherwise."""
 
-import sys
-from pathlib import Path
-
 import mujoco
 import pytest
 import torch
@@ -26,9 +23,7 @@ from npdr_ppl.models.effects import (
     candidate_effects,
     effects,
 )
-
-sys.path.insert(0, str(Path(__file__).parent))
-from mujoco_files import (  # noqa: E402
+from tests.helpers.mujoco_files import (
     GYMNASIUM,
     HARD,
     ROLLING,

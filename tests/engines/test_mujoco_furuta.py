@@ -1,14 +1,15 @@
 """MuJoCo as a simulator against the equations of the Furuta pendulum, in open and closed loop."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.loop.control_task import control_task
+from npdr_ppl.loop.domains import Domains
+from npdr_ppl.loop.policy_optimisation import returns_of
 from npdr_ppl.models.effects import (
     ActuatorLag,
     Backlash,
@@ -25,12 +26,7 @@ from npdr_ppl.models.effects import (
 )
 from npdr_ppl.models.furuta import Furuta, SwingUpReward
 from npdr_ppl.policies.furuta_swing_up import FurutaSwingUp
-from npdr_ppl.workflows.control_task import control_task
-from npdr_ppl.workflows.domains import Domains
-from npdr_ppl.workflows.policy_optimisation import returns_of
-
-sys.path.insert(0, str(Path(__file__).parent))
-from mujoco_files import (  # noqa: E402
+from tests.helpers.mujoco_files import (
     arm,
     furuta_domains,
     furuta_in_mujoco,

@@ -2,8 +2,6 @@
 
 import math
 import pickle
-import sys
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -18,16 +16,14 @@ from npdr_ppl.engines.mujoco import open_loop as mujoco_open_loop
 from npdr_ppl.errors import DataError, ModelError, ShapeError
 from npdr_ppl.language.channels import Parameter
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.language.inverse_dynamics import Motion
+from npdr_ppl.language.linear_dynamics import Motion
 from npdr_ppl.models.effects import (
     Bias,
     CoulombFriction,
     InputDelay,
     ViscousFriction,
 )
-
-sys.path.insert(0, str(Path(__file__).parent))
-from mujoco_files import (  # noqa: E402
+from tests.helpers.mujoco_files import (
     ARM,
     GYMNASIUM,
     arm,

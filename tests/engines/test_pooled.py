@@ -17,13 +17,10 @@ from npdr_ppl.inference.registry import backend
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects.actuation import InputDelay
 from npdr_ppl.rollouts import Rollouts
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from bullet_models import PendulumModel, bullet_pendulum, pendulum_urdf  # noqa: E402
-from faulty import FaultRates  # noqa: E402
-from faulty_simulator import FaultMessenger  # noqa: E402
-from pooled_models import Drift  # noqa: E402
+from tests.helpers.bullet_models import PendulumModel, bullet_pendulum, pendulum_urdf
+from tests.helpers.faulty import FaultRates
+from tests.helpers.faulty_simulator import FaultMessenger
+from tests.helpers.pooled_models import Drift
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -147,7 +144,7 @@ import sys
 sys.path.insert(0, {here!r})
 import pyro, pyro.distributions as dist
 import npdr_ppl as npdr
-from bullet_models import SENSORS, TORQUE
+from tests.helpers.bullet_models import SENSORS, TORQUE
 from npdr_ppl.engines.bullet import BulletSettings, BulletSimulator, Urdf
 
 def build(client, parameters):
@@ -169,7 +166,7 @@ def test_the_command_line_chooses_workers(monkeypatch, capsys, recording, tmp_pa
     folder, _ = recording
     file = tmp_path / "own.py"
     urdf = str(folder / "pendulum.urdf")
-    file.write_text(MODEL_FILE.format(here=str(Path(__file__).parent), urdf=urdf))
+    file.write_text(MODEL_FILE.format(here=str(Path(__file__).parents[2]), urdf=urdf))
 
     def fit(model, *words):
         out = tmp_path / f"fit-{len(list(tmp_path.iterdir()))}"

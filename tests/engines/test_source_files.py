@@ -10,7 +10,7 @@ import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.engines.bullet import BulletSimulator, Sensor
-from npdr_ppl.engines.source_files import recorded_files
+from npdr_ppl.engines.common.source_files import recorded_files
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.rollouts import Rollouts

@@ -1,30 +1,25 @@
 """Closed loop in simulators on workers: the engine's episodes are those of a loop written out."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 import npdr_ppl as npdr
-from npdr_ppl.engines.stepped import SteppedSimulator
+from npdr_ppl.engines.pooled.stepped_simulator import SteppedSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.loop.control_task import ControlTask
+from npdr_ppl.loop.domains import Domains
+from npdr_ppl.loop.policy_optimisation import optimise_policy
 from npdr_ppl.models.effects import EncoderBias, InputDelay, ViscousFriction
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.linear import Linear
 from npdr_ppl.policies.mppi import MPPI
 from npdr_ppl.policies.playback import Playback
 from npdr_ppl.policies.search_registry import policy_search
-from npdr_ppl.workflows.control_task import ControlTask
-from npdr_ppl.workflows.domains import Domains
-from npdr_ppl.workflows.policy_optimisation import optimise_policy
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from bullet_models import bullet_pendulum, pendulum_urdf  # noqa: E402
+from tests.helpers.bullet_models import bullet_pendulum, pendulum_urdf
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -14,11 +14,8 @@ import pytest
 import npdr_ppl as npdr
 from npdr_ppl.engines.workers import Faults, Pool, WorkerOptions
 from npdr_ppl.errors import ModelError, SimulationError
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from faulty import FaultRates, Faulty  # noqa: E402
-from pool_tasks import (  # noqa: E402
+from tests.helpers.faulty import FaultRates, Faulty
+from tests.helpers.pool_tasks import (
     CountSetUps,
     FailsToLoad,
     FailsToSetUp,
@@ -169,13 +166,13 @@ def test_a_draw_ends_with_its_template():
 
 @pytest.mark.parametrize("executor", ["loky", "threads", "serial"])
 def test_an_interrupt_ends_all_processes(tmp_path, executor):
-    here = Path(__file__).parent
+    here = Path(__file__).parents[2]
     script = (
-        f"import signal, sys; sys.path[:0] = {[str(here.parents[1]), str(here)]}\n"
+        f"import signal, sys; sys.path[:0] = {[str(here)]}\n"
         # Where the tests run in the background, a shell has told them to ignore interrupts.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "import npdr_ppl as npdr\n"
-        "from pool_tasks import Sleep\n"
+        "from tests.helpers.pool_tasks import Sleep\n"
         "if __name__ == '__main__':\n"
         f"    with npdr.workers({executor!r}) as used:\n"
         f"        used.pool.run(Sleep({str(tmp_path)!r}), [60.0] * 4)\n"

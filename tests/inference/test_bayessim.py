@@ -9,9 +9,9 @@ from torch import nn
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Problem
 from npdr_ppl.inference.bayessim import BayesSim
-from npdr_ppl.inference.fourier import FourierFeatures, median_distance
-from npdr_ppl.inference.mixture import Mixture
 from npdr_ppl.inference.online_bayessim import OnlineBayesSim
+from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
+from npdr_ppl.inference.parts.samplers.fourier import FourierFeatures, median_distance
 from npdr_ppl.randomness import seeded
 
 NORMAL = torch.distributions.Normal(0.0, 1.0)

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from npdr_ppl.inference.conditioned_flow import conditioned
-from npdr_ppl.inference.flows import FlowNetwork
+from npdr_ppl.inference.parts.flows.conditioned_flow import conditioned
+from npdr_ppl.inference.parts.flows.flows import FlowNetwork
 
 
 @pytest.mark.parametrize("flow", ["nsf", "maf", "affine-nsf"])

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from npdr_ppl.errors import BackendError, ShapeError
-from npdr_ppl.inference.conjugate import StudentT, linear_posterior, row_noise
+from npdr_ppl.inference.parts.samplers.conjugate import StudentT, linear_posterior, row_noise
 from npdr_ppl.randomness import seeded
 
 

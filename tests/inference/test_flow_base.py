@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.features import fit_preconditioner, whiten_unseen
-from npdr_ppl.inference.flow_base import FlowBase, fit_base
-from npdr_ppl.inference.mixture import Mixture
+from npdr_ppl.inference.parts.flows.flow_base import FlowBase, fit_base
+from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
+from npdr_ppl.inference.parts.training.preconditioning import fit_preconditioner, whiten_unseen
 from npdr_ppl.inference.snpe_c import SNPEC
 from npdr_ppl.randomness import seeded
 

@@ -7,10 +7,10 @@ import torch
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.features import fit_preconditioner
 from npdr_ppl.inference.fmpe import FMPE, flow_matching_loss
-from npdr_ppl.inference.mixture import Mixture
-from npdr_ppl.inference.velocity import VelocityDensity, VelocityNetwork, end_angle
+from npdr_ppl.inference.parts.flows.velocity import VelocityDensity, VelocityNetwork, end_angle
+from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
+from npdr_ppl.inference.parts.training.preconditioning import fit_preconditioner
 from npdr_ppl.randomness import seeded
 
 NORMAL = torch.distributions.Normal(0.0, 1.0)

@@ -3,7 +3,7 @@
 import torch
 from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 
-from npdr_ppl.inference.gaussian_mixture import GaussianMixture, triangular_factors
+from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture, triangular_factors
 from npdr_ppl.randomness import seeded
 
 

@@ -8,15 +8,15 @@ from torch import nn
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.likelihood_features import (
+from npdr_ppl.inference.nle import NLE
+from npdr_ppl.inference.nre import contrastive_loss
+from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
+from npdr_ppl.inference.parts.training.likelihood_preconditioning import (
     degrees_of,
     discriminants,
     fit_likelihood_preconditioner,
     polynomials,
 )
-from npdr_ppl.inference.mixture import Mixture
-from npdr_ppl.inference.nle import NLE
-from npdr_ppl.inference.nre import contrastive_loss
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.randomness import seeded
 

@@ -12,8 +12,9 @@ import npdr_ppl as npdr
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.nuts import NUTS
 from npdr_ppl.models.pendulum import pendulum
+from npdr_ppl.preparation.binding import bind, problem_of
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.randomness import seeded
-from npdr_ppl.workflows.binding import BindingOptions, bind, problem_of
 
 
 def gain_model(noise):
@@ -67,7 +68,7 @@ def test_absent_channels_do_not_count():
     values = {}
     for names, measured in rollouts.items():
         bound = bind(
-            partial(pendulum, noise=noise), measured, BindingOptions("all", None, "estimated")
+            partial(pendulum, noise=noise), measured, DataOptions("all", None, "estimated")
         )
         log_likelihood = problem_of(bound).log_likelihood
         assert log_likelihood is not None

@@ -8,16 +8,20 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
-from npdr_ppl.inference.features import fit_preconditioner
-from npdr_ppl.inference.gaussian_mixture import GaussianMixture
-from npdr_ppl.inference.mixture_density import MixtureDensityNetwork, mixture_at, perceptron
-from npdr_ppl.inference.proposal_correction import (
+from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
+from npdr_ppl.inference.parts.mixtures.mixture_density import (
+    MixtureDensityNetwork,
+    mixture_at,
+    perceptron,
+)
+from npdr_ppl.inference.parts.mixtures.proposal_correction import (
     correct_regression,
     proposal_of,
     tilt_forms,
     tilted,
     whiten_forms,
 )
+from npdr_ppl.inference.parts.training.preconditioning import fit_preconditioner
 from npdr_ppl.randomness import seeded
 
 F64 = torch.float64

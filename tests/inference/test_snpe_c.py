@@ -9,7 +9,7 @@ from torch import nn
 
 from npdr_ppl.errors import BackendError, ShapeError
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.mixture import Mixture
+from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.inference.snpe_c import SNPEC, atomic_loss
 from npdr_ppl.randomness import seeded

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.func import stack_module_state
 
-from npdr_ppl.inference.flows import build_networks
-from npdr_ppl.inference.stacked_flow import stacked_log_prob
+from npdr_ppl.inference.parts.flows.flows import build_networks
+from npdr_ppl.inference.parts.flows.stacked_flow import stacked_log_prob
 
 
 @pytest.mark.parametrize("flow", ["nsf", "maf", "affine-nsf"])

@@ -7,7 +7,7 @@ import torch
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.tempering import UnnormalisedDensity, tempered_particles
+from npdr_ppl.inference.parts.samplers.tempering import UnnormalisedDensity, tempered_particles
 from npdr_ppl.randomness import seeded
 
 NORMAL = torch.distributions.Normal(0.0, 1.0)

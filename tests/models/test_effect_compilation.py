@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from npdr_ppl.engines.compilation import has_compiler
+from npdr_ppl.engines.common.compilation import has_compiler
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import Backlash, ParameterDrift, Payload, SensorDelay
 from npdr_ppl.models.pendulum import Pendulum

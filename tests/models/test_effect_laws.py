@@ -33,7 +33,7 @@ from npdr_ppl.models.effects import (
 from npdr_ppl.models.emps import Emps
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.pendulum import Pendulum
-from tests.models.effect_replay import FREE, replay
+from tests.helpers.effect_replay import FREE, replay
 
 
 def test_presliding_friction_slides_like_coulomb_friction():

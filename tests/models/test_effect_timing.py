@@ -19,7 +19,7 @@ from npdr_ppl.models.emps import Emps
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.linear import Linear
-from tests.models.effect_replay import FREE, replay
+from tests.helpers.effect_replay import FREE, replay
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.0107])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from npdr_ppl.engines.integrators import INTEGRATORS
+from npdr_ppl.engines.common.integrators import INTEGRATORS
 from npdr_ppl.language.effects import ParameterEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.cart_pole import CartPole
@@ -24,7 +24,7 @@ from npdr_ppl.models.effects import (
 from npdr_ppl.models.emps import Emps
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.pendulum import Pendulum
-from tests.models.effect_recovery import Recovery
+from tests.helpers.effect_recovery import Recovery
 
 SIMULATORS = (Pendulum, Furuta, CartPole, Emps)
 

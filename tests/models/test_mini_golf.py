@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import npdr_ppl as npdr
-from npdr_ppl.engines.pooled import Segment
+from npdr_ppl.engines.pooled.pool_simulator import Segment
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from npdr_ppl.engines.compilation import has_compiler
+from npdr_ppl.engines.common.compilation import has_compiler
 from npdr_ppl.errors import ModelError, ShapeError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import CoulombFriction, InputDelay, SensorLowPass, Tilt

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from npdr_ppl.engines.compilation import has_compiler
+from npdr_ppl.engines.common.compilation import has_compiler
 from npdr_ppl.errors import ModelError, NpdrError
 from npdr_ppl.models.effects import InputDelay
 from npdr_ppl.models.furuta import Furuta, SwingUpReward

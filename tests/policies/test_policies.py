@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.linalg import solve_continuous_are
 
-from npdr_ppl.engines.compilation import has_compiler
+from npdr_ppl.engines.common.compilation import has_compiler
 from npdr_ppl.errors import ModelError, ShapeError
 from npdr_ppl.models.cart_pole import CartPole
 from npdr_ppl.policies.linear import AngleFeatures, Linear

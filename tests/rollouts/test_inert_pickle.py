@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.rollouts.inert_pickle import Record, read_pickle
+from npdr_ppl.rollouts.io.inert_pickle import Record, read_pickle
 
 RECORD = f"{__name__} Plain"
 

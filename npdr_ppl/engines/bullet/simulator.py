@@ -15,9 +15,9 @@ from npdr_ppl.engines.bullet.parameters import BoundParameter
 from npdr_ppl.engines.bullet.scene import Builder, Scene, Urdf
 from npdr_ppl.engines.bullet.settings import BulletSettings
 from npdr_ppl.engines.bullet.stepping import BulletSimulation, stepping
-from npdr_ppl.engines.pooled import Segment
-from npdr_ppl.engines.source_files import recorded_files
-from npdr_ppl.engines.stepped import SteppedSimulator
+from npdr_ppl.engines.common.source_files import recorded_files
+from npdr_ppl.engines.pooled.pool_simulator import Segment
+from npdr_ppl.engines.pooled.stepped_simulator import SteppedSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.effects import Effect, EnvironmentEffect, ForceEffect

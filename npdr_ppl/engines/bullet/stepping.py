@@ -7,7 +7,7 @@ from typing import Any
 from npdr_ppl.engines.bullet.channels import Command
 from npdr_ppl.engines.bullet.forces import JointForces
 from npdr_ppl.engines.bullet.scene import Scene
-from npdr_ppl.engines.pooled import Segment
+from npdr_ppl.engines.pooled.pool_simulator import Segment
 
 __all__ = ["BulletSimulation", "Drive", "stepping"]
 
@@ -22,7 +22,7 @@ _NO_LIMIT = 1e9
 
 @dataclass(frozen=True)
 class BulletSimulation:
-    """A simulation under way; see :class:`~npdr_ppl.engines.stepped.Simulation`.
+    """A simulation under way; see :class:`~npdr_ppl.engines.pooled.stepped_simulator.Simulation`.
 
     Attributes:
         advance: Makes all substeps of a step.

@@ -6,18 +6,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from npdr_ppl.engines.episodes import EpisodeRequest, Episodes
+from npdr_ppl.engines.common.episodes import EpisodeRequest, Episodes
 from npdr_ppl.engines.gymnasium.attributes import Attribute, Path, vector
-from npdr_ppl.engines.pooled import Segment
-from npdr_ppl.engines.stepped import SteppedSimulator
-from npdr_ppl.errors import DataError, ModelError
-from npdr_ppl.language.channels import Channel, Parameter, Port
-from npdr_ppl.language.environments import (
+from npdr_ppl.engines.gymnasium.environments import (
     box_channels,
     limited_channels,
     load_gymnasium,
     make_environment,
 )
+from npdr_ppl.engines.pooled.pool_simulator import Segment
+from npdr_ppl.engines.pooled.stepped_simulator import SteppedSimulator
+from npdr_ppl.errors import DataError, ModelError
+from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.inputs import Inputs
 
 __all__ = ["GymnasiumSimulator"]
@@ -262,7 +262,7 @@ class GymnasiumSimulator(SteppedSimulator):
 
 
 class _Simulation:
-    """An environment under way; see :class:`~npdr_ppl.engines.stepped.Simulation`."""
+    """An environment whose episode is running, as the engine's workers step it."""
 
     def __init__(
         self,

@@ -1,23 +1,20 @@
 """Closed loop in MuJoCo: batches of policies in batches of domains."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 
-from npdr_ppl.engines.closed_loop import LoopBody, begin, run_eagerly
-from npdr_ppl.engines.episodes import EpisodeRequest, Episodes
+from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.episodes import EpisodeRequest, Episodes
+from npdr_ppl.engines.common.policy_loop import LoopBody, begin, run_eagerly
 from npdr_ppl.engines.mujoco.batches import quiet
+from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.stepper import MujocoStepper
-from npdr_ppl.engines.stepping import flatten
-
-if TYPE_CHECKING:
-    from npdr_ppl.engines.mujoco.simulator import MujocoSimulator
 
 __all__ = ["roll_out"]
 
 
-def roll_out(simulator: "MujocoSimulator", request: EpisodeRequest) -> Episodes:
+def roll_out(simulator: MujocoMechanism, request: EpisodeRequest) -> Episodes:
     """Simulates episodes of policies in domains; see :class:`EpisodeRequest`."""
     num_steps, step = request.num_steps, request.time_step
     given = {n: torch.as_tensor(x).detach().double() for n, x in request.parameters.items()}

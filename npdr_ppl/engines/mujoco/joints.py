@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.mujoco.ports import ForcePort
 from npdr_ppl.language.effect_context import Joint
 

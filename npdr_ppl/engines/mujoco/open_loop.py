@@ -9,24 +9,21 @@ import logging
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.engines.commands import CommandRecord, commands_at
-from npdr_ppl.engines.effect_chain import State, Tables
+from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.commands import CommandRecord, commands_at
+from npdr_ppl.engines.common.effect_chain import State, Tables
+from npdr_ppl.engines.common.segment_start import recorded_start, true_start, with_past_commands
 from npdr_ppl.engines.mujoco.batches import quiet
+from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.native import run_all_steps
 from npdr_ppl.engines.mujoco.stepper import MujocoStepper
-from npdr_ppl.engines.segment_start import recorded_start, true_start, with_past_commands
-from npdr_ppl.engines.stepping import flatten
 from npdr_ppl.language.inputs import Inputs
-
-if TYPE_CHECKING:
-    from npdr_ppl.engines.mujoco.simulator import MujocoSimulator
 
 __all__ = ["CHUNK_BYTES", "replay"]
 
@@ -36,9 +33,7 @@ CHUNK_BYTES = 1 << 28
 """Memory for the commands and records of the simulations that run at a time."""
 
 
-def replay(
-    simulator: "MujocoSimulator", parameters: Mapping[str, Tensor], inputs: Inputs
-) -> Tensor:
+def replay(simulator: MujocoMechanism, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
     """Simulates all parameters, segments and steps; see :meth:`Simulator.simulate`."""
     simulator.check_parameters(parameters)
     simulator.check_inputs(inputs)
@@ -86,7 +81,7 @@ class _Replay:
 
     def __init__(
         self,
-        simulator: "MujocoSimulator",
+        simulator: MujocoMechanism,
         given: dict[str, Tensor],
         inputs: Inputs,
         shape: torch.Size,

@@ -2,47 +2,21 @@
 
 import copy
 import importlib
-import logging
-import math
 from collections.abc import Mapping
-from os import PathLike
-from pathlib import Path
+from functools import cached_property
 from typing import Any, Self
 
-import numpy as np
-import torch
 from torch import Tensor
 
-from npdr_ppl.engines.closed_loop_simulator import ClosedLoopSimulator
-from npdr_ppl.engines.effect_chain import Tables, needed_histories
-from npdr_ppl.engines.episodes import EpisodeRequest, Episodes
-from npdr_ppl.engines.mujoco.batches import make_batch, prepared_copy, quiet
-from npdr_ppl.engines.mujoco.channels import (
-    Component,
-    Reading,
-    Selection,
-    action_channels,
-    choose,
-    mjcf_sensors,
-    state_components,
-)
+from npdr_ppl.engines.common.episodes import EpisodeRequest, Episodes
 from npdr_ppl.engines.mujoco.closed_loop import roll_out
-from npdr_ppl.engines.mujoco.environment import environment_ports, with_environment
-from npdr_ppl.engines.mujoco.fields import did_you_mean, element_names
-from npdr_ppl.engines.mujoco.inverse_dynamics import bound_inverse_dynamics
+from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
+from npdr_ppl.engines.mujoco.mujoco_linear_dynamics import bound_inverse_dynamics
 from npdr_ppl.engines.mujoco.open_loop import replay
-from npdr_ppl.engines.mujoco.parameters import Binding, Bindings, Derivation
-from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
-from npdr_ppl.engines.mujoco_inverse_dynamics import load_mjcf
-from npdr_ppl.engines.source_files import recorded_mjcf
-from npdr_ppl.errors import ModelError
-from npdr_ppl.language.channels import Channel
-from npdr_ppl.language.effects import ForceEffect, ParameterEffect
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.linear_dynamics import InverseDynamics
 
 __all__ = ["MujocoSimulator"]
-
-logger = logging.getLogger(__name__)
 
 _FINER = 2
 """Engine steps of :meth:`MujocoSimulator.with_finer_steps`, of order four, for each of the
@@ -50,7 +24,7 @@ simulator's own. Forces of effects are constant over an engine step whatever its
 shorter ones bring those closer to the truth."""
 
 
-class MujocoSimulator(ClosedLoopSimulator):
+class MujocoSimulator(MujocoMechanism):
     """Any MJCF file as a simulator; channels, nominal values and ports are read from it.
 
     States are by default the position and the velocity of every hinge and slide, ``elbow`` and
@@ -94,87 +68,19 @@ class MujocoSimulator(ClosedLoopSimulator):
         (Parameter(name='payload', unit='kg', nominal=0.024, description='body pole mass'),)
     """
 
-    def __init__(
-        self,
-        source: str | PathLike[str] | Any,
-        parameters: Mapping[str, Binding] | None = None,
-        *,
-        derived: Mapping[str, Derivation] | None = None,
-        states: Selection = None,
-        sensors: Selection = None,
-        units: Mapping[str, str] | None = None,
-        bounds: Mapping[str, tuple[float, float]] | None = None,
-        time_step: float | None = None,
-        substeps: int | None = None,
-        num_threads: int | None = None,
-        keyframe: str | None = None,
-    ) -> None:
-        if substeps is not None and substeps < 1:
-            raise ModelError(f"MujocoSimulator needs at least one substep, got {substeps=}.")
-        with quiet(logger.warning):
-            self.model: Any = load_mjcf(source)
-        self._source = recorded_mjcf(source)
-        self._models: dict[tuple[float, tuple[int, ...]], Any] = {}
-        is_path = isinstance(source, str | PathLike)
-        self._label = Path(source).name if is_path else "a model"
-        self.substeps, self.num_threads = substeps, num_threads
-        self._refinement = 1
-        self.time_step = time_step or (substeps or 1) * float(self.model.opt.timestep)
-        self._declare_channels(states, sensors, units or {}, bounds or {})
-        taken = [channel.name for channel in (*self.states, *self.sensors, *self.actions)]
-        self.force_ports = force_ports(self.model, taken)
-        self.bindings = Bindings(self.model, parameters or {}, derived or {})
-        self.parameters = self.bindings.parameters
-        taken += [*self.joints, *(parameter.name for parameter in self.parameters)]
-        self._environment = environment_ports(self.model, driven_dofs(self.model), taken)
-        self.ports = (
-            *derive_ports(self.model, self.force_ports, self.actions, self.readings),
-            *(port.port for port in self._environment),
-        )
-        # Derivations that do not fit should say so now.
-        self.bindings.assignments({}, self.nominal())
-        self.initial_positions = self._initial_positions(keyframe)
-        self.inverse_dynamics = bound_inverse_dynamics(self)
-
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        return f"MujocoSimulator({self._label})"
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the force ports."""
-        return tuple(port.port.name for port in self.force_ports)
-
-    def recorded_settings(self) -> dict[str, Any]:
-        """Returns the text of the MJCF and what the parameters set in it, and the version."""
-        return {
-            "engine": "mujoco",
-            "version": importlib.import_module("mujoco").__version__,
-            "mjcf": self._source,
-            "parameters": {p.name: p.description for p in self.parameters},
-            "time_step": self.time_step,
-            "substeps": self.num_substeps(self.time_step),
-        }
-
-    @property
-    def is_rate(self) -> tuple[bool, ...]:
-        """Whether each state is a velocity, those of balls and free bodies included."""
-        return tuple(component.is_velocity for component in self.components)
-
-    def num_substeps(self, time_step: float) -> int:
-        """Returns the engine steps per control step of so many seconds."""
-        suggested = max(1, round(time_step / float(self.model.opt.timestep)))
-        return self._refinement * (self.substeps or suggested)
+    @cached_property
+    def inverse_dynamics(self) -> InverseDynamics | None:
+        """The inverse dynamics as a linear form, or ``None`` where there is none."""
+        return bound_inverse_dynamics(self)
 
     def with_finer_steps(self) -> Self | None:
         """Returns a copy with twice the engine steps, of order four; ``None`` if it is one."""
-        if self._refinement > 1:
+        if self.refinement > 1:
             return None
         mujoco: Any = importlib.import_module("mujoco")
         changed = copy.copy(self)
-        changed._refinement = _FINER
-        changed.model, changed._models = copy.copy(self.model), {}
+        changed.refinement = _FINER
+        changed.model, changed.prepared_models = copy.copy(self.model), {}
         changed.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
         return changed
 
@@ -188,113 +94,3 @@ class MujocoSimulator(ClosedLoopSimulator):
         The arguments for compilation change nothing: the engine is compiled.
         """
         return roll_out(self, request)
-
-    def histories(self, given: Mapping[str, Tensor], time_step: float) -> tuple[int, ...]:
-        """Returns how much of the past each action effect and then each sensor effect asks for.
-
-        Args:
-            given: Given parameters.
-            time_step: Seconds per step.
-        """
-        own = tuple(effect.own_parameters(given) for effect in self.effects)
-        return needed_histories(self.effects, own, time_step)
-
-    def make_batch(
-        self, given: Mapping[str, Tensor], num_simulations: int, time_step: float, time: Tensor
-    ) -> tuple[Any, Tables]:
-        """Returns a batch with its parameters set, and the effects' parameters.
-
-        Args:
-            given: Given parameters, ``(N,)`` or numbers, in float64.
-            num_simulations: N.
-            time_step: Seconds per control step.
-            time: Seconds from the rollout's beginning to each segment's middle.
-        """
-        complete = self.complete(given, torch.float64, torch.device("cpu"))
-        domain = self.changed(complete, time)
-        drifting = {e.port for e in self.effects if isinstance(e, ParameterEffect)}
-        given = {**given, **{name: domain[name] for name in drifting}}
-        own = tuple(effect.own_parameters(domain) for effect in self.effects)
-        assignments = self.bindings.assignments(given, domain)
-        assignments = with_environment(
-            self.model, self._environment, self.effects, own, assignments
-        )
-        model = self._prepared(time_step / self.num_substeps(time_step), set(assignments))
-        num_threads = self.num_threads or torch.get_num_threads()
-        return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)
-
-    def _prepared(self, step: float, assigned: set[tuple[str, int]]) -> Any:
-        """Returns a model for batches; one that was made before serves again."""
-        dofs = {
-            port.velocity
-            for port in self.force_ports
-            for effect in self.effects
-            if isinstance(effect, ForceEffect) and effect.port == port.port.name
-        }
-        # Where the file has dry friction, or a parameter sets it, the file's solver stays.
-        crisp = tuple(
-            dof
-            for dof in sorted(dofs)
-            if self.model.dof_frictionloss[dof] == 0.0
-            and ("dof_frictionloss", dof) not in assigned
-        )
-        key = step, crisp
-        if key not in self._models:
-            self._models[key] = prepared_copy(self.model, step, crisp)
-        return self._models[key]
-
-    def _declare_channels(
-        self,
-        states: Selection,
-        sensors: Selection,
-        units: Mapping[str, str],
-        bounds: Mapping[str, tuple[float, float]],
-    ) -> None:
-        """Sets states, sensors and actions."""
-        known = {c.channel.name: c for c in state_components(self.model)}
-        chosen: tuple[Component, ...] = choose(known, states, "state")
-        # Positions first, as everywhere.
-        self.components = tuple(sorted(chosen, key=lambda component: component.is_velocity))
-
-        def finished(channel: Channel) -> Channel:
-            lower, upper = bounds.get(channel.name, (-math.inf, math.inf))
-            unit = units.get(channel.name, channel.unit)
-            return Channel(channel.name, unit, lower, upper, channel.rate_of)
-
-        self.states = tuple(finished(c.channel) for c in self.components)
-        things: dict[str, Component | Reading] = {
-            r.channel.name: r for r in mjcf_sensors(self.model)
-        }
-        # A sensor element that is called like a state is most often that state's sensor; the state
-        # is what the name means.
-        things |= {
-            channel.name: Component(channel, c.address, c.is_velocity)
-            for channel, c in zip(self.states, self.components, strict=True)
-        }
-        default = [channel.name for channel in self.states]
-        self.readings: tuple[Component | Reading, ...] = choose(
-            things, default if sensors is None else sensors, "state or sensor"
-        )
-        self.sensors = tuple(finished(r.channel) for r in self.readings)
-        taken = [channel.name for channel in (*self.states, *self.sensors)]
-        self.actions = tuple(
-            Channel(a.name, units.get(a.name, a.unit), a.lower, a.upper)
-            for a in action_channels(self.model, taken)
-        )
-        all_names = [*taken, *(action.name for action in self.actions)]
-        for name in (*units, *bounds):
-            if name not in all_names:
-                raise ModelError(
-                    f"{self.name} has no channel {name!r}; {did_you_mean(name, all_names)}"
-                )
-
-    def _initial_positions(self, keyframe: str | None) -> Any:
-        """Returns the qpos of components that are no states."""
-        if keyframe is None:
-            return np.array(self.model.qpos0)
-        names = element_names(self.model, "key")
-        if keyframe not in names:
-            raise ModelError(
-                f"{self.name} has no keyframe {keyframe!r}; {did_you_mean(keyframe, names)}"
-            )
-        return np.array(self.model.key_qpos[names.index(keyframe)])

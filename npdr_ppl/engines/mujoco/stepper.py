@@ -2,20 +2,18 @@
 
 import importlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.effect_chain import EffectChain, Moments, State, Tables
-from npdr_ppl.engines.integrators import Components
+from npdr_ppl.engines.common.effect_chain import EffectChain, Moments, State, Tables
+from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.mujoco.batches import state_view
 from npdr_ppl.engines.mujoco.channels import Component, Reading
 from npdr_ppl.engines.mujoco.joints import JointStates
-
-if TYPE_CHECKING:
-    from npdr_ppl.engines.mujoco.simulator import MujocoSimulator
+from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 
 __all__ = ["ACCELERATION_STAGE", "MujocoStepper", "lost_simulations"]
 
@@ -44,13 +42,13 @@ class MujocoStepper(EffectChain):
 
     def __init__(
         self,
-        simulator: "MujocoSimulator",
+        simulator: MujocoMechanism,
         batch: Any,
         time_step: float,
         histories: tuple[int, ...],
     ) -> None:
         super().__init__(simulator, simulator.joints, time_step, histories)
-        self.simulator: MujocoSimulator = simulator
+        self.simulator: MujocoMechanism = simulator
         self.substeps = simulator.num_substeps(time_step)
         self._engine_step = time_step / self.substeps
         self._batch = batch
@@ -232,7 +230,7 @@ class MujocoStepper(EffectChain):
         return torch.where(self.is_lost, torch.nan, values)
 
 
-def place_states(simulator: "MujocoSimulator", batch: Any, components: tuple[Tensor, ...]) -> None:
+def place_states(simulator: MujocoMechanism, batch: Any, components: tuple[Tensor, ...]) -> None:
     """Puts a batch into states; components that are no states of the simulator's stay put.
 
     Args:

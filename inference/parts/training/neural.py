@@ -1,0 +1,377 @@
+"""What all backends that train an ensemble of networks share: data, training, state on disk.
+
+A method says which networks, which loss and which of the simulations; :class:`NeuralBackend` does
+the rest. Every round trains anew on the simulations so far.
+"""
+
+import logging
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from npdr_ppl.errors import BackendError
+from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
+from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
+from npdr_ppl.inference.parts.training.simulation_checks import (
+    check_problem,
+    check_restored,
+    finite_rows,
+)
+from npdr_ppl.inference.parts.training.training import (
+    Evaluator,
+    Loss,
+    TrainingOptions,
+    in_turn,
+    train,
+    vectorised,
+)
+
+__all__ = ["NeuralBackend", "NeuralState", "Simulations"]
+
+logger = logging.getLogger(__name__)
+
+MIN_SIMULATIONS = 10
+"""Simulations below which there is nothing to hold out and no covariance to estimate."""
+
+
+@dataclass(frozen=True)
+class Simulations:
+    """Successful simulations.
+
+    Attributes:
+        z: Parameters, ``(n, d)``.
+        x: Features, ``(n,) + observation.shape``.
+        rounds: The round each came from, ``(n,)``.
+    """
+
+    z: Tensor
+    x: Tensor
+    rounds: Tensor
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def __getitem__(self, rows: Tensor) -> "Simulations":
+        return Simulations(self.z[rows], self.x[rows], self.rounds[rows])
+
+    def followed_by(self, z: Tensor, x: Tensor, number: int) -> "Simulations":
+        """Returns these and a round's."""
+        rounds = torch.full((len(z),), number, dtype=torch.long)
+        return Simulations(
+            torch.cat((self.z, z)), torch.cat((self.x, x)), torch.cat((self.rounds, rounds))
+        )
+
+
+@dataclass(frozen=True)
+class NeuralState(State):
+    """What the next round needs.
+
+    Attributes:
+        simulations: All successful simulations.
+        weights: The networks' parameters and buffers by name, each ``(members, ...)``; empty
+            before the first round.
+        preconditioner: What the networks' data are preconditioned with.
+    """
+
+    simulations: Simulations
+    weights: Mapping[str, Tensor]
+    preconditioner: Preconditioner | None
+
+
+@dataclass(frozen=True)
+class NeuralBackend(Backend):
+    """A backend that trains an ensemble of networks on preconditioned simulations.
+
+    Args:
+        members: Independently trained networks; the posterior is the mixture of theirs.
+        epochs: Passes through the simulations at most.
+        batch_size: Rows of a mini-batch at most; fewer with few simulations.
+        learning_rate: Peak of the one-cycle schedule.
+        weight_decay: Decoupled weight decay.
+        averaging: Decay of the running average of the weights.
+        validation_fraction: Fraction of the simulations each member holds out.
+        patience: Epochs without improvement after which training stops.
+    """
+
+    objective: ClassVar[str] = "validation_log_prob"
+    """Name of the figure that training maximises."""
+
+    preconditioner_type: ClassVar[type[Preconditioner]] = Preconditioner
+    """What :meth:`_precondition` returns."""
+
+    shares_held_out: ClassVar[bool] = False
+    """Whether all members hold out the same simulations rather than each its own."""
+
+    members: int = 2
+    epochs: int = 30
+    batch_size: int = 512
+    learning_rate: float = 1e-2
+    weight_decay: float = 0.0
+    averaging: float = 0.99
+    validation_fraction: float = 0.1
+    patience: int = 20
+
+    def __post_init__(self) -> None:
+        """Validates the options that all have; a method adds its own."""
+        self._check_ranges(
+            members=(1, float("inf")),
+            epochs=(1, float("inf")),
+            batch_size=(1, float("inf")),
+            patience=(1, float("inf")),
+            learning_rate=(1e-12, float("inf")),
+            weight_decay=(0.0, float("inf")),
+            averaging=(0.0, 1 - 1e-9),
+            validation_fraction=(1e-9, 0.9),
+        )
+
+    def _check_ranges(self, **ranges: tuple[float, float]) -> None:
+        """Checks that options lie in closed ranges.
+
+        Raises:
+            BackendError: One does not.
+        """
+        for option, (low, high) in ranges.items():
+            if not low <= getattr(self, option) <= high:
+                raise BackendError(
+                    f"{self.name}: {option} must lie between {low} and {high}; "
+                    f"got {getattr(self, option)}."
+                )
+
+    def _check_choice(self, option: str, allowed: Sequence[str]) -> None:
+        """Checks that an option is one of some words.
+
+        Raises:
+            BackendError: It is not.
+        """
+        if getattr(self, option) not in allowed:
+            raise BackendError(
+                f"{self.name}: {option} must be one of {', '.join(allowed)}; "
+                f"got {getattr(self, option)!r}."
+            )
+
+    def _check_widths(self, option: str) -> None:
+        """Makes an option a tuple and checks that it names widths of hidden layers.
+
+        Raises:
+            BackendError: It does not.
+        """
+        widths = tuple(getattr(self, option))
+        object.__setattr__(self, option, widths)
+        if not widths or min(widths) < 1:
+            raise BackendError(f"{self.name}: {option} must name positive widths; got {widths}.")
+
+    @abstractmethod
+    def _networks(self, problem: Problem) -> Sequence[nn.Module]:
+        """Returns the ensemble's untrained networks, drawing from torch's global stream."""
+
+    def _starting_networks(
+        self,
+        problem: Problem,
+        state: NeuralState,
+        preconditioner: Preconditioner,
+        simulations: Simulations,
+    ) -> Sequence[nn.Module]:
+        """Returns the networks that a round's training starts from: untrained ones.
+
+        Args:
+            problem: The problem.
+            state: The state before the round.
+            preconditioner: That of the round.
+            simulations: What the round trains on.
+        """
+        return self._networks(problem)
+
+    def _evaluator(self, problem: Problem) -> Evaluator:
+        """Returns how all networks are evaluated at once; embedding networks are in turn."""
+        return vectorised if problem.build_network is None else in_turn
+
+    @abstractmethod
+    def _loss(
+        self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
+    ) -> Loss:
+        """Returns the objective of the present round on the problem's device."""
+
+    def _validation_loss(
+        self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
+    ) -> Loss | None:
+        """Returns the objective at held-out rows where :meth:`_loss` is random, else ``None``."""
+        return None
+
+    def _calibration(
+        self,
+        problem: Problem,
+        preconditioner: Preconditioner,
+        simulations: Simulations,
+        weights: Mapping[str, Tensor],
+        held_out: Tensor,
+    ) -> dict[str, Tensor]:
+        """Returns what is fitted after training and kept with the weights: nothing.
+
+        Args:
+            problem: The problem.
+            preconditioner: That of the round.
+            simulations: What the round trained on.
+            weights: The trained networks' parameters and buffers.
+            held_out: Numbers of the simulations each member held out, ``(members, n)``.
+        """
+        return {}
+
+    def _training_rows(self, problem: Problem, state: NeuralState) -> Tensor:
+        """Returns which of the earlier rounds' simulations to train on, ``(n,)``."""
+        return torch.ones(len(state.simulations), dtype=torch.bool)
+
+    def _precondition(self, problem: Problem, simulations: Simulations) -> Preconditioner:
+        """Returns the preconditioner of the present round's networks."""
+        is_raw = problem.build_network is not None
+        return fit_preconditioner(simulations.z, simulations.x, is_raw)
+
+    def init(self, problem: Problem) -> NeuralState:
+        """Returns the state before any simulation."""
+        check_problem(problem)
+        none = Simulations(
+            torch.empty(0, problem.num_parameters),
+            torch.empty(0, *problem.observation.shape),
+            torch.empty(0, dtype=torch.long),
+        )
+        return NeuralState(0, none, {}, None)
+
+    def tell(
+        self,
+        problem: Problem,
+        state: State,
+        z: Tensor,
+        x: Tensor,
+        progress: Callable[[float, str], None] | None = None,
+    ) -> tuple[NeuralState, RoundInfo]:
+        """Trains the ensemble anew on the simulations so far; see :meth:`Backend.tell`.
+
+        Raises:
+            ShapeError: The shapes do not fit the problem.
+            BackendError: Too few simulations succeeded.
+        """
+        start = perf_counter()
+        state = self._own(state)
+        num_simulations = len(z)
+        min_rows = MIN_SIMULATIONS if state.round == 0 else 1
+        z, x, num_failed = finite_rows(problem, z.detach().cpu(), x.detach().cpu(), min_rows)
+        simulations = state.simulations.followed_by(z, x, state.round)
+        used = torch.ones(len(simulations), dtype=torch.bool)
+        used[: len(state.simulations)] = self._training_rows(problem, state)
+        rows = simulations[used]
+        preconditioner = self._precondition(problem, rows)
+        clipped = self._clipped_features(problem, preconditioner)
+        device = problem.device
+        fit = train(
+            self._starting_networks(problem, state, preconditioner, rows),
+            self._loss(problem, preconditioner.to(device), rows),
+            len(rows),
+            TrainingOptions(
+                epochs=self.epochs,
+                batch_size=self.batch_size,
+                learning_rate=self.learning_rate,
+                weight_decay=self.weight_decay,
+                averaging=self.averaging,
+                validation_fraction=self.validation_fraction,
+                patience=self.patience,
+                shares_held_out=self.shares_held_out,
+            ),
+            device,
+            evaluator=self._evaluator(problem),
+            progress=progress,
+            validation_loss=self._validation_loss(problem, preconditioner.to(device), rows),
+        )
+        weights = {name: value.cpu() for name, value in fit.weights.items()}
+        weights |= self._calibration(problem, preconditioner, rows, weights, fit.held_out.cpu())
+        info = RoundInfo(
+            num_simulations,
+            num_failed,
+            perf_counter() - start,
+            {
+                self.objective: self._objective(fit.validation.cpu(), preconditioner).tolist(),
+                "best_epoch": fit.best_epochs.tolist(),
+                "epochs": fit.epochs,
+                "trained_on": len(rows),
+                "clipped_features": clipped,
+            },
+        )
+        return NeuralState(state.round + 1, simulations, weights, preconditioner), info
+
+    def _objective(self, validation: Tensor, preconditioner: Preconditioner) -> Tensor:
+        """Returns the validation objective in the units of the reference coordinates."""
+        return validation + preconditioner.log_det
+
+    def _clipped_features(self, problem: Problem, preconditioner: Preconditioner) -> int:
+        """Counts the observation's features outside the simulated range, with a warning."""
+        clipped = self._outside(problem, preconditioner)
+        if clipped.any():
+            logger.warning(
+                "%d of %d features of the observation lie outside the simulated range and were "
+                "clipped to it: %s. The model may be wrong or its prior too narrow.",
+                int(clipped.sum()),
+                clipped.numel(),
+                clipped.flatten().nonzero().flatten().tolist()[:10],
+            )
+        return int(clipped.sum())
+
+    def _outside(self, problem: Problem, preconditioner: Preconditioner) -> Tensor:
+        """Returns which of the observation's features lie outside the simulated range."""
+        return preconditioner.outside(problem.observation.cpu())
+
+    def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Splits a state into tensors and JSON-serialisable values."""
+        state = self._own(state)
+        own = state.simulations
+        tensors = {"z": own.z, "x": own.x, "rounds": own.rounds}
+        tensors |= {f"weights.{name}": value for name, value in state.weights.items()}
+        if state.preconditioner is not None:
+            parts = state.preconditioner.tensors()
+            tensors |= {f"preconditioner.{name}": value for name, value in parts.items()}
+        return tensors, {"backend": self.name, "round": state.round}
+
+    def restore(
+        self, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
+    ) -> NeuralState:
+        """Rebuilds a state from :meth:`tensors`; see :func:`check_restored` for errors."""
+        check_restored(self.name, problem, tensors, values)
+        z, x = tensors["z"], tensors["x"]
+        parts = {
+            prefix: {
+                name.removeprefix(f"{prefix}."): value
+                for name, value in tensors.items()
+                if name.startswith(f"{prefix}.")
+            }
+            for prefix in ("weights", "preconditioner")
+        }
+        fitted = parts["preconditioner"]
+        return NeuralState(
+            round=int(values["round"]),
+            simulations=Simulations(z, x, tensors["rounds"]),
+            weights=parts["weights"],
+            preconditioner=self.preconditioner_type.from_tensors(fitted) if fitted else None,
+        )
+
+    def _own(self, state: State) -> NeuralState:
+        """Returns the state as this backend's.
+
+        Raises:
+            BackendError: It is not.
+        """
+        if not isinstance(state, NeuralState):
+            raise BackendError(f"{self.name} cannot continue from a {type(state).__name__}.")
+        return state
+
+    def _trained(self, state: State) -> tuple[NeuralState, Preconditioner]:
+        """Returns a state that has seen simulations, and its preconditioner.
+
+        Raises:
+            BackendError: It has not.
+        """
+        state = self._own(state)
+        if state.preconditioner is None:
+            raise BackendError("There is no posterior yet: tell the backend simulations first.")
+        return state, state.preconditioner

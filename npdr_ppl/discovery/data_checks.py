@@ -1,0 +1,189 @@
+"""Problems of the data that no physics explains, to be ruled out first.
+
+A recording in degrees, with a sign turned round or its commands stamped too late looks like a
+device with a missing effect, and a large catalogue will offer one. Each such problem has a remedy
+that can be tried: the recording is changed back and the model fitted again. A remedy that makes
+most of the misfit disappear names the problem.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis
+from npdr_ppl.errors import DataError, NpdrError
+from npdr_ppl.language.channels import Channel
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.simulator_checks import OTHER_UNITS, check_units
+
+__all__ = ["data_problems", "recording_problems"]
+
+GROSS = 0.1
+"""Residual in units of what a window's readings change by, above which remedies are tried."""
+
+CURE = 0.5
+"""By which factor a remedy has to reduce the residual to name the problem."""
+
+SHIFTS = (1, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20)
+"""Steps by which commands may be stamped too late or too early."""
+
+LONGEST_DELAY = 0.04
+"""Seconds that a device may take to answer a command; commands stamped too early look the same."""
+
+SPIKE = 12.0
+"""Jumps, in standard deviations of a channel's second differences, that tell lost samples."""
+
+RESTS = 0.01
+"""Change within a step, in a channel's root-mean-square change, below which the channel rests."""
+
+MIN_STEPS = 20
+
+MOST_LOST = 0.02
+"""Share of the steps above which jumps are how the device moves."""
+
+Array = NDArray[np.float64]
+
+
+def data_problems(hypothesis: Hypothesis, rollouts: Rollouts, options: DataOptions) -> list[str]:
+    """Returns problems of a recording, a sentence each.
+
+    Args:
+        hypothesis: The model, fitted to the recording.
+        rollouts: The recording.
+        options: Its segments.
+    """
+    return recording_problems(hypothesis.segments.measured, rollouts) or _wrong_readings(
+        hypothesis, rollouts, options
+    )
+
+
+def recording_problems(sensors: Sequence[Channel], rollouts: Rollouts) -> list[str]:
+    """Returns problems that show without simulating, a sentence each.
+
+    Args:
+        sensors: What the model says of the recorded channels.
+        rollouts: The recording.
+    """
+    problems = _lost_samples(rollouts, [sensor.name for sensor in sensors])
+    try:
+        check_units(rollouts, sensors)
+    except DataError as error:
+        problems.append(str(error))
+    return problems
+
+
+def _wrong_readings(hypothesis: Hypothesis, rollouts: Rollouts, options: DataOptions) -> list[str]:
+    # As remedies are tried, with states as the smoother sees them: along the fit they would be
+    # where the wrong readings have led it.
+    as_read = fit_hypothesis(hypothesis.model, rollouts, options, max_steps=6, is_rough=True)
+    present = _relative_misfit(as_read)
+    if present < GROSS:
+        return []
+    cured: dict[str, float] = {}
+    for problem, changed in _remedies(hypothesis, rollouts):
+        try:
+            tried = fit_hypothesis(hypothesis.model, changed, options, max_steps=6, is_rough=True)
+        except NpdrError:
+            continue
+        cured[problem] = _relative_misfit(tried)
+    if not cured:
+        return []
+    best = min(cured, key=lambda problem: cured[problem])
+    return [best] if cured[best] < CURE * present else []
+
+
+def _relative_misfit(hypothesis: Hypothesis) -> float:
+    """Returns the residual in units of what windows' readings change by, the mean channel's."""
+    segments = hypothesis.segments
+    mask = segments.inputs.mask[..., None]
+    names = segments.inputs.channel_names
+    columns = [names.index(name) for name in segments.channel_names]
+    change = segments.observed - segments.inputs.initial_values[:, None, columns]
+    spread = ((change * mask).square().sum((0, 1)) / mask.sum()).sqrt().double()
+    ratio = hypothesis.fit.scale / spread.clamp_min(1e-12)
+    return float(ratio.clamp_max(10.0).log().mean().exp())
+
+
+def _remedies(hypothesis: Hypothesis, rollouts: Rollouts) -> Iterator[tuple[str, Rollouts]]:
+    sensors = hypothesis.segments.measured
+    units = {sensor.name: sensor.unit.removesuffix("/s") for sensor in sensors}
+    pairs = [[s.rate_of, s.name] for s in sensors if s.rate_of in units]
+    for group in [[name] for name in units] + pairs:
+        text = f"The sign of {' and '.join(group)} looks turned round."
+        yield text, _scaled(rollouts, group, -1.0)
+    for si, (other, factor) in OTHER_UNITS.items():
+        chosen = [name for name, unit in units.items() if unit == si]
+        for group in [[name] for name in chosen] + ([chosen] if len(chosen) > 1 else []):
+            looks = "look" if len(group) > 1 else "looks"
+            sentence = f"{' and '.join(group)} {looks} recorded in {other}, not in SI units."
+            yield sentence, _scaled(rollouts, group, 1.0 / factor)
+    for k, name in enumerate(rollouts.action_names):
+        actions = [_column(a, k, lambda x: -x) for a in rollouts.actions]
+        text = f"The sign of {name} looks turned round."
+        yield text, replace(rollouts, actions=tuple(actions))
+    for steps in SHIFTS:
+        if 4 * steps < min(rollouts.lengths):
+            yield (
+                f"The commands look stamped about {steps} steps too late.",
+                _shifted(rollouts, steps),
+            )
+            if steps * rollouts.time_step > LONGEST_DELAY:
+                text = f"The commands look stamped about {steps} steps too early."
+                yield text, _shifted(rollouts, -steps)
+
+
+def _scaled(rollouts: Rollouts, channels: Sequence[str], factor: float) -> Rollouts:
+    factors = np.where([name in channels for name in rollouts.channel_names], factor, 1.0)
+    return replace(rollouts, readings=tuple(values * factors for values in rollouts.readings))
+
+
+def _column(values: Array, k: int, change: Callable[[Array], Array]) -> Array:
+    result = values.copy()
+    result[:, k] = change(result[:, k])
+    return result
+
+
+def _shifted(rollouts: Rollouts, steps: int) -> Rollouts:
+    """Returns the recording with every command given some steps earlier, or later if negative."""
+    size = abs(steps)
+
+    def moved(actions: Array) -> Array:
+        if steps > 0:
+            return np.concatenate((actions[size:], np.repeat(actions[-1:], size, 0)))
+        return np.concatenate((np.repeat(actions[:1], size, 0), actions[:-size]))
+
+    return replace(rollouts, actions=tuple(moved(actions) for actions in rollouts.actions))
+
+
+def _lost_samples(rollouts: Rollouts, channels: Sequence[str]) -> list[str]:
+    """Finds moments at which most channels jump at once and go on as if nothing had happened."""
+    columns = [rollouts.channel_names.index(name) for name in channels]
+    problems = []
+    for index, readings in enumerate(rollouts.readings):
+        first = np.diff(readings[:, columns], axis=0)
+        second = np.abs(np.diff(first, axis=0))
+        first = np.abs(first[1:])
+        # What is usual while the device moves: it may have stood still most of the time.
+        rests = first <= RESTS * np.sqrt(np.square(first).mean(0))
+        moves = rests.mean(1) <= 0.5
+        if moves.sum() < MIN_STEPS:
+            continue
+        # Only what moves can jump; an encoder's count is no jump.
+        steady = np.median(first[moves], axis=0)
+        spread = np.maximum(np.median(second[moves], axis=0) / 0.6745, 0.1 * steady)
+        moving = steady > 0
+        if moving.sum() < 2:
+            continue
+        jumps = second[:, moving] > SPIKE * spread[moving]
+        together = jumps.mean(1) > 0.5
+        count = int((np.diff(together.astype(int), prepend=0) == 1).sum())
+        if 0 < count and together.mean() < MOST_LOST:
+            begin = float(np.flatnonzero(together)[0] + 1) * rollouts.time_step
+            problems.append(
+                f"Rollout {index} looks as if samples were lost {count} times, first at "
+                f"{begin:.3g} s."
+            )
+    return problems

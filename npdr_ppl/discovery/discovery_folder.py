@@ -1,0 +1,138 @@
+"""The folder of a discovery: what was asked, and the results once they are complete.
+
+    run.json            model, options, seed, versions, a checksum of the recordings
+    discovery.json      the results; written last, so that a folder that has it is complete
+    revised_model.py    the model with the effects that were missing
+
+A discovery that was killed leaves no ``discovery.json`` and begins anew when it is asked for
+again; one that is complete is not repeated.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from npdr_ppl.discovery.discovery_options import DiscoveryOptions
+from npdr_ppl.discovery.discovery_result import Discovery, describe_candidate
+from npdr_ppl.discovery.investigation import Investigation
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.io.atomic_files import replacing
+from npdr_ppl.run_files import (
+    holds_this_run,
+    make_folder,
+    plain,
+    read_json,
+    source_text,
+    versions,
+    write_json,
+)
+
+__all__ = ["STAGES", "DiscoveryFolder", "Stage", "findings_until"]
+
+Stage = Literal["check", "locate", "alarm", "name", "prove"]
+"""The stages, each of which includes those before."""
+
+STAGES: tuple[Stage, ...] = get_args(Stage)
+
+
+class DiscoveryFolder:
+    """Reads and writes the folder of one discovery.
+
+    Args:
+        path: The folder; it is made when something is written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def begin(
+        self,
+        model: Callable[..., Any],
+        rollouts: Rollouts,
+        holdout: Rollouts | None,
+        options: DiscoveryOptions,
+    ) -> None:
+        """Describes the discovery, or checks that the folder holds this very one already.
+
+        Raises:
+            DataError: The folder holds another one.
+        """
+        settings = dataclasses.asdict(options)
+        settings["effects"] = options.effects and [repr(e) for e in options.effects]
+        seed = settings.pop("seed")
+        description = plain(
+            {
+                "command": "discover",
+                "model": {
+                    "name": getattr(model, "__name__", type(model).__name__),
+                    "source": source_text(model),
+                },
+                "options": settings,
+                "seed": seed,
+                "recordings": [_checksum(r) for r in (rollouts, holdout) if r is not None],
+            }
+        )
+        file = self.path / "run.json"
+        make_folder(self.path)
+        if not holds_this_run(file, description):
+            write_json(file, description | {"versions": versions()})
+
+    def finished(self, stage: Stage) -> dict[str, Any] | None:
+        """Returns the results up to a stage if they are here already."""
+        file = self.path / "discovery.json"
+        if not file.exists():
+            return None
+        found = read_json(file)
+        reached = found.get("stage", STAGES[0])
+        return found if STAGES.index(reached) >= STAGES.index(stage) else None
+
+    def finish(self, found: dict[str, Any], source: str | None = None) -> None:
+        """Writes the results.
+
+        Args:
+            found: The content of ``discovery.json``.
+            source: The revised model as Python source, once there is one.
+        """
+        if source is not None:
+            with replacing(self.path / "revised_model.py") as temporary:
+                temporary.write_text(source, encoding="utf-8")
+        write_json(self.path / "discovery.json", found)
+
+
+def findings_until(
+    investigation: Investigation, stage: Stage
+) -> tuple[dict[str, Any], Discovery | None]:
+    """Runs an investigation up to a stage.
+
+    Args:
+        investigation: The investigation.
+        stage: The last stage.
+
+    Returns:
+        The content of ``discovery.json``, and all of the discovery if a verdict was reached.
+    """
+    reached = STAGES.index(stage)
+    if reached >= STAGES.index("name"):
+        discovery = investigation.conclude()
+        return {"stage": stage, **discovery.to_dict()}, discovery
+    found: dict[str, Any] = {"stage": stage, "data_problems": list(investigation.problems)}
+    if reached >= STAGES.index("locate"):
+        found["where"] = [spot.to_dict() for spot in investigation.where]
+    if reached >= STAGES.index("alarm"):
+        first = investigation.first
+        found["alarm"] = {"p_value": first.alarm.p_value, "fired": first.alarm.fired}
+        found["ranking"] = [
+            describe_candidate(candidate, first.alarm.p_values[candidate.name])
+            for candidate in first.ranking
+        ]
+    return found | {"seconds": investigation.seconds}, None
+
+
+def _checksum(rollouts: Rollouts) -> str:
+    digest = hashlib.sha256(repr((rollouts.channel_names, rollouts.time_step)).encode())
+    for readings, actions in zip(rollouts.readings, rollouts.actions, strict=True):
+        digest.update(readings.tobytes())
+        digest.update(actions.tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,182 @@
+"""What discovery found."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.discovery_options import DiscoveryOptions
+from npdr_ppl.discovery.finding import Finding
+from npdr_ppl.discovery.proof.held_out_gap import Gap
+from npdr_ppl.discovery.proof.next_experiment import NextExperiment
+from npdr_ppl.discovery.proof.parameter_intervals import Draws, Estimate
+from npdr_ppl.discovery.proof.residual_map import Spot
+from npdr_ppl.discovery.revised_model import revised_source
+from npdr_ppl.discovery.screening.alarm import Alarm
+from npdr_ppl.discovery.screening.encoder_resolution import Count
+from npdr_ppl.discovery.screening.screening import Screened
+from npdr_ppl.discovery.search.prior_ends import PriorEnd
+from npdr_ppl.discovery.search.search import Search
+from npdr_ppl.language.handlers import num_finer_steps
+from npdr_ppl.rollouts.io.atomic_files import replacing
+from npdr_ppl.run_files import write_json
+
+__all__ = ["Discovery", "Verdict", "describe_candidate"]
+
+Verdict = Literal["none", "named", "ambiguous", "unknown"]
+"""Nothing is missing; what is missing has a name; it has several names that the recording cannot
+tell apart; it is none of the catalogue."""
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """What discovery found.
+
+    Attributes:
+        verdict: What the recording says of the model.
+        reason: The verdict in a sentence.
+        problems: What is wrong with the recording itself; nothing is named then.
+        narrow_priors: Priors outside which the revised model's parameters lie; the search was made
+            with wider ones.
+        alarm: Whether the model as it was and the recording disagree.
+        remainder: The same for the revised model.
+        unexplained: Share of the misfit that the revised model leaves and something could explain.
+        where: The windows that the model as it was misses most, the worst first.
+        effects: What was missing, in the order of finding.
+        ranking: All candidates at the model as it was, by linear gain.
+        separation: Distance between the leading candidates once parameters are refitted, in
+            standard deviations, ``(n, n)``; the diagonal is the distance from none.
+        separation_names: Their names.
+        gap: Metrics on the held-out recording; empty without one.
+        next_experiment: What to record next, where candidates could not be told apart.
+        model: The model as it was.
+        revised: The model with the effects.
+        parameters: All parameters' estimates in the revised model, by site.
+        draws: Draws of the revised model's posterior.
+        counts: Channels that are read in whole counts, as an encoder's, and what rounding makes
+            of what the revised model leaves there.
+        search: How it was found.
+        options: How it was searched.
+        seconds: Time spent, by stage.
+    """
+
+    verdict: Verdict
+    reason: str
+    problems: tuple[str, ...]
+    narrow_priors: tuple[PriorEnd, ...]
+    alarm: Alarm
+    remainder: Alarm
+    unexplained: float
+    where: list[Spot]
+    effects: list[Finding]
+    ranking: list[Screened]
+    separation: Tensor
+    separation_names: tuple[str, ...]
+    gap: dict[str, Gap]
+    next_experiment: NextExperiment | None
+    model: Callable[..., Any]
+    revised: Callable[..., Any]
+    parameters: dict[str, Estimate]
+    draws: Draws
+    counts: dict[str, Count]
+    search: Search
+    options: DiscoveryOptions
+    seconds: dict[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns JSON-serialisable values; architecture's names, and more."""
+        return {
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "data_problems": list(self.problems),
+            "priors_too_narrow": [str(end) for end in self.narrow_priors],
+            "alarm": {"p_value": self.alarm.p_value, "fired": self.alarm.fired},
+            "remainder": {
+                "p_value": self.remainder.p_value,
+                "fired": self.remainder.fired,
+                "unexplained": self.unexplained,
+            },
+            "where": [spot.to_dict() for spot in self.where],
+            "finer_steps": num_finer_steps(self.revised),
+            "effects": [finding.to_dict() for finding in self.effects],
+            "ranking": [describe_candidate(s, self.alarm.p_values[s.name]) for s in self.ranking],
+            "separation": {
+                "names": list(self.separation_names),
+                "distance": self.separation.tolist(),
+            },
+            "gap": {name: gap.to_dict() for name, gap in self.gap.items()},
+            "next_experiment": self.next_experiment and self.next_experiment.to_dict(),
+            "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
+            "counts": {name: count.to_dict() for name, count in self.counts.items()},
+            "seconds": self.seconds,
+        }
+
+    def source(self) -> str:
+        """Returns the revised model as Python source."""
+        effects = tuple(finding.effect for finding in self.effects)
+        fitted = {
+            name: float(value)
+            for name, value in self.search.final.parameters.items()
+            if torch.as_tensor(value).numel() == 1
+        }
+        return revised_source(self.model, effects, fitted)
+
+    def save(self, folder: Path) -> None:
+        """Writes ``revised_model.py`` and then ``discovery.json``, which makes it count.
+
+        Args:
+            folder: Where to; made if it is not there.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(folder / "revised_model.py") as temporary:
+            temporary.write_text(self.source(), encoding="utf-8")
+        write_json(folder / "discovery.json", self.to_dict())
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draws the probabilities of what was missing and the gap on held-out rollouts.
+
+        :func:`~npdr_ppl.display.plots.discovery_figures.write_discovery_figures` draws all the
+        rest.
+
+        Args:
+            axes: Where to draw: a panel for each effect, or one of what was tried where none was
+                added, and one for each metric that has a noise floor; ``None`` for a new figure.
+
+        Returns:
+            The axes, one per panel.
+        """
+        from npdr_ppl.discovery.discovery_view import plot_discovery
+
+        return plot_discovery(
+            self.verdict, self.effects, self.search.rounds[-1].weights, self.gap, axes
+        )
+
+    def _repr_html_(self) -> str:
+        from npdr_ppl.discovery.discovery_view import discovery_html
+
+        return discovery_html(self.verdict, self.reason, self.effects, self.gap)
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{f.effect.name} ({f.probability:.0%})" for f in self.effects)
+        return f"Discovery({self.verdict}{': ' + found if found else ''})"
+
+
+def describe_candidate(candidate: Screened, p_value: float) -> dict[str, Any]:
+    """Returns a candidate of the ranking as JSON-serialisable values."""
+    effect = candidate.variant.effect
+    return {
+        "effect": effect.id,
+        "port": effect.port,
+        "gain": candidate.gain,
+        "separation": candidate.separation,
+        "absorbed": candidate.absorbed,
+        "p_value": p_value,
+        "estimate": {
+            name.removeprefix(f"{effect.name}."): float(value)
+            for name, value in candidate.variant.parameters(candidate.sizes).items()
+        },
+        "minimum_detectable": candidate.minimum_detectable,
+    }

@@ -1,0 +1,160 @@
+"""What a discovery shows of itself in a notebook: its findings, and two small drawings."""
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from npdr_ppl.discovery.finding import Finding
+from npdr_ppl.discovery.proof.held_out_gap import LEVEL, Gap
+from npdr_ppl.drawing.html import table
+from npdr_ppl.drawing.panels import panels
+from npdr_ppl.drawing.theme import COLORS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["discovery_html", "draw_gap", "draw_probabilities", "plot_discovery", "short_name"]
+
+MOST_BARS = 5
+"""Alternatives drawn of one effect."""
+
+CHOSEN, OTHERS, BEFORE = COLORS["posterior"], COLORS["prior"], COLORS["nominal"]
+
+
+def short_name(name: str) -> str:
+    """Returns an effect's name in two lines: what it is, and the port."""
+    port, _, effect = name.rpartition(".")
+    channels = port.split(",")
+    where = ", ".join(channels) if len(channels) < 3 else f"{channels[0]} … {channels[-1]}"
+    return f"{effect.replace('_', ' ')}\n{where}"
+
+
+def plot_discovery(
+    verdict: str,
+    effects: Sequence[Finding],
+    weights: Mapping[str, float],
+    gap: Mapping[str, Gap],
+    axes: Any = None,
+) -> Any:
+    """Draws what was found and the gap; see :meth:`Discovery.plot`.
+
+    Args:
+        verdict: What the recording says of the model.
+        effects: What was missing.
+        weights: Probabilities of what was tried last, by name.
+        gap: Metrics on the held-out recording.
+        axes: Axes to draw on; ``None`` makes a figure.
+    """
+    shown = probabilities(effects, weights)
+    metrics = {m: values for m, values in gap.items() if values.noise_floor is not None}
+    count = max(1, len(shown) + len(metrics))
+    given = panels(axes, count, columns=count, size=(2.8, 2.6))
+    given[0].set_title(f"verdict: {verdict}")
+    for axis, (title, bars, chosen) in zip(given, shown, strict=False):
+        draw_probabilities(axis, bars, chosen=chosen, title=title)
+    for axis, (metric, values) in zip(given[len(shown) :], metrics.items(), strict=False):
+        draw_gap(axis, metric, values)
+        axis.legend()
+    return given
+
+
+def probabilities(
+    effects: Sequence[Finding], weights: Mapping[str, float]
+) -> list[tuple[str, Mapping[str, float], Sequence[str]]]:
+    """Returns title, probabilities and the chosen name of each panel.
+
+    One panel for each effect that was found, with what could stand in its place; where none was
+    found, one with what was tried, if anything, ``""`` standing for none.
+    """
+    if effects:
+        return [
+            (f"what effect {k} could be", f.alternatives, (f.effect.name,))
+            for k, f in enumerate(effects, start=1)
+        ]
+    return [("nothing was added", weights, ("",))] if weights else []
+
+
+def draw_probabilities(
+    axis: "Axes", bars: Mapping[str, float], *, chosen: Sequence[str], title: str = ""
+) -> None:
+    """Draws probabilities as horizontal bars, the greatest on top.
+
+    Args:
+        axis: Where to.
+        bars: Probabilities by name of the effect; ``""`` for none.
+        chosen: Names whose bars have the colour of what was chosen.
+        title: Title of the panel.
+    """
+    names = sorted(bars, key=lambda name: -bars[name])[:MOST_BARS]
+    values = [bars[name] for name in names]
+    colors = [CHOSEN if name in chosen else OTHERS for name in names]
+    axis.barh(range(len(names)), values, color=colors, height=0.7)
+    for row, value in enumerate(values):
+        axis.text(value, row, f" {value:.0%}", va="center", fontsize=7)
+    axis.set_yticks(range(len(names)), [short_name(n) if n else "none" for n in names], fontsize=7)
+    axis.set_xlim(0.0, 1.15)
+    axis.set_xticks([0.0, 0.5, 1.0])
+    axis.set_ylim(max(len(names), 2) - 0.4, -0.6)
+    axis.set_xlabel("probability")
+    axis.set_title(title)
+
+
+def draw_gap(axis: "Axes", metric: str, gap: Gap) -> None:
+    """Draws a metric on held-out rollouts before and after, and what it should come to.
+
+    Args:
+        axis: Where to.
+        metric: Its name.
+        gap: Its values.
+    """
+    values = [gap.before, gap.after]
+    axis.bar([0, 1], values, color=[BEFORE, CHOSEN], width=0.65)
+    if gap.noise_floor is not None:
+        axis.axhline(gap.noise_floor, color="k", ls="--", lw=1.0, label="noise floor")
+    elif metric == "coverage":
+        axis.axhline(LEVEL, color="k", ls=":", lw=1.2, label="what it should be")
+    # Below the axis, where no line crosses the figures.
+    axis.set_xticks(
+        [0, 1], [f"{w}\n{v:.3g}" for w, v in zip(("before", "after"), values, strict=True)]
+    )
+    axis.set_xlim(-0.5, 1.5)
+    finite = [v for v in (*values, gap.noise_floor or 0.0) if math.isfinite(v)]
+    axis.set_ylim(0.0, 1.15 * max([*finite, 1e-12]))
+    title = metric.upper() if metric != "coverage" else f"coverage of {LEVEL:.0%} bands"
+    closed = gap.closed
+    axis.set_title(title if closed is None else f"{title}: {closed:.0%} closed")
+
+
+def discovery_html(
+    verdict: str, reason: str, effects: Sequence[Finding], gap: Mapping[str, Gap]
+) -> str:
+    """Returns verdict, findings and gap as HTML."""
+    parts = [f"<div><strong>Discovery: {escape(verdict)}</strong><p>{escape(reason)}</p>"]
+    if effects:
+        rows = [
+            [
+                f.effect.name if k == 0 else "",
+                f"{f.probability:.0%}" if k == 0 else "",
+                name,
+                f"{p.mean:.4g} ± {p.sd:.2g} {'' if p.unit == '1' else p.unit}",
+                (", ".join(f.equivalent_to) or "–") if k == 0 else "",
+            ]
+            for f in effects
+            for k, (name, p) in enumerate(f.parameters.items())
+        ]
+        head = ["effect", "probability", "parameter", "estimate", "not told from"]
+        parts.append(table(head, rows))
+    if gap:
+        rows = [
+            [
+                metric,
+                f"{values.before:.4g}",
+                f"{values.after:.4g}",
+                "–" if values.noise_floor is None else f"{values.noise_floor:.4g}",
+                "–" if values.closed is None else f"{values.closed:.0%}",
+            ]
+            for metric, values in gap.items()
+        ]
+        parts.append(table(["held out", "before", "after", "noise floor", "closed"], rows))
+    return "".join([*parts, "</div>"])

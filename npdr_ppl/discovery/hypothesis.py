@@ -1,0 +1,224 @@
+"""A hypothesis: the model with some effects, fitted to the recording."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.handlers import add_effect
+from npdr_ppl.language.simulator import Simulator
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.effective_share import effective_share
+from npdr_ppl.preparation.initial_states import Starts
+from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
+from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
+from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["Hypothesis", "fit_hypothesis", "with_effects"]
+
+LEAST_PENALISED = -1.0
+"""Coordinate below which the prior no longer speaks against a hypothesis: that an effect is small
+is no reason to doubt it, and half-normal priors have zero strength at minus infinity."""
+
+MOST_READINGS = 100_000
+"""Number of readings above which neighbouring ones are averaged before candidates are tested: ten
+thousand candidate columns of as many readings take a minute. The benchmarks' recordings have
+fewer."""
+
+FEWEST_AVERAGES = 40
+"""Fewest averages per segment: four for each of its ten pulses of force."""
+
+EDGE = 3.0
+"""Coordinate beyond which a prior hardly goes: three standard deviations of a normal one."""
+
+Model = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A model with effects, at its best along the recording.
+
+    Attributes:
+        model: The model, effects included.
+        effects: The effects that were added to the model in question, in the order of adding.
+        segments: The model along the recording.
+        fit: Parameters and initial states that leave least.
+    """
+
+    model: Model
+    effects: tuple[Effect, ...]
+    segments: SegmentModel
+    fit: SegmentFit
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The effects' names."""
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def simulator(self) -> Simulator:
+        """The simulator with all effects."""
+        return self.segments.simulator
+
+    @cached_property
+    def difference(self) -> Tensor:
+        """What was measured less what is simulated at the fit, ``(S, K, C)``."""
+        simulated = self.segments.simulate(self.fit.z[None], self.fit.offsets[None])[0]
+        return self.segments.observed - simulated
+
+    @cached_property
+    def _linearised(self) -> Linearisation:
+        return self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
+
+    def averaged(self) -> "Hypothesis":
+        """Returns the same with averages of neighbouring readings, where there are very many.
+
+        For a :class:`Projection` only: a likelihood counts all readings.
+        """
+        segments = self.segments.averaged(MOST_READINGS, FEWEST_AVERAGES)
+        return self if segments is self.segments else replace(self, segments=segments)
+
+    @property
+    def can_be_linearised(self) -> bool:
+        """Whether the simulation succeeds at the fit and everywhere beside it."""
+        return self._linearised.is_regular
+
+    @property
+    def linearisation(self) -> Linearisation:
+        """Residuals and derivatives at the fit, whitened by its own scale.
+
+        Raises:
+            DataError: Simulations fail beside the fit.
+        """
+        if not self.can_be_linearised:
+            raise DataError(
+                "Simulations fail right beside the model's closest fit; check the recording's "
+                "units, take shorter segments, or narrow the priors."
+            )
+        return self._linearised
+
+    def estimated_starts(self, rollouts: Rollouts) -> Starts | None:
+        """Estimates what the segments start from along the fitted motion, and how well."""
+        return self.segments.estimated_starts(self.fit.z, self.fit.scale, rollouts)
+
+    @cached_property
+    def parameters(self) -> dict[str, Tensor]:
+        """The parameters, ``site.shape`` by latent site."""
+        values = self.segments.prior.to_parameters(self.fit.z[None])
+        return {name: value[0] for name, value in values.items()}
+
+    @cached_property
+    def share(self) -> float:
+        """Share of the readings that are worth an independent one."""
+        assert self.segments.steps_per_average == 1
+        residual = self.segments.whitened(self.difference, self.fit.scale)
+        mask = self.segments.inputs.mask
+        return float(
+            effective_share(residual.unflatten(-1, (-1, len(self.fit.scale))), mask).mean()
+        )
+
+    @cached_property
+    def likelihood(self) -> SegmentLikelihood:
+        """The recording's likelihood with the noise that the fit leaves.
+
+        Raises:
+            DataError: Simulations fail beside the fit.
+        """
+        return SegmentLikelihood(
+            self.segments, self.fit, self.linearisation, self.share, is_noise_declared=False
+        )
+
+    def losses(self, scale: Tensor) -> Tensor:
+        """Returns minus the log density of each segment, up to a constant, ``(S,)``.
+
+        Args:
+            scale: Standard deviation of the readings per channel, ``(C,)``.
+        """
+        residual = self.segments.whitened(self.difference, scale)
+        return 0.5 * (residual.square().sum(-1) + self.fit.offsets.square().sum(-1))
+
+    def at_edge(self, effect: Effect) -> tuple[str, ...]:
+        """Returns the names of an effect's shapes that lie where their priors hardly go.
+
+        There a law is the limit of its own that another law may be: wind without a speed is drag.
+        Strengths may be as small or large as they are, and frequencies are looked for anywhere.
+        """
+        shapes = {p.name for p in effect.parameters} - set(effect.strength) - {effect.wave}
+        if not effect.strength:
+            return ()
+        sites = dict(zip(effect.parameter_names, (p.name for p in effect.parameters), strict=True))
+        return tuple(
+            sites[site.name]
+            for site in self.segments.prior.sites
+            if sites.get(site.name) in shapes
+            and bool((self.fit.z[site.coordinates].abs() > EDGE).any())
+        )
+
+    @property
+    def complexity(self) -> float:
+        """The loss that the priors and the number of the effects' parameters add to the evidence.
+
+        Half the squared coordinates, and half the log of the number of segments for each parameter
+        of an effect: the prior of each is worth one segment (Kass & Wasserman 1995). Priors as
+        wide as typical sizes would speak against every effect that is small and yet plain.
+        """
+        z = self.fit.z.clamp_min(LEAST_PENALISED)
+        num = sum(len(effect.parameters) for effect in self.effects)
+        return 0.5 * float(z.square().sum()) + 0.5 * num * math.log(len(self.fit.offsets))
+
+
+def with_effects(model: Model, effects: Sequence[Effect]) -> Model:
+    """Returns the model with effects attached."""
+    for effect in effects:
+        model = add_effect(model, effect)
+    return model
+
+
+def fit_hypothesis(
+    model: Model,
+    rollouts: Rollouts,
+    options: DataOptions,
+    *,
+    effects: tuple[Effect, ...] = (),
+    start: Mapping[str, Tensor] | None = None,
+    offsets: Tensor | None = None,
+    starts: Starts | None = None,
+    held: Mapping[str, float] | None = None,
+    max_steps: int = 12,
+    is_rough: bool = False,
+) -> Hypothesis:
+    """Fits a model with effects to a recording.
+
+    Args:
+        model: The model in question.
+        rollouts: The recording.
+        options: Its segments.
+        effects: Effects to add.
+        start: Parameters to begin with by site; the others begin in the middle of their priors.
+        offsets: Offsets of the initial states to begin with, ``(S, m)``.
+        starts: What the segments start from, if better known than by the smoother.
+        held: Reference coordinates of sites that are not fitted.
+        max_steps: Greatest number of steps.
+        is_rough: Whether to leave it at rough steps.
+
+    Raises:
+        DataError: The simulation fails at the start, or the data do not fit the model.
+    """
+    model = with_effects(model, effects)
+    segments = SegmentModel(model, rollouts, options, starts)
+    z = segments.place_of(start or {})
+    stays = torch.zeros(z.shape, dtype=torch.bool)
+    for site in segments.prior.sites:
+        if held and site.name in held:
+            z[site.coordinates], stays[site.coordinates] = held[site.name], True
+    fit = fit_segments(
+        segments, z, offsets=offsets, held=stays, max_steps=max_steps, is_rough=is_rough
+    )
+    return Hypothesis(model, effects, segments, fit)

@@ -1,0 +1,406 @@
+"""Discovery: is something wrong, where, what is it, and does adding it help?"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property
+from typing import Any
+
+from torch.distributions import Distribution
+
+from npdr_ppl.discovery.data_checks import data_problems, recording_problems
+from npdr_ppl.discovery.discovery_options import DiscoveryOptions
+from npdr_ppl.discovery.discovery_result import Discovery, Verdict
+from npdr_ppl.discovery.finding import Finding
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.proof.held_out_gap import Gap, prove
+from npdr_ppl.discovery.proof.next_experiment import NextExperiment, next_experiment
+from npdr_ppl.discovery.proof.parameter_intervals import (
+    Draws,
+    Estimate,
+    estimates,
+    posterior_draws,
+)
+from npdr_ppl.discovery.proof.residual_map import Spot, worst_windows
+from npdr_ppl.discovery.screening.encoder_resolution import counts
+from npdr_ppl.discovery.screening.equivalents import equivalents
+from npdr_ppl.discovery.search.alternatives import Added
+from npdr_ppl.discovery.search.evidence import SURVIVES
+from npdr_ppl.discovery.search.limits import limits
+from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
+from npdr_ppl.discovery.search.search import LEADING, Round, Search, Searcher, explained
+from npdr_ppl.discovery.search.trials import PLAINLY
+from npdr_ppl.errors import DataError, ModelError
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["Investigation", "discover"]
+
+MOST_UNEXPLAINED = 0.01
+"""Share of the misfit that may stay unexplained where what was found is to be called the cause."""
+
+MOST_UNHEARD = 0.05
+"""The same where the alarm takes what is left for chance, although it is worth as much evidence as
+settles which of two it is."""
+
+MINOR = 0.1
+"""Share of the findings that may be in doubt where the rest is to be called named."""
+
+TOLD_APART = 3
+"""The likeliest, which the next experiment is to tell apart."""
+
+COARSE = (
+    "The model's integration steps are too coarse for this recording; the revised model takes "
+    "finer ones."
+)
+
+
+class Investigation:
+    """A model and a recording, examined stage by stage; each stage can be asked for alone.
+
+    A stage does what it needs of the stages before, and nothing is done twice.
+
+    Args:
+        model: A Pyro model with one black-box site; a simulator with ports is all it needs.
+        rollouts: The recording that effects are found and fitted on.
+        holdout: Rollouts to prove it on, of another excitation where there are some; never used
+            to choose or fit anything.
+        options: How to search.
+        report: Called with a sentence at each step.
+
+    Attributes:
+        seconds: Time spent, by stage.
+
+    Raises:
+        DataError: The held-out rollouts have other channels, or are none.
+    """
+
+    def __init__(
+        self,
+        model: Callable[..., Any],
+        rollouts: Rollouts,
+        *,
+        holdout: Rollouts | None = None,
+        options: DiscoveryOptions | None = None,
+        report: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        if holdout is not None and not isinstance(holdout, Rollouts):
+            raise DataError(
+                f"holdout takes rollouts, e.g. rollouts[[3]], but was given {holdout!r}."
+            )
+        if holdout is not None and holdout.channel_names != rollouts.channel_names:
+            raise DataError("The held-out rollouts have other channels than those to fit.")
+        self.model = model
+        self.rollouts = rollouts
+        self.holdout = holdout
+        self.options = options or DiscoveryOptions()
+        self.seconds: dict[str, float] = {}
+        self._binding = self.options.binding(rollouts)
+        self._searcher = Searcher(model, rollouts, self.options, report)
+        self._drawn: list[tuple[Hypothesis, Draws]] = []
+
+    @cached_property
+    def given(self) -> Hypothesis:
+        """The model as it is, fitted."""
+        with _timed(self.seconds, "fit"):
+            try:
+                fitted = self._searcher.fit_base()
+            except DataError as error:
+                measured = SegmentModel(self.model, self.rollouts, self._binding).measured
+                problems = recording_problems(measured, self.rollouts)
+                if not problems:
+                    raise
+                raise DataError(f"{error} {problems[0]}") from error
+        for effect in self.options.effects or ():
+            # Screening leaves out what the simulator cannot have; who asks by name is told.
+            fitted.simulator.with_effects(effect)
+            if effect.is_noise:
+                raise ModelError(
+                    f"{effect.name} only scatters readings, so that no fit can find it; counts "
+                    "are read off the recording."
+                )
+        return fitted
+
+    @cached_property
+    def start(self) -> Hypothesis:
+        """The same in finer steps and with wider priors, where the model's own do not suffice."""
+        return self._start[0]
+
+    @cached_property
+    def _start(self) -> tuple[Hypothesis, Mapping[str, Distribution]]:
+        """The fit that the search begins with, and the priors that the model has itself."""
+        given = self.given
+        with _timed(self.seconds, "choose steps"):
+            found = self._searcher.with_finer_steps(given)
+            priors = found.segments.prior.distributions
+            return self._searcher.with_wider_priors(found), priors
+
+    @cached_property
+    def narrow_priors(self) -> tuple[PriorEnd, ...]:
+        """The priors outside which the parameters of the final fit lie."""
+        final = self.search.final
+        if not self._searcher.are_priors_widened:
+            return ()
+        return beyond(self._start[1], final)
+
+    @cached_property
+    def problems(self) -> tuple[str, ...]:
+        """What is wrong with the recording itself."""
+        start = self.start
+        with _timed(self.seconds, "check data"):
+            return tuple(data_problems(start, self.rollouts, self._binding))
+
+    @cached_property
+    def where(self) -> list[Spot]:
+        """The windows that the model as it is misses most, the worst first."""
+        return worst_windows(self.start, self.rollouts)
+
+    @cached_property
+    def first(self) -> Round:
+        """Alarm and ranking at the model as it is."""
+        start = self.start
+        with _timed(self.seconds, "screen"):
+            return self._searcher.look(start)
+
+    @cached_property
+    def search(self) -> Search:
+        """The effects that were missing; none are looked for in a recording with problems."""
+        problems, first = self.problems, self.first
+        with _timed(self.seconds, "search"):
+            return self._searcher.run(
+                first, max_effects=0 if problems else self.options.max_effects
+            )
+
+    @cached_property
+    def _at_edge(self) -> list[tuple[str, ...]]:
+        """For each effect, the shapes that lie or may lie where their priors hardly go."""
+        search = self.search
+        final, explains = search.final, sum(added.share for added in search.added)
+        result = []
+        with _timed(self.seconds, "limits"):
+            for added in search.added:
+                names = list(final.at_edge(added.effect))
+                if added.share > MINOR * explains:
+                    names += limits(final, added.effect, self._searcher.trials)
+                result.append(tuple(dict.fromkeys(names)))
+        return result
+
+    def _draws(self, hypothesis: Hypothesis) -> Draws:
+        """Returns draws of a hypothesis's posterior."""
+        for known, draws in self._drawn:
+            if known is hypothesis:
+                return draws
+        with _timed(self.seconds, f"posterior {len(self._drawn) + 1}"):
+            draws = posterior_draws(hypothesis, seed=self.options.seed)
+        self._drawn.append((hypothesis, draws))
+        return draws
+
+    @cached_property
+    def gap(self) -> dict[str, Gap]:
+        """Metrics on the held-out recording; empty without one."""
+        if self.holdout is None:
+            return {}
+        given, final = self.given, self.search.final
+        draws_before, draws_after = self._draws(given), self._draws(final)
+        with _timed(self.seconds, "prove"):
+            binding = _like(self._binding, self.rollouts, self.holdout)
+            return prove(
+                given,
+                final,
+                self.holdout,
+                binding,
+                draws_before=draws_before,
+                draws_after=draws_after,
+                seed=self.options.seed,
+            )
+
+    def _advice(self, name: str) -> NextExperiment | None:
+        """Returns the experiment that would tell the likeliest in an effect's place apart."""
+        search = self.search
+        added = next(a for a in search.added if a.effect.name == name)
+        likeliest = sorted(added.alternatives, key=lambda n: added.alternatives[n], reverse=True)
+        names = [n for n in likeliest[:TOLD_APART] if added.alternatives[n] >= SURVIVES]
+        survivors = [search.trials[added.place, n] for n in names]
+        if len(survivors) < 2:
+            return None
+        ids = {name.rsplit(".", 1)[1] for name in names}
+        classes = [g for g in added.effect.equivalence if len(ids & set(g.members)) > 1]
+        return next_experiment(survivors, self.rollouts, self._binding, classes)
+
+    def conclude(self) -> Discovery:
+        """Returns what all stages came to."""
+        search = self.search
+        final = search.final
+        unexplained = _unexplained(search)
+        every = estimates(final, self._draws(final), _units(final))
+        effects = [
+            _finding(added, search, every, at_edge)
+            for added, at_edge in zip(search.added, self._at_edge, strict=True)
+        ]
+        verdict, reason = _judge(search, effects, self.problems, unexplained, self.options)
+        if self.narrow_priors and not self.problems:
+            reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
+        if self._searcher.are_steps_coarse:
+            reason = f"{reason} {COARSE}"
+        gap = self.gap
+        with _timed(self.seconds, "next experiment"):
+            advice = None
+            if verdict == "ambiguous":
+                advice = self._advice(_most_doubtful(effects, self.options).effect.name)
+        return Discovery(
+            verdict=verdict,
+            reason=reason,
+            problems=self.problems,
+            narrow_priors=self.narrow_priors,
+            alarm=self.first.alarm,
+            remainder=search.rounds[-1].alarm,
+            unexplained=unexplained,
+            where=self.where,
+            effects=effects,
+            ranking=self.first.ranking,
+            separation=self.first.separation,
+            separation_names=tuple(c.name for c in self.first.ranking[:LEADING]),
+            gap=gap,
+            next_experiment=advice,
+            model=search.rounds[0].hypothesis.model,
+            revised=final.model,
+            parameters=every,
+            draws=self._draws(final),
+            counts=counts(final, self.rollouts),
+            search=search,
+            options=self.options,
+            seconds=self.seconds,
+        )
+
+
+def discover(
+    model: Callable[..., Any],
+    rollouts: Rollouts,
+    *,
+    holdout: Rollouts | None = None,
+    options: DiscoveryOptions | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> Discovery:
+    """Finds what a model misses in a recording, names it, adds it and proves that it helps.
+
+    Args:
+        model: A Pyro model with one black-box site; a simulator with ports is all it needs.
+        rollouts: The recording that effects are found and fitted on.
+        holdout: Rollouts to prove it on, of another excitation where there are some; never used
+            to choose or fit anything.
+        options: How to search.
+        report: Called with a sentence at each step.
+
+    Raises:
+        DataError: The recording is too short, or does not fit the model.
+        ModelError: The model cannot be inferred, or an effect to search for cannot be found.
+    """
+    return Investigation(
+        model, rollouts, holdout=holdout, options=options, report=report
+    ).conclude()
+
+
+def _judge(
+    search: Search,
+    effects: list[Finding],
+    problems: tuple[str, ...],
+    unexplained: float,
+    options: DiscoveryOptions,
+) -> tuple[Verdict, str]:
+    """Returns the verdict and what it rests on."""
+    if problems:
+        return "unknown", f"The data come first: {problems[0]}"
+    if not effects:
+        if not search.rounds[-1].alarm.fired:
+            return "none", "Nothing is missing that this recording could show."
+        return "unknown", "Simulation and recording disagree, and no effect explains it."
+    left = search.rounds[-1].alarm
+    # Of one look, however many there were: it adds nothing, it only says that something is left.
+    is_heard = left.p_value <= options.false_alarm_rate
+    # The alarm allows for every kind of noise, and misses what shows in few segments.
+    is_plain = 0.5 * search.final.share * left.gain > PLAINLY
+    if (is_heard and unexplained > MOST_UNEXPLAINED) or (is_plain and unexplained > MOST_UNHEARD):
+        return "unknown", (
+            f"What was found leaves {unexplained:.0%} of the disagreement unexplained, most of it "
+            f"in {left.loudest}."
+        )
+    explains = sum(f.share for f in effects)
+    strained = [f for f in effects if f.at_edge and f.share > MINOR * explains]
+    if strained:
+        return "unknown", (
+            f"{strained[0].effect.name} explains it with {strained[0].at_edge[0]} where "
+            "hardly any device has it, so the law is likely another that is alike there."
+        )
+    unsure = [f for f in effects if f.probability < options.confidence]
+    sure = [f for f in effects if f.probability >= options.confidence]
+    if sure and sum(f.share for f in unsure) <= MINOR * explains:
+        return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
+    doubtful = _most_doubtful(effects, options)
+    names = " or ".join(n for n, p in doubtful.alternatives.items() if p >= SURVIVES)
+    return "ambiguous", f"The recording cannot tell which it is: {names}."
+
+
+def _finding(
+    added: Added, search: Search, every: dict[str, Estimate], at_edge: tuple[str, ...]
+) -> Finding:
+    effect = added.effect
+    survivors = [
+        name
+        for name, probability in added.alternatives.items()
+        if (probability >= SURVIVES or name in added.fitting) and name != effect.name
+    ]
+    known = equivalents(effect, search.final.names)
+    ids = dict.fromkeys([name.rsplit(".", 1)[1] for name in survivors] + list(known))
+    return Finding(
+        effect,
+        added.probability,
+        added.alternatives,
+        tuple(name for name in ids if name != effect.id),
+        added.share,
+        {
+            site.removeprefix(f"{effect.name}."): every[site]
+            for site in effect.parameter_names
+            if site in every
+        },
+        at_edge,
+    )
+
+
+def _unexplained(search: Search) -> float:
+    """Returns the share of the misfit that the last model leaves and one law could explain."""
+    done = explained(search.rounds[0].hypothesis, search.final)
+    left = search.rounds[-1].alarm.gain
+    return left / max(left + done, 1e-12)
+
+
+def _units(hypothesis: Hypothesis) -> dict[str, str]:
+    simulator = hypothesis.simulator
+    units = {parameter.name: parameter.unit for parameter in simulator.parameters}
+    for effect in simulator.effects:
+        own = effect.units(simulator.port(effect.port))
+        units |= {f"{effect.name}.{name}": unit for name, unit in own.items()}
+    return units
+
+
+def _most_doubtful(effects: list[Finding], options: DiscoveryOptions) -> Finding:
+    """Returns the effect that explains most of those that are in doubt."""
+    return max(
+        (found for found in effects if found.probability < options.confidence),
+        key=lambda found: found.share,
+    )
+
+
+def _like(binding: DataOptions, rollouts: Rollouts, holdout: Rollouts) -> DataOptions:
+    """Returns segments of the same duration at the held-out recording's rate."""
+    length = binding.steps(rollouts)
+    assert length is not None
+    steps = round(length * rollouts.time_step / holdout.time_step)
+    return DataOptions(None, max(2, steps), binding.initial_state, binding.precision)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    begin = time.monotonic()
+    yield
+    seconds[stage] = time.monotonic() - begin

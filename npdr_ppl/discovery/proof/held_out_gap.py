@@ -1,0 +1,188 @@
+"""The proof: how far the model was from recordings that were held out, and how far it is now."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npdr_ppl import metrics
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.proof.parameter_intervals import Draws
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.initial_states import error_factors
+from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.randomness import seeded
+from npdr_ppl.rollouts import Rollouts, stitch
+
+__all__ = ["Gap", "prove"]
+
+NUM_DRAWS = 40
+"""Posterior predictive trajectories."""
+
+LEVEL = 0.9
+"""Probability of the predictive interval whose coverage is reported."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A metric on held-out rollouts.
+
+    Attributes:
+        before: With the model as it was, refitted.
+        after: With the revised model.
+        noise_floor: What the revised model would leave of a recording of its own, because
+            measurements and initial states have errors; ``None`` for a metric that has no floor.
+            Another model may leave a little less by chance.
+    """
+
+    before: float
+    after: float
+    noise_floor: float | None
+
+    @property
+    def closed(self) -> float | None:
+        """Share of what could be closed that was closed; ``None`` where nothing could be."""
+        if self.noise_floor is None or self.before <= self.noise_floor:
+            return None
+        return (self.before - self.after) / (self.before - self.noise_floor)
+
+    def to_dict(self) -> dict[str, float | None]:
+        """Returns JSON-serialisable values."""
+        return {
+            "before": self.before,
+            "after": self.after,
+            "noise_floor": self.noise_floor,
+            "closed": self.closed,
+        }
+
+
+def prove(
+    before: Hypothesis,
+    after: Hypothesis,
+    rollouts: Rollouts,
+    options: DataOptions,
+    *,
+    draws_before: Draws,
+    draws_after: Draws,
+    seed: int,
+) -> dict[str, Gap]:
+    """Compares two fitted models on rollouts that neither was fitted to.
+
+    Args:
+        before: The model as it was.
+        after: The revised model.
+        rollouts: The held-out recording, of another excitation where there is one.
+        options: Its segments.
+        draws_before: Draws of the posterior of the model as it was.
+        draws_after: Draws of the posterior of the revised model.
+        seed: Seed of the predictive draws.
+    """
+    with seeded(seed, "discovery", "proof"):
+        drawn = draws_after.resampled(NUM_DRAWS)
+        old = _Scores.of(before, draws_before.resampled(NUM_DRAWS), rollouts, options)
+        new = _Scores.of(after, drawn, rollouts, options)
+        floor = _floor(after, drawn, rollouts, options)
+    return {
+        "rmse": Gap(old.rmse, new.rmse, floor["rmse"]),
+        "dtw": Gap(old.dtw, new.dtw, floor["dtw"]),
+        "crps": Gap(old.crps, new.crps, floor["crps"]),
+        "coverage": Gap(old.coverage, new.coverage, None),
+    }
+
+
+@dataclass(frozen=True)
+class _Scores:
+    rmse: float
+    dtw: float
+    crps: float
+    coverage: float
+
+    @classmethod
+    def of(
+        cls, hypothesis: Hypothesis, drawn: Tensor, rollouts: Rollouts, options: DataOptions
+    ) -> "_Scores":
+        segments = SegmentModel(hypothesis.model, rollouts, options)
+        z = hypothesis.fit.z[None]
+        centre = segments.simulate(z, _no_offsets(segments, 1))[0].double()
+        draws = _predictive(hypothesis, drawn, segments)
+        return cls(
+            *_distances(segments, centre, rollouts),
+            _crps(segments, draws, segments.observed.double()),
+            _coverage(segments, draws),
+        )
+
+
+def _floor(
+    hypothesis: Hypothesis, drawn: Tensor, rollouts: Rollouts, options: DataOptions
+) -> dict[str, float]:
+    """Returns the metrics of a recording that the model itself might have made.
+
+    From initial states as far off as they turn out to be along the recording, with measurements
+    off by their noise, scored against the prediction from the smoother's estimate.
+    """
+    segments = SegmentModel(hypothesis.model, rollouts, options)
+    z, unmoved = hypothesis.fit.z[None], _no_offsets(segments, 1)
+    centre = segments.simulate(z, unmoved)[0].double()
+    offsets = torch.randn(unmoved.shape).double()
+    now = segments.linearise(z[0], unmoved[0], hypothesis.fit.scale, is_rough=True)
+    if now.is_finite:
+        offsets = offsets * error_factors(now.residual, now.by_starts)
+    made = segments.simulate(z, offsets)[0].double()
+    made = (
+        made + reading_noise(rollouts, segments.channel_names) * torch.randn(made.shape).double()
+    )
+    channels = segments.channel_names
+    predicted = stitch(centre, segments.inputs, channels)
+    recorded = stitch(made, segments.inputs, channels)
+    draws = _predictive(hypothesis, drawn, segments)
+    return {
+        "rmse": float(metrics.rmse(predicted, recorded).mean()),
+        "dtw": float(metrics.dtw(predicted, recorded).mean()),
+        "crps": _crps(segments, draws, made),
+    }
+
+
+def reading_noise(rollouts: Rollouts, channels: tuple[str, ...]) -> Tensor:
+    """Returns the standard deviation of the readings' own errors, ``(C,)``.
+
+    From third differences, where any smooth motion is negligible.
+    """
+    columns = [rollouts.channel_names.index(name) for name in channels]
+    parts = []
+    for readings in rollouts.readings:
+        third = torch.as_tensor(readings[:, columns]).diff(n=3, dim=0).double()
+        parts.append(third.abs().median(0).values / 0.6745 / 20**0.5)
+    return torch.stack(parts).median(0).values
+
+
+def _no_offsets(segments: SegmentModel, num: int) -> Tensor:
+    shape = num, segments.inputs.num_segments, segments.num_offsets
+    return torch.zeros(shape, dtype=torch.float64)
+
+
+def _predictive(hypothesis: Hypothesis, drawn: Tensor, segments: SegmentModel) -> Tensor:
+    """Returns posterior predictive trajectories, readings' noise included."""
+    offsets = torch.randn(_no_offsets(segments, len(drawn)).shape, dtype=torch.float64)
+    trajectory = segments.simulate(drawn, offsets).double()
+    return trajectory + hypothesis.fit.scale * torch.randn(trajectory.shape, dtype=torch.float64)
+
+
+def _distances(segments: SegmentModel, centre: Tensor, rollouts: Rollouts) -> tuple[float, float]:
+    channels = segments.channel_names
+    simulated = stitch(centre, segments.inputs, channels)
+    measured = rollouts.series(channels)
+    return (
+        float(metrics.rmse(simulated, measured).mean()),
+        float(metrics.dtw(simulated, measured).mean()),
+    )
+
+
+def _crps(segments: SegmentModel, draws: Tensor, observed: Tensor) -> float:
+    ranges = (observed * segments.inputs.mask[..., None]).abs().amax((0, 1)).clamp_min(1e-12)
+    by_step = metrics.crps_by_step(draws, observed, segments.inputs.mask, is_fair=True)
+    return float((by_step / ranges).mean())
+
+
+def _coverage(segments: SegmentModel, draws: Tensor) -> float:
+    values = metrics.pit(draws, segments.observed.double())
+    return float(metrics.coverage(values, [LEVEL], segments.inputs.mask)[0])

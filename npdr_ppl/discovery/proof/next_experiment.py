@@ -1,0 +1,202 @@
+"""The experiment that would tell the survivors apart.
+
+One survivor makes a recording under each excitation, the others are refitted to it: the experiment
+to do is the one whose smallest separation, over all pairs, is largest.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.errors import NpdrError
+from npdr_ppl.language.effect_context import EquivalenceClass, Excitation
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.segment_fit import SegmentFit
+from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["NextExperiment", "excitation_commands", "next_experiment"]
+
+SECONDS = 4.0
+
+SAFE_SHARE = 1.0
+"""Amplitude in the greatest command of the recording: never more than the device has seen."""
+
+
+@dataclass(frozen=True)
+class NextExperiment:
+    """What to record next.
+
+    Attributes:
+        excitation: The kind of excitation; ``None`` where none that was tried helps.
+        separations: Smallest separation of any two survivors, in standard deviations of the
+            readings, by excitation; NaN where the simulation failed.
+        amplitude: Greatest command, by action.
+        separated_by: What would tell the survivors apart in words, where they are a known class.
+    """
+
+    excitation: Excitation | None
+    separations: dict[str, float]
+    amplitude: dict[str, float]
+    separated_by: str
+
+    def to_dict(self) -> dict[str, object]:
+        """Returns JSON-serialisable values."""
+        finite = {k: v if math.isfinite(v) else None for k, v in self.separations.items()}
+        return {
+            "excitation": self.excitation,
+            "separations": finite,
+            "amplitude": self.amplitude,
+            "separated_by": self.separated_by,
+        }
+
+
+ENOUGH = 5.0
+"""Separation from which an experiment is worth doing."""
+
+
+def next_experiment(
+    survivors: Sequence[Hypothesis],
+    rollouts: Rollouts,
+    options: DataOptions,
+    classes: Sequence[EquivalenceClass],
+) -> NextExperiment:
+    """Compares excitations by how far they would set the survivors apart.
+
+    Args:
+        survivors: Fitted hypotheses that the recording cannot tell apart.
+        rollouts: The recording; its greatest commands bound the excitations.
+        options: Its segments.
+        classes: Equivalence classes of the effects in question.
+    """
+    largest = np.max([np.abs(actions).max(0) for actions in rollouts.actions], axis=0)
+    shapes = excitation_commands(rollouts.time_step)
+    commands = SAFE_SHARE * largest * np.stack(list(shapes.values()))[..., None]
+    made = [_made(survivor, rollouts, commands) for survivor in survivors]
+    works = np.all([np.isfinite(readings).all((1, 2)) for readings in made], axis=0)
+    smallest = np.where(works, math.inf, math.nan)
+    for a, readings in zip(survivors, made, strict=True) if works.any() else ():
+        recorded = _recorded(a, rollouts, readings[works], commands[works])
+        for b in survivors:
+            if a is not b:
+                found = _separations(a, b, recorded, options)
+                smallest[works] = np.minimum(smallest[works], found)
+    separations = dict(zip(shapes, smallest.tolist(), strict=True))
+    finite = {name: s for name, s in separations.items() if math.isfinite(s)}
+    best = max(finite, key=lambda name: finite[name]) if finite else None
+    if best is not None and finite[best] < ENOUGH:
+        best = None
+    return NextExperiment(
+        best,  # pyright: ignore[reportArgumentType]
+        separations,
+        dict(zip(rollouts.action_names, (SAFE_SHARE * largest).tolist(), strict=True)),
+        "; ".join(dict.fromkeys(group.separated_by for group in classes)),
+    )
+
+
+def excitation_commands(time_step: float) -> dict[str, NDArray[np.float64]]:
+    """Returns commands between −1 and 1, ``(T,)`` each."""
+    t = np.arange(round(SECONDS / time_step)) * time_step
+    levels = np.array([0.5, -0.25, 1.0, -0.75, 0.25, -1.0, 0.75, -0.5])
+    phase = 2 * np.pi * (0.3 * t + 0.5 * (8.0 - 0.3) / SECONDS * t**2)
+    waves = np.zeros_like(t)
+    for k, frequency in enumerate((0.4, 0.9, 1.7, 3.1)):
+        waves += np.sin(2 * np.pi * frequency * t + k)
+    shapes = {
+        "slow_ramp": 2.0 * np.abs(2.0 * (t / SECONDS - np.floor(t / SECONDS + 0.5))) - 1.0,
+        "reversals": np.sign(np.sin(2 * np.pi * 1.5 * t)),
+        "steps": levels[(t / SECONDS * len(levels)).astype(int)],
+        "chirp": np.sin(phase),
+        "hold": np.full_like(t, 0.3),
+        "wide_range": waves / np.abs(waves).max(),
+    }
+    return {name: np.asarray(shape, dtype=np.float64) for name, shape in shapes.items()}
+
+
+def _made(
+    hypothesis: Hypothesis, rollouts: Rollouts, commands: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Returns what a hypothesis would read under commands ``(E, T, A)``, from rest, ``(E, T, C)``.
+
+    NaN where it cannot be simulated.
+    """
+    segments = hypothesis.segments
+    start = torch.tensor(rollouts.readings[0][0]).expand(len(commands), -1)
+    actions = torch.tensor(commands)
+    history = segments.inputs.past_actions.shape[-2]
+    inputs = Inputs(
+        actions=actions,
+        action_names=rollouts.action_names,
+        initial_readings=start,
+        initial_values=start,
+        channel_names=rollouts.channel_names,
+        past_actions=actions.new_zeros(len(commands), history, actions.shape[-1]),
+        time_step=rollouts.time_step,
+        mask=torch.ones(actions.shape[:2], dtype=torch.bool),
+        rollout=torch.arange(len(commands)),
+        start=torch.zeros(len(commands), dtype=torch.long),
+        initial_rates=torch.zeros_like(start),
+    )
+    columns = [segments.sensor_names.index(name) for name in segments.channel_names]
+    box = segments.black_box(hypothesis.fit.z[None])
+    try:
+        simulated = box.simulator.simulate(box.parameters, inputs)[0]
+    except NpdrError:
+        return np.full((*commands.shape[:2], len(columns)), math.nan)
+    return simulated[..., columns].double().numpy()
+
+
+def _recorded(
+    hypothesis: Hypothesis,
+    rollouts: Rollouts,
+    readings: NDArray[np.float64],
+    commands: NDArray[np.float64],
+) -> Rollouts:
+    """Returns a recording of readings ``(E, T, C)`` under commands ``(E, T, A)``."""
+    names, channels = rollouts.channel_names, hypothesis.segments.channel_names
+    start = rollouts.readings[0][0][[names.index(name) for name in channels]]
+    return Rollouts.from_arrays(
+        [np.concatenate((start[None], series)) for series in readings],
+        list(commands),
+        channel_names=channels,
+        action_names=rollouts.action_names,
+        time_step=rollouts.time_step,
+    )
+
+
+def _separations(
+    made: Hypothesis, refitted: Hypothesis, recorded: Rollouts, options: DataOptions
+) -> NDArray[np.float64]:
+    """Returns how far each rollout that one hypothesis made is from the other, refitted to it.
+
+    NaN where the other cannot be simulated there.
+    """
+    segments = SegmentModel(refitted.model, recorded, options)
+    offsets: Tensor = torch.zeros(
+        segments.inputs.num_segments, segments.num_offsets, dtype=torch.float64
+    )
+    fit = SegmentFit(refitted.fit.z, offsets, made.fit.scale)
+    num = len(recorded.readings)
+    try:
+        projection = Projection(Hypothesis(refitted.model, refitted.effects, segments, fit))
+    except NpdrError:
+        return np.full(num, math.nan)
+
+    def by_rollout(values: Tensor) -> Tensor:
+        result = values.new_zeros(num, *values.shape[1:])
+        return result.index_add(0, segments.inputs.rollout, values)
+
+    score = by_rollout(projection.parameter_scores)
+    prior = torch.eye(score.shape[-1], dtype=torch.float64)
+    information = by_rollout(projection.parameter_information_by_segment) + prior
+    explained = (score * torch.linalg.solve(information, score)).sum(-1)
+    left = by_rollout(projection.misfit_by_segment) - explained
+    return left.clamp_min(0.0).sqrt().numpy()

@@ -1,0 +1,128 @@
+"""How sure the parameters of a hypothesis are: draws of its posterior, and their summaries."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.inference.parts.samplers.importance_weights import systematic
+from npdr_ppl.preparation.importance_sampling import sample_posterior
+from npdr_ppl.randomness import derived_seed
+
+__all__ = ["Draws", "Estimate", "estimates", "posterior_draws"]
+
+COPIES = 16
+BANDWIDTH = 0.3
+"""Each draw is smeared over so many places, by so many standard deviations, before an interval is
+read off: the shortest one of bare draws lies where they happen to be dense."""
+
+MASS = 0.94
+"""Of the interval of highest density."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter's posterior in a few numbers.
+
+    Attributes:
+        mean: Mean, in ``unit``.
+        sd: Standard deviation.
+        hdi_94: The shortest interval that holds 94 %.
+        unit: Its unit.
+    """
+
+    mean: float
+    sd: float
+    hdi_94: tuple[float, float]
+    unit: str
+
+    def to_dict(self) -> dict[str, object]:
+        """Returns JSON-serialisable values; what is not finite is null."""
+        mean, sd, low, high = (
+            value if math.isfinite(value) else None for value in (self.mean, self.sd, *self.hdi_94)
+        )
+        return {"mean": mean, "sd": sd, "hdi_94": [low, high], "unit": self.unit}
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Weighted draws of a posterior.
+
+    Attributes:
+        z: Reference coordinates, ``(n, d)``.
+        weights: Their weights, ``(n,)``, one in all.
+    """
+
+    z: Tensor
+    weights: Tensor
+
+    def smoothed(self) -> "Draws":
+        """Returns draws with smooth marginals of the same mean and variance (West 1993)."""
+        mean = self.weights @ self.z
+        sd = (self.weights @ (self.z - mean).square()).sqrt()
+        places = torch.special.ndtri((torch.arange(COPIES).double() + 0.5) / COPIES)
+        shrunk = mean + (1.0 - BANDWIDTH**2) ** 0.5 * (self.z - mean)
+        smeared = shrunk[:, None] + BANDWIDTH * (places / places.std())[:, None] * sd
+        return Draws(smeared.flatten(0, 1), self.weights.repeat_interleave(COPIES) / COPIES)
+
+    def resampled(self, num: int) -> Tensor:
+        """Returns draws of equal weight, ``(num, d)``, chosen from torch's global stream."""
+        return self.z[systematic(self.weights.log(), num)]
+
+
+def posterior_draws(hypothesis: Hypothesis, *, seed: int) -> Draws:
+    """Returns draws of the posterior along the recording.
+
+    By adaptive importance sampling; see :mod:`npdr_ppl.preparation.importance_sampling`.
+
+    Args:
+        hypothesis: The fitted model.
+        seed: Seed of the draws.
+
+    Raises:
+        DataError: Simulations fail beside the fit.
+    """
+    own_seed = derived_seed(seed, "discovery", "posterior")
+    found = sample_posterior(hypothesis.likelihood, seed=own_seed)
+    counts = found.weights > 0.0  # what could not be simulated may lie anywhere
+    return Draws(found.z[counts], found.weights[counts])
+
+
+def estimates(
+    hypothesis: Hypothesis, draws: Draws, units: Mapping[str, str]
+) -> dict[str, Estimate]:
+    """Returns every scalar parameter's estimate, by site.
+
+    Args:
+        hypothesis: The fitted model.
+        draws: Draws of its posterior.
+        units: The parameters' units.
+    """
+    draws = draws.smoothed()
+    values = hypothesis.segments.prior.to_parameters(draws.z)
+    result = {}
+    for name, value in values.items():
+        if value[0].numel() == 1:
+            column = value.double().flatten()
+            mean = draws.weights @ column
+            sd = (draws.weights @ (column - mean).square()).sqrt()
+            interval = _shortest(column, draws.weights)
+            result[name] = Estimate(float(mean), float(sd), interval, units.get(name, ""))
+    return result
+
+
+def _shortest(values: Tensor, weights: Tensor) -> tuple[float, float]:
+    """Returns the ends of the shortest interval of the mass."""
+    ordered, order = values.sort()
+    # Each draw stands for the mass on both sides of it.
+    mass = weights[order].cumsum(0) - 0.5 * weights[order]
+    end = torch.searchsorted(mass, mass + MASS)
+    inside = end < len(ordered)
+    widths = torch.where(inside, ordered[end.clamp_max(len(ordered) - 1)] - ordered, math.inf)
+    start = int(widths.argmin())
+    if not bool(inside[start]):
+        return float(ordered[0]), float(ordered[-1])
+    return float(ordered[start]), float(ordered[end[start]])

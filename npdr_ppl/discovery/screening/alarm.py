@@ -1,0 +1,150 @@
+"""The alarm: whether anything is missing, whatever it may be."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+from torch import Tensor
+
+from npdr_ppl.discovery.discovery_options import DiscoveryOptions
+from npdr_ppl.discovery.screening.generic_laws import (
+    GenericLaw,
+    generic_laws,
+    reading_laws,
+    ringing_laws,
+    ripple_laws,
+    wave_laws,
+)
+from npdr_ppl.discovery.screening.latent_force import Responses
+from npdr_ppl.discovery.screening.moments import forces_at_moments
+from npdr_ppl.discovery.screening.permutation_tests import LargestStatistic
+from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.screening import Screened, Screening
+from npdr_ppl.discovery.screening.sensitivities import Variant
+from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.effects import Effect
+
+__all__ = ["Alarm", "sound_alarm"]
+
+CATALOGUE_SHARE, LAW_SHARE, RINGING_SHARE, MOMENT_SHARE = 0.6, 0.2, 0.1, 0.1
+"""Shares of the false alarms that the catalogue's candidates, generic laws, what rings and forces
+at some moments may raise."""
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Whether a fitted model and the recording disagree.
+
+    Attributes:
+        p_value: Probability of as large a disagreement by chance, all searching counted.
+        fired: Whether it is below the rate of false alarms that was asked for.
+        loudest: What disagrees most: an effect's name, or that of a law outside the catalogue.
+        gain: Greatest reduction of the misfit by one candidate or law.
+        p_values: The same probability for each candidate and law, by name.
+    """
+
+    p_value: float
+    fired: bool
+    loudest: str
+    gain: float
+    p_values: dict[str, float]
+
+
+def sound_alarm(
+    projection: Projection,
+    variants: Iterable[Variant],
+    found: Responses,
+    sensors: Sequence[Channel],
+    options: DiscoveryOptions,
+    num_looks: int = 0,
+) -> tuple[Alarm, list[Screened]]:
+    """Tests a fitted hypothesis against every candidate and every generic law at once.
+
+    Every shape and size of a candidate that was tried counts, and every frequency of a wave.
+    Candidates and laws are looked at one after another, so that what they change need not fit into
+    memory together.
+
+    Args:
+        projection: The fitted hypothesis.
+        variants: All candidates in all their shapes and sizes.
+        found: The responses to pulses of force.
+        sensors: The simulator's sensors.
+        options: The rate of false alarms and the seed.
+        num_looks: How often the recording was looked at before.
+
+    Returns:
+        The alarm, and the candidates that explain anything, the best first.
+    """
+    chance = LargestStatistic(projection, seed=options.seed)
+    generic = generic_laws(found, sensors) + reading_laws(projection)
+    waves = wave_laws(found)
+    listed = [wave for port in waves.values() for wave in port] + ripple_laws(found, sensors)
+    # Each kind is tested separately, so that many implausible laws do not hide an effect of the
+    # catalogue.
+    values: dict[str, float] = {}
+    screening = Screening(projection)
+    effects: list[Effect] = []
+    changes = _screened(variants, screening, effects)
+    for p, effect in zip(chance.p_values(changes), effects, strict=True):
+        values[effect.name] = min(values.get(effect.name, 1.0), p / CATALOGUE_SHARE)
+    ranking = screening.ranking()
+    gains = {candidate.name: candidate.gain for candidate in ranking}
+    names: list[str] = []
+    changes = _unexplained(generic, projection, gains, names)
+    p_values = chance.p_values(chain(changes, (law.change for law in listed)))
+    for p, name in zip(p_values, (*names, *(law.name for law in listed)), strict=True):
+        values[name] = min(1.0, p / LAW_SHARE)
+    names = []
+    changes = _unexplained(ringing_laws(projection), projection, gains, names)
+    for p, name in zip(chance.p_values(changes), names, strict=True):
+        values[name] = min(1.0, p / RINGING_SHARE)
+    for effect in {effect.name: effect for effect in effects if effect.wave}.values():
+        own = [values[wave.name] for wave in waves.get(effect.port, [])]
+        values[effect.name] = min([values[effect.name], *own])
+    moments = forces_at_moments(projection, found)
+    for moment in moments:
+        values[moment.name] = min(1.0, len(moments) * moment.p_value / MOMENT_SHARE)
+    # Some segments stand out by chance: their gain counts only where that is unlikely.
+    unlikely = [moment for moment in moments if values[moment.name] <= options.false_alarm_rate]
+    gains |= {moment.name: moment.gain for moment in unlikely}
+    if not values:
+        return Alarm(1.0, False, "", 0.0, {}), ranking
+    p_value = min(values.values())
+    loudest = [name for name, p in values.items() if p == p_value]
+    alarm = Alarm(
+        p_value,
+        # Every effect that was added is one more look.
+        p_value <= options.false_alarm_rate / (1 + num_looks),
+        min(loudest, key=lambda name: (-gains.get(name, 0.0), name)),
+        max(gains.values(), default=0.0),
+        values,
+    )
+    return alarm, ranking
+
+
+def _screened(
+    variants: Iterable[Variant], screening: Screening, effects: list[Effect]
+) -> Iterator[Tensor]:
+    """Yields what candidates change, once each is screened; notes the effects they are of.
+
+    Shapes that were found on the recording itself are screened only: chance would find others.
+    """
+    for variant in variants:
+        screening.add(variant)
+        if not variant.is_hinted:
+            effects.append(variant.effect)
+            yield variant.change
+
+
+def _unexplained(
+    laws: Iterable[GenericLaw], projection: Projection, gains: dict[str, float], names: list[str]
+) -> Iterator[Tensor]:
+    """Yields what laws change that refitted parameters do not explain; notes gains and names."""
+    for law in laws:
+        change = law.change
+        scores = projection.scores(change)
+        # What is absorbed up to rounding errors leaves nothing to judge.
+        if float(scores.absorbed.min()) < 1.0 - 1e-6:
+            gains[law.name] = scores.gain(slice(None))
+            names.append(law.name)
+            yield change

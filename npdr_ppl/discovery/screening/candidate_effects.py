@@ -1,0 +1,70 @@
+"""The candidates at a hypothesis: which effects may be added, and what each would change."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+
+from npdr_ppl.discovery.discovery_options import DiscoveryOptions
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.equivalents import irreducible
+from npdr_ppl.discovery.screening.generic_laws import strongest_frequency
+from npdr_ppl.discovery.screening.latent_force import Responses
+from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.sensitivities import Variant, sensitivities
+from npdr_ppl.discovery.search.side_by_side import num_processes, side_by_side
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.models.effects import candidate_effects
+
+__all__ = ["candidates_at", "variants_of"]
+
+PARTS_PER_PROCESS = 4
+"""Parts of the candidates that each process takes one after another: the changes of a part are in
+memory together."""
+
+
+def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Effect, ...]:
+    """Returns the effects that may be added to a hypothesis."""
+    if options.effects is not None:
+        candidates = tuple(e for e in options.effects if e.name not in hypothesis.names)
+    else:
+        candidates = irreducible(candidate_effects(hypothesis.simulator), hypothesis.names)
+    simulator, time_step = hypothesis.simulator, hypothesis.segments.inputs.time_step
+    return tuple(
+        effect.at_rate(simulator.port(effect.port), time_step)
+        for effect in candidates
+        if not effect.is_noise
+    )
+
+
+def variants_of(
+    candidates: tuple[Effect, ...], projection: Projection, found: Responses
+) -> Iterator[Variant]:
+    """Yields the candidates in all their shapes and sizes, waves at the strongest frequency too.
+
+    Args:
+        candidates: The effects.
+        projection: The fitted hypothesis that they would be added to.
+        found: What pulses of force at the joints would change there.
+    """
+    hypothesis = projection.hypothesis
+    hints = {
+        effect.name: {effect.wave: strongest_frequency(projection, found, effect.port)}
+        for effect in candidates
+        if effect.wave and effect.port in found.by_port
+    }
+    number = num_processes(hypothesis.simulator)
+    if number == 1:
+        yield from sensitivities(hypothesis, candidates, hints)
+        return
+    # Every part holds effects of every kind.
+    num_parts = min(len(candidates), PARTS_PER_PROCESS * number)
+    parts = [candidates[k::num_parts] for k in range(num_parts)]
+    bare = replace(hypothesis)  # without what it has computed, which need not travel
+    for part in side_by_side(partial(_listed, bare, hints=hints), parts, number):
+        yield from part
+
+
+def _listed(
+    hypothesis: Hypothesis, effects: tuple[Effect, ...], hints: Mapping[str, Mapping[str, float]]
+) -> list[Variant]:
+    return list(sensitivities(hypothesis, effects, hints))

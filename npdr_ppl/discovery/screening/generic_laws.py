@@ -1,0 +1,313 @@
+"""Laws that no one would call physics, to notice what the catalogue has no word for.
+
+Polynomials, signs and products of whatever is recorded, waves in time, and ripples: waves in a
+position, by themselves or as a factor of a command or of the direction of motion. Each is a force
+at a joint, and what it would change is a weighted sum of the responses to pulses. Errors of a
+sensor are functions of what it reads. And what is carried on a spring, or stands on one, rings
+after every change of speed.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.latent_force import Responses
+from npdr_ppl.discovery.screening.permutation_tests import MOST_NUMBERS
+from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.language.channels import Channel
+
+__all__ = [
+    "FREQUENCIES",
+    "GenericLaw",
+    "generic_laws",
+    "reading_laws",
+    "ringing_laws",
+    "ripple_laws",
+    "strongest_frequency",
+    "wave_laws",
+]
+
+SIGN_WIDTH = 0.1
+"""Over which part of a channel's spread a sign changes."""
+
+FREQUENCIES = 120
+"""Frequencies tried of a wave in time, spaced by half the resolution of the longest rollout."""
+
+RIPPLES = 40
+"""Wave numbers tried of a ripple, spaced by half the resolution of a position's range."""
+
+RINGS = 30
+"""Frequencies tried of what rings …"""
+
+SLOWEST_RING = 0.02
+"""… from so many periods per time step to half of one, evenly in their logarithm …"""
+
+RING_DAMPING = 0.1
+"""… with this damping ratio."""
+
+
+@dataclass(frozen=True)
+class GenericLaw:
+    """A law that is no one's: a function of what is recorded, as a force at a port.
+
+    Attributes:
+        name: What it is, e.g. ``"arm: arm_velocity²"``.
+        make: Returns the change. It is computed on demand, because the changes of hundreds of
+            laws of a long recording do not fit into memory together.
+    """
+
+    name: str
+    make: Callable[[], Tensor]
+
+    @property
+    def change(self) -> Tensor:
+        """What it would change in the whitened readings, ``(S, N, k)``; made anew each time."""
+        return self.make()
+
+
+def generic_laws(found: Responses, sensors: Sequence[Channel] = ()) -> list[GenericLaw]:
+    """Returns what a dictionary of laws would change.
+
+    Args:
+        found: The responses to pulses.
+        sensors: The simulator's sensors; waves are tried of angles.
+    """
+    values = _dictionary(found, {sensor.name for sensor in sensors if sensor.unit == "rad"})
+    return [
+        GenericLaw(f"{port}: {name}", partial(torch.matmul, change, value[..., None]))
+        for port, change in found.by_port.items()
+        for name, value in values.items()
+    ]
+
+
+def wave_laws(found: Responses) -> dict[str, list[GenericLaw]]:
+    """Returns what waves in time of many frequencies would change, by port.
+
+    Args:
+        found: The responses to pulses.
+    """
+    return {
+        port: [
+            GenericLaw(
+                f"{port}: wave of {frequency:.3g} Hz",
+                partial(_waved, change, found, frequency),
+            )
+            for frequency in _frequencies(found).tolist()
+        ]
+        for port, change in found.by_port.items()
+    }
+
+
+def ripple_laws(found: Responses, sensors: Sequence[Channel]) -> list[GenericLaw]:
+    """Returns what ripples over every position would change at every port.
+
+    Args:
+        found: The responses to pulses.
+        sensors: The simulator's sensors, which say what is a position and what its velocity.
+    """
+    recorded = [sensor for sensor in sensors if sensor.name in found.channels]
+    velocities = {sensor.rate_of: sensor.name for sensor in recorded if sensor.rate_of}
+    commands = [name for name in found.channels if name not in {s.name for s in recorded}]
+    laws = []
+    for position in (s for s in recorded if not s.rate_of and not s.unit.endswith("/s")):
+        x = found.channels[position.name]
+        extent = float(x.max() - x.min())
+        if extent <= 0.0:
+            continue
+        factors = {"": torch.ones_like(x)}
+        factors |= {f"{name} times ": found.channels[name] for name in commands}
+        if position.name in velocities:
+            direction = _sign(found.channels[velocities[position.name]])
+            factors["direction times "] = direction
+        for j in range(1, RIPPLES + 1):
+            number = j * math.pi / extent
+            name = f"ripple of {number:.3g} 1/{position.unit} in {position.name}"
+            laws += [
+                GenericLaw(
+                    f"{port}: {text}{name}",
+                    partial(_rippled, change, factor, x, number),
+                )
+                for port, change in found.by_port.items()
+                for text, factor in factors.items()
+            ]
+    return laws
+
+
+def _waved(change: Tensor, found: Responses, frequency: float) -> Tensor:
+    return change @ _wave(found, frequency)
+
+
+def _rippled(change: Tensor, factor: Tensor, x: Tensor, number: float) -> Tensor:
+    """Returns what a factor times a ripple over x, both ``(S, pulses)``, would change."""
+    phase = number * (x - x.mean())
+    return change @ (factor[..., None] * torch.stack((phase.sin(), phase.cos()), dim=-1))
+
+
+def reading_laws(projection: Projection) -> list[GenericLaw]:
+    """Returns what errors of each sensor that depend on its reading would change.
+
+    A segment starts from where its sensor says it is, so errors count from there on.
+
+    Args:
+        projection: The fitted model.
+    """
+    hypothesis, segments = projection.hypothesis, projection.hypothesis.segments
+    # Of readings, not of what was read: that has its noise in common with the residuals.
+    simulated = segments.observed - hypothesis.difference
+    laws = []
+    for c, sensor in enumerate(segments.measured):
+        x = simulated[..., c]
+        for name, value in _of_one(sensor.name, x, sensor.unit == "rad").items():
+            make = partial(_error_of, hypothesis, c, value - value[:, :1])
+            laws.append(GenericLaw(f"{sensor.name}: error of {name}", make))
+    return laws
+
+
+def _error_of(hypothesis: Hypothesis, channel: int, error: Tensor) -> Tensor:
+    """Returns an error of one channel, ``(S, K)``, in the whitened readings, ``(S, N, 1)``."""
+    errors = torch.zeros_like(hypothesis.segments.observed, dtype=torch.float64)
+    errors[..., channel] = error
+    return hypothesis.segments.whitened(errors, hypothesis.fit.scale)[..., None]
+
+
+def ringing_laws(projection: Projection) -> list[GenericLaw]:
+    """Returns what a part that rings after every change of speed would change.
+
+    A mass on a spring that the measured part carries, or that carries it; which phase its swing
+    has in the readings is left open. A segment begins without a swing.
+
+    Args:
+        projection: The fitted model.
+    """
+    hypothesis, segments = projection.hypothesis, projection.hypothesis.segments
+    simulated = (segments.observed - hypothesis.difference).double()
+    laws = []
+    for name, position, rate in _motions(segments.measured):
+        moving = simulated[..., position if rate is None else rate]
+        if rate is None:
+            moving = moving.diff(dim=1, prepend=moving[:, :1])
+        kick = moving.diff(dim=1, prepend=moving[:, :1])
+        for periods in torch.logspace(math.log10(SLOWEST_RING), math.log10(0.5), RINGS).tolist():
+            make = partial(_rung, hypothesis, kick, position, rate, periods)
+            frequency = periods / segments.inputs.time_step
+            laws.append(GenericLaw(f"{name}: ringing at {frequency:.3g} Hz", make))
+    return laws
+
+
+def _rung(
+    hypothesis: Hypothesis, kick: Tensor, position: int | None, rate: int | None, periods: float
+) -> Tensor:
+    """Returns what rings after kicks, ``(S, K)``, in the whitened readings, ``(S, N, 2)``.
+
+    Args:
+        hypothesis: The fitted model.
+        kick: Changes of speed.
+        position: Column of the position that rings, if it is measured.
+        rate: Column of its velocity, if that is measured.
+        periods: Periods per time step.
+    """
+    segments = hypothesis.segments
+    steps = torch.arange(kick.shape[1])
+    ages = (steps[:, None] - steps).clamp_min(0)
+    angle = 2.0 * math.pi * periods
+    decay = complex(-RING_DAMPING, math.sqrt(1.0 - RING_DAMPING**2)) * angle
+    after = torch.exp(decay * ages).tril()
+    swing = kick.to(after.dtype) @ after.mT  # of the rate, (S, K)
+    changed = torch.zeros((*segments.observed.shape, 2), dtype=torch.float64)
+    if rate is not None:
+        changed[..., rate, :] = torch.view_as_real(swing)
+    if position is not None:
+        h = 1.0 if rate is None else segments.inputs.time_step
+        changed[..., position, :] = torch.view_as_real(swing * h / decay)
+    scale = hypothesis.fit.scale
+    return torch.stack([segments.whitened(c, scale) for c in changed.unbind(-1)], dim=-1)
+
+
+def _motions(measured: Sequence[Channel]) -> list[tuple[str, int | None, int | None]]:
+    """Returns what moves: its name, and the columns of its position and its velocity."""
+    columns = {sensor.name: c for c, sensor in enumerate(measured)}
+    positions = {s.rate_of: c for c, s in enumerate(measured) if s.rate_of}
+    result: list[tuple[str, int | None, int | None]] = [
+        (sensor.name, c, positions.get(sensor.name))
+        for c, sensor in enumerate(measured)
+        if not sensor.rate_of
+    ]
+    alone = (s for s in measured if s.rate_of and s.rate_of not in columns)
+    return result + [(s.name, None, columns[s.name]) for s in alone]
+
+
+def strongest_frequency(projection: Projection, found: Responses, port: str) -> float:
+    """Returns the frequency in Hz of the wave in time that explains most as a force at a port.
+
+    Args:
+        projection: The fitted model.
+        found: The responses to pulses.
+        port: The port.
+    """
+    frequencies = _frequencies(found)
+    change = found.by_port[port]
+    gains: list[float] = []
+    for chunk in frequencies.split(max(1, MOST_NUMBERS // (2 * change[..., 0].numel()))):
+        waves = torch.cat([_wave(found, frequency) for frequency in chunk.tolist()], dim=-1)
+        scores = projection.scores(change @ waves)
+        gains += [scores.gain(slice(2 * k, 2 * k + 2)) for k in range(len(chunk))]
+    return float(frequencies[max(range(len(gains)), key=gains.__getitem__)])
+
+
+def _frequencies(found: Responses) -> Tensor:
+    step = 0.5 / float(found.time.max() - found.time.min())
+    return step * torch.arange(1, FREQUENCIES + 1, dtype=torch.float64)
+
+
+def _wave(found: Responses, frequency: float) -> Tensor:
+    """Returns sine and cosine at the pulses, ``(S, pulses, 2)``."""
+    angle = 2.0 * torch.pi * frequency * found.time
+    return torch.stack((angle.sin(), angle.cos()), dim=-1)
+
+
+def _sign(x: Tensor) -> Tensor:
+    """Returns the sign of a channel, which changes over a part of its spread."""
+    return torch.tanh(x / x.square().mean().sqrt().clamp_min(1e-12) / SIGN_WIDTH)
+
+
+def _dictionary(found: Responses, angles: set[str]) -> dict[str, Tensor]:
+    """Returns the laws' values at the pulses, each of unit spread."""
+    channels, time = found.channels, found.time
+    values: dict[str, Tensor] = {"1": torch.ones_like(time), "t": time}
+    signs = {name: _sign(x) for name, x in channels.items()}
+    for name, x in channels.items():
+        values |= _of_one(name, x, name in angles)
+        values[f"sign {name}"] = signs[name]
+        values[f"t·{name}"] = time * values[name]
+    names = list(channels)
+    unit = {name: values[name] for name in names}
+    for i, one in enumerate(names):
+        for other in names[i + 1 :]:
+            values[f"{one}·{other}"] = unit[one] * unit[other]
+            values[f"{one}²·{other}"] = unit[one].square() * unit[other]
+            values[f"{one}·{other}²"] = unit[one] * unit[other].square()
+            values[f"|{one}|·sign {other}"] = unit[one].abs() * signs[other]
+            values[f"|{other}|·sign {one}"] = unit[other].abs() * signs[one]
+    return {k: v / v.square().mean().sqrt().clamp_min(1e-12) for k, v in values.items()}
+
+
+def _of_one(name: str, channel: Tensor, is_angle: bool) -> dict[str, Tensor]:
+    """Returns functions of one channel by what they are."""
+    x = channel / channel.square().mean().sqrt().clamp_min(1e-12)
+    values = {
+        name: x,
+        f"{name}²": x.square(),
+        f"{name}³": x**3,
+        f"{name}|{name}|": x * x.abs(),
+        f"|{name}|": x.abs(),
+    }
+    if is_angle:
+        for order in (1, 2, 3):
+            values[f"sin {order} {name}"] = torch.sin(order * channel)
+            values[f"cos {order} {name}"] = torch.cos(order * channel)
+    return values

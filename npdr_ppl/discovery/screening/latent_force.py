@@ -1,0 +1,167 @@
+"""The force that the model lacks, whatever its law.
+
+A pulse of force at a joint during a part of every segment changes the readings linearly while it
+is small. With the responses to all pulses, the effect of *any* force law along the recording is a
+weighted sum, without another simulation: the law's values at the pulses are the weights. So many
+laws can be tried (:mod:`~npdr_ppl.discovery.screening.generic_laws`), and the missing force itself
+can be estimated and shown against the states.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.language.channels import Parameter, Port
+from npdr_ppl.language.effect_context import Start
+from npdr_ppl.models.effects.timed import TimedForceEffect
+
+__all__ = ["LatentForce", "Responses", "latent_force", "responses"]
+
+PULSES = 10
+"""Pulses per segment and joint."""
+
+SMALL = 1e-3
+"""Height of a pulse, in the port's rated force: a response is a derivative."""
+
+
+class Pulse(TimedForceEffect):
+    """A constant force during a part of each segment."""
+
+    id = "pulse"
+    parameters = (
+        Parameter("height", "{port}", 0.0, "force during the pulse"),
+        Parameter("begin", "s", 0.0, "when it begins, from the segment's start"),
+        Parameter("end", "s", 0.0, "when it ends"),
+    )
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Returns priors that no one uses: pulses are never inferred."""
+        one = dist.Normal(0.0, port.rated)
+        return {"height": one, "begin": dist.HalfNormal(1.0), "end": dist.HalfNormal(1.0)}
+
+    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:
+        """Returns the time since the segment's start, in the middle of the first step."""
+        return torch.full_like(start.time, 0.5 * start.time_step)
+
+    def force(
+        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
+    ) -> Tensor:
+        """Returns the height during the pulse."""
+        is_on = (memory >= parameters["begin"]) & (memory < parameters["end"])
+        return parameters["height"] * is_on
+
+
+@dataclass(frozen=True)
+class Responses:
+    """What pulses change along the recording.
+
+    Attributes:
+        by_port: Change of the whitened readings per unit of force, ``(S, N, pulses)``, by port.
+        units: Unit of each port's force.
+        rated: Each port's rated force.
+        channels: Readings when each pulse begins, as simulated, ``(S, pulses)``, by channel, and
+            the commands, by action.
+        time: Seconds since the rollout began when each pulse begins, ``(S, pulses)``.
+        rollout: Index of each segment's rollout, ``(S,)``.
+    """
+
+    by_port: dict[str, Tensor]
+    units: dict[str, str]
+    rated: dict[str, float]
+    channels: dict[str, Tensor]
+    time: Tensor
+    rollout: Tensor
+
+
+@dataclass(frozen=True)
+class LatentForce:
+    """The missing force at a joint, estimated without a law.
+
+    Attributes:
+        port: The joint.
+        unit: Unit of the force.
+        force: Estimate per pulse, ``(S, pulses)``.
+        error: Its standard deviation, ``(S, pulses)``.
+    """
+
+    port: str
+    unit: str
+    force: Tensor
+    error: Tensor
+
+
+def responses(hypothesis: Hypothesis) -> Responses:
+    """Returns what pulses at every joint would change.
+
+    Args:
+        hypothesis: The fitted model.
+    """
+    segments, fit = hypothesis.segments, hypothesis.fit
+    inputs, simulator = segments.inputs, hypothesis.simulator
+    steps = inputs.num_steps
+    edges = torch.linspace(0, steps, min(PULSES, steps) + 1).round().long().unique()
+    seconds = edges.double() * inputs.time_step
+    box = segments.black_box(fit.z[None])
+    base = segments.run(simulator, box.parameters, fit.offsets[None])[0]
+    by_port, units, rated = {}, {}, {}
+    for port in simulator.ports:
+        if port.kind != "force":
+            continue
+        pulse = Pulse(port.name)
+        height = SMALL * port.rated
+        batch = {
+            f"{pulse.name}.height": torch.full((len(edges) - 1,), height, dtype=torch.float64),
+            f"{pulse.name}.begin": seconds[:-1],
+            f"{pulse.name}.end": seconds[1:],
+        }
+        starts = fit.offsets[None].expand(len(edges) - 1, -1, -1)
+        moved = segments.run(simulator.with_effects(pulse), {**box.parameters, **batch}, starts)
+        change = segments.whitened(moved - base, fit.scale) / height
+        if bool(change.isfinite().all()):
+            by_port[port.name] = change.permute(1, 2, 0)
+            units[port.name], rated[port.name] = port.unit, port.rated
+    begins = edges[:-1]
+    channels = {
+        name: base[:, begins.clamp_min(1) - 1, k].double()
+        for k, name in enumerate(segments.channel_names)
+    }
+    for k, name in enumerate(inputs.action_names):
+        channels[name] = inputs.actions[:, begins, k].double()
+    time = (inputs.start[:, None] + begins) * inputs.time_step
+    return Responses(by_port, units, rated, channels, time.double(), inputs.rollout)
+
+
+def latent_force(projection: Projection, found: Responses) -> list[LatentForce]:
+    """Estimates the missing force at every joint, with the initial states integrated out.
+
+    Each pulse's force is normal about zero; its standard deviation is the one under which the
+    recording is likeliest (empirical Bayes), the same for all segments of a joint.
+
+    Args:
+        projection: The fitted model.
+        found: The responses to pulses.
+    """
+    result = []
+    for port, change in found.by_port.items():
+        weighted = projection.solve(change)
+        gram = change.mT @ weighted
+        score = (weighted.mT @ projection.residual[..., None])[..., 0]
+        values, vectors = torch.linalg.eigh(gram)
+        rotated = (vectors.mT @ score[..., None])[..., 0]
+        spreads = found.rated[port] * torch.logspace(-4, 1, 26, dtype=torch.float64)
+        growth = 1.0 + values.clamp_min(0.0)[None] * spreads[:, None, None] ** 2
+        gain = spreads[:, None, None] ** 2 * rotated.square() / growth - growth.log()
+        spread = spreads[gain.sum((1, 2)).argmax()]
+        precision = gram + torch.eye(gram.shape[-1], dtype=torch.float64) / spread**2
+        covariance = torch.linalg.inv(precision)
+        force = (covariance @ score[..., None])[..., 0]
+        error = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+        result.append(LatentForce(port, found.units[port], force, error))
+    return result

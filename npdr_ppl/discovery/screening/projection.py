@@ -1,0 +1,201 @@
+"""What is left of a change once everything that must not speak has been taken out.
+
+The state at each segment's start is known within the smoother's error, and the parameters are
+refitted together with whatever is added: both can imitate an effect. With residuals r, starts'
+derivatives G and parameters' derivatives J, whitened, starts are integrated out by
+
+    C = 1 + G Gᵀ,     C⁻¹ = 1 − G (1 + Gᵀ G)⁻¹ Gᵀ
+
+segment by segment, and parameters by projecting on what J cannot explain: a column x has the score
+
+    g = xᵀ C⁻¹ r − B Jᵀ C⁻¹ r,     B = xᵀ C⁻¹ J (Jᵀ C⁻¹ J + 1)⁻¹
+
+and, with a second column y, the information xᵀ C⁻¹ y − B Jᵀ C⁻¹ y. Sums of a segment's terms are
+independent from segment to segment; what is inside one is not, so the variance of a score is
+taken from how the segments' terms scatter (Liang & Zeger 1986), never from their number.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK
+
+__all__ = ["Projection", "Scores", "loss_without"]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores and information of P columns.
+
+    Attributes:
+        by_segment: Projected scores, ``(S, P)``.
+        information: Projected information, ``(P, P)``.
+        total: Information before the parameters were refitted, ``(P,)``.
+    """
+
+    by_segment: Tensor
+    information: Tensor
+    total: Tensor
+
+    @property
+    def score(self) -> Tensor:
+        """Scores of all segments, ``(P,)``."""
+        return self.by_segment.sum(0)
+
+    @property
+    def absorbed(self) -> Tensor:
+        """Share of each column that refitted parameters explain, ``(P,)``."""
+        return 1.0 - self.information.diagonal() / self.total.clamp_min(1e-30)
+
+    def gain(self, own: slice) -> float:
+        """Returns by how much some of the columns together reduce the misfit."""
+        score = self.score[own]
+        inverse = torch.linalg.pinv(self.information[own, own], hermitian=True)
+        return float(score @ inverse @ score)
+
+
+class Projection:
+    """A fitted hypothesis, ready to be asked about columns.
+
+    Args:
+        hypothesis: The hypothesis.
+        keep: Coordinates of the parameters that are refitted, a mask ``(d,)``; all by default.
+    """
+
+    def __init__(self, hypothesis: Hypothesis, keep: Tensor | None = None) -> None:
+        now = hypothesis.linearisation
+        by_z = now.by_parameters if keep is None else now.by_parameters[..., keep]
+        self.hypothesis = hypothesis
+        self._starts = now.by_starts
+        eye = torch.eye(now.by_starts.shape[-1], dtype=torch.float64)
+        self._inner = eye + now.by_starts.mT @ now.by_starts
+        #: Residuals as they were with the initial states at the smoother's estimate, (S, N).
+        self.residual = now.residual + (now.by_starts @ hypothesis.fit.offsets[..., None])[..., 0]
+        self._by_z = by_z
+        self._weights = self.solve(by_z)
+        self._weighted = self.solve(self.residual[..., None])[..., 0]
+        prior = torch.eye(by_z.shape[-1], dtype=torch.float64)
+        self._information = (by_z.mT @ self._weights).sum(0) + prior
+        self._score = (by_z.mT @ self._weighted[..., None])[..., 0]  # (S, d)
+
+    def projected(self, columns: Tensor) -> Tensor:
+        """Returns C^-½ x less what refitted parameters explain of it.
+
+        Its products with the whitened residuals are scores, those with itself information.
+
+        Args:
+            columns: The columns x, ``(S, N, P)``.
+        """
+        refit = torch.linalg.solve(self._information, self._explained(columns))
+        return self.whitened(columns - self._by_z @ refit)
+
+    def whitened(self, columns: Tensor) -> Tensor:
+        """Returns C^-½ x: with independent components of unit variance where x is a residual.
+
+        Args:
+            columns: The columns x, ``(S, N, P)``.
+        """
+        directions, sizes, _ = self._starts_by_size
+        shrunk = 1.0 - (1.0 + sizes.square()).rsqrt()
+        return columns - directions @ (shrunk[..., None] * (directions.mT @ columns))
+
+    @cached_property
+    def _starts_by_size(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Singular value decomposition of the starts' derivatives."""
+        return torch.linalg.svd(self._starts, full_matrices=False)
+
+    def _explained(self, columns: Tensor) -> Tensor:
+        """Returns the parameters' scores with columns for residuals, ``(d, P)``."""
+        return (self._weights.mT @ columns).sum(0)
+
+    @property
+    def parameter_scores(self) -> Tensor:
+        """Scores of the parameters by segment, ``(S, d)``."""
+        return self._score
+
+    @property
+    def parameter_information_by_segment(self) -> Tensor:
+        """Information of the parameters in each segment, ``(S, d, d)``."""
+        return self._by_z.mT @ self._weights
+
+    @property
+    def parameter_information(self) -> Tensor:
+        """Information of the parameters with their prior, ``(d, d)``."""
+        return self._information
+
+    def misfit_at(self, z: Tensor) -> Tensor:
+        """Returns rᵀ C⁻¹ r at other parameters, ``(n,)``; starts are taken to act as they do here.
+
+        Args:
+            z: Parameters, ``(n, d)``.
+        """
+        segments, fit = self.hypothesis.segments, self.hypothesis.fit
+        offsets = fit.offsets[None]
+        together = max(1, MAX_READINGS_PER_CHUNK // max(1, segments.observed.numel()))
+        result = []
+        for points in z.split(together):
+            left = segments.residuals(points, offsets.expand(len(points), -1, -1), fit.scale)
+            columns = left.permute(1, 2, 0) + self._starts @ fit.offsets[..., None]
+            result.append((columns * self.solve(columns)).sum((0, 1)))
+        return torch.cat(result)
+
+    def solve(self, columns: Tensor) -> Tensor:
+        """Returns C⁻¹ x, ``(S, N, P)``."""
+        inner = torch.linalg.solve(self._inner, self._starts.mT @ columns)
+        return columns - self._starts @ inner
+
+    @cached_property
+    def misfit(self) -> float:
+        """rᵀ C⁻¹ r."""
+        return float(self.misfit_by_segment.sum())
+
+    @property
+    def misfit_by_segment(self) -> Tensor:
+        """The same of each segment, ``(S,)``."""
+        return (self.residual * self._weighted).sum(-1)
+
+    def scores(self, columns: Tensor) -> Scores:
+        """Returns the scores of columns, ``(S, N, P)``."""
+        weighted = self.solve(columns)
+        cross = self._explained(columns)
+        refit = torch.linalg.solve(self._information, cross)
+        own = (columns.mT @ weighted).sum(0)
+        by_segment = (columns.mT @ self._weighted[..., None])[..., 0] - self._score @ refit
+        return Scores(by_segment, own - cross.mT @ refit, own.diagonal())
+
+
+def loss_without(hypothesis: Hypothesis, effect: Effect) -> float:
+    """Returns by how much the evidence falls without one of a hypothesis's effects.
+
+    To first order in what the other parameters and the initial states make up for.
+
+    Args:
+        hypothesis: The hypothesis.
+        effect: One of its effects.
+    """
+    segments, fit = hypothesis.segments, hypothesis.fit
+    strengths = effect.strength or tuple(p.name for p in effect.parameters)
+    resting = {
+        f"{effect.name}.{p.name}": torch.tensor([p.nominal], dtype=torch.float64)
+        for p in effect.parameters
+        if p.name in strengths
+    }
+    box = segments.black_box(fit.z[None])
+    starts = fit.offsets[None]
+    present = segments.run(box.simulator, box.parameters, starts)[0]
+    absent = segments.run(box.simulator, {**box.parameters, **resting}, starts)[0]
+    change = segments.whitened(present - absent, fit.scale)
+    if not bool(change.isfinite().all()):
+        return math.nan
+    keep = torch.ones(len(fit.z), dtype=torch.bool)
+    for site in segments.prior.sites:
+        if site.name in effect.parameter_names:
+            keep[site.coordinates] = False
+    information = Projection(hypothesis, keep).scores(change[..., None]).information
+    return 0.5 * hypothesis.share * float(information)

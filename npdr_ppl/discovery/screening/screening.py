@@ -1,0 +1,139 @@
+"""Screening: every candidate's linear gain, in its best shape and size.
+
+A candidate's gain is how far its strengths, fitted together with all parameters and the initial
+states, reduce the misfit. Whether that is more than chance can do is for
+:mod:`npdr_ppl.discovery.screening.permutation_tests` to say.
+"""
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.screening.projection import Projection, Scores
+from npdr_ppl.discovery.screening.sensitivities import Variant
+
+__all__ = ["Screened", "Screening", "screen"]
+
+DETECTABLE = 5.0
+"""Separation from which an effect shows among a hundred candidates."""
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A candidate in its best shape and size.
+
+    Attributes:
+        variant: The candidate.
+        sizes: Fitted strengths in sizes, ``(k,)``.
+        gain: Reduction of the misfit, in units of the readings' variance.
+        separation: Distance ‖(1 − P) S β‖ between the model with and without it, in standard
+            deviations.
+        absorbed: Share of its change that refitted parameters explain.
+        minimum_detectable: Distance from none in parameter units at which it would show, by
+            strength.
+    """
+
+    variant: Variant
+    sizes: Tensor
+    gain: float
+    separation: float
+    absorbed: float
+    minimum_detectable: dict[str, float]
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.variant.effect.name
+
+    def without_change(self) -> "Screened":
+        """Returns the same without what it changes along the recording, which takes memory."""
+        nothing = self.variant.change.new_zeros(0)
+        return replace(self, variant=replace(self.variant, change=nothing))
+
+
+class Screening:
+    """Ranks candidates, seen one after another, by their linear gain.
+
+    Args:
+        projection: The fitted hypothesis.
+    """
+
+    def __init__(self, projection: Projection) -> None:
+        self._projection = projection
+        self._best: dict[str, Screened] = {}
+
+    def add(self, variant: Variant) -> None:
+        """Keeps a candidate if no other shape or size of the same effect gains more."""
+        scores = self._projection.scores(variant.change)
+        sizes, gain = _within_limits(scores, variant)
+        if gain <= 0.0:
+            return
+        name = variant.effect.name
+        if name not in self._best or gain > self._best[name].gain:
+            separation = float(sizes @ scores.information @ sizes) ** 0.5
+            self._best[name] = Screened(
+                variant,
+                sizes,
+                gain,
+                separation,
+                float(scores.absorbed.max()),
+                _minimum_detectable(scores, variant),
+            )
+
+    def ranking(self) -> list[Screened]:
+        """Returns the best shape and size of each effect, that of the greatest gain first."""
+        return sorted(self._best.values(), key=lambda s: (-s.gain, s.name))
+
+
+def screen(projection: Projection, variants: Iterable[Variant]) -> list[Screened]:
+    """Returns the best shape and size of each effect, that of the greatest linear gain first.
+
+    Args:
+        projection: The fitted hypothesis.
+        variants: The candidates' sensitivities.
+    """
+    screening = Screening(projection)
+    for variant in variants:
+        screening.add(variant)
+    return screening.ranking()
+
+
+def _within_limits(scores: Scores, variant: Variant) -> tuple[Tensor, float]:
+    """Returns the sizes of greatest gain that the priors admit, and the gain.
+
+    Sizes at a limit stay there and the others are fitted: all choices are tried, there are few
+    strengths.
+    """
+    num = len(variant.strengths)
+    precision = variant.deviation.square().reciprocal().diag()
+    information, score = scores.information + precision, scores.score
+    best, gain = torch.zeros(num, dtype=torch.float64), 0.0
+    for states in itertools.product((0, 1, 2), repeat=num):
+        sizes = torch.zeros(num, dtype=torch.float64)
+        fixed = [k for k in range(num) if states[k]]
+        for k in fixed:
+            limit = variant.lower[k] if states[k] == 1 else variant.upper[k]
+            sizes[k] = limit
+        if not bool(sizes.isfinite().all()):
+            continue
+        free = [k for k in range(num) if not states[k]]
+        if free:
+            rest = (score - information @ sizes)[free]
+            sizes[free] = torch.linalg.solve(information[free][:, free], rest)
+        if bool(((sizes < variant.lower - 1e-9) | (sizes > variant.upper + 1e-9)).any()):
+            continue
+        found = float(2.0 * score @ sizes - sizes @ information @ sizes)
+        if found > gain:
+            best, gain = sizes, found
+    return best, gain
+
+
+def _minimum_detectable(scores: Scores, variant: Variant) -> dict[str, float]:
+    sizes = DETECTABLE / scores.information.diagonal().clamp_min(1e-30).sqrt()
+    return {
+        name: float(sizes[k]) * abs(variant.values[name] - float(variant.nominal[k]))
+        for k, name in enumerate(variant.strengths)
+    }

@@ -1,0 +1,326 @@
+"""What each candidate effect would change along the recording.
+
+At zero strength an effect changes nothing, and close to it the change is linear in the strengths.
+The slope is a finite difference of the black box: one simulation with the effect switched on at a
+small size, less the one without. Parameters that give an effect its shape are tried at several
+values, and effects that are not smooth in their strength at several sizes.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.engines.pooled.pool_simulator import PooledSimulator
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.simulator import Simulator
+
+__all__ = ["Variant", "sensitivities"]
+
+NEXT = 1.1
+"""Ratio of one resonance to the next that is tried: lightly damped, it is a tenth wide."""
+
+SIZES = (1.0, 0.25)
+"""Sizes of an effect that is not smooth, in those its probe gives."""
+
+RESONANT_SIZES = tuple(0.05 * NEXT**k for k in range(40))
+"""Sizes of a resonance, in those its probe gives: up to twice as large."""
+
+BITES = 0.7
+"""Where in the commands' range a limit is tried first."""
+
+ROUNDING = 100.0
+"""Rounding errors of the largest reading below which a change is none: what an effect leaves that
+changes nothing, such as an encoder's bias where no force depends on its position."""
+
+SMALL = 0.05
+"""Size of one that is smooth: small enough for the linear term to rule."""
+
+SHAPE_QUANTILES = (0.5, 0.15, 0.85)
+"""Where in their priors shapes are tried; the first stands for all that is not varied."""
+
+MOST_SHAPES = 7
+"""Shapes tried of one effect."""
+
+
+MOST_TOGETHER = 10_000
+"""Segments simulated together: beyond, their states outgrow a processor's cache."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """An effect of one shape, switched on at one size.
+
+    Attributes:
+        effect: The effect.
+        values: Its parameters at size one, by short name.
+        strengths: Names of those that scale it.
+        nominal: Their values at zero strength.
+        lower: Least number of sizes that the priors admit, by strength.
+        upper: Greatest number of sizes, by strength.
+        deviation: Standard deviation of the priors in sizes, by strength.
+        change: What one size changes in the whitened readings, ``(S, N, k)``.
+        is_hinted: Whether its shape was found on the recording itself.
+    """
+
+    effect: Effect
+    values: Mapping[str, float]
+    strengths: tuple[str, ...]
+    nominal: Tensor
+    lower: Tensor
+    upper: Tensor
+    deviation: Tensor
+    change: Tensor
+    is_hinted: bool = False
+
+    def parameters(self, sizes: Tensor) -> dict[str, Tensor]:
+        """Returns the parameters by site name for numbers of sizes, ``(k,)``."""
+        values = {name: torch.tensor(v, dtype=torch.float64) for name, v in self.values.items()}
+        for k, name in enumerate(self.strengths):
+            values[name] = self.nominal[k] + sizes[k] * (values[name] - self.nominal[k])
+        return {f"{self.effect.name}.{name}": value for name, value in values.items()}
+
+
+def sensitivities(
+    hypothesis: Hypothesis,
+    effects: tuple[Effect, ...],
+    hints: Mapping[str, Mapping[str, float]] | None = None,
+) -> Iterator[Variant]:
+    """Yields what each effect would change, in each shape and size.
+
+    Effects are simulated some at a time, so that memory does not grow with their number; those
+    whose simulation fails are left out.
+
+    Args:
+        hypothesis: Where the effects are to be added.
+        effects: The candidates.
+        hints: Shapes to try besides, by effect's name: values of its parameters.
+    """
+    segments, fit = hypothesis.segments, hypothesis.fit
+    box = segments.black_box(fit.z[None])
+    base = segments.run(box.simulator, box.parameters, fit.offsets[None])[0]
+    probes = []
+    for effect in effects:
+        try:
+            box.simulator.with_effects(effect)
+        except ModelError:
+            continue
+        probes.append(
+            _probe(effect, segments.inputs, box.simulator, (hints or {}).get(effect.name))
+        )
+    largest = float(segments.whitened(base, fit.scale).abs().max())
+    rounding = ROUNDING * torch.finfo(base.dtype).eps * largest
+    for group in _groups(probes, box.simulator, segments.inputs.num_segments):
+        changed = box.simulator.with_effects(*(probe.effect for probe in group))
+        starts = fit.offsets[None].expand(sum(len(probe.runs) for probe in group), -1, -1)
+        moved = segments.run(changed, {**box.parameters, **_side_by_side(group)}, starts)
+        differences = segments.whitened(moved - base, fit.scale)
+        for probe, rows in zip(
+            group, differences.split([len(probe.runs) for probe in group]), strict=True
+        ):
+            yield from _variants(probe, rows, rounding)
+
+
+@dataclass(frozen=True)
+class _Probe:
+    """An effect to be switched on, in several shapes and sizes.
+
+    Attributes:
+        effect: The effect.
+        priors: Its priors, by parameter.
+        cases: Values of its parameters at size one, whether they are hinted, and the size.
+        strengths: Names of the parameters that scale it.
+        nominal: Their values at zero strength, or where a limit rests.
+        runs: Parameters of each simulation: one per case and strength, the others resting.
+    """
+
+    effect: Effect
+    priors: Mapping[str, Distribution]
+    cases: list[tuple[dict[str, float], bool, float]]
+    strengths: tuple[str, ...]
+    nominal: Tensor
+    runs: list[dict[str, float]]
+
+
+def _probe(
+    effect: Effect, inputs: Inputs, simulator: Simulator, hint: Mapping[str, float] | None
+) -> _Probe:
+    port = simulator.port(effect.port)
+    priors = effect.priors(port)
+    probe = effect.probe(port)
+    strengths = effect.strength or tuple(p.name for p in effect.parameters)
+    resting = {p.name: p.nominal for p in effect.parameters}
+    if effect.port in inputs.action_names:
+        probe = _within_reach(effect, probe, inputs)
+    shapes = [(shape, False) for shape in _shapes(effect, priors, strengths)]
+    if hint:
+        shapes.append(({**shapes[0][0], **hint}, True))
+    sizes = SIZES if _needs_size(effect, strengths) else (SMALL,)
+    if effect.is_resonant:
+        shapes, sizes = shapes[:1], RESONANT_SIZES
+    cases = [
+        ({**probe, **shape}, is_hinted, size)
+        for (shape, is_hinted), size in itertools.product(shapes, sizes)
+    ]
+    nominal = torch.tensor([_resting(resting[n], probe[n]) for n in strengths]).double()
+    runs = [
+        _switched_on(values, size, on, nominal[k], resting, strengths)
+        for values, _, size in cases
+        for k, on in enumerate(strengths)
+    ]
+    return _Probe(effect, priors, cases, strengths, nominal, runs)
+
+
+def _groups(
+    probes: list[_Probe], simulator: Simulator, num_segments: int
+) -> Iterator[list[_Probe]]:
+    """Yields effects of one kind that are simulated together, each alone in rows of its own.
+
+    An effect at zero strength changes nothing, and a step of many simulations costs little more
+    than one of a few. Where each simulation is a call of an engine, effects stay apart.
+    """
+    together = 1 if isinstance(simulator, PooledSimulator) else MOST_TOGETHER
+    kinds: dict[object, list[_Probe]] = {}
+    for probe in probes:
+        effect = probe.effect
+        kind = (simulator.port(effect.port).kind, getattr(effect, "needs_joint", False))
+        kinds.setdefault(kind, []).append(probe)
+    for members in kinds.values():
+        group: list[_Probe] = []
+        for probe in members:
+            size = num_segments * sum(len(p.runs) for p in (*group, probe))
+            if group and size > together:
+                yield group
+                group = []
+            group.append(probe)
+        yield group
+
+
+def _side_by_side(group: list[_Probe]) -> dict[str, Tensor]:
+    """Returns the parameters of all effects of a group in the rows of each."""
+    result = {}
+    for probe in group:
+        resting = {p.name: p.nominal for p in probe.effect.parameters}
+        rows = [run if p is probe else resting for p in group for run in p.runs]
+        result |= {
+            f"{probe.effect.name}.{name}": torch.tensor([row[name] for row in rows]).double()
+            for name in resting
+        }
+    return result
+
+
+def _variants(probe: _Probe, rows: Tensor, rounding: float) -> list[Variant]:
+    """Returns what an effect changes, of what its runs changed in the whitened readings.
+
+    Changes up to a rounding error are none.
+    """
+    strengths, nominal = probe.strengths, probe.nominal
+    result = []
+    parts = rows.split(len(strengths))
+    for (values, is_hinted, size), part in zip(probe.cases, parts, strict=True):
+        if not bool(part.isfinite().all()) or float(part.abs().max()) <= rounding:
+            continue
+        difference = part / size
+        full = torch.tensor([values[n] for n in strengths], dtype=torch.float64)
+        lower, upper, deviation = _limits(probe.priors, strengths, nominal, full)
+        if probe.effect.is_resonant:
+            lower, upper = lower.clamp_min(size / NEXT), upper.clamp_max(size * NEXT)
+        change = difference.permute(1, 2, 0)
+        result.append(
+            Variant(
+                probe.effect,
+                values,
+                strengths,
+                nominal,
+                lower,
+                upper,
+                deviation,
+                change,
+                is_hinted,
+            )
+        )
+    return result
+
+
+def _switched_on(
+    values: Mapping[str, float],
+    size: float,
+    on: str,
+    nominal: Tensor,
+    resting: Mapping[str, float],
+    strengths: tuple[str, ...],
+) -> dict[str, float]:
+    """Returns an effect's parameters with one strength at a size and the others resting."""
+    rest = {name: resting[name] if name in strengths else value for name, value in values.items()}
+    zero = float(nominal)
+    return rest | {on: size * (values[on] - zero) + zero}
+
+
+def _shapes(
+    effect: Effect, priors: Mapping[str, Distribution], strengths: tuple[str, ...]
+) -> list[dict[str, float]]:
+    """Returns values of the parameters that give an effect its shape, nominal ones first."""
+    varied = [p for p in effect.parameters if p.name not in strengths]
+    shapes: list[dict[str, float]] = [{p.name: p.nominal for p in varied}]
+    for parameter in varied:
+        for quantile in SHAPE_QUANTILES[1:]:
+            value = float(priors[parameter.name].icdf(torch.tensor(quantile)))
+            shapes.append({**shapes[0], parameter.name: value})
+    return shapes[:MOST_SHAPES]
+
+
+def _needs_size(effect: Effect, strengths: tuple[str, ...]) -> bool:
+    """Returns whether an effect shows only at a size, not in the slope at zero.
+
+    A lag far below the sampling time changes nothing that is sampled.
+    """
+    units = {p.name: p.unit for p in effect.parameters}
+    return not effect.is_smooth or any(units[name] == "s" for name in strengths)
+
+
+def _within_reach(effect: Effect, probe: dict[str, float], inputs: Inputs) -> dict[str, float]:
+    """Returns the probe with limits that the commands of the recording reach."""
+    k = inputs.action_names.index(effect.port)
+    peak = float(inputs.actions[..., k].abs().max())
+    return {
+        p.name: probe[p.name] if math.isfinite(p.nominal) else BITES * peak
+        for p in effect.parameters
+    }
+
+
+def _resting(nominal: float, probe: float) -> float:
+    """Returns zero strength as a number to interpolate from: a limit rests at the peak."""
+    return nominal if math.isfinite(nominal) else probe / BITES
+
+
+def _limits(
+    priors: Mapping[str, Distribution],
+    strengths: tuple[str, ...],
+    nominal: Tensor,
+    full: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns least, greatest and typical numbers of sizes that the priors admit."""
+    lower, upper, deviation = [], [], []
+    for k, name in enumerate(strengths):
+        prior = priors[name]
+        unit = float(full[k] - nominal[k])
+        support: object = prior.support
+        low = float(getattr(support, "lower_bound", -math.inf))
+        high = float(getattr(support, "upper_bound", math.inf))
+        ends = sorted(((low - float(nominal[k])) / unit, (high - float(nominal[k])) / unit))
+        lower.append(ends[0])
+        upper.append(ends[1])
+        spread = (float(prior.variance) + (float(prior.mean) - float(nominal[k])) ** 2) ** 0.5
+        deviation.append(max(spread / abs(unit), 1e-6))
+    return (
+        torch.tensor(lower, dtype=torch.float64),
+        torch.tensor(upper, dtype=torch.float64),
+        torch.tensor(deviation, dtype=torch.float64),
+    )

@@ -1,0 +1,214 @@
+"""The model as it is, fitted to a recording: where fit, compare, train and discover all begin.
+
+The closest parameters and initial states are searched for from two places, the initial states are
+estimated once more along the motion that was found, and the integration steps are refined where
+they are too coarse for the recording.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import (
+    EDGE,
+    Hypothesis,
+    Model,
+    fit_hypothesis,
+    with_effects,
+)
+from npdr_ppl.discovery.search.evidence import closest, weigh
+from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.handlers import with_finer_steps
+from npdr_ppl.preparation.closest_fit import ITERATIONS_BEFORE_STEPS, search_prior
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.progress import Step
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["CONFIDENCE", "BaseFit", "fit_base", "in_finer_steps", "off_the_ends"]
+
+NOTICEABLE = 5.0
+"""Distance by which steps of a higher order move all readings together, in standard deviations of
+what a fit leaves, from which they are taken unless the recording speaks against them: effects
+would be found that make up for it. Refitted parameters make up for four fifths of a distance."""
+
+CONFIDENCE = 0.9
+"""Probability above which a recording is taken to be made in coarse steps itself."""
+
+
+ATTEMPTS = 4
+"""Times that a fit is made once more from inside the priors, each time from where the last led."""
+
+
+@dataclass(frozen=True)
+class BaseFit:
+    """A model fitted to a recording.
+
+    Attributes:
+        model: The model, in finer steps where its own are too coarse.
+        hypothesis: Its closest fit.
+        are_steps_coarse: Whether its own steps are too coarse for the recording.
+    """
+
+    model: Model
+    hypothesis: Hypothesis
+    are_steps_coarse: bool
+
+
+def fit_base(
+    model: Model,
+    rollouts: Rollouts,
+    binding: DataOptions,
+    *,
+    near: Mapping[str, Tensor] | None = None,
+    seed: int = 0,
+    progress: Step | None = None,
+) -> Hypothesis:
+    """Fits a model as it is to a recording.
+
+    Args:
+        model: The model.
+        rollouts: The recording.
+        binding: Its segments.
+        near: Parameters near which the fit is known to lie; searched for by default.
+        seed: Seed of the search.
+        progress: Called with the fraction of the search done and a short status.
+
+    Raises:
+        DataError: No parameters can be simulated along the recording, simulations fail beside the
+            fit, or the data do not fit the model.
+    """
+    begun: list[Hypothesis] = []
+    failure: DataError | None = None
+    for start in _starts(model, rollouts, binding, near, seed, progress):
+        try:
+            begun.append(fit_hypothesis(model, rollouts, binding, start=start, is_rough=True))
+        except DataError as error:
+            failure = error
+    if not begun:
+        assert failure is not None
+        raise failure
+    best = closest(begun)
+    fitted = fit_hypothesis(
+        model, rollouts, binding, start=best.parameters, offsets=best.fit.offsets
+    )
+    fitted = off_the_ends(fitted, model, rollouts, binding)
+    found = Trials(model, rollouts, binding).with_own_starts(fitted)
+    _ = found.linearisation  # all that follows needs it
+    return found
+
+
+def off_the_ends(
+    fitted: Hypothesis, model: Model, rollouts: Rollouts, binding: DataOptions
+) -> Hypothesis:
+    """Returns a fit that has not slid to a prior's end along what the recording does not show.
+
+    Steps along a flat direction lead anywhere, and at an end a parameter hardly moves in reference
+    coordinates. Such a fit is made once more from inside; the one of greater posterior density is
+    kept.
+
+    Args:
+        fitted: The fit.
+        model: The model without the effects of the fit.
+        rollouts: The recording.
+        binding: Its segments.
+    """
+    for _ in range(ATTEMPTS):
+        z = fitted.fit.z
+        is_at_end = z.abs() > EDGE
+        if not bool(is_at_end.any()):
+            break
+        inside = torch.where(is_at_end, z.sign(), z)
+        start = fitted.segments.prior.to_parameters(inside[None])
+        try:
+            other = fit_hypothesis(
+                model,
+                rollouts,
+                binding,
+                effects=fitted.effects,
+                start={name: value[0] for name, value in start.items()},
+                offsets=fitted.fit.offsets,
+                starts=fitted.segments.starts,
+            )
+        except DataError:
+            break
+        if _loss(other, fitted.fit.scale) >= _loss(fitted, fitted.fit.scale):
+            break
+        fitted = other
+    return fitted
+
+
+def _loss(hypothesis: Hypothesis, scale: Tensor) -> float:
+    """Returns minus the log density of a fit, up to a constant, for noise of a scale ``(C,)``."""
+    return float(hypothesis.losses(scale).sum() + 0.5 * hypothesis.fit.z.square().sum())
+
+
+def in_finer_steps(
+    current: Hypothesis,
+    model: Model,
+    rollouts: Rollouts,
+    binding: DataOptions,
+    *,
+    report: Callable[[str], None] = lambda _: None,
+) -> BaseFit:
+    """Returns a fit in finer steps, where its own err noticeably; else as it is.
+
+    The error of coarse steps would be found as a delay. A recording that was itself made in coarse
+    steps is left to them.
+
+    Args:
+        current: A fitted hypothesis of the model.
+        model: The model without the effects of the hypothesis.
+        rollouts: The recording.
+        binding: Its segments.
+        report: Called with a sentence where steps are refined.
+    """
+    is_coarse = False
+    while current.simulator.with_finer_steps() is not None:
+        finer_model = with_finer_steps(model)
+        trials = Trials(finer_model, rollouts, binding)
+        finer = None
+        if _step_error(current, finer_model, rollouts, binding) > NOTICEABLE:
+            finer = trials.refitted(current)
+            if finer is not None:
+                finer = off_the_ends(finer, finer_model, rollouts, binding)
+        if finer is None or weigh([current, finer], [0.0, 0.0], seed=0)[0] > CONFIDENCE:
+            break
+        report("the model's steps are too coarse for this recording: finer ones")
+        is_coarse, model = True, finer_model
+        current = trials.with_own_starts(finer)
+    return BaseFit(model, current, is_coarse)
+
+
+def _starts(
+    model: Model,
+    rollouts: Rollouts,
+    binding: DataOptions,
+    near: Mapping[str, Tensor] | None,
+    seed: int,
+    progress: Step | None,
+) -> list[Mapping[str, Tensor]]:
+    """Returns where to begin: the prior's middle and the best of a search, or what is known."""
+    if near:
+        return [near]
+    segments = SegmentModel(model, rollouts, binding)
+    z = search_prior(segments, iterations=ITERATIONS_BEFORE_STEPS, seed=seed, progress=progress)
+    found = segments.prior.to_parameters(z[None])
+    return [{}, {name: value[0] for name, value in found.items()}]
+
+
+def _step_error(
+    current: Hypothesis, model: Model, rollouts: Rollouts, binding: DataOptions
+) -> float:
+    """Returns how far a model's simulation is from a hypothesis's, in what that leaves."""
+    fit = current.fit
+    finer = SegmentModel(
+        with_effects(model, current.effects), rollouts, binding, current.segments.starts
+    )
+    here = fit.z[None], fit.offsets[None]
+    difference = finer.simulate(*here) - current.segments.simulate(*here)
+    return float(finer.whitened(difference[0], fit.scale).norm().nan_to_num(math.inf))

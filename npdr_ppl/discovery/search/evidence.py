@@ -1,0 +1,70 @@
+"""Which of several hypotheses a recording speaks for, and how sure that is.
+
+Each segment's log density under each fitted hypothesis is computed with one scale of the readings
+and one share of independent readings, those of the hypothesis that leaves least. Evidence is their
+sum, less what the priors and the number of parameters cost, plus the log of the prior
+probability. The weights are pseudo-BMA+ (Yao, Vehtari, Simpson & Gelman 2018): evidence is
+resampled over blocks of segments by the Bayesian bootstrap, so that two hypotheses which differ by
+a few lucky segments share the probability.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.permutation_tests import block_sums
+
+__all__ = ["INDISTINCT", "SURVIVES", "closest", "evidence", "weigh"]
+
+RESAMPLINGS = 1000
+
+SURVIVES = 0.05
+"""Probability from which an alternative has to be reckoned with."""
+
+INDISTINCT = 2.0
+"""Loss of log density up to which a recording does not tell two laws, or a law from its limit: two
+standard deviations of a likelihood ratio of one parameter."""
+
+
+def closest(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
+    """Returns the hypothesis that leaves least, by the geometric mean over the channels."""
+    return min(hypotheses, key=lambda h: float(h.fit.scale.log().sum()))
+
+
+def evidence(
+    hypotheses: Sequence[Hypothesis], log_prior: Sequence[float], reference: Hypothesis
+) -> Tensor:
+    """Returns the log evidence of each hypothesis by block of segments, ``(H, blocks)``.
+
+    Args:
+        hypotheses: H fitted hypotheses.
+        log_prior: Log of each one's prior probability.
+        reference: The one whose residuals give scale and share.
+    """
+    scale, share = reference.fit.scale, reference.share
+    rows = []
+    for hypothesis, prior in zip(hypotheses, log_prior, strict=True):
+        blocks = -share * block_sums(hypothesis.losses(scale)[:, None])[:, 0]
+        rows.append(blocks + (prior - hypothesis.complexity) / len(blocks))
+    return torch.stack(rows)
+
+
+def weigh(
+    hypotheses: Sequence[Hypothesis], log_prior: Sequence[float], *, seed: int
+) -> list[float]:
+    """Returns the probability of each hypothesis, one of them being true.
+
+    Args:
+        hypotheses: H fitted hypotheses.
+        log_prior: Log of each one's prior probability, up to a constant.
+        seed: Seed of the bootstrap.
+    """
+    rows = evidence(hypotheses, log_prior, closest(hypotheses))
+    generator = torch.Generator().manual_seed(seed)
+    draws = torch.rand(RESAMPLINGS, rows.shape[1], generator=generator, dtype=torch.float64)
+    weights = -draws.clamp_min(1e-300).log()  # exponential, hence Dirichlet once normalised
+    weights = weights / weights.mean(-1, keepdim=True)
+    return (weights @ rows.mT).nan_to_num(-math.inf).softmax(-1).mean(0).tolist()

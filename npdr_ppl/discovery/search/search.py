@@ -1,0 +1,340 @@
+"""The search: add the effect that explains most, look again, take back what became needless."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+from torch import Tensor
+
+from npdr_ppl.discovery.discovery_options import DiscoveryOptions
+from npdr_ppl.discovery.hypothesis import Hypothesis, Model
+from npdr_ppl.discovery.screening.alarm import Alarm, sound_alarm
+from npdr_ppl.discovery.screening.candidate_effects import candidates_at, variants_of
+from npdr_ppl.discovery.screening.latent_force import Responses, responses
+from npdr_ppl.discovery.screening.projection import Projection, loss_without
+from npdr_ppl.discovery.screening.screening import Screened
+from npdr_ppl.discovery.screening.separation import separation_matrix
+from npdr_ppl.discovery.search.alternatives import (
+    Added,
+    Rivals,
+    find_rivals,
+    log_prior,
+    tried_before,
+    weigh_rivals,
+)
+from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps
+from npdr_ppl.discovery.search.evidence import SURVIVES, closest, weigh
+from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
+from npdr_ppl.discovery.search.side_by_side import num_processes, side_by_side
+from npdr_ppl.discovery.search.trials import PLAINLY, Trials
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.memory import release_freed_memory
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["Round", "Search", "Searcher", "explained"]
+
+LEAST_SHARE = 1e-4
+"""Stop when the unexplained misfit is below this fraction of the explained misfit: where a large
+effect was missing, integrators and the laws' own details differ by as much."""
+
+LEADING = 10
+"""Candidates whose distances from each other are computed."""
+
+PRIOR_OF_ANY = 0.5
+"""Prior probability that anything of the catalogue is missing."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """What was seen at one state of the model.
+
+    Attributes:
+        hypothesis: The model as it was, fitted.
+        averaged: The same, with averages of a very long recording's readings.
+        alarm: Whether something was missing then.
+        ranking: The candidates by linear gain.
+        separation: How far the leading ones are apart; see :mod:`separation`.
+        responses: What pulses of force at the joints would change.
+        weights: Probability of each candidate fitted in full, by name; ``""`` for none.
+        trials: The model with each of them, by name.
+    """
+
+    hypothesis: Hypothesis
+    averaged: Hypothesis
+    alarm: Alarm
+    ranking: list[Screened]
+    separation: Tensor
+    responses: Responses
+    weights: dict[str, float] = field(default_factory=dict)
+    trials: dict[str, Hypothesis] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Search:
+    """What the search came to.
+
+    Attributes:
+        rounds: What was seen before each addition, and at last.
+        final: The model at last.
+        added: Its effects.
+        removed: Names of effects that were added and taken back.
+        trials: Hypotheses of the last look at each effect, by the name of what stood in for what.
+    """
+
+    rounds: list[Round]
+    final: Hypothesis
+    added: list[Added]
+    removed: list[str]
+    trials: dict[tuple[str, str], Hypothesis]
+
+
+class Searcher:
+    """Searches a recording for missing effects.
+
+    Args:
+        model: The model in question.
+        rollouts: The recording.
+        options: How to search.
+        report: Called with a sentence at each step.
+        binding: Its segments; those of the options by default.
+
+    Attributes:
+        model: The model in question, in finer steps once its own have turned out too coarse.
+        are_steps_coarse: Whether they have.
+        are_priors_widened: Whether some of its priors ended too early and were widened.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        rollouts: Rollouts,
+        options: DiscoveryOptions,
+        report: Callable[[str], None] = lambda _: None,
+        *,
+        binding: DataOptions | None = None,
+    ) -> None:
+        self.model = model
+        self.rollouts = rollouts
+        self.options = options
+        self.binding: DataOptions = binding or options.binding(rollouts)
+        self.are_steps_coarse = False
+        self.are_priors_widened = False
+        self._last: Round | None = None
+        self._report = report
+
+    @property
+    def trials(self) -> Trials:
+        """Fits of the model in the steps that it has now."""
+        return Trials(self.model, self.rollouts, self.binding)
+
+    def fit_base(self) -> Hypothesis:
+        """Fits the model as it is; see :func:`~npdr_ppl.discovery.search.base_fit.fit_base`."""
+        self._report("fitting the model as it is")
+        return fit_base(self.model, self.rollouts, self.binding, seed=self.options.seed)
+
+    def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
+        """Returns a hypothesis in finer steps where its own are too coarse; else as it is.
+
+        All later hypotheses are in the steps of what is returned.
+
+        Args:
+            current: A fitted hypothesis.
+        """
+        found = in_finer_steps(
+            current, self.model, self.rollouts, self.binding, report=self._report
+        )
+        self.model = found.model
+        self.are_steps_coarse = self.are_steps_coarse or found.are_steps_coarse
+        return found.hypothesis
+
+    def with_wider_priors(self, current: Hypothesis) -> Hypothesis:
+        """Returns a hypothesis with wider priors where its own end too early; else as it is.
+
+        No effect is to be named that a wider prior explains as well: all later hypotheses have the
+        priors of what is returned.
+
+        Args:
+            current: A fitted hypothesis.
+        """
+        found = widen_where_it_helps(self.model, current, self.rollouts, self.binding)
+        if found is None:
+            return current
+        self._report(f"{found.ends[0]}")
+        self.model, self.are_priors_widened = found.model, True
+        # What the narrow prior left had hidden how coarse the steps are.
+        return self.with_finer_steps(found.hypothesis)
+
+    def run(self, first: Round, *, max_effects: int) -> Search:
+        """Adds effects until no alarm fires, nothing helps, or there are enough.
+
+        Args:
+            first: What was seen at the model as it is.
+            max_effects: How many are enough.
+
+        Returns:
+            What came of it; its first round is in finer steps if those turned out to be needed.
+        """
+        current, now = first.hypothesis, first
+        rounds = [first]
+        removed: list[str] = []
+        while (
+            now.alarm.fired
+            and len(current.effects) < max_effects
+            and now.alarm.gain > LEAST_SHARE * explained(first.hypothesis, current)
+        ):
+            best, weights, tried = self._extended(current, now)
+            rounds[-1] = replace(now, weights=weights, trials=tried)
+            if best is None or _is_negligible(first.hypothesis, current, tried[best]):
+                break
+            current, needless = self._pruned(tried[best])
+            current = self.trials.with_own_starts(current)
+            removed += needless
+            if not self.are_steps_coarse and self.with_finer_steps(current) is not current:
+                # What was missing had hidden how coarse they are: begin anew.
+                current = self.fit_base()
+                first = now = self.look(current)
+                rounds, removed = [first], []
+                continue
+            if any(set(current.names) == set(r.hypothesis.names) for r in rounds):
+                break
+            now = self.look(current)
+            rounds.append(now)
+        current, added, trials = self.with_rivals(current, rounds)
+        if set(current.names) != set(rounds[-1].hypothesis.names):
+            rounds.append(self.look(current))  # something was swapped: what is left is another
+        return Search(rounds, current, added, removed, trials)
+
+    def look(self, hypothesis: Hypothesis) -> Round:
+        """Screens all candidates at a fitted hypothesis; the last one asked for is kept."""
+        if self._last is not None and self._last.hypothesis is hypothesis:
+            return self._last
+        release_freed_memory()
+        averaged = hypothesis.averaged()
+        projection = Projection(averaged)
+        found = responses(averaged)
+        candidates = candidates_at(hypothesis, self.options)
+        variants = variants_of(candidates, projection, found)
+        sensors = hypothesis.simulator.sensors
+        looks = len(hypothesis.effects)
+        alarm, ranking = sound_alarm(projection, variants, found, sensors, self.options, looks)
+        separation = separation_matrix(projection, ranking[:LEADING])
+        ranking = [candidate.without_change() for candidate in ranking]
+        width = averaged.segments.steps_per_average
+        if width > 1:
+            fastest = 0.5 / (width * hypothesis.segments.inputs.time_step)
+            self._report(
+                f"a long recording: means of {width} steps were searched, in which nothing above "
+                f"{fastest:.3g} Hz shows"
+            )
+        best = ", ".join(s.name for s in ranking[:3]) or "none"
+        self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
+        self._last = Round(hypothesis, averaged, alarm, ranking, separation, found)
+        return self._last
+
+    def _extended(
+        self, current: Hypothesis, now: Round
+    ) -> tuple[str | None, dict[str, float], dict[str, Hypothesis]]:
+        """Returns the candidate that explains most, unless none does, with weights and trials.
+
+        A candidate explains something if chance does not, as the alarm counts, or if the evidence
+        against the model without it is strong.
+        """
+        ranking = now.ranking
+        trials = self.trials.extended(current, ranking, self._report)
+        if not trials:
+            return None, {}, {}
+        trials = self.trials.converged(trials)
+        each = math.log(PRIOR_OF_ANY / max(1, len(ranking)))
+        hypotheses = [current, *trials.values()]
+        prior = [math.log(1 - PRIOR_OF_ANY), *(each + log_prior(t) for t in trials.values())]
+        weights = dict(zip(("", *trials), weigh(hypotheses, prior, seed=0), strict=True))
+        best = max(trials, key=lambda name: weights[name])
+        trials = self.trials.apart_from_waves_in_step(trials)
+        if best not in trials:
+            self._report(f"{best} keeps in step with the motion, so it is a law of the state")
+            if not trials:
+                return None, weights, trials
+            wave, best = best, max(trials, key=lambda name: weights[name])
+            if weights[best] < SURVIVES * weights[wave]:
+                return None, weights, trials
+        is_chance = now.alarm.p_values.get(best, 1.0) > self.options.false_alarm_rate
+        if is_chance and weights[""] > 1.0 - self.options.confidence:
+            return None, weights, trials
+        self._report(f"adding {best}")
+        return best, weights, trials
+
+    def _pruned(self, current: Hypothesis) -> tuple[Hypothesis, list[str]]:
+        """Takes back effects that the last addition made needless."""
+        removed: list[str] = []
+        for effect in current.effects[:-1]:
+            if loss_without(current, effect) > PLAINLY:
+                continue
+            without = self.trials.without(current, effect)
+            if without is None:
+                continue
+            if _speaks_for(without, current) > self.options.confidence:
+                self._report(f"removing {effect.name}")
+                current, removed = without, [*removed, effect.name]
+        return current, removed
+
+    def with_rivals(
+        self, current: Hypothesis, rounds: list[Round]
+    ) -> tuple[Hypothesis, list[Added], dict[tuple[str, str], Hypothesis]]:
+        """Asks of each effect what else could stand in its place, and swaps what is likelier.
+
+        Args:
+            current: The model with all effects, fitted.
+            rounds: What was seen on the way to it.
+
+        Returns:
+            The model at last, its effects, and the models with each rival; see :class:`Search`.
+        """
+        added: list[Added] = []
+        trials: dict[tuple[str, str], Hypothesis] = {}
+        waiting = current.effects
+        while waiting:
+            asked = current
+            for effect, rivals in zip(waiting, self._rivals(asked, waiting, rounds), strict=True):
+                waiting = waiting[1:]
+                current, found = weigh_rivals(rounds[0].hypothesis, asked, effect, rivals)
+                probability = found.alternatives[effect.name]
+                self._report(f"{effect.name}: probability {probability:.2f}")
+                added.append(found)
+                tried = {effect.name: asked} | ({} if rivals is None else rivals.others)
+                trials |= {(effect.name, name): trial for name, trial in tried.items()}
+                if current is not asked:
+                    current = self.trials.with_own_starts(current)
+                    break  # the rivals of the others are to be found beside what was swapped in
+        return current, added, trials
+
+    def _rivals(
+        self, current: Hypothesis, effects: Sequence[Effect], rounds: list[Round]
+    ) -> Iterator[Rivals | None]:
+        """Yields the rivals of each effect, in their order."""
+        seen = [(r.hypothesis, r.trials) for r in rounds]
+        known = {effect.name: tried_before(current, effect, seen) for effect in effects}
+        new = [effect for effect in effects if known[effect.name] is None]
+        function = partial(find_rivals, current, trials=self.trials, options=self.options)
+        number = num_processes(current.simulator)
+        # With fewer of them than processes, each search had better use all.
+        found = side_by_side(function, new, number if len(new) >= number else 1)
+        for effect in effects:
+            yield known[effect.name] or next(found)
+
+
+def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:
+    """Returns the probability of one of two hypotheses."""
+    return weigh([one, other], [0.0, 0.0], seed=0)[0]
+
+
+def _is_negligible(first: Hypothesis, current: Hypothesis, extended: Hypothesis) -> bool:
+    """Returns whether the last effect explains next to nothing beside all that was explained."""
+    return explained(current, extended) < LEAST_SHARE * explained(first, extended)
+
+
+def explained(first: Hypothesis, final: Hypothesis) -> float:
+    """Returns by how much the misfit was reduced, in units of the readings' variance."""
+    scale = closest([first, final]).fit.scale
+    return max(0.0, 2.0 * float((first.losses(scale) - final.losses(scale)).sum()))

@@ -1,0 +1,131 @@
+"""The force that a model lacks, against what was going on when it lacked it."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from npdr_ppl.discovery.screening.latent_force import LatentForce, latent_force
+from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.search.search import Round
+from npdr_ppl.display.plots.marginals import add_legend
+from npdr_ppl.drawing.theme import COLORS, theme
+
+__all__ = ["plot_latent_force"]
+
+BINS = 15
+"""Bins along a channel, of equal width between its lowest and highest hundredth."""
+
+FEWEST = 8
+"""Estimates in a bin that is drawn."""
+
+MOST_DOTS = 250
+"""Estimates drawn as dots, picked at random; all count for the line."""
+
+WIDTH = 2.0
+"""Half the band's width, in standard errors of a bin's mean."""
+
+BEFORE, AFTER = "the model as it was", "the revised model"
+
+LOOKS = {BEFORE: COLORS["nominal"], AFTER: COLORS["posterior"]}
+
+Array = NDArray[np.float64]
+
+
+def plot_latent_force(
+    first: Round, last: Round | None = None, units: Mapping[str, str] | None = None
+) -> Figure | None:
+    """Draws the missing force at every joint against every channel, command and time.
+
+    Each dot is the mean force over a pulse; the line is their mean in bins, weighted by the
+    estimates' precision, the band two standard errors of it. The axis is the lines': some dots
+    lie outside.
+
+    Args:
+        first: What was seen at the model as it was.
+        last: What was seen at the revised model.
+        units: Units of channels and commands by name.
+
+    Returns:
+        The figure, or ``None`` where the model has no joint that a force could act on.
+    """
+    rounds = {BEFORE: first}
+    if last is not None and last.hypothesis is not first.hypothesis:
+        rounds[AFTER] = last
+    forces = {title: _forces(now) for title, now in rounds.items()}
+    ports = list(forces[BEFORE])
+    if not ports:
+        return None
+    against = {title: _axes_of(now) for title, now in rounds.items()}
+    names = list(against[BEFORE])
+    with theme():
+        size = (1.75 * len(names) + 0.6, 1.7 * len(ports) + 0.5)
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(len(ports), len(names), sharex="col", sharey="row", squeeze=False)
+        for row, port in zip(axes, ports, strict=True):
+            reach = [
+                _draw(axis, against[title][name], found[port], title)
+                for title, found in forces.items()
+                for axis, name in zip(row, names, strict=True)
+                if port in found
+            ]
+            for axis in row:
+                axis.axhline(0.0, color="0.8", lw=0.6, zorder=0)
+                axis.ticklabel_format(axis="y", scilimits=(-2, 3))
+            limit = 1.5 * max(reach) + np.finfo(float).tiny
+            row[0].set_ylim(-limit, limit)
+            unit = forces[BEFORE][port].unit
+            row[0].set_ylabel(f"missing at\n{port}\n[{unit}]", fontsize="small")
+        for axis, name in zip(axes[-1], names, strict=True):
+            unit = "s" if name == "time" else (units or {}).get(name, "")
+            axis.set_xlabel(f"{name} [{unit}]" if unit else name)
+        add_legend(figure, loc="outside upper center", ncols=len(rounds))
+    return figure
+
+
+def _draw(axis: Axes, x: Array, found: LatentForce, title: str) -> float:
+    """Draws one joint's force against one channel; returns how far the band reaches."""
+    force = found.force.numpy().ravel()
+    precision = found.error.numpy().ravel().clip(1e-12) ** -2.0
+    few = np.random.default_rng(0).permutation(len(x))[:MOST_DOTS]
+    axis.plot(
+        x[few], force[few], ".", ms=1.5, alpha=0.4, color=LOOKS[title], rasterized=True, zorder=1
+    )
+    centre, mean, error = _binned(x, force, precision)
+    axis.fill_between(
+        centre, mean - WIDTH * error, mean + WIDTH * error,
+        color=LOOKS[title], alpha=0.3, lw=0, zorder=2,
+    )  # fmt: skip
+    axis.plot(centre, mean, color=LOOKS[title], lw=1.2, label=title, zorder=3)
+    return float((np.abs(mean) + WIDTH * error).max(initial=0.0))
+
+
+def _binned(x: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Returns centres, weighted means and their standard errors."""
+    low, high = np.quantile(x, 0.01), np.quantile(x, 0.99)
+    edges = np.linspace(low, high, BINS + 1)
+    place = np.digitize(x, edges[1:-1])
+    rows = []
+    for bin_index in range(BINS):
+        part = place == bin_index
+        if part.sum() < FEWEST:
+            continue
+        share = weight[part] / weight[part].sum()
+        mean = float(share @ y[part])
+        error = float(np.sqrt((share**2) @ (y[part] - mean) ** 2))
+        rows.append((float(share @ x[part]), mean, error))
+    centre, mean, error = np.array(rows).reshape(-1, 3).T
+    return centre, mean, error
+
+
+def _forces(now: Round) -> dict[str, LatentForce]:
+    found = latent_force(Projection(now.averaged), now.responses)
+    return {force.port: force for force in found}
+
+
+def _axes_of(now: Round) -> dict[str, Array]:
+    """Returns what the forces are drawn against, flattened as they are."""
+    values = {name: v.numpy().ravel() for name, v in now.responses.channels.items()}
+    return values | {"time": now.responses.time.numpy().ravel()}

@@ -1,0 +1,310 @@
+"""Charts as plain Plotly specifications: traces and layouts that JSON can hold.
+
+They are dictionaries rather than Plotly's own objects, so that a report is written without
+importing the larger part of that library; the tests have Plotly check them.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.display.reports.content import ChartPart
+from npdr_ppl.drawing.marginal import density
+from npdr_ppl.drawing.theme import COLORS, SERIES
+
+__all__ = [
+    "bands_chart",
+    "bars_chart",
+    "intervals_chart",
+    "lines_chart",
+    "marginals_chart",
+    "matrix_chart",
+    "pit_chart",
+    "rounded",
+]
+
+Array = NDArray[np.float64]
+
+MAX_POINTS = 400
+"""Points of a line; a phone shows no more, and a page has to stay small."""
+
+MAX_MARKERS = 40
+"""Points of a line that are marked; more would hide it."""
+
+_GRID = 120
+_BINS = 20
+_BANDS = ((0.05, 0.95, "rgba(0,114,178,0.22)"), (0.25, 0.75, "rgba(0,114,178,0.4)"))
+_DIGITS = 5
+
+
+def rounded(values: Any) -> list[Any]:
+    """Returns numbers with five digits, and None for what JSON has not."""
+    flat = np.asarray(values, dtype=float)
+    if flat.ndim > 1:
+        return [rounded(row) for row in flat]
+    return [float(f"{v:.{_DIGITS}g}") if np.isfinite(v) else None for v in flat.tolist()]
+
+
+def marginals_chart(
+    posterior: Mapping[str, Array], prior: Mapping[str, Array], units: Mapping[str, str]
+) -> ChartPart:
+    """Draws marginals of the posterior over the prior; a menu chooses the parameter."""
+    names = list(posterior)
+    data: list[dict[str, Any]] = []
+    for index, name in enumerate(names):
+        together = np.concatenate([posterior[name], prior[name]])
+        grid = np.linspace(together.min(), together.max(), _GRID)
+        for label, samples in (("prior", prior[name]), ("posterior", posterior[name])):
+            shown = density(samples, grid) if samples.std() > 0 else np.full(_GRID, np.nan)
+            data.append(
+                {
+                    "type": "scatter",
+                    "mode": "lines",
+                    "name": label,
+                    "fill": "tozeroy",
+                    "x": rounded(grid),
+                    "y": rounded(shown),
+                    "line": {"color": COLORS[label]},
+                    "visible": index == 0,
+                }
+            )
+    titles = [_with_unit(name, units.get(name, "")) for name in names]
+    buttons = [
+        {
+            "label": name,
+            "method": "update",
+            "args": [
+                {"visible": [index == row for row in range(len(names)) for _ in range(2)]},
+                {"xaxis.title.text": titles[index]},
+            ],
+        }
+        for index, name in enumerate(names)
+    ]
+    menu: dict[str, Any] = {
+        "buttons": buttons,
+        "x": 0.0,
+        "xanchor": "left",
+        "y": 1.22,
+        "yanchor": "top",
+    }
+    menu |= {"bgcolor": "#8c959f", "font": {"color": "#000000"}}
+    layout = _layout(titles[0] if titles else "", "density")
+    layout["yaxis"] |= {"showticklabels": False, "rangemode": "tozero"}
+    layout["margin"] |= {"t": 60, "b": 80}
+    layout["legend"] |= {"y": -0.25, "yanchor": "top"}
+    layout["updatemenus"] = [menu] if len(names) > 1 else []
+    caption = "Marginal posterior over the prior. What the data say nothing about keeps its prior."
+    return ChartPart("marginals", caption, data, layout, 360)
+
+
+def intervals_chart(
+    name: str,
+    rows: Mapping[str, tuple[float, float, float]],
+    *,
+    title: str,
+    caption: str,
+) -> ChartPart:
+    """Draws intervals as horizontal bars about their middle, ``label: (low, middle, high)``."""
+    labels = list(rows)
+    values = np.array([rows[label] for label in labels], dtype=float).reshape(-1, 3)
+    data = [
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "x": rounded(values[:, 1]),
+            "y": labels,
+            "marker": {"color": COLORS["posterior"], "size": 9},
+            "showlegend": False,
+            "error_x": {
+                "type": "data",
+                "symmetric": False,
+                "array": rounded(values[:, 2] - values[:, 1]),
+                "arrayminus": rounded(values[:, 1] - values[:, 0]),
+            },
+        }
+    ]
+    layout = _layout(title, "")
+    layout["yaxis"] |= {"automargin": True, "autorange": "reversed"}
+    return ChartPart(name, caption, data, layout, 130 + 28 * len(labels))
+
+
+def bars_chart(
+    name: str, bars: Mapping[str, Mapping[str, float]], *, title: str, caption: str
+) -> ChartPart:
+    """Draws horizontal bars, ``series: {label: value}``; several series are stacked."""
+    data = [
+        {
+            "type": "bar",
+            "orientation": "h",
+            "name": series,
+            "y": list(values),
+            "x": rounded(list(values.values())),
+            "marker": {"color": SERIES[index % len(SERIES)]},
+            "showlegend": len(bars) > 1,
+        }
+        for index, (series, values) in enumerate(bars.items())
+    ]
+    layout = _layout(title, "")
+    layout["barmode"] = "stack"
+    layout["yaxis"] |= {"automargin": True, "autorange": "reversed"}
+    count = max((len(values) for values in bars.values()), default=0)
+    return ChartPart(name, caption, data, layout, 140 + 28 * count)
+
+
+def lines_chart(
+    name: str,
+    lines: Mapping[str, tuple[Sequence[float], Sequence[float | None]]],
+    *,
+    titles: tuple[str, str],
+    caption: str,
+    diagonal: bool = False,
+) -> ChartPart:
+    """Draws lines with markers, ``label: (x, y)``, where wanted over the diagonal."""
+    data: list[dict[str, Any]] = [
+        {
+            "type": "scatter",
+            "mode": "lines+markers" if len(x) <= MAX_MARKERS else "lines",
+            "name": label,
+            "x": rounded(x),
+            "y": rounded(np.array([np.nan if v is None else v for v in y], dtype=float)),
+            "line": {"color": SERIES[index % len(SERIES)]},
+            # Black would vanish on a dark page.
+            **({"meta": "ink"} if SERIES[index % len(SERIES)] == "#000000" else {}),
+        }
+        for index, (label, (x, y)) in enumerate(lines.items())
+    ]
+    if diagonal:
+        data.append(
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "name": "as it should be",
+                "x": [0, 1],
+                "y": [0, 1],
+                "meta": "ink",
+                "line": {"dash": "dot", "width": 1},
+            }
+        )
+    return ChartPart(name, caption, data, _layout(*titles), 340)
+
+
+def bands_chart(
+    name: str, time: Array, measured: Array, predictive: Array, *, titles: tuple[str, str]
+) -> ChartPart:
+    """Draws the predictive bands of one channel and the recording.
+
+    Args:
+        name: Identifier on the page.
+        time: Seconds or steps, ``(T,)``.
+        measured: The recording, ``(T,)``.
+        predictive: Draws, ``(n, T)``.
+        titles: Of the axes.
+    """
+    stride = max(1, -(-len(time) // MAX_POINTS))
+    kept = slice(None, None, stride)
+    x = rounded(time[kept])
+    data: list[dict[str, Any]] = []
+    for low, high, color in _BANDS:
+        bounds = np.quantile(predictive[:, kept], [low, high], axis=0)
+        for bound, fill in zip(bounds, ("none", "tonexty"), strict=True):
+            data.append(
+                {
+                    "type": "scatter",
+                    "mode": "lines",
+                    "x": x,
+                    "y": rounded(bound),
+                    "fill": fill,
+                    "fillcolor": color,
+                    "line": {"width": 0},
+                    "hoverinfo": "skip",
+                    "name": f"posterior {high - low:.0%}",
+                    "showlegend": fill == "tonexty",
+                }
+            )
+    data.append(
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": x,
+            "y": rounded(measured[kept]),
+            "name": "measured",
+            "meta": "ink",
+            "line": {"width": 1.5},
+        }
+    )
+    caption = f"{titles[1]}: what was measured, over what the fitted model predicts."
+    return ChartPart(name, caption, data, _layout(*titles), 300)
+
+
+def pit_chart(pit: Array) -> ChartPart:
+    """Draws the histogram of probability integral transforms, ``(readings,)``."""
+    counts, edges = np.histogram(pit, bins=_BINS, range=(0.0, 1.0))
+    share = counts * _BINS / max(1, counts.sum())
+    data: list[dict[str, Any]] = [
+        {
+            "type": "bar",
+            "x": rounded((edges[1:] + edges[:-1]) / 2),
+            "y": rounded(share),
+            "marker": {"color": COLORS["posterior"]},
+            "showlegend": False,
+        },
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": [0, 1],
+            "y": [1, 1],
+            "meta": "ink",
+            "line": {"dash": "dot", "width": 1},
+            "name": "as it should be",
+        },
+    ]
+    caption = (
+        "Where readings fall within the predictive distribution. Flat at 1 is right; a hill means "
+        "predictions wider than need be, a valley too narrow ones, a slope a bias."
+    )
+    layout = _layout("share of predictions below the reading", "density") | {"bargap": 0.05}
+    return ChartPart("pit", caption, data, layout, 280)
+
+
+def matrix_chart(samples: Mapping[str, Array]) -> ChartPart:
+    """Draws the correlations between parameters."""
+    names = list(samples)
+    # A parameter without any spread has no correlation.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        matrix = np.corrcoef(np.stack([samples[name] for name in names]))
+    data = [
+        {
+            "type": "heatmap",
+            "x": names,
+            "y": names,
+            "z": rounded(matrix),
+            "zmin": -1,
+            "zmax": 1,
+            "colorscale": "RdBu",
+            "reversescale": True,
+            "colorbar": {"thickness": 12},
+        }
+    ]
+    layout = _layout("", "")
+    layout["xaxis"] |= {"automargin": True}
+    layout["yaxis"] |= {"automargin": True, "autorange": "reversed"}
+    caption = (
+        "Correlation of parameters in the posterior. Close to ±1: the data tell only a "
+        "combination of the two."
+    )
+    return ChartPart("correlations", caption, data, layout, 420)
+
+
+def _layout(x: str, y: str) -> dict[str, Any]:
+    return {
+        "margin": {"l": 55, "r": 15, "t": 20, "b": 50},
+        "xaxis": {"title": {"text": x}},
+        "yaxis": {"title": {"text": y}},
+        "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"},
+    }
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit and unit != "1" else name

@@ -1,0 +1,78 @@
+"""The report on the demonstration: returns before and after, and what discovery found between."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from npdr_ppl.display.reports.charts import bars_chart
+from npdr_ppl.display.reports.content import (
+    KeyFigure,
+    Part,
+    Report,
+    Section,
+    TablePart,
+    TextPart,
+    Verdict,
+    number,
+)
+from npdr_ppl.display.reports.discovery import discovery_report
+from npdr_ppl.display.reports.training import training_report
+from npdr_ppl.run_files import read_json
+
+__all__ = ["demo_report"]
+
+SHARED = ("Effects", "Where", "Revised model")
+"""Sections of discovery's own report that are part of the story."""
+
+
+def demo_report(folder: Path) -> Report:
+    """Reads what ``npdr demo`` wrote.
+
+    Args:
+        folder: Folder with ``demo.json`` and the run of the loop.
+    """
+    result = read_json(folder / "demo.json")
+    returns = result["returns"]
+    revision = folder / "revision_0"
+    found: list[Section] = []
+    if (revision / "discovery.json").exists():
+        sections = discovery_report(revision).sections
+        found = [section for section in sections if section.title in SHARED]
+    rest = [s for s in training_report(folder).sections if s.title != "Returns"]
+    sections = [
+        Section("Returns on the rig", _returns(returns)),
+        *found,
+        Section("The rig in truth", _truth(result["truth"])),
+        *rest,
+    ]
+    figures = [KeyFigure(name, number(value, ".0f")) for name, value in returns.items()]
+    figures.append(KeyFigure("Effects added", str(len(result["effects"]))))
+    return Report("demo", "The story of a rig", _verdict(result), figures, sections)
+
+
+def _verdict(result: Mapping[str, Any]) -> Verdict:
+    before, after = result["returns"].values()
+    gain = f"The return on the rig went from {before:.0f} to {after:.0f}."
+    names = ", ".join(f"{row['effect']} at {row['port']}" for row in result["effects"])
+    if not names:
+        return Verdict("nothing was found", f"Discovery named no missing effect. {gain}", "warn")
+    succeeds = after >= result["success"]
+    meaning = f"The model got {names}. {gain} From {result['success']:.0f} on it stands upright."
+    word = "the revised model's policy works" if succeeds else "the policy still fails"
+    return Verdict(word, meaning, "good" if succeeds else "warn")
+
+
+def _returns(returns: Mapping[str, float]) -> list[Part]:
+    caption = "Return of one episode on the rig, which is made by MuJoCo; 2500 is the greatest."
+    return [bars_chart("returns", {"return": dict(returns)}, title="return", caption=caption)]
+
+
+def _truth(truth: Mapping[str, Any]) -> list[Part]:
+    rows = [[name, number(value, ".4g")] for name, value in truth.items() if name != "parameters"]
+    rows += [[name, number(value, ".4g")] for name, value in truth["parameters"].items()]
+    text = (
+        "The loop never saw these. Friction is MuJoCo's own, which gives way a little before it "
+        "slips, and the rates are filtered differences of encoder counts: near relatives of the "
+        "catalogue's effects, not the same formulas."
+    )
+    return [TextPart(text), TablePart(("quantity", "value in SI units"), rows)]

@@ -1,0 +1,293 @@
+"""The report on a search for the missing effect, from the names that ``discovery.json`` has.
+
+Everything but ``verdict`` is optional here: a search that found no gap has nothing to say of the
+effects that would close it.
+"""
+
+import base64
+import difflib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from npdr_ppl.display.reports.charts import ChartPart, bars_chart, rounded
+from npdr_ppl.display.reports.content import (
+    CodePart,
+    DiffPart,
+    KeyFigure,
+    Part,
+    PicturePart,
+    Report,
+    Section,
+    TablePart,
+    TextPart,
+    Verdict,
+    number,
+)
+from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
+from npdr_ppl.drawing.theme import SERIES
+from npdr_ppl.run_files import read_json
+
+__all__ = ["discovery_report"]
+
+MAX_PICTURE_BYTES = 700_000
+"""Sum of the pictures on a page; the rest is named, so that the page stays small."""
+
+
+def discovery_report(folder: Path) -> Report:
+    """Reads what ``npdr discover`` wrote.
+
+    Args:
+        folder: Folder with ``discovery.json``, and possibly ``revised_model.py`` and figures.
+    """
+    result = read_json(folder / "discovery.json")
+    description = run_description(folder) | {
+        name: result[name] for name in ("model", "seed", "versions") if name in result
+    }
+    effects = result.get("effects") or []
+    sections = [
+        Section("Gap on held-out rollouts", _gap(result.get("gap") or {})),
+        Section("Effects", _effects(effects, result.get("ranking") or [])),
+        Section("Where", _where(result.get("where") or [])),
+        *_next(result.get("next_experiment")),
+        *_revision(folder, description),
+        *_pictures(folder),
+        *source_section(description),
+        provenance_section(description, folder),
+    ]
+    return Report(
+        "discover",
+        "Search for the missing effect",
+        _verdict(result, effects),
+        _key_figures(result, effects),
+        sections,
+    )
+
+
+def _verdict(result: Mapping[str, Any], effects: list[Any]) -> Verdict:
+    word = str(result["verdict"])
+    best = _named(effects[0]) if effects else "an effect"
+    others = ", ".join(_named(effect) for effect in effects[1:])
+    p_value = number((result.get("alarm") or {}).get("p_value"))
+    gained = _gained(result.get("gap") or {})
+    verdicts = {
+        "none": Verdict(
+            "no effect is missing",
+            f"The model explains the recording as it is (alarm: p = {p_value}).",
+            "good",
+        ),
+        "named": Verdict(f"missing: {best}", gained, "good"),
+        "ambiguous": Verdict(
+            f"missing: {best}, or another",
+            f"These data do not tell it from {others or 'its equivalents'}. {gained}",
+            "warn",
+        ),
+        "unknown": Verdict(
+            "something unknown is missing",
+            "The model misses the recording, and no effect of the catalogue explains how.",
+            "bad",
+        ),
+    }
+    return verdicts.get(word, Verdict(word, str(result.get("reason", ""))))
+
+
+def _gained(gap: Mapping[str, Any]) -> str:
+    """Returns in a sentence what the revised model gains on held-out rollouts."""
+    closed = [
+        f"{values['closed']:.0%} in {metric}"
+        for metric, values in gap.items()
+        if values.get("closed") is not None
+    ]
+    if not closed:
+        return "What it gains on held-out rollouts was not measured."
+    return f"Of the gap on held-out rollouts it closes {', '.join(closed)}."
+
+
+def _key_figures(result: Mapping[str, Any], effects: list[Any]) -> list[KeyFigure]:
+    alarm = result.get("alarm") or {}
+    fired = alarm.get("fired")
+    word = "–" if fired is None else "fired" if fired else "silent"
+    figures = [KeyFigure("Alarm", word, f"p = {number(alarm.get('p_value'))}")]
+    if effects:
+        figures.append(
+            KeyFigure(
+                "Probability", number(effects[0].get("probability"), ".0%"), _named(effects[0])
+            )
+        )
+    for metric, values in (result.get("gap") or {}).items():
+        shown = f"{number(values.get('before'))} → {number(values.get('after'))}"
+        figures.append(
+            KeyFigure(f"Gap closed, {metric}", number(values.get("closed"), ".0%"), shown)
+        )
+    return figures
+
+
+def _gap(gap: Mapping[str, Any]) -> list[Part]:
+    if not gap:
+        return [TextPart("No gap was measured.")]
+    names = ("before", "after", "noise_floor")
+    rows = [
+        [
+            metric,
+            *(number(values.get(name)) for name in names),
+            number(values.get("closed"), ".0%"),
+        ]
+        for metric, values in gap.items()
+    ]
+    caption = (
+        "Closed: share of the way from before to the noise floor, which is what the revised model "
+        "would leave of a recording of its own."
+    )
+    columns = ("metric", "before", "after", "noise floor", "closed")
+    parts: list[Part] = [TablePart(columns, rows, caption)]
+    # Metrics have scales of their own, so each is drawn in units of what it was before.
+    data: list[dict[str, Any]] = []
+    for name, color in zip(names, SERIES, strict=False):
+        shares = {
+            metric: values[name] / values["before"]
+            for metric, values in gap.items()
+            if values.get("before") and values.get(name) is not None
+        }
+        label = name.replace("_", " ")
+        data.append(
+            {
+                "type": "bar",
+                "name": label,
+                "marker": {"color": color},
+                "x": list(shares),
+                "y": rounded(list(shares.values())),
+            }
+        )
+    layout: dict[str, Any] = {
+        "barmode": "group",
+        "margin": {"l": 55, "r": 15, "t": 20, "b": 40},
+        "xaxis": {"title": {"text": ""}},
+        "yaxis": {"title": {"text": "relative to before"}},
+        "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"},
+    }
+    parts.append(ChartPart("gap", "Error on held-out rollouts, relative to before.", data, layout))
+    return parts
+
+
+def _effects(effects: list[Any], ranking: list[Any]) -> list[Part]:
+    if not effects:
+        return [TextPart("No effect was added.")]
+    rows = [
+        [
+            _named(effect),
+            number(effect.get("probability"), ".0%"),
+            ", ".join(map(str, effect.get("equivalent_to") or [])) or "–",
+        ]
+        for effect in effects
+    ]
+    columns = ("effect", "probability", "these data do not tell it from")
+    parts: list[Part] = [TablePart(columns, rows)]
+    parameters = [
+        [
+            f"{_named(effect)}, {name}",
+            number(row.get("mean"), ".4g"),
+            number(row.get("sd"), ".2g"),
+            " … ".join(number(bound, ".4g") for bound in row.get("hdi_94") or []) or "–",
+            str(row.get("unit", "")),
+        ]
+        for effect in effects
+        for name, row in (effect.get("parameters") or {}).items()
+    ]
+    if parameters:
+        columns = ("parameter", "mean", "sd", "94 % interval", "unit")
+        parts.append(TablePart(columns, parameters, "Parameters of the effects."))
+    scored = {
+        _named(e): float(e["probability"])
+        for e in ranking or effects
+        if isinstance(e, Mapping) and e.get("probability") is not None
+    }
+    if scored:
+        caption = "Probability of each candidate that was tried."
+        parts.append(
+            bars_chart(
+                "probability", {"probability": scored}, title="probability", caption=caption
+            )
+        )
+    return parts
+
+
+def _where(where: list[Any]) -> list[Part]:
+    if not where:
+        return [TextPart("No place stands out.")]
+    rows = [
+        [
+            str(place.get("channel", "–")),
+            str(place.get("rollout", "–")),
+            _span(place.get("time_span", place.get("time"))),
+            _words(place.get("region", "–")),
+            number(place.get("z"), ".1f"),
+        ]
+        for place in where
+    ]
+    columns = ("channel", "rollout", "time [s]", "region", "z")
+    caption = "Where the model misses the recording by most, in standard deviations."
+    return [TablePart(columns, rows, caption)]
+
+
+def _next(experiment: Any) -> list[Section]:
+    if not experiment:
+        return []
+    if not isinstance(experiment, Mapping):
+        return [Section("Next experiment", [TextPart(_words(experiment))])]
+    rows = [[str(name), _words(value)] for name, value in experiment.items()]
+    caption = "The recording that would tell the remaining candidates apart."
+    return [Section("Next experiment", [TablePart(("what", "value"), rows, caption, "prose")])]
+
+
+def _revision(folder: Path, description: Mapping[str, Any]) -> list[Section]:
+    """Returns the revised model, as a diff where the model before is known."""
+    file = folder / "revised_model.py"
+    if not file.exists():
+        return []
+    revised = file.read_text(encoding="utf-8")
+    model = description.get("model")
+    before = model.get("source") if isinstance(model, Mapping) else model
+    if not isinstance(before, str) or not before.strip():
+        return [Section("Revised model", [CodePart(revised, "revised_model.py, for MODEL.")])]
+    lines = difflib.unified_diff(
+        before.splitlines(), revised.splitlines(), "model", "revised_model.py", lineterm=""
+    )
+    caption = "What changed; revised_model.py is a file that MODEL accepts."
+    return [Section("Revised model", [DiffPart(list(lines), caption)])]
+
+
+def _pictures(folder: Path) -> list[Section]:
+    parts: list[Part] = []
+    left_out, size = [], 0
+    for file in sorted(folder.glob("*.png")):
+        content = base64.b64encode(file.read_bytes()).decode("ascii")
+        if size + len(content) > MAX_PICTURE_BYTES:
+            left_out.append(file.name)
+            continue
+        size += len(content)
+        caption = file.stem.replace("_", " ")
+        parts.append(PicturePart(f"data:image/png;base64,{content}", caption))
+    if left_out:
+        parts.append(TextPart(f"Too large for this page: {', '.join(left_out)}."))
+    return [Section("Figures", parts)] if parts else []
+
+
+def _named(effect: Any) -> str:
+    if not isinstance(effect, Mapping):
+        return str(effect)
+    port = effect.get("port")
+    return f"{effect.get('effect', 'effect')} at {port}" if port else str(effect.get("effect"))
+
+
+def _span(value: Any) -> str:
+    if isinstance(value, list) and len(value) == 2:
+        return f"{number(value[0])} … {number(value[1])}"
+    return _words(value) if value is not None else "–"
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_words(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_words(item) for item in value)
+    return number(value) if isinstance(value, float) else str(value)

@@ -1,0 +1,154 @@
+"""The report on a fit."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from npdr_ppl.display.reports.charts import intervals_chart
+from npdr_ppl.display.reports.content import (
+    FindingsPart,
+    KeyFigure,
+    Part,
+    Report,
+    Section,
+    TablePart,
+    TextPart,
+    number,
+)
+from npdr_ppl.display.reports.meanings import decision_verdict, findings
+from npdr_ppl.display.reports.posterior_parts import posterior_charts, predictive_charts
+from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
+from npdr_ppl.run_files import read_json
+
+__all__ = ["fit_report", "parameters_table"]
+
+
+def fit_report(folder: Path) -> Report:
+    """Reads what ``npdr fit`` wrote.
+
+    Args:
+        folder: Folder with ``fit.json`` and ``posterior.nc``.
+    """
+    result = read_json(folder / "fit.json")
+    description = run_description(folder)
+    diagnosis = result.get("diagnosis") or {}
+    return Report(
+        "fit",
+        f"Fit of {len(result['parameters'])} parameters by {result['backend']}",
+        decision_verdict(diagnosis),
+        _key_figures(result, diagnosis),
+        [
+            Section("Parameters", _parameters(result, diagnosis, folder)),
+            *_recording(folder),
+            Section("Diagnostics", [FindingsPart(findings(diagnosis))]),
+            *source_section(description),
+            provenance_section(description, folder),
+        ],
+    )
+
+
+def parameters_table(
+    parameters: Mapping[str, Any],
+    *,
+    units: Mapping[str, str],
+    most_likely: Mapping[str, Any],
+    contraction: Mapping[str, Any],
+) -> TablePart:
+    """Returns mean, spread and interval of every parameter as a table."""
+    rows = []
+    for name, row in parameters.items():
+        for label, mean, sd, (low, high), likely in _elements(name, row, most_likely.get(name)):
+            unit = units.get(name, "")
+            rows.append(
+                [
+                    f"{label} [{unit}]" if unit and unit != "1" else label,
+                    number(mean, ".4g"),
+                    number(sd, ".2g"),
+                    f"{number(low, '.4g')} … {number(high, '.4g')}",
+                    number(likely, ".4g"),
+                    number(contraction.get(label), ".0%"),
+                ]
+            )
+    columns = ("parameter", "mean", "sd", "94 % interval", "most likely", "contraction")
+    return TablePart(columns, rows, "The interval holds 94 % of the posterior.")
+
+
+def _elements(
+    name: str, row: Mapping[str, Any], likely: Any
+) -> list[tuple[str, Any, Any, Any, Any]]:
+    """Returns label, mean, sd, interval and most likely value of every scalar of a parameter."""
+    mean, sd, interval = row["mean"], row["sd"], row["hdi_94"]
+    if not isinstance(mean, list):
+        return [(name, mean, sd, interval, likely)]
+    likely = likely if isinstance(likely, list) else [None] * len(mean)
+    result: list[tuple[str, Any, Any, Any, Any]] = []
+    for i, parts in enumerate(zip(mean, sd, interval, likely, strict=True)):
+        label = name[:-1] + f",{i}]" if name.endswith("]") else f"{name}[{i}]"
+        result += _elements(
+            label, dict(zip(("mean", "sd", "hdi_94"), parts, strict=False)), parts[3]
+        )
+    return result
+
+
+def _key_figures(result: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list[KeyFigure]:
+    metrics, seconds = result.get("metrics") or {}, result.get("seconds") or {}
+    judged = f"on {metrics.get('evaluated_on', 'fitted')} rollouts"
+    figures = [
+        KeyFigure("RMSE", number(metrics.get("rmse")), judged),
+        KeyFigure("DTW", number(metrics.get("dtw")), judged),
+        KeyFigure("Coverage of the 90 % band", number(diagnosis.get("coverage_90"), ".0%")),
+        KeyFigure("r̂ across members", number(diagnosis.get("r_hat"), ".2f")),
+        KeyFigure(
+            "Time",
+            f"{sum(v for v in seconds.values() if v is not None):.0f} s",
+            ", ".join(f"{name} {number(value, '.0f')} s" for name, value in seconds.items()),
+        ),
+    ]
+    if faults := result.get("faults"):
+        lost = ", ".join(f"{count} {name}" for name, count in faults.items())
+        figures.append(KeyFigure("Faulty simulations", str(sum(faults.values())), lost))
+    return figures
+
+
+def _parameters(
+    result: Mapping[str, Any], diagnosis: Mapping[str, Any], folder: Path
+) -> list[Part]:
+    contraction = diagnosis.get("contraction") or {}
+    parts: list[Part] = [
+        parameters_table(
+            result["parameters"],
+            units=result.get("units") or {},
+            most_likely=result.get("most_likely") or {},
+            contraction=contraction,
+        )
+    ]
+    if data := _posterior(folder):
+        return parts + posterior_charts(data, result.get("units") or {})
+    # Without draws, the intervals alone, each in units of its own middle.
+    scalars = {
+        name: row
+        for name, row in result["parameters"].items()
+        if not isinstance(row["mean"], list) and row["mean"]
+    }
+    rows = {
+        name: (row["hdi_94"][0] / row["mean"], 1.0, row["hdi_94"][1] / row["mean"])
+        for name, row in scalars.items()
+    }
+    caption = "94 % intervals relative to the mean; the draws (posterior.nc) are not there."
+    if not rows:
+        return [*parts, TextPart("The draws (posterior.nc) are not there.")]
+    return [*parts, intervals_chart("intervals", rows, title="relative to mean", caption=caption)]
+
+
+def _recording(folder: Path) -> list[Section]:
+    if not (data := _posterior(folder)):
+        return []
+    charts = predictive_charts(data, folder / "run")
+    return [Section("Predictions and the recording", charts)] if charts else []
+
+
+def _posterior(folder: Path) -> Any:
+    from npdr_ppl.arviz_module import from_netcdf
+
+    file = folder / "posterior.nc"
+    return from_netcdf(file) if file.exists() else None

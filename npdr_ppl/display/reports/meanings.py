@@ -1,0 +1,236 @@
+"""Diagnostics in plain language: what a figure measures, and what this value of it says."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from npdr_ppl.display.reports.content import Finding, Tone, Verdict, number
+from npdr_ppl.posterior.diagnostics import Decision, Thresholds
+
+__all__ = ["decision_verdict", "findings"]
+
+MIN_ESS = 400
+"""Effective draws below which intervals are rough (Vehtari et al. 2021)."""
+
+SMALL_PIT_DEVIATION = 0.15
+"""Distance from uniform that a few hundred correlated readings easily show by chance."""
+
+_TONES: Mapping[str, Tone] = {
+    Decision.ACCEPT: "good",
+    Decision.MORE_ROUNDS: "warn",
+    Decision.OTHER_EXCITATION: "warn",
+    Decision.WIDEN: "warn",
+    Decision.NEW_ROLLOUT: "warn",
+    Decision.REVISE_MODEL: "bad",
+    Decision.STOP: "bad",
+}
+
+
+def decision_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
+    """Returns the verdict of a diagnosis, as ``fit.json`` has it."""
+    word = str(diagnosis.get("decision", "no decision"))
+    return Verdict(word, str(diagnosis.get("reason", "")), _TONES.get(word, "plain"))
+
+
+def findings(diagnosis: Mapping[str, Any]) -> list[Finding]:
+    """Returns the figures of a diagnosis with their meaning."""
+    limits = Thresholds()
+    return [
+        *_against_simulator(diagnosis, limits),
+        *_convergence(diagnosis, limits),
+        *_prediction(diagnosis, limits),
+        *_against_prior(diagnosis, limits),
+        *_leaving_out(diagnosis, limits),
+    ]
+
+
+def _against_simulator(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+    """Returns what the simulator itself says of model and estimator, where it was asked."""
+    result = []
+    p_value, k = _value(diagnosis, "model_p_value"), _value(diagnosis, "estimator_k")
+    if not math.isnan(p_value):
+        is_missing = diagnosis.get("decision") == Decision.REVISE_MODEL
+        result.append(
+            Finding(
+                "what no parameters explain",
+                f"p = {p_value:.2g}",
+                "bad" if is_missing else "good",
+                "Residuals at the best parameters show something regular: an effect is missing."
+                if is_missing
+                else "At the best parameters nothing regular is left of the recording.",
+            )
+        )
+    if not math.isnan(k):
+        is_right = k <= limits.pareto_k
+        result.append(
+            Finding(
+                "posterior against the simulator, Pareto k",
+                number(k, ".2f"),
+                "good" if is_right else "warn",
+                f"The draws are weighted evenly by the simulator (limit {limits.pareto_k})."
+                if is_right
+                else "Few draws carry most of the weight that the simulator gives them: the "
+                "estimator has not converged.",
+            )
+        )
+    return result
+
+
+def _convergence(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+    r_hat, ess = _value(diagnosis, "r_hat"), _value(diagnosis, "ess")
+    if math.isnan(r_hat):
+        agreement = Finding(
+            "r̂ across members",
+            "–",
+            "plain",
+            "Only one estimator was trained, so nothing tells whether another would agree.",
+        )
+    elif r_hat <= limits.r_hat:
+        agreement = Finding(
+            "r̂ across members",
+            number(r_hat, ".2f"),
+            "good",
+            f"Independently trained estimators give the same posterior (limit {limits.r_hat}).",
+        )
+    else:
+        agreement = Finding(
+            "r̂ across members",
+            number(r_hat, ".2f"),
+            "warn",
+            f"Independently trained estimators disagree (limit {limits.r_hat}): the estimator "
+            "decides, not the data. More simulations or rounds help.",
+        )
+    draws = Finding(
+        "Effective sample size",
+        number(ess, ".0f"),
+        "good" if ess >= MIN_ESS else "warn",
+        "Independent draws that the intervals stand on. "
+        + ("Enough." if ess >= MIN_ESS else f"Below {MIN_ESS}, ends of intervals are rough."),
+    )
+    return [agreement, draws]
+
+
+def _prediction(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+    coverage = _value(diagnosis, "coverage_90")
+    p_value = _value(diagnosis, "segment_p_value")
+    pit = _value(diagnosis, "pit_deviation")
+    lost = 0.9 - coverage > limits.coverage_shortfall
+    unlikely = p_value < limits.segment_p_value
+    wide = coverage > 0.98
+    return [
+        Finding(
+            "Coverage of the 90 % band",
+            number(coverage, ".0%"),
+            "bad" if lost else "good",
+            "Share of readings inside the central 90 % of the predictions. "
+            + (
+                "Far too few: the model cannot do what the device does."
+                if lost
+                else "More than 90 %: predictions are cautious."
+                if wide
+                else "As it should be."
+            ),
+        ),
+        Finding(
+            "Worst segment, p-value",
+            number(p_value, ".3f"),
+            "bad" if unlikely else "good",
+            "How often the fitted model itself strays as far as the recording does where it fits "
+            "worst. "
+            + (
+                "Almost never: an effect is missing, at least there."
+                if unlikely
+                else "Often enough: nothing stands out."
+            ),
+        ),
+        Finding(
+            "Deviation of the PIT",
+            number(pit, ".2f"),
+            "good" if pit <= SMALL_PIT_DEVIATION else "warn",
+            "Greatest distance between the distribution of readings within the predictions and a "
+            "uniform one. "
+            + (
+                "Small."
+                if pit <= SMALL_PIT_DEVIATION
+                else "Not small: predictions are too wide, too narrow or shifted; see the "
+                "histogram."
+            ),
+        ),
+    ]
+
+
+def _against_prior(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+    contraction = _numbers(diagnosis, "contraction")
+    edges = _numbers(diagnosis, "edge_mass")
+    result = []
+    if contraction:
+        unlearnt = [name for name, value in contraction.items() if value < limits.contraction]
+        nothing = len(unlearnt) == len(contraction)
+        tone: Tone = "bad" if nothing else "warn" if unlearnt else "good"
+        result.append(
+            Finding(
+                "Contraction",
+                f"{min(contraction.values()):.0%} … {max(contraction.values()):.0%}",
+                tone,
+                "How much narrower than its prior a parameter became (0 % nothing was learnt, "
+                "100 % all). "
+                + (
+                    f"Hardly anything was learnt about {', '.join(unlearnt)}; a rollout that "
+                    "excites the system more may tell."
+                    if unlearnt
+                    else "Something was learnt about every parameter."
+                ),
+            )
+        )
+    if edges:
+        pressed = [name for name, mass in edges.items() if mass > limits.edge_mass]
+        result.append(
+            Finding(
+                "Mass at the prior's edge",
+                f"{max(edges.values()):.0%}",
+                "warn" if pressed else "good",
+                "Share of the posterior in the outermost 2 % of the prior. "
+                + (
+                    f"{', '.join(pressed)} would go further if the prior let it: widen the prior, "
+                    "or ask what it makes up for."
+                    if pressed
+                    else "No parameter presses against its prior."
+                ),
+            )
+        )
+    return result
+
+
+def _leaving_out(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+    elpd = diagnosis.get("elpd_loo") or [None, None]
+    k = _value(diagnosis, "pareto_k")
+    if elpd[0] is None:
+        return []
+    if math.isnan(k):
+        trust = "It could not be told whether the estimate can be trusted (no Pareto k)."
+    elif k <= limits.pareto_k:
+        trust = f"Pareto k is {k:.2f}: the estimate can be trusted."
+    else:
+        trust = (
+            f"Pareto k is {k:.2f} (limit {limits.pareto_k}): a segment is so influential that the "
+            "estimate cannot be trusted; judge by held-out rollouts."
+        )
+    return [
+        Finding(
+            "elpd by PSIS-LOO",
+            f"{number(elpd[0], '.1f')} ± {number(elpd[1], '.1f')}",
+            "plain" if k <= limits.pareto_k else "warn",
+            "Log predictive density of each segment when it is left out; larger is better, and "
+            f"only differences between models on the same data mean something. {trust}",
+        )
+    ]
+
+
+def _value(diagnosis: Mapping[str, Any], name: str) -> float:
+    value = diagnosis.get(name)
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _numbers(diagnosis: Mapping[str, Any], name: str) -> dict[str, float]:
+    values = diagnosis.get(name) or {}
+    return {key: float(value) for key, value in values.items() if value is not None}

@@ -1,0 +1,84 @@
+"""What a result came from: versions, seeds, settings, the model's source and checksums of data."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from npdr_ppl.display.reports.content import CodePart, Section, TablePart, TextPart
+from npdr_ppl.run_files import read_json
+
+__all__ = ["checksum", "data_files", "provenance_section", "run_description", "source_section"]
+
+_BLOCK = 1 << 20
+
+
+def run_description(folder: Path) -> dict[str, Any]:
+    """Returns what ``run.json`` or ``loop.json`` says about a run; empty if there is neither."""
+    for file in (folder / "run.json", folder / "run" / "run.json", folder / "loop.json"):
+        if file.exists():
+            return read_json(file)
+    return {}
+
+
+def data_files(folder: Path) -> list[Path]:
+    """Returns the files with measured data that a run keeps."""
+    found = [
+        *folder.glob("data_*"),
+        *folder.glob("run/data_*"),
+        *folder.glob("rollouts/*.nc"),
+        *folder.glob("recording.*"),
+    ]
+    return sorted(found)
+
+
+def source_section(description: Mapping[str, Any]) -> list[Section]:
+    """Returns the model's source as a section, or none where it was not recorded."""
+    model = description.get("model")
+    text = model.get("source") if isinstance(model, Mapping) else model
+    if not isinstance(text, str) or not text.strip():
+        return []
+    return [Section("Model", [CodePart(text.rstrip(), "Source of the model as it ran.")])]
+
+
+def provenance_section(description: Mapping[str, Any], folder: Path) -> Section:
+    """Returns versions, seeds, settings and checksums."""
+    rows = [
+        [name, _words(description[name])]
+        for name in (
+            "backend",
+            "options",
+            "target",
+            "task",
+            "seed",
+            "rounds",
+            "iterations",
+            "num_simulations",
+            "binding",
+        )
+        if name in description
+    ]
+    versions = description.get("versions") or {}
+    rows += [[f"version of {name}", str(value)] for name, value in versions.items()]
+    if fingerprint := description.get("fingerprint"):
+        rows.append(["SHA-256 of the features of the data", str(fingerprint)])
+    rows += [[f"SHA-256 of {f.relative_to(folder)}", checksum(f)] for f in data_files(folder)]
+    if not rows:
+        return Section("Provenance", [TextPart("The run recorded nothing about its origin.")])
+    caption = "What is needed to make this result again."
+    return Section("Provenance", [TablePart(("what", "value"), rows, caption, "prose")])
+
+
+def checksum(path: Path) -> str:
+    """Returns a file's SHA-256 as hexadecimal digits."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} = {_words(item)}" for key, item in value.items())
+    return str(value)

@@ -1,0 +1,189 @@
+"""The report on a run of the NPDR loop."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from npdr_ppl.display.reports.charts import ChartPart, lines_chart
+from npdr_ppl.display.reports.content import (
+    Finding,
+    FindingsPart,
+    KeyFigure,
+    Part,
+    Report,
+    Section,
+    TablePart,
+    TextPart,
+    Tone,
+    Verdict,
+    number,
+)
+from npdr_ppl.display.reports.fit import parameters_table
+from npdr_ppl.display.reports.meanings import findings
+from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
+from npdr_ppl.loop.policy_check import NextStep
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.run_files import read_json
+
+__all__ = ["training_report"]
+
+Records = Sequence[Mapping[str, Any]]
+
+MAX_POLICY_PARAMETERS = 50
+"""Parameters of a policy that are listed; a network's are not for reading."""
+
+MAX_POINTS = 400
+
+
+def training_report(folder: Path) -> Report:
+    """Reads what ``npdr train`` wrote.
+
+    Args:
+        folder: Folder with ``train.json``.
+    """
+    result = read_json(folder / "train.json")
+    description = run_description(folder)
+    records = result["iterations"]
+    last = records[-1] if records else {}
+    diagnosis = _last_diagnosis(last)
+    sections = [
+        Section("Returns", _returns(records)),
+        Section("Decisions", [FindingsPart(_decisions(records))]),
+        Section("Parameters", _parameters(last, diagnosis)),
+        Section("Policy", _policy(result)),
+        *_rollout(folder),
+        *source_section(description),
+        provenance_section(description, folder),
+    ]
+    if diagnosis:
+        sections.insert(3, Section("Last diagnosis", [FindingsPart(findings(diagnosis))]))
+    title = f"Training of a policy, {len(records)} iterations"
+    return Report("train", title, _verdict(result, records), _key_figures(records), sections)
+
+
+def _verdict(result: Mapping[str, Any], records: Records) -> Verdict:
+    if not records:
+        return Verdict("nothing yet", "No iteration is finished.", "warn")
+    deployed = result.get("deployed")
+    first, best = records[0].get("real_return"), max(_real(records), default=float("nan"))
+    gain = (
+        f"On the target the return went from {number(first, '.4g')} at first to "
+        f"{number(best, '.4g')} at best."
+    )
+    if deployed is None:
+        word = "last policy"
+        sentence = f"{gain} The last policy is handed over; it has not been run on the target."
+        return Verdict(word, sentence, "warn")
+    measured = records[deployed].get("real_return") if deployed < len(records) else None
+    word = f"policy of iteration {deployed + 1}"
+    return Verdict(
+        word, f"{gain} The policy handed over was measured: {number(measured, '.4g')}.", "good"
+    )
+
+
+def _real(records: Records) -> list[float]:
+    return [float(r["real_return"]) for r in records if r.get("real_return") is not None]
+
+
+def _key_figures(records: Records) -> list[KeyFigure]:
+    last = records[-1] if records else {}
+    real = _real(records)
+    effects = ", ".join(str(name) for name in last.get("effects") or [])
+    added = [KeyFigure("Effects of the model", effects)] if effects else []
+    count = sum(len(record.get("real_returns") or []) for record in records)
+    return [
+        KeyFigure("Best return on the target", number(max(real, default=None), ".4g")),
+        KeyFigure("First return on the target", number(real[0] if real else None, ".4g")),
+        KeyFigure(
+            "Last return in simulation", number(last.get("sim_return"), ".4g"), "over domains"
+        ),
+        KeyFigure(
+            "Last success in simulation",
+            number(last.get("simulated_success"), ".0%"),
+            "of the posterior's draws",
+        ),
+        KeyFigure("Real rollouts", str(last.get("num_rollouts", count))),
+        *added,
+        KeyFigure("Last decision", str(last.get("decision", "–"))),
+    ]
+
+
+def _returns(records: Records) -> list[Part]:
+    numbers = [float(n) for n in range(1, len(records) + 1)]
+    lines = {
+        "on the target": (numbers, [record.get("real_return") for record in records]),
+        # What an iteration trains, the next one runs.
+        "in simulation": ([n + 1 for n in numbers], [r.get("sim_return") for r in records]),
+    }
+    caption = "Return by iteration of the policy that ran; in simulation, mean over its domains."
+    return [lines_chart("returns", lines, titles=("iteration", "return"), caption=caption)]
+
+
+def _decisions(records: Records) -> list[Finding]:
+    result = []
+    for index, record in enumerate(records, start=1):
+        for decision in record.get("decisions") or [record]:
+            word = str(decision.get("decision", "–"))
+            tone: Tone = "good" if word == "accept" else "warn"
+            did = decision.get("action")
+            meaning = (
+                f"{decision.get('reason', '')} The loop {did}."
+                if did
+                else str(decision.get("reason", ""))
+            )
+            result.append(Finding(f"Iteration {index}", word, tone, meaning))
+        for check in record.get("checks") or []:
+            word = str(check["decision"])
+            passed: Tone = "good" if word == NextStep.DEPLOY else "warn"
+            name = f"Iteration {index}, the new policy"
+            result.append(Finding(name, word, passed, str(check["reason"])))
+    return result
+
+
+def _last_diagnosis(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    decisions = record.get("decisions") or []
+    return (decisions[-1].get("diagnosis") or {}) if decisions else {}
+
+
+def _parameters(record: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list[Part]:
+    parameters = record.get("parameters") or {}
+    if not parameters:
+        return [TextPart("The last iteration has no posterior.")]
+    contraction = diagnosis.get("contraction") or {}
+    model = record.get("internal_model") or {}
+    return [
+        parameters_table(parameters, units={}, most_likely=model, contraction=contraction),
+    ]
+
+
+def _policy(result: Mapping[str, Any]) -> list[Part]:
+    policy = result.get("policy") or {}
+    if not policy or len(policy) > MAX_POLICY_PARAMETERS:
+        return [TextPart(f"A policy of {len(policy)} parameters; train.json lists them.")]
+    rows = [[name, number(value, ".4g")] for name, value in policy.items()]
+    return [TablePart(("parameter", "value"), rows, "The policy that is handed over.")]
+
+
+def _rollout(folder: Path) -> list[Section]:
+    """Draws the last real rollout."""
+    files = sorted((folder / "rollouts").glob("*.nc"))
+    if not files:
+        return []
+    rollouts = Rollouts.from_netcdf(files[-1])
+    readings = np.asarray(rollouts.series()[0], dtype=float)
+    time = np.asarray(rollouts.time[0], dtype=float)[: len(readings)]
+    stride = max(1, -(-len(time) // MAX_POINTS))
+    charts: list[ChartPart] = [
+        lines_chart(
+            f"rollout-{index}",
+            {name: (time[::stride].tolist(), readings[::stride, index].tolist())},
+            titles=("time [s]", f"{name} [{unit}]" if unit else name),
+            caption=f"{name} in the last real rollout.",
+        )
+        for index, (name, unit) in enumerate(
+            zip(rollouts.channel_names, rollouts.channel_units, strict=False)
+        )
+    ]
+    return [Section("Last real rollout", charts)]

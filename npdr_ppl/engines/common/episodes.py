@@ -1,0 +1,137 @@
+"""What is asked of a closed loop, and what comes of it."""
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.common.compilation import CompileMode
+from npdr_ppl.engines.common.integrators import Components
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.simulator import Simulator
+
+__all__ = ["EpisodeBatch", "EpisodeRequest", "Episodes", "FeedbackPolicy", "Reward"]
+
+Reward = Callable[[Components, Components, Components], Tensor]
+"""Maps positions and velocities at a step's start and its commands, before any limit, to the
+reward of the step."""
+
+
+class FeedbackPolicy(Protocol):
+    """What the loop asks of a policy; see :class:`npdr_ppl.policies.base.Policy`."""
+
+    observations: tuple[str, ...]
+    actions: tuple[str, ...]
+    parameters: Tensor
+
+    def constants(self, domain: Mapping[str, Tensor]) -> Any:
+        """Returns what ``act`` needs, computed once per episode."""
+        ...
+
+    def initial_memory(self, observation: tuple[Tensor, ...]) -> Any:
+        """Returns the policy's own state at the start."""
+        ...
+
+    def act(
+        self, observation: tuple[Tensor, ...], time: Tensor | float, memory: Any, constants: Any
+    ) -> tuple[tuple[Tensor, ...], Any]:
+        """Returns commands and the next memory."""
+        ...
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Simulated episodes of a batch of shape B, broadcast over policies, domains and states.
+
+    An episode ends after the step at which a state leaves its bounds; records are zero after it.
+
+    Attributes:
+        returns: Sum of rewards, ``B``; ``None`` without a reward.
+        lengths: Steps until the episode ended, ``B``.
+        readings: What the sensors reported, the start included, ``B + (steps + 1, sensors)``;
+            ``None`` unless recorded.
+        commands: Commands before any limit, ``B + (steps, actions)``; ``None`` unless recorded.
+    """
+
+    returns: Tensor | None
+    lengths: Tensor
+    readings: Tensor | None = None
+    commands: Tensor | None = None
+
+
+class EpisodeBatch(NamedTuple):
+    """The three that make a batch, of one floating type and on one device.
+
+    Attributes:
+        policy: The policies.
+        domain: All parameters, missing ones nominal.
+        shape: The batch's shape B, to which all three broadcast.
+    """
+
+    policy: FeedbackPolicy
+    domain: dict[str, Tensor]
+    shape: torch.Size
+
+
+@dataclass(frozen=True)
+class EpisodeRequest:
+    """Episodes that an engine is to run.
+
+    Attributes:
+        parameters: Domain and effect parameters; missing ones are nominal.
+        policy: The policies; ``policy.parameters`` has the shape ``(..., parameters)``.
+        initial_states: True states at the start, ``(..., states)``.
+        num_steps: Greatest number of steps.
+        reward: Reward of a step.
+        time_step: Seconds per step.
+        record: Whether to return readings and commands.
+        compile: Replaces the simulator's choice.
+        expected_calls: How many calls of this size are to come.
+        internal_model: Parameters of the policies' own model; ``None`` for each domain's own.
+    """
+
+    parameters: Mapping[str, Tensor]
+    policy: FeedbackPolicy
+    initial_states: Tensor
+    num_steps: int
+    reward: Reward | None
+    time_step: float
+    record: bool
+    compile: CompileMode | None
+    expected_calls: int
+    internal_model: Mapping[str, float] | None = None
+
+    def believed(self, domain: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Returns what the policy's own model takes for a domain's parameters."""
+        given = self.internal_model or {}
+        like = next(iter(domain.values()))
+        return {**domain, **{name: like.new_tensor(value) for name, value in given.items()}}
+
+    def check(self, simulator: Simulator) -> None:
+        """Raises a ModelError where parameters or channels are not the simulator's."""
+        simulator.check_parameters(self.parameters)
+        sensors = [sensor.name for sensor in simulator.sensors]
+        missing = [name for name in self.policy.observations if name not in sensors]
+        missing += [a.name for a in simulator.actions if a.name not in self.policy.actions]
+        if missing:
+            raise ModelError(
+                f"{type(self.policy).__name__} and {simulator.name} do not fit together: "
+                f"{', '.join(missing)} is on one side only."
+            )
+
+    def batch(
+        self, simulator: Simulator, dtype: torch.dtype, device: torch.device
+    ) -> EpisodeBatch:
+        """Returns policies and domains as the engine computes with them."""
+        policy = copy.copy(self.policy)
+        policy.parameters = policy.parameters.to(dtype=dtype, device=device)
+        domain = simulator.complete(self.parameters, dtype, device)
+        shape = torch.broadcast_shapes(
+            *(value.shape for value in domain.values()),
+            policy.parameters.shape[:-1],
+            self.initial_states.shape[:-1],
+        )
+        return EpisodeBatch(policy, domain, shape)

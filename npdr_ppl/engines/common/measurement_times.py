@@ -1,0 +1,156 @@
+"""Readings that are late or early: the states behind them and before them.
+
+A segment starts from what was read there. If the sensors lag by d, that is the state d ago, and
+the segment starts from where the recorded commands have led since. For as long as d a late sensor
+also reports what was true before the segment. States are moved in time with the simulator's own
+accelerations in the middle of each span, without effects.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from torch import Tensor
+
+from npdr_ppl.engines.common.integrators import Components
+from npdr_ppl.language.effects import SensorEffect
+from npdr_ppl.language.simulator import Simulator
+
+__all__ = ["Accelerations", "catch_up", "earlier_changes", "sensor_leads"]
+
+Accelerations = Callable[[Components, int], Components]
+"""Rates of a state's velocities under the commands of a step; steps before 0 are past."""
+
+
+def sensor_leads(
+    effects: list[tuple[int, SensorEffect, tuple[int, ...]]],
+    parameters: tuple[Mapping[str, Tensor], ...],
+    time: Tensor,
+) -> dict[int, Tensor]:
+    """Returns by how many seconds each sensor channel's readings are ahead, where they are.
+
+    Args:
+        effects: Place in ``parameters``, effect and channels.
+        parameters: Parameters of all effects by short name.
+        time: Seconds since the rollout began, ``(N,)``.
+    """
+    leads: dict[int, Tensor] = {}
+    for place, effect, columns in effects:
+        lead = effect.lead(parameters[place], time)
+        if lead is not None:
+            leads |= {column: leads.get(column, 0.0) + lead for column in columns}
+    return leads
+
+
+def catch_up(
+    simulator: Simulator,
+    states: Components,
+    accelerations: Accelerations,
+    leads: Sequence[Tensor | None],
+    time_step: float,
+) -> Components:
+    """Returns the state now behind one that was read too early or too late.
+
+    A position whose rate is no state stays as it was read.
+
+    Args:
+        simulator: The system, whose effects are left out.
+        states: Positions as read, then velocities as read or derived from positions, ``(N,)``.
+        accelerations: See :data:`Accelerations`.
+        leads: By how many seconds each state's reading is ahead.
+        time_step: Seconds per step.
+    """
+    ages = [None if lead is None else -lead for lead in leads]
+    known = [age.detach() for age in ages if age is not None]
+    oldest = max((float(age.max()) for age in known), default=0.0)
+    for step in range(-math.ceil(oldest / time_step), 0):
+        spans = [
+            None if age is None else (age + (step + 1) * time_step).clamp(0.0, time_step)
+            for age in ages
+        ]
+        states = _moved(simulator, states, accelerations, step, ages, spans)
+        ages = [_difference(age, span) for age, span in zip(ages, spans, strict=True)]
+    if any(float(age.min()) < 0.0 for age in known):
+        states = _moved(simulator, states, accelerations, 0, ages, ages)
+    return states
+
+
+def earlier_changes(
+    simulator: Simulator,
+    states: Components,
+    accelerations: Accelerations,
+    time_step: float,
+    num_steps: int,
+) -> dict[int, tuple[Tensor, ...]]:
+    """Returns how the sensor channels differed before the start, latest first; 0 if no states.
+
+    Args:
+        simulator: The system, whose effects are left out.
+        states: Positions, then velocities at the start, ``(N,)``.
+        accelerations: See :data:`Accelerations`.
+        time_step: Seconds per step.
+        num_steps: How many steps to go back.
+    """
+    names = [state.name for state in simulator.states]
+    found: dict[int, list[Tensor]] = {column: [] for column in range(len(simulator.sensors))}
+    now, none = states, [states[0].new_zeros(()) for _ in states]
+    back = [value - time_step for value in none]
+    for step in range(1, num_steps + 1):
+        now = _moved(simulator, now, accelerations, -step, none, back)
+        for column, sensor in enumerate(simulator.sensors):
+            i = names.index(sensor.name) if sensor.name in names else None
+            change = states[0].new_zeros(states[0].shape) if i is None else now[i] - states[i]
+            found[column].append(change)
+    return {column: tuple(changes) for column, changes in found.items()}
+
+
+def _moved(
+    simulator: Simulator,
+    states: Components,
+    accelerations: Accelerations,
+    step: int,
+    ages: Sequence[Tensor | None],
+    spans: Sequence[Tensor | None],
+) -> Components:
+    """Returns the states so many seconds later, under the commands of one step.
+
+    Args:
+        simulator: The system.
+        states: The states, each of its own time.
+        accelerations: See :data:`Accelerations`.
+        step: The step.
+        ages: How many seconds ago each was true; ``None`` for now.
+        spans: By how many seconds to move each; ``None`` to leave it.
+    """
+    halves = [None if span is None else 0.5 * span for span in spans]
+    middle = _under(simulator, states, accelerations(states, step), ages, halves)
+    return _under(simulator, states, accelerations(middle, step), ages, spans)
+
+
+def _under(
+    simulator: Simulator,
+    states: Components,
+    accelerations: Components,
+    ages: Sequence[Tensor | None],
+    spans: Sequence[Tensor | None],
+) -> Components:
+    """Returns the states so many seconds later, under constant accelerations; see _moved."""
+    result = list(states)
+    places = {state.name: i for i, state in enumerate(simulator.states)}
+    for j, acceleration in enumerate(accelerations, start=len(states) - len(accelerations)):
+        if (span := spans[j]) is not None:
+            result[j] = states[j] + span * acceleration
+        i = places.get(simulator.states[j].rate_of or "")
+        if i is None or (span := spans[i]) is None:
+            continue
+        # From the velocity at the span's end, which may be known of another time.
+        velocity, position_age = result[j], _difference(ages[i], span)
+        velocity_age = _difference(ages[j], spans[j])
+        if position_age is not None:
+            apart = position_age if velocity_age is None else position_age - velocity_age
+            velocity = velocity - apart * acceleration
+        result[i] = states[i] + span * velocity - 0.5 * span * span * acceleration
+    return tuple(result)
+
+
+def _difference(age: Tensor | None, span: Tensor | None) -> Tensor | None:
+    return age if age is None or span is None else age - span

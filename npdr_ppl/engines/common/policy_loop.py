@@ -1,0 +1,215 @@
+"""The loop of a policy and a simulator that steps in this process: reward and termination too."""
+
+import copy
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.compilation import (
+    compiled,
+    mark_sizes_dynamic,
+    signature,
+)
+from npdr_ppl.engines.common.effect_chain import EffectChain, State, Tables
+from npdr_ppl.engines.common.episodes import Episodes, FeedbackPolicy, Reward
+from npdr_ppl.engines.common.integrators import Components
+
+__all__ = ["LoopBody", "PolicyLoop", "begin", "run_compiled", "run_eagerly"]
+
+# Simulations that a compiled kernel advances through the whole episode before the next block, so
+# that memory stays bounded. Measured: larger is faster up to here, because calls cost 50 µs each.
+_BLOCK = 1 << 16
+
+
+class PolicyLoop(NamedTuple):
+    """What the loop carries from step to step."""
+
+    state: State
+    readings: Components
+    policy_memory: Any
+    is_running: Tensor
+    total: Tensor
+    length: Tensor
+
+
+class LoopBody:
+    """The loop's body; everything in it is fixed before the first step.
+
+    Args:
+        stepper: Advances the state.
+        policy: What acts.
+        reward: Reward of a step, if any.
+        steps_per_call: Steps of :meth:`run`.
+    """
+
+    def __init__(
+        self,
+        stepper: EffectChain,
+        policy: FeedbackPolicy,
+        reward: Reward | None,
+        steps_per_call: int = 1,
+    ) -> None:
+        simulator = stepper.simulator
+        self.stepper, self.steps_per_call = stepper, steps_per_call
+        # Without its parameters and their defaults, so that a compiled body cannot hold on to some
+        # by mistake.
+        self.policy = copy.copy(policy)
+        del self.policy.parameters
+        vars(self.policy).pop("parameter_info", None)
+        self.reward = reward
+        sensors = [sensor.name for sensor in simulator.sensors]
+        self.observed = tuple(sensors.index(name) for name in policy.observations)
+        self.order = tuple(policy.actions.index(action.name) for action in simulator.actions)
+        self.limits = tuple((action.lower, action.upper) for action in simulator.actions)
+        self.bounds = tuple((state.lower, state.upper) for state in simulator.states)
+
+    @property
+    def signature(self) -> Any:
+        """Equal for bodies that compile to the same code."""
+        parts = signature(self.policy), signature(self.reward), self.steps_per_call
+        return "roll_out", self.stepper.signature, *parts
+
+    def step(
+        self, loop: PolicyLoop, tables: Tables, policy_constants: Any, time: Tensor | float
+    ) -> tuple[PolicyLoop, Components]:
+        """Advances the loop by one step; also returns the commands before any limit."""
+        state, stepper = loop.state, self.stepper
+        observation = tuple(loop.readings[i] for i in self.observed)
+        chosen, memory = self.policy.act(observation, time, loop.policy_memory, policy_constants)
+        commands = tuple(chosen[i] for i in self.order)
+        limited = tuple(
+            command.clamp(*limit) for command, limit in zip(commands, self.limits, strict=True)
+        )
+        total = loop.total
+        if self.reward is not None:
+            reward = self.reward(state.positions, state.velocities, commands)
+            total = torch.where(loop.is_running, total + reward, total)
+        length = torch.where(loop.is_running, loop.length + 1.0, loop.length)
+        state = stepper.advance(state, limited, tables)
+        state, readings = stepper.read(state, tables)
+        is_running = loop.is_running
+        for value, (lower, upper) in zip(
+            (*state.positions, *state.velocities), self.bounds, strict=True
+        ):
+            # Written so that a NaN counts as outside.
+            if lower == -upper:
+                is_running = is_running & (value.abs() <= upper)
+            else:
+                is_running = is_running & (value >= lower) & (value <= upper)
+        return PolicyLoop(state, readings, memory, is_running, total, length), commands
+
+    def run(
+        self, loop: PolicyLoop, tables: Tables, policy_constants: Any, start: Tensor
+    ) -> PolicyLoop:
+        """Advances the loop by ``steps_per_call`` steps from a time in seconds."""
+        for step in range(self.steps_per_call):
+            time = start + step * self.stepper.time_step
+            loop, _ = self.step(loop, tables, policy_constants, time)
+        return loop
+
+
+def begin(body: LoopBody, states: Components, tables: Tables) -> PolicyLoop:
+    """Returns the loop before its first step, at rest with respect to commands."""
+    zero = torch.zeros_like(states[0])
+    simulator, num_positions = body.stepper.simulator, body.stepper.num_positions
+    positions, velocities = states[:num_positions], states[num_positions:]
+    no_readings = (None,) * len(simulator.sensors)
+    state = body.stepper.start(
+        positions, velocities, tables, (zero,) * len(simulator.actions), no_readings, zero
+    )
+    readings = body.stepper.true_readings(positions, velocities, tables)
+    memory = body.policy.initial_memory(tuple(readings[i] for i in body.observed))
+    return PolicyLoop(state, readings, memory, torch.ones_like(zero, dtype=torch.bool), zero, zero)
+
+
+def run_eagerly(
+    body: LoopBody,
+    loop: PolicyLoop,
+    tables: Tables,
+    constants: Any,
+    num_steps: int,
+    shape: torch.Size,
+    record: bool,
+) -> Episodes:
+    """Runs all steps one by one, and records them if asked to."""
+    readings, commands = [loop.readings], []
+    for k in range(num_steps):
+        loop, chosen = body.step(loop, tables, constants, k * body.stepper.time_step)
+        if record:
+            readings.append(loop.readings)
+            commands.append(tuple(c.expand_as(loop.length) for c in chosen))
+    if not record:
+        return _episodes(loop, shape, body.reward)
+    return _episodes(loop, shape, body.reward, readings, commands)
+
+
+def run_compiled(
+    body: LoopBody,
+    loop: PolicyLoop,
+    tables: Tables,
+    constants: Any,
+    num_steps: int,
+    shape: torch.Size,
+) -> Episodes:
+    """Runs all steps block by block, and the few that do not fill a kernel call eagerly."""
+    loop = flatten(loop, loop.total.shape, expand=True)
+    key = body.signature, loop.total.dtype, loop.total.device.type
+    run, at_once = compiled(key, body.run), body.steps_per_call
+    num_simulations = loop.total.shape[0]
+    num_blocks = -(-num_simulations // _BLOCK)
+    edges = [i * num_simulations // num_blocks for i in range(num_blocks + 1)]
+    num_calls = num_steps // at_once
+    time_step = body.stepper.time_step
+    starts = torch.arange(num_calls, dtype=loop.total.dtype, device=loop.total.device)
+    starts = (starts * (at_once * time_step)).unbind()
+    done = []
+    for first, last in zip(edges, edges[1:], strict=False):
+
+        def block(x: Tensor, first: int = first, last: int = last) -> Tensor:
+            return x[first:last]
+
+        part, block_tables, block_constants = pytree.tree_map_only(
+            Tensor, block, (loop, tables, constants)
+        )
+        # A tensor that comes in twice, as a rate and a filter's memory of it, is another kind of
+        # argument, for which torch compiles anew; in the first state none has met another yet.
+        for start in starts[:1]:
+            part = body.run(part, block_tables, block_constants, start)
+        mark_sizes_dynamic((part, block_tables, block_constants))
+        for start in starts[1:]:
+            part = run(part, block_tables, block_constants, start)
+        for k in range(num_calls * at_once, num_steps):
+            part, _ = body.step(part, block_tables, block_constants, k * time_step)
+        done.append(part)
+    loop = loop._replace(
+        total=torch.cat([part.total for part in done]),
+        length=torch.cat([part.length for part in done]),
+    )
+    return _episodes(loop, shape, body.reward)
+
+
+def _episodes(
+    loop: PolicyLoop,
+    shape: torch.Size,
+    reward: Reward | None,
+    readings: list[Components] | None = None,
+    commands: list[Components] | None = None,
+) -> Episodes:
+    """Returns the loop's outcome in the batch's shape."""
+    returns = None if reward is None else loop.total.reshape(shape)
+    lengths = loop.length.long().reshape(shape)
+    if readings is None or commands is None:
+        return Episodes(returns, lengths)
+
+    def stacked(steps: list[Components], last: Tensor) -> Tensor:
+        table = torch.stack([torch.stack(step, dim=-1) for step in steps], dim=-2)
+        exists = torch.arange(len(steps), device=table.device) <= last[:, None]
+        table = torch.where(exists[..., None], table, torch.zeros_like(table))
+        return table.reshape(*shape, *table.shape[-2:])
+
+    return Episodes(
+        returns, lengths, stacked(readings, loop.length), stacked(commands, loop.length - 1.0)
+    )

@@ -1,0 +1,140 @@
+"""How segments start: from what was recorded, back through the sensor effects to the truth."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.common.commands import CommandRecord, commands_at
+from npdr_ppl.engines.common.effect_chain import EffectChain, State, Tables
+from npdr_ppl.engines.common.integrators import Components
+from npdr_ppl.engines.common.measurement_times import catch_up, sensor_leads
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.simulator import Simulator
+
+__all__ = ["RecordedStart", "recorded_start", "true_start", "with_past_commands"]
+
+
+class RecordedStart(NamedTuple):
+    """What is known of the segments' start; tensors of the flat batch shape ``(N,)``.
+
+    Attributes:
+        states: Each state component as recorded or estimated from records.
+        readings: What each sensor reported; ``None`` where that is not on record.
+        time: Seconds since the rollout began.
+        is_derived: Whether each state component is the rate of a recorded position.
+    """
+
+    states: Components
+    readings: tuple[Tensor | None, ...]
+    time: Tensor
+    is_derived: tuple[bool, ...]
+
+    def part(self, first: int, last: int) -> "RecordedStart":
+        """Returns what is known of some of the N simulations."""
+        return RecordedStart(
+            tuple(value[first:last] for value in self.states),
+            tuple(None if value is None else value[first:last] for value in self.readings),
+            self.time[first:last],
+            self.is_derived,
+        )
+
+
+def recorded_start(simulator: Simulator, inputs: Inputs, shape: torch.Size) -> RecordedStart:
+    """Returns what is known of the segments' start.
+
+    Args:
+        simulator: The simulator.
+        inputs: The segments.
+        shape: Shape of the batch and the segments, of numel N.
+    """
+
+    def spread(value: Tensor) -> Tensor:
+        return value.expand(shape).reshape(-1)
+
+    columns = {name: i for i, name in enumerate(inputs.channel_names)}
+    has_rates = inputs.initial_rates is not None
+    return RecordedStart(
+        tuple(spread(value) for value in simulator.initial_states(inputs)),
+        tuple(
+            spread(inputs.initial_readings[..., columns[s.name]]) if s.name in columns else None
+            for s in simulator.sensors
+        ),
+        spread(inputs.start.to(inputs.initial_values) * inputs.time_step),
+        tuple(has_rates and state.rate_of in columns for state in simulator.states),
+    )
+
+
+def true_start(
+    chain: EffectChain,
+    tables: Tables,
+    recorded: RecordedStart,
+    records: Sequence[CommandRecord],
+) -> Components:
+    """Returns the true state behind what was recorded through the sensor effects.
+
+    A velocity that was derived from readings of its position has that sensor's scale and timing,
+    and none of the offset or scale of the sensor for velocities.
+
+    Args:
+        chain: The effects.
+        tables: The effects' parameters.
+        recorded: What is known of the start.
+        records: Commands of each action channel.
+    """
+    if not chain.sensor_effects:
+        return recorded.states
+    states = chain.simulator.states
+    sensors = {sensor.name: i for i, sensor in enumerate(chain.simulator.sensors)}
+    true = list(recorded.states)
+    for place, effect, columns in chain.sensor_effects:
+        for i, state in enumerate(states):
+            value = true[i]
+            if sensors.get(state.name) in columns:
+                value = effect.initial_value(value, tables.effects[place])
+            if recorded.is_derived[i]:
+                rate = true[i]
+                if sensors.get(state.rate_of or "") in columns:
+                    rate = effect.initial_rate(rate, tables.effects[place])
+                # At a rollout's first sample velocities are read; see Simulator.initial_states.
+                value = torch.where(recorded.time == 0.0, value, rate)
+            true[i] = value
+    leads = sensor_leads(chain.sensor_effects, tables.effects, recorded.time)
+    if not leads:
+        return tuple(true)
+    sources = (
+        sensors.get((state.rate_of or "") if is_derived else state.name)
+        for state, is_derived in zip(states, recorded.is_derived, strict=True)
+    )
+    late = tuple(None if source is None else leads.get(source) for source in sources)
+    split = chain.num_positions
+
+    def accelerations(states: Components, step: int) -> Components:
+        commands = commands_at(records, step)
+        return chain.accelerations(states[:split], states[split:], commands, tables)
+
+    return catch_up(chain.simulator, tuple(true), accelerations, late, chain.time_step)
+
+
+def with_past_commands(
+    chain: EffectChain,
+    state: State,
+    tables: Tables,
+    records: tuple[CommandRecord, ...],
+    num_steps: int,
+) -> State:
+    """Returns the state with the action effects' memory as the recorded past made it.
+
+    Args:
+        chain: The effects.
+        state: State at the segments' start, as if the oldest command had been given for long.
+        tables: The effects' parameters.
+        records: Commands of each action channel.
+        num_steps: Steps of the past that are on record.
+    """
+    if chain.action_effects:
+        for step in range(-num_steps, 0):
+            views = tuple(record.view(step) for record in records)
+            state, _, _ = chain.act(state, commands_at(records, step), tables, views)
+    return state

@@ -1,0 +1,156 @@
+"""Effects on commands and readings of a whole batch, for engines that see neither.
+
+In open loop commands do not depend on what the simulation does, and it does not depend on what
+sensors make of it. So both kinds of effect stay outside of the engine, where torch treats all
+simulations at once; only forces have to go in.
+"""
+
+import copy
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.commands import CommandRecord, commands_at
+from npdr_ppl.engines.common.effect_chain import (
+    EffectChain,
+    Moments,
+    State,
+    Tables,
+    needed_histories,
+)
+from npdr_ppl.engines.common.integrators import Components
+from npdr_ppl.engines.common.segment_start import recorded_start, true_start, with_past_commands
+from npdr_ppl.language.effects import ActionEffect, SensorEffect
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.simulator import Simulator
+
+__all__ = ["Signals", "needs_accelerations"]
+
+
+def needs_accelerations(effect: SensorEffect) -> bool:
+    """Returns whether an effect needs states at other times, which take the engine's rates."""
+    return effect.needs_past or type(effect).lead is not SensorEffect.lead
+
+
+class Signals:
+    """The way of commands to an engine, and of its readings back.
+
+    Args:
+        simulator: Declares actions, sensors and effects.
+        domain: All parameters, each broadcasting to ``shape``.
+        inputs: The segments, float64.
+        shape: The batch shape and the segments, of numel N.
+
+    Attributes:
+        start_times: Seconds from the rollout's beginning to each segment's start, ``(N,)``.
+    """
+
+    def __init__(
+        self, simulator: Simulator, domain: Mapping[str, Tensor], inputs: Inputs, shape: torch.Size
+    ) -> None:
+        self._inputs = inputs
+        self._recorded = recorded_start(simulator, inputs, shape)
+        self.start_times = self._recorded.time
+
+        def chain(
+            kind: type[ActionEffect] | type[SensorEffect],
+        ) -> tuple[_SignalChain, tuple[dict[str, Tensor], ...]]:
+            part = copy.copy(simulator)
+            part.effects = tuple(e for e in simulator.effects if isinstance(e, kind))
+            effects = tuple(effect.own_parameters(domain) for effect in part.effects)
+            histories = needed_histories(part.effects, effects, inputs.time_step)
+            return _SignalChain(part, (), inputs.time_step, histories), flatten(effects, shape)
+
+        # Commands are all known before the engine runs, and readings only after.
+        self._action_chain, self._action_parameters = chain(ActionEffect)
+        self._sensor_chain, self._sensor_parameters = chain(SensorEffect)
+        columns = {name: i for i, name in enumerate(inputs.action_names)}
+        self._records = tuple(
+            CommandRecord(inputs, columns[a.name], shape, (a.lower, a.upper), torch.float64)
+            for a in simulator.actions
+        )
+
+    @property
+    def has_action_effects(self) -> bool:
+        """Whether what reaches the engine differs between simulations of the same segment."""
+        return bool(self._action_chain.action_effects)
+
+    def initial_states(self) -> Tensor:
+        """Returns the true state at each segment's start, ``(N, states)``.
+
+        An offset or a wrong scale of a sensor is taken out of what was read there.
+        """
+        tables = Tables(None, self._sensor_parameters)
+        components = true_start(self._sensor_chain, tables, self._recorded, ())
+        if not components:
+            return torch.zeros(len(self.start_times), 0, dtype=torch.float64)
+        return torch.stack(components, dim=-1)
+
+    def actions(self) -> Tensor:
+        """Returns what reaches the engine, ``(N, steps, actions)``."""
+        chain, tables = self._action_chain, Tables(None, self._action_parameters)
+        past = self._inputs.past_actions.shape[-2]
+        settled = commands_at(self._records, -1 - past)
+        state = chain.start((), (), tables, settled, (), self.start_times, num_past=past)
+        state = with_past_commands(chain, state, tables, self._records, past)
+        steps = []
+        for step in range(self._inputs.num_steps):
+            commands = commands_at(self._records, step)
+            views = tuple(record.view(step) for record in self._records)
+            state, reached, _ = chain.act(state, commands, tables, views)
+            steps.append(torch.stack([x.expand_as(commands[0]) for x in reached], dim=-1))
+        return torch.stack(steps, dim=-2)
+
+    def readings(self, values: Tensor, initial_states: Tensor) -> Tensor:
+        """Returns what the sensors make of true values after each step.
+
+        Args:
+            values: True values, ``(N, steps, sensors)``.
+            initial_states: True states at the start, ``(N, states)``.
+        """
+        chain, effects = self._sensor_chain, self._sensor_parameters
+        if not chain.sensor_effects:
+            return values
+        tables = Tables(self._true_at_start(values, initial_states), effects)
+        state = chain.start((), (), tables, (), self._recorded.readings, self.start_times)
+        steps = []
+        for present in values.unbind(-2):
+            state, read = chain.report(state, present.unbind(-1), tables)
+            steps.append(torch.stack(read, dim=-1))
+        return torch.stack(steps, dim=-2)
+
+    def _true_at_start(self, values: Tensor, initial_states: Tensor) -> Components:
+        """Returns each sensor's true value at the segments' start."""
+        simulator = self._sensor_chain.simulator
+        states = {s.name: initial_states[:, i] for i, s in enumerate(simulator.states)}
+        # A value that is neither a state nor recorded is that after the first step.
+        return tuple(
+            states.get(sensor.name, values[:, 0, place] if reading is None else reading)
+            for place, (sensor, reading) in enumerate(
+                zip(simulator.sensors, self._recorded.readings, strict=True)
+            )
+        )
+
+
+class _SignalChain(EffectChain):
+    """Effects between a command and the engine, or between the engine and a reading."""
+
+    def true_readings(
+        self, positions: Components, velocities: Components, tables: Tables
+    ) -> Components:
+        """Returns the true values at the start, which are the constants here."""
+        return tables.constants
+
+    def accelerations(
+        self, positions: Components, velocities: Components, actions: Components, tables: Tables
+    ) -> Components:
+        """Is the engine's own matter; effects that need it are not attached."""
+        raise NotImplementedError
+
+    def move(
+        self, state: State, actions: Components, tables: Tables, moments: Moments = ()
+    ) -> State:
+        """Is the engine's own matter."""
+        raise NotImplementedError

@@ -1,0 +1,151 @@
+"""A mechanical system whose accelerations are written in torch: what its model author declares."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.closed_loop_simulator import ClosedLoopSimulator
+from npdr_ppl.engines.common.compilation import CompileMode
+from npdr_ppl.engines.common.effect_chain import Tables, needed_histories
+from npdr_ppl.engines.common.integrators import Components, Integrator, integrator
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.effects import EnvironmentEffect
+
+__all__ = ["Forces", "MechanicalSystem"]
+
+Forces = tuple[Tensor | float, ...]
+"""Generalised forces to add, one per joint; 0.0 where no effect acts."""
+
+
+class MechanicalSystem(ClosedLoopSimulator):
+    """A second-order mechanical system q̈ = a(q, q̇, u, f), for a whole batch at once.
+
+    A subclass declares channels, parameters and ports, and writes :meth:`accelerations`. The
+    state is the positions, then the velocities, in the order of ``joints``; every velocity names
+    its position in ``rate_of``.
+
+    Computations run in the widest floating type among the given parameters and the inputs'
+    actions, on the actions' device.
+
+    Args:
+        integrator: Name of the integration method; ``None`` for the model's default.
+        substeps: Integration steps per time step.
+        compile: Whether to compile the time loop: ``auto`` where a compiler exists and one call
+            is large enough to pay back some ten seconds of compilation.
+
+    Attributes:
+        joints: Names of the force ports, one per generalised coordinate.
+        default_integrator: The model's integration method.
+    """
+
+    is_deterministic = True
+    is_differentiable = True
+    joints: tuple[str, ...]
+    default_integrator: str = "rk4"
+
+    def __init__(
+        self,
+        *,
+        integrator: str | None = None,
+        substeps: int = 1,
+        compile: CompileMode = "auto",
+    ) -> None:
+        if substeps < 1:
+            raise ModelError(f"{self.name} needs at least one substep, got {substeps=}.")
+        if compile not in ("auto", "always", "never"):
+            raise ModelError(f"compile is 'auto', 'always' or 'never', got {compile!r}.")
+        self.integrator: Integrator = _integrator(integrator or self.default_integrator)
+        self.substeps = substeps
+        self.compile: CompileMode = compile
+
+    @abstractmethod
+    def accelerations(
+        self,
+        positions: Components,
+        velocities: Components,
+        actions: Components,
+        forces: Forces,
+        constants: Any,
+    ) -> Components:
+        """Returns the acceleration of each joint; must be affine in ``forces``.
+
+        Args:
+            positions: Generalised positions, one tensor per joint.
+            velocities: Their rates.
+            actions: Commands, limited to their channels' bounds and changed by action effects.
+            forces: Generalised forces of attached effects, to be added to the joints' own.
+            constants: What :meth:`constants` returned.
+        """
+
+    def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Returns the quantities that environment ports stand for, by port name."""
+        return {}
+
+    def constants(self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]) -> Any:
+        """Returns what :meth:`accelerations` needs, computed once per simulation.
+
+        Any nesting of tuples and dictionaries of tensors. By default the parameters by name,
+        overlaid by the environment's quantities.
+        """
+        return {**parameters, **environment}
+
+    def inverse_inertia(
+        self, positions: Components, velocities: Components, constants: Any
+    ) -> tuple[Components, ...] | None:
+        """Returns the rows of W = ∂a/∂f, or ``None`` to have it probed with unit forces."""
+        return None
+
+    def readings(
+        self, positions: Components, velocities: Components, constants: Any
+    ) -> Components:
+        """Returns the true value of every sensor channel; by default the states of that name."""
+        values = dict(zip((s.name for s in self.states), (*positions, *velocities), strict=True))
+        return tuple(values[sensor.name] for sensor in self.sensors)
+
+    @property
+    def rate_lag(self) -> float:
+        """Part of a time step between the state's rates and the derivatives of its positions."""
+        return self.integrator.rate_lag / self.substeps
+
+    def common_dtype(self, parameters: Mapping[str, Tensor], other: Tensor) -> torch.dtype:
+        """Returns the widest floating type among the tensors."""
+        dtype = other.dtype
+        for value in parameters.values():
+            if isinstance(value, Tensor) and value.is_floating_point():
+                dtype = torch.promote_types(dtype, value.dtype)
+        return dtype
+
+    def tables(
+        self,
+        parameters: Mapping[str, Tensor],
+        shape: torch.Size,
+        time_step: float,
+        *,
+        expand: bool = False,
+    ) -> tuple[Tables, tuple[int, ...]]:
+        """Returns the constants of a simulation, flat, and the lengths of effects' histories.
+
+        Args:
+            parameters: What :meth:`complete` returned, each broadcasting to ``shape``.
+            shape: Shape of the batch, of numel N.
+            time_step: Seconds per step.
+            expand: Whether to expand what does not vary; see :func:`flatten`.
+        """
+        effects = tuple(effect.own_parameters(parameters) for effect in self.effects)
+        environment = self.environment(parameters)
+        for effect, values in zip(self.effects, effects, strict=True):
+            if isinstance(effect, EnvironmentEffect):
+                quantity = environment[effect.port]
+                environment[effect.port] = effect.environment(quantity, values)
+        constants = self.constants(parameters, environment)
+        histories = needed_histories(self.effects, effects, time_step)
+        return flatten(Tables(constants, effects), shape, expand=expand), histories
+
+
+def _integrator(name: str) -> Integrator:
+    """Returns the integrator called ``name``, out of reach of the argument of that name."""
+    return integrator(name)

@@ -1,0 +1,174 @@
+"""One step of a mechanical system with its effects, for recorded actions and for policies."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.common.effect_chain import EffectChain, Moments, State, Tables
+from npdr_ppl.engines.common.integrators import Components
+from npdr_ppl.engines.ode.drive import drive_forces, inverse_inertia
+from npdr_ppl.engines.ode.dry_friction import (
+    DryFriction,
+    dry_friction_over_step,
+    stopping_friction,
+)
+from npdr_ppl.engines.ode.mechanical_system import MechanicalSystem
+from npdr_ppl.language.effect_context import Joint
+
+__all__ = ["Stepper"]
+
+
+class Stepper(EffectChain):
+    """Advances states by one time step under the effects attached to a simulator.
+
+    Args:
+        simulator: The system and its effects.
+        time_step: Seconds per step.
+        histories: Past commands that each action effect may ask for, then past values of each
+            sensor effect.
+    """
+
+    def __init__(
+        self, simulator: MechanicalSystem, time_step: float, histories: tuple[int, ...]
+    ) -> None:
+        super().__init__(simulator, simulator.joints, time_step, histories)
+        self.simulator: MechanicalSystem = simulator
+        self._substep = time_step / simulator.substeps
+        # Of the first order, positions are no better than that anyway.
+        self._takes_moments = simulator.integrator.order > 1
+
+    @property
+    def force_step(self) -> float:
+        """Seconds per integration step."""
+        return self._substep
+
+    def true_readings(
+        self, positions: Components, velocities: Components, tables: Tables
+    ) -> Components:
+        """Returns the true value of every sensor channel."""
+        return self.simulator.readings(positions, velocities, tables.constants)
+
+    def accelerations(
+        self, positions: Components, velocities: Components, actions: Components, tables: Tables
+    ) -> Components:
+        """Returns the accelerations without any effect."""
+        none = (0.0,) * len(positions)
+        return self.simulator.accelerations(positions, velocities, actions, none, tables.constants)
+
+    def move(
+        self, state: State, actions: Components, tables: Tables, moments: Moments = ()
+    ) -> State:
+        """Advances the dynamics by one time step; see :meth:`EffectChain.move`."""
+        means, left = self.by_substep(actions, moments, self.simulator.substeps)
+        for present in means:
+            state = self._move_once(state, present, left, tables)
+        return state
+
+    def _move_once(
+        self, state: State, actions: Components, moments: Moments, tables: Tables
+    ) -> State:
+        """Advances the dynamics by one substep."""
+        if self.needs_joints:
+            state = self.begin_step(state, self._joints(state, actions, tables), tables)
+        simulator, constants = self.simulator, tables.constants
+        start = state.positions, state.velocities
+        dry: tuple[Any, ...] = (0.0,) * len(state.positions)
+
+        def acceleration(positions: Components, velocities: Components) -> Components:
+            smooth = self._forces(positions, velocities, state, tables, dry)
+            return simulator.accelerations(positions, velocities, actions, smooth, constants)
+
+        forces = self._forces(*start, state, tables, dry)
+        first = even = simulator.accelerations(*start, actions, forces, constants)
+        within = self.force_moments(state, tables)
+        is_uneven = any(moment is not None for moment in (*moments, *within))
+        shifts: Components | None = None
+        if self._takes_moments and is_uneven:
+            # Positions move by ∫ (h − t) a dt, of which the integrator sees ½ h² times the mean.
+            late = simulator.accelerations(
+                *start, _shifted(actions, moments), _shifted(forces, within), constants
+            )
+            shifts = tuple(a - b for a, b in zip(even, late, strict=True))
+
+        def bounds_at(velocities: Components) -> tuple[Tensor | None, ...]:
+            return self.dry_friction_bounds(state._replace(velocities=velocities), tables)
+
+        bounds = self.dry_friction_bounds(state, tables)
+        friction: DryFriction | None = None
+        if any(bound is not None for bound in bounds):
+            inertia = inverse_inertia(simulator, *start, actions, forces, constants, first)
+            given = state.velocities, first, inertia, self._substep
+            if simulator.integrator.order == 1:
+                friction = stopping_friction(bounds, *given)
+            else:
+                friction = dry_friction_over_step(bounds, bounds_at, *given)
+            dry = tuple(0.0 if force is None else force for force in friction.forces)
+            # Accelerations are affine in the forces, so the first evaluation is not repeated.
+            for joint, force in enumerate(friction.forces):
+                if force is not None:
+                    # Not fused, lest what friction holds creep by what that would round otherwise.
+                    first = tuple(
+                        a + row[joint] * force for a, row in zip(first, inertia, strict=True)
+                    )
+        q, v = simulator.integrator.step(acceleration, *start, first, self._substep)
+        if shifts is not None:
+            q = tuple(qi + shift for qi, shift in zip(q, shifts, strict=True))
+        if shifts is not None and any(moment is not None for moment in within):
+            # What moved further was faster on the way, and more was damped. Springs' and impacts'
+            # forces move things far within a step; where a command changes, this is below a
+            # hundredth of its delay and not worth another evaluation.
+            h = self._substep
+            faster = tuple(
+                vi + shift / h for vi, shift in zip(state.velocities, shifts, strict=True)
+            )
+            damped = simulator.accelerations(state.positions, faster, actions, forces, constants)
+            v = tuple(vi + h * (b - a) for vi, a, b in zip(v, even, damped, strict=True))
+        if friction is not None:
+            # Rounding must not leave a velocity whose sign then means something to a policy.
+            v = tuple(
+                vi if held is None else torch.where(held, 0.0, vi)
+                for vi, held in zip(v, friction.is_held, strict=True)
+            )
+            q = tuple(
+                qi if shortfall is None else qi + shortfall
+                for qi, shortfall in zip(q, friction.shortfalls, strict=True)
+            )
+        memory = self.next_force_memory(state, tables)
+        return state._replace(positions=q, velocities=v, force_memory=memory)
+
+    def _joints(self, state: State, actions: Components, tables: Tables) -> tuple[Joint, ...]:
+        """Returns the joints as they are before the effects that ask for them act."""
+        simulator, constants = self.simulator, tables.constants
+        q, v = state.positions, state.velocities
+        forces = self._forces(q, v, state, tables, (0.0,) * len(q), before_step=True)
+        acceleration = simulator.accelerations(q, v, actions, forces, constants)
+        inertia = inverse_inertia(simulator, q, v, actions, forces, constants, acceleration)
+        drive = drive_forces(simulator, q, v, actions, forces, constants, acceleration, inertia)
+        return tuple(
+            Joint(q[i], v[i], acceleration[i], inertia[i][i], drive[i], self._takes_moments)
+            for i in range(len(q))
+        )
+
+    def _forces(
+        self,
+        positions: Components,
+        velocities: Components,
+        state: State,
+        tables: Tables,
+        dry: tuple[Any, ...],
+        *,
+        before_step: bool = False,
+    ) -> tuple[Any, ...]:
+        """Returns the smooth forces in a state of the integrator, on top of the dry ones."""
+        if not self.force_effects:
+            return dry
+        smooth = self.applied_forces(positions, velocities, state, tables, before_step=before_step)
+        return tuple(d if f is None else d + f for d, f in zip(dry, smooth, strict=True))
+
+
+def _shifted(values: tuple[Any, ...], moments: Moments) -> tuple[Any, ...]:
+    """Returns actions or forces with their moments added; no moments are none of any."""
+    if not moments:
+        return values
+    return tuple(v if m is None else v + m for v, m in zip(values, moments, strict=True))

@@ -1,0 +1,259 @@
+"""Closed loop on workers: one episode per draw, policy and effects next to the engine."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.effect_chain import (
+    EffectChain,
+    Moments,
+    State,
+    Tables,
+    needed_histories,
+)
+from npdr_ppl.engines.common.episodes import EpisodeRequest, Episodes
+from npdr_ppl.engines.common.integrators import Components
+from npdr_ppl.engines.common.policy_loop import LoopBody, begin
+from npdr_ppl.engines.pooled.pool_simulator import Segment
+from npdr_ppl.engines.pooled.steppable_simulator import Simulation, SteppableSimulator
+from npdr_ppl.engines.workers.session import run_on_workers
+from npdr_ppl.engines.workers.task import Draw, Task
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.effects import ActionEffect, SensorEffect
+
+__all__ = ["roll_out"]
+
+_ONE = torch.Size((1,))
+
+
+@dataclass(frozen=True)
+class _OneEpisode:
+    """What differs between the episodes of a call.
+
+    Attributes:
+        parameters: Values in the order of the task's names, ``(parameters,)``.
+        policy: Parameters of the policy.
+        initial_state: True state at the start, ``(states,)``.
+    """
+
+    parameters: np.ndarray
+    policy: np.ndarray
+    initial_state: np.ndarray
+
+
+@dataclass(frozen=True)
+class _RunEpisode(Task):
+    """Runs a policy in a simulator.
+
+    Attributes:
+        simulator: The simulator.
+        names: Names of all parameters, effects' included.
+        request: What is asked for, without what differs between episodes.
+    """
+
+    simulator: SteppableSimulator
+    names: tuple[str, ...]
+    request: EpisodeRequest
+
+    def set_up(self) -> Any:
+        """Returns the simulator's workspace."""
+        return self.simulator.set_up()
+
+    def run(self, workspace: Any, draw: Draw) -> np.ndarray:
+        """Returns return and length, then readings and commands where they are recorded."""
+        with torch.no_grad():
+            return self._run(workspace, draw.payload, draw.seed)
+
+    def _run(self, workspace: Any, one: _OneEpisode, seed: int) -> np.ndarray:
+        request, simulator = self.request, self.simulator
+        num_steps, time_step = request.num_steps, request.time_step
+        values = torch.from_numpy(one.parameters).unbind()
+        domain = dict(zip(self.names, values, strict=True))
+        middle = torch.tensor(0.5 * num_steps * time_step, dtype=torch.float64)
+        present = simulator.changed(domain, middle)
+        segment = Segment(
+            one.initial_state, np.zeros((num_steps, len(simulator.actions))), time_step, 0.0
+        )
+        numbers = {name: float(value) for name, value in present.items()}
+        simulation = simulator.begin(workspace, numbers, segment, seed)
+        stepper = _OneStepper(simulator, simulation, segment, present)
+        policy = copy.copy(request.policy)
+        policy.parameters = torch.from_numpy(one.policy)
+        constants = flatten(policy.constants(request.believed(domain)), _ONE)
+        body = LoopBody(stepper, policy, request.reward)
+        loop = begin(body, stepper.states(), stepper.tables)
+        readings, commands = [loop.readings], []
+        for step in range(num_steps):
+            loop, chosen = body.step(loop, stepper.tables, constants, step * time_step)
+            readings.append(loop.readings)
+            commands.append(chosen)
+            if not bool(loop.is_running):
+                break
+        outcome = np.array([float(loop.total), float(loop.length)])
+        if not request.record:
+            return outcome
+        return np.concatenate(
+            (
+                outcome,
+                _padded(readings, num_steps + 1, len(simulator.sensors)),
+                _padded(commands, num_steps, len(simulator.actions)),
+            )
+        )
+
+
+def _padded(rows: list[Components], num_rows: int, num_columns: int) -> np.ndarray:
+    """Returns a record of so many rows, flat, zero after the last one."""
+    table = np.zeros((num_rows, num_columns))
+    for row, values in zip(table, rows, strict=False):
+        row[:] = [float(value) for value in values]
+    return table.reshape(-1)
+
+
+class _OneStepper(EffectChain):
+    """Advances one simulation, between the effects on its commands and on its readings.
+
+    Those on forces and on the environment are the engine's own matter.
+
+    Args:
+        simulator: The system and its effects.
+        simulation: The simulation, at its start.
+        segment: Where the simulation finds its actions.
+        parameters: All parameters, numbers.
+
+    Attributes:
+        tables: The effects' parameters.
+    """
+
+    def __init__(
+        self,
+        simulator: SteppableSimulator,
+        simulation: "Simulation",
+        segment: Segment,
+        parameters: Mapping[str, Tensor],
+    ) -> None:
+        part = copy.copy(simulator)
+        part.effects = tuple(
+            e for e in simulator.effects if isinstance(e, ActionEffect | SensorEffect)
+        )
+        # Positions first, as rewards are given them.
+        rates = simulator.is_rate
+        order = sorted(range(len(rates)), key=lambda column: rates[column])
+        part.states = tuple(simulator.states[column] for column in order)
+        own = tuple(effect.own_parameters(parameters) for effect in part.effects)
+        histories = needed_histories(part.effects, own, segment.time_step)
+        super().__init__(part, (), segment.time_step, histories)
+        self.tables = Tables(None, flatten(own, _ONE, expand=True))
+        sensors = [sensor.name for sensor in part.sensors]
+        self._columns = [sensors.index(state.name) for state in part.states]
+        self._simulation, self._segment = simulation, segment
+        self._step = 0
+        values = list(self._read())
+        # What an engine shows of a state that it was just given may be rounded, or of before.
+        for column, value in zip(self._columns, segment.initial_state[order], strict=True):
+            values[column] = torch.full(_ONE, float(value), dtype=torch.float64)
+        self._values: Components = tuple(values)
+
+    @property
+    def num_positions(self) -> int:
+        """How many of the states are positions."""
+        return sum(not is_rate for is_rate in self.simulator.is_rate)
+
+    def states(self) -> Components:
+        """Returns the present state, positions first, ``(1,)`` each."""
+        return tuple(self._values[column] for column in self._columns)
+
+    def true_readings(
+        self, positions: Components, velocities: Components, tables: Tables
+    ) -> Components:
+        """Returns the true value of every sensor channel."""
+        return self._values
+
+    def accelerations(
+        self, positions: Components, velocities: Components, actions: Components, tables: Tables
+    ) -> Components:
+        """Is the engine's own matter; effects that need it are not attached."""
+        raise NotImplementedError
+
+    def move(
+        self, state: State, actions: Components, tables: Tables, moments: Moments = ()
+    ) -> State:
+        """Advances the simulation by one step."""
+        self._segment.actions[self._step] = [float(action) for action in actions]
+        self._simulation.advance(self._step)
+        self._step += 1
+        self._values = self._read()
+        present, split = self.states(), self.num_positions
+        return state._replace(positions=present[:split], velocities=present[split:])
+
+    def _read(self) -> Components:
+        values = torch.as_tensor(np.asarray(self._simulation.read(), dtype=np.float64))
+        return tuple(values[:, None].unbind())
+
+
+def roll_out(simulator: SteppableSimulator, request: EpisodeRequest) -> Episodes:
+    """Simulates episodes of policies in domains; see :class:`EpisodeRequest`.
+
+    Raises:
+        ModelError: A state is not among the sensors.
+    """
+    sensors = [sensor.name for sensor in simulator.sensors]
+    hidden = [state.name for state in simulator.states if state.name not in sensors]
+    if hidden:
+        raise ModelError(
+            f"{simulator.name} cannot run policies: reward and bounds look at its states, but "
+            f"there is no sensor of {', '.join(hidden)}."
+        )
+    policy, domain, shape = request.batch(simulator, torch.float64, torch.device("cpu"))
+
+    def rows(values: Tensor) -> np.ndarray:
+        values = values.detach().to(device="cpu", dtype=torch.float64)
+        width = values.shape[-1]
+        return values.expand(*shape, width).reshape(shape.numel(), width).numpy()
+
+    table = torch.zeros(*shape, len(domain), dtype=torch.float64)
+    for column, value in enumerate(domain.values()):
+        table[..., column] = value.detach()
+    payloads = [
+        _OneEpisode(*one)
+        for one in zip(
+            rows(table), rows(policy.parameters), rows(request.initial_states), strict=True
+        )
+    ]
+    # What differs between episodes must not travel with each chunk.
+    policy.parameters = policy.parameters.new_zeros(policy.parameters.shape[-1])
+    shared = replace(request, parameters={}, policy=policy, initial_states=torch.zeros(0))
+    seed = 0 if simulator.is_deterministic else int(torch.randint(2**62, ()))
+    outcome = run_on_workers(_RunEpisode(simulator, tuple(domain), shared), payloads, seed)
+    return _collected(simulator, outcome.values, request, shape)
+
+
+def _collected(
+    simulator: SteppableSimulator,
+    values: list[np.ndarray | None],
+    request: EpisodeRequest,
+    shape: torch.Size,
+) -> Episodes:
+    """Returns the workers' results in the batch's shape; lost episodes have NaN for a return."""
+    num_readings = (request.num_steps + 1) * len(simulator.sensors)
+    num_commands = request.num_steps * len(simulator.actions)
+    width = 2 + (num_readings + num_commands if request.record else 0)
+    lost = np.zeros(width)
+    lost[0] = np.nan
+    table = torch.from_numpy(np.stack([lost if value is None else value for value in values]))
+    returns = None if request.reward is None else table[:, 0].reshape(shape)
+    lengths = table[:, 1].long().reshape(shape)
+    if not request.record:
+        return Episodes(returns, lengths)
+    readings, commands = table[:, 2:].split((num_readings, num_commands), dim=-1)
+    return Episodes(
+        returns,
+        lengths,
+        readings.reshape(*shape, request.num_steps + 1, len(simulator.sensors)),
+        commands.reshape(*shape, request.num_steps, len(simulator.actions)),
+    )

@@ -1,0 +1,24 @@
+"""Simulators on workers in which policies run, because they can stop after each step."""
+
+from npdr_ppl.engines.common.episodes import EpisodeRequest, Episodes
+from npdr_ppl.engines.pooled.pooled_closed_loop import roll_out
+from npdr_ppl.engines.pooled.steppable_simulator import Simulation, SteppableSimulator
+
+__all__ = ["Simulation", "SteppedSimulator"]
+
+
+class SteppedSimulator(SteppableSimulator):
+    """A simulator that is given one segment at a time and can stop after each step.
+
+    A subclass writes :meth:`begin` instead of :meth:`simulate_one`. In closed loop every episode
+    is one draw for the workers, with policy, reward and effects evaluated next to the engine. An
+    episode that is lost for good has NaN for a return and no steps. All states have to be among
+    the sensors, because reward and bounds look at them.
+    """
+
+    def run_episodes(self, request: EpisodeRequest) -> Episodes:
+        """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`.
+
+        The arguments for compilation change nothing.
+        """
+        return roll_out(self, request)

@@ -1,0 +1,152 @@
+"""A run of the NPDR loop as a folder: JSON, safetensors and NetCDF; nothing is ever unpickled.
+
+    loop.json                         what is run: model, target, task, options, seed, versions
+    rollouts/rollout_<n>.nc           real rollouts, each with its journal ``.jsonl``
+    policy_<k>.safetensors, .json     the policy that POLOPT number k came to, 0 being the prior's
+    inference_<i>_<attempt>/          runs of inference, see :mod:`npdr_ppl.posterior.run_folder`
+    policy_<k>_<d>.safetensors, .json tries of policy k: before another rollout, for the mean or
+                                      for the tail; policy k is the last or the better one
+    revision_<i>/, revision_<i>_<l>/  what discovery found: revised_model.py, then discovery.json;
+                                      look l of an iteration comes after a rollout that a check
+                                      of the new policy asked for
+    iteration_<i>.json                the record of a finished iteration
+    train.json                        the result so far
+
+Every file replaces its predecessor in one step, so a run killed at any moment leaves a folder that
+:func:`npdr_ppl.train` continues from.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from npdr_ppl.loop.control_task import ControlTask
+from npdr_ppl.run_files import (
+    holds_this_run,
+    load_tensors,
+    make_folder,
+    plain,
+    read_json,
+    save_tensors,
+    source_text,
+    versions,
+    write_json,
+)
+from npdr_ppl.targets.base import TargetDomain
+
+if TYPE_CHECKING:
+    from npdr_ppl.loop.loop_options import LoopOptions
+
+__all__ = ["LoopFolder"]
+
+FORMAT = 1
+
+
+class LoopFolder:
+    """Reads and writes the folder of one run of the loop.
+
+    Args:
+        path: The folder; it is made if absent.
+
+    Attributes:
+        path: The folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def begin(
+        self,
+        model: Callable[..., Any],
+        target: TargetDomain,
+        task: ControlTask,
+        options: "LoopOptions",
+        *,
+        seed: int,
+    ) -> None:
+        """Describes the run, or checks that the folder holds this very run already.
+
+        Raises:
+            DataError: The folder holds a run with another model, target or options.
+        """
+        make_folder(self.path)
+        description = plain(
+            {
+                "format": FORMAT,
+                "model": source_text(model),
+                "target": repr(target),
+                "task": task.name,
+                "num_steps": task.num_steps,
+                "options": _words(options),
+                "seed": seed,
+            }
+        )
+        # More iterations of the same run are welcome.
+        iterations = description["options"].pop("iterations")
+        file = self.path / "loop.json"
+        if not holds_this_run(file, description):
+            write_json(file, description | {"iterations": iterations, "versions": versions()})
+
+    @property
+    def rollouts(self) -> Path:
+        """Folder of the real rollouts."""
+        return self.path / "rollouts"
+
+    def inference(self, index: int, attempt: int) -> Path:
+        """Returns the folder of a run of inference."""
+        return self.path / f"inference_{index}_{attempt}"
+
+    def revision(self, index: int, look: int = 0) -> Path:
+        """Returns the folder of what was looked for in an iteration."""
+        return self.path / f"revision_{_numbered(index, look or None)}"
+
+    def save_policy(
+        self,
+        number: int,
+        parameters: Tensor,
+        figures: Mapping[str, Any],
+        *,
+        draft: int | None = None,
+    ) -> None:
+        """Saves a trained policy, or a draft; the JSON goes last and makes it count."""
+        file = self.path / f"policy_{_numbered(number, draft)}.json"
+        save_tensors(file.with_suffix(".safetensors"), {"parameters": parameters})
+        write_json(file, figures)
+
+    def policy(
+        self, number: int, draft: int | None = None
+    ) -> tuple[Tensor, dict[str, Any]] | None:
+        """Returns parameters and figures of a trained policy, ``None`` before it is."""
+        file = self.path / f"policy_{_numbered(number, draft)}.json"
+        if not file.exists():
+            return None
+        return load_tensors(file.with_suffix(".safetensors"))["parameters"], read_json(file)
+
+    def save_iteration(self, index: int, record: Mapping[str, Any]) -> None:
+        """Saves the record of a finished iteration."""
+        write_json(self.path / f"iteration_{index}.json", record)
+
+    def iteration(self, index: int) -> dict[str, Any] | None:
+        """Returns the record of an iteration, ``None`` if it is not finished."""
+        file = self.path / f"iteration_{index}.json"
+        return read_json(file) if file.exists() else None
+
+    def write_result(self, result: Mapping[str, Any]) -> None:
+        """Writes ``train.json``."""
+        write_json(self.path / "train.json", result)
+
+
+def _numbered(number: int, part: int | None) -> str:
+    return f"{number}" if part is None else f"{number}_{part}"
+
+
+def _words(options: "LoopOptions") -> dict[str, Any]:
+    """Returns the options as what JSON has; objects of one's own by their text."""
+    result = {}
+    for item in dataclasses.fields(options):
+        value = getattr(options, item.name)
+        result[item.name] = value if isinstance(value, int | float | str | None) else repr(value)
+    return result

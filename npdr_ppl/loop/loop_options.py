@@ -1,0 +1,169 @@
+"""Options of the NPDR loop, and what it can do about a decision."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Literal
+
+from npdr_ppl.discovery.discovery_options import DiscoveryOptions
+from npdr_ppl.errors import ModelError
+from npdr_ppl.inference.base import Backend
+from npdr_ppl.loop.risk import MeanReturn, Risk, TailMean
+from npdr_ppl.policies.search import PolicySearch
+from npdr_ppl.posterior.diagnostics import Thresholds
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["NEW_ATTEMPTS", "SPREAD_WIDER", "Action", "LoopOptions", "Model", "Revise"]
+
+Model = Callable[..., Any]
+
+Revise = Callable[[Model, Rollouts, Path | None], Model | None]
+"""Looks for what a model lacks: takes the model, all real rollouts and a folder of its own, and
+returns the revised model, or ``None`` if it found nothing. Called again with the same folder, as
+when a run is resumed, it must return the same."""
+
+
+class Action(StrEnum):
+    """What the loop did about a decision."""
+
+    TRAINED = "trained the policy on the posterior"
+    MIXED = "trained the policy on the posterior mixed with the prior"
+    SPREAD = "trained the policy on the posterior, spread wider"
+    MORE_ROUNDS = "added a round"
+    ANOTHER_ROLLOUT = "ran another rollout"
+    REVISED = "revised the model"
+    NOTHING_FOUND = "looked for a missing effect, found none, and spread the domains wider"
+    KEPT = "kept the policy"
+    LOGGED = "none, decisions are only logged"
+
+
+# After these the posterior is inferred anew, in a folder of its own.
+NEW_ATTEMPTS = (Action.ANOTHER_ROLLOUT, Action.REVISED)
+# After these the policy is trained in domains spread wider: the model is wrong.
+SPREAD_WIDER = (Action.SPREAD, Action.NOTHING_FOUND)
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """Options of Algorithm 1.
+
+    Attributes:
+        iterations: Iterations of the loop.
+        rollouts: Real rollouts H of each iteration.
+        extra_rollouts: Real rollouts that diagnoses, and checks before deploying, may ask for in
+            the whole run.
+        rollouts_used: Whether inference sees all rollouts so far or the latest iteration's.
+        backend: The inference backend; one with options of its own if it is no name.
+        rounds: Rounds R of inference in each iteration; one for backends that are not sequential.
+        extra_rounds: Rounds that a diagnosis may ask for in each iteration.
+        num_simulations: Simulations of each round.
+        binding: How rollouts are prepared for inference.
+        noise: ``"auto"`` gives a model without noise that of the closest fit's residuals;
+            ``"model"`` takes it as it is.
+        start: Where inference starts: from the prior; in the neighbourhood of the closest fit,
+            where initial states are uncertain; or in later iterations, as in the paper, from the
+            last posterior. Backends that cannot start elsewhere start from the prior.
+        search: The policy search; one with options of its own if it is no name.
+        search_iterations: Iterations of the policy search, each time.
+        domains: Whether the policy is trained in draws of the posterior or at its most likely
+            sample.
+        num_domains: Domains that the policy is trained in.
+        num_initial_states: Initial states in each.
+        risk: What the policy search maximises over the domains at first: their mean return, or the
+            mean of the worst.
+        least_success: Share of the posterior's draws, in simulation, in which a new policy must
+            succeed before it runs on the target; 0 checks nothing. Where it does not, another
+            rollout is recorded if one is left to ask for, otherwise the policy is trained for the
+            worst domains. The default is the share of successes that one would ask of the target,
+            which is one draw of the posterior if the model is right. It takes a task with a
+            threshold of success.
+        num_checked: Draws of the posterior in which a new policy is tried. With 200 the standard
+            error of a share of 0.9 is 0.02.
+        tail_share: Share of the domains, the worst ones, whose mean return is then maximised, in
+            (0, 1]. EPOpt (Rajeswaran et al. 2017) takes a tenth of 240; a fifth of the default 50
+            domains is as many as can be averaged.
+        is_warm_start: Whether the search goes on from the last policy or begins anew.
+        starts_from_prior: Whether the first policy is trained on the prior or taken as it comes.
+        spread: Parameters of the domains are multiplied by numbers uniform in 1 ± ``spread``.
+        prior_share: Share of the domains drawn from the prior where the posterior is widened.
+        internal_model: Parameters of the policy's own model on the target: the most likely
+            sample's, or nominal.
+        deploys: Which policy the run ends with: the one with the best measured return, or the
+            last, which no real rollout has tried yet. Where no measured return reached the
+            task's threshold it is the last.
+        follows_decisions: Whether diagnoses change what the loop does, or are logged only.
+        stop_return: Mean real return of an iteration that ends the loop; ``None`` to use all
+            iterations.
+        stops: What it takes besides that return: an accepted posterior, which is then at hand, or
+            nothing, which spares inference and training on a device that already does its task.
+        thresholds: Limits behind the decisions.
+        discovers: When discovery looks in all real rollouts so far for effects that the model
+            lacks: in each iteration before anything is inferred, or after the posterior of the
+            model as it is has been diagnosed, whatever the diagnosis. The noise that a model gets
+            from its closest fit can make up for an effect in every diagnosis, so discovery's own
+            alarm has the last word.
+        discovery: How it searches; its seed comes from that of the run.
+    """
+
+    iterations: int = 5
+    rollouts: int = 1
+    extra_rollouts: int = 0
+    rollouts_used: Literal["all", "latest"] = "all"
+    backend: str | Backend = "snpe-c"
+    rounds: int = 3
+    extra_rounds: int = 2
+    num_simulations: int = 5_000
+    binding: DataOptions = field(
+        default_factory=lambda: DataOptions("score", 50, "uncertain", "float32")
+    )
+    noise: Literal["auto", "model"] = "auto"
+    start: Literal["prior", "closest fit", "posterior"] = "closest fit"
+    search: str | PolicySearch[Any] = "power"
+    search_iterations: int = 20
+    domains: Literal["posterior", "most likely"] = "posterior"
+    num_domains: int = 50
+    num_initial_states: int = 4
+    risk: Risk = MeanReturn()
+    least_success: float = 0.9
+    num_checked: int = 200
+    tail_share: float = 0.2
+    is_warm_start: bool = True
+    starts_from_prior: bool = True
+    spread: float = 0.1
+    prior_share: float = 0.2
+    internal_model: Literal["most likely", "nominal"] = "most likely"
+    deploys: Literal["best measured", "last"] = "best measured"
+    follows_decisions: bool = True
+    stop_return: float | None = None
+    stops: Literal["accepted posterior", "measured return"] = "accepted posterior"
+    thresholds: Thresholds = field(default_factory=Thresholds)
+    discovers: Literal["never", "before inference", "after diagnosis"] = "never"
+    discovery: DiscoveryOptions = field(default_factory=DiscoveryOptions)
+
+    def __post_init__(self) -> None:
+        """Checks the options.
+
+        Raises:
+            ModelError: One is out of range.
+        """
+        least = {
+            "iterations": 1, "rollouts": 1, "rounds": 1, "num_simulations": 10,
+            "search_iterations": 1, "num_domains": 1, "num_initial_states": 1,
+            "extra_rollouts": 0, "extra_rounds": 0, "spread": 0, "prior_share": 0,
+            "least_success": 0, "num_checked": 1,
+        }  # fmt: skip
+        for name, low in least.items():
+            if not getattr(self, name) >= low:
+                raise ModelError(f"{name} must be at least {low}; got {getattr(self, name)}.")
+        for name in ("spread", "prior_share", "least_success"):
+            if getattr(self, name) > 1:
+                raise ModelError(f"{name} must be at most 1; got {getattr(self, name)}.")
+        if not 0.0 < self.tail_share <= 1.0:
+            raise ModelError(f"tail_share must be above 0 and at most 1; got {self.tail_share}.")
+
+    @property
+    def tail(self) -> TailMean:
+        """What the policy search maximises where too few of the posterior's draws succeed."""
+        return TailMean(self.tail_share)

@@ -1,0 +1,74 @@
+"""What a training run came to, and which of its policies to deploy."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from npdr_ppl.loop.loop_options import Model
+from npdr_ppl.policies.base import Policy
+from npdr_ppl.posterior.posterior import Posterior
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["Training", "Tried", "best_measured"]
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a training run came to.
+
+    Attributes:
+        policy: The policy to deploy.
+        domain: Parameters of its internal model.
+        deployed: Number of the iteration whose rollouts measured it; ``None`` for the last
+            policy, which none has.
+        iterations: The records of the iterations, as in ``train.json``.
+        rollouts: All real rollouts.
+        posterior: The last posterior; ``None`` if no iteration was computed in this process.
+        model: The model, with what was added to it.
+    """
+
+    policy: Policy
+    domain: dict[str, float]
+    deployed: int | None
+    iterations: list[dict[str, Any]]
+    rollouts: Rollouts
+    posterior: Posterior | None
+    model: Model
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the content of ``train.json``."""
+        values = self.policy.parameters.tolist()
+        return {
+            "iterations": self.iterations,
+            "policy": dict(zip(self.policy.names, values, strict=True)),
+            "deployed": self.deployed,
+            "internal_model": self.domain,
+        }
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A policy that ran on the target, its internal model, and what it reached there."""
+
+    policy: Policy
+    domain: dict[str, float]
+    real_return: float
+
+
+def best_measured(
+    tried: Sequence[Tried], deploys: Literal["best measured", "last"], threshold: float | None
+) -> int | None:
+    """Returns the iteration of the policy to deploy, ``None`` for the last policy.
+
+    Args:
+        tried: What was measured, by iteration.
+        deploys: The loop's option.
+        threshold: Return above which the task counts as done; where none was measured, the last
+            policy, which nobody has tried, is the better bet.
+    """
+    if deploys == "last" or not tried:
+        return None
+    best = max(range(len(tried)), key=lambda index: tried[index].real_return)
+    if threshold is not None and tried[best].real_return < threshold:
+        return None
+    return best

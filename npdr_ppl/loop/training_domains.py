@@ -1,0 +1,47 @@
+"""The domains that the loop trains a policy in after an iteration."""
+
+from collections.abc import Callable
+
+import torch
+
+from npdr_ppl.loop.domains import Domains, domains_at
+from npdr_ppl.loop.loop_options import SPREAD_WIDER, Action, LoopOptions
+from npdr_ppl.posterior.posterior import Posterior
+
+__all__ = ["training_domains"]
+
+
+def training_domains(
+    posterior: Posterior,
+    options: LoopOptions,
+    action: Action,
+    *,
+    from_prior: Callable[[int], Domains],
+    seed: int,
+    most_likely_seed: int,
+) -> Domains:
+    """Returns draws of the posterior, or its most likely sample, spread as the options say.
+
+    Args:
+        posterior: The posterior.
+        options: Options of the loop.
+        action: What the diagnosis led to; it may ask for more spread, or for some of the prior.
+        from_prior: Draws so many domains from the prior.
+        seed: Seed of the draws.
+        most_likely_seed: Seed of the search for the most likely sample.
+    """
+    num_prior = 0
+    if action is Action.MIXED:
+        num_prior = round(options.prior_share * options.num_domains)
+    number = options.num_domains - num_prior
+    if options.domains == "posterior":
+        z = posterior.sample_mixture(number, seed=seed)
+    else:
+        most_likely = posterior.most_likely(seed=most_likely_seed)
+        z = posterior.prior.to_reference({k: v[None] for k, v in most_likely.items()})
+        z = z.expand(number, -1)
+    generator = torch.Generator().manual_seed(seed)
+    # Where the model is wrong its posterior is too narrow, by how much nobody knows.
+    spread = options.spread * (2.0 if action in SPREAD_WIDER else 1.0)
+    domains = domains_at(posterior.prior, z).spread(spread, generator)
+    return domains.followed_by(from_prior(num_prior)) if num_prior else domains

@@ -1,0 +1,48 @@
+"""What is known of an estimator and a model by other means than the posterior's own draws.
+
+The checks travel with the exported posterior, as JSON in the attribute ``checks``, so that
+:func:`npdr_ppl.diagnose` reads nothing but the export::
+
+    estimator   how the learnt posterior compares with the simulator, and whether it was corrected
+    model       whether the recording shows anything that no parameters explain
+    priors      sentences about priors that end before the recording's parameters
+"""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from npdr_ppl.posterior.estimator_check import EstimatorCheck
+    from npdr_ppl.posterior.prepare import Preparation
+
+__all__ = ["ATTRIBUTE", "checks_of"]
+
+ATTRIBUTE = "checks"
+"""Name of the exported object's attribute."""
+
+
+def checks_of(
+    preparation: "Preparation | None", estimator: "EstimatorCheck | None"
+) -> dict[str, Any]:
+    """Returns the checks as JSON-serialisable values; empty where nothing is known.
+
+    Args:
+        preparation: What was done with the recording first.
+        estimator: How the learnt posterior compares with the simulator.
+    """
+    result: dict[str, Any] = {}
+    if estimator is not None:
+        result["estimator"] = estimator.to_dict()
+    if preparation is None or preparation.hypothesis is None:
+        return result
+    result["priors"] = [str(end) for end in preparation.ends]
+    alarm = preparation.alarm
+    if alarm is None:
+        return result
+    result["model"] = {
+        "p_value": alarm.p_value,
+        "fired": alarm.fired,
+        "loudest": alarm.loudest,
+        "misfit": preparation.misfit if math.isfinite(preparation.misfit) else None,
+    }
+    return result

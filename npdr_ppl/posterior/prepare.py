@@ -1,0 +1,347 @@
+"""What every command does with a recording before it infers anything.
+
+Initial states are estimated, and taken to be uncertain; the model's closest fit is found; its
+integration steps are refined where they are too coarse; noise that the model does not declare is
+estimated; and features are chosen. ``fit``, ``compare``, ``train`` and ``discover`` share this.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.discovery_options import DiscoveryOptions
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.alarm import Alarm
+from npdr_ppl.discovery.search.base_fit import BaseFit, fit_base, in_finer_steps
+from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
+from npdr_ppl.discovery.search.search import Searcher
+from npdr_ppl.embeddings import Embedding
+from npdr_ppl.embeddings.score import Score
+from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
+from npdr_ppl.language.handlers import with_noise
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.preparation.binding import Data, bind
+from npdr_ppl.preparation.closest_fit import ClosestFit, closest_fit
+from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS, PLAIN_FEATURES, DataOptions
+from npdr_ppl.preparation.evaluation import declares_noise
+from npdr_ppl.preparation.initial_states import Starts
+from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
+from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
+from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.progress import Step
+from npdr_ppl.randomness import seeded
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["Preparation", "can_be_prepared", "held_out", "prepare", "score_embedding"]
+
+NEGLIGIBLE = 1e-9
+"""Standard deviation of a channel that was not measured: no unit makes it large."""
+
+MARGIN = 0.1
+"""Least standard deviation of the neighbourhood of a fit, in the prior's."""
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """A model and a recording, ready for inference.
+
+    Attributes:
+        model: The model, with noise, in finer steps where its own are too coarse.
+        plain_model: The same without noise that was estimated.
+        rollouts: The recording.
+        options: The options, with features that can be applied.
+        noise: Estimated standard deviation by channel, in its unit; ``None`` if the model keeps
+            its own.
+        noise_of_sensors: The same for all sensors; next to none where nothing was measured.
+        are_steps_coarse: Whether the model's own integration steps are too coarse.
+        hypothesis: The closest fit, where initial states are uncertain and the simulator is
+            deterministic; ``None`` otherwise, and nothing below is known then.
+        likelihood: The recording's likelihood.
+        widest: The closest fit with wider priors where some end too early, else the same.
+        ends: The priors that end too early.
+        searcher: What discovery searches with.
+        closest: The parameters that leave least where initial states are taken as true.
+    """
+
+    model: Callable[..., Any]
+    plain_model: Callable[..., Any]
+    rollouts: Rollouts
+    options: DataOptions
+    noise: dict[str, float] | None
+    noise_of_sensors: dict[str, float] | None = None
+    are_steps_coarse: bool = False
+    hypothesis: Hypothesis | None = None
+    likelihood: SegmentLikelihood | None = None
+    widest: Hypothesis | None = None
+    ends: tuple[PriorEnd, ...] = ()
+    searcher: Searcher | None = None
+    closest: ClosestFit | None = None
+
+    @property
+    def starts(self) -> Starts | None:
+        """The segments' estimated initial states."""
+        return None if self.hypothesis is None else self.hypothesis.segments.starts
+
+    @property
+    def alarm(self) -> Alarm | None:
+        """Whether anything is missing that no parameters explain, as discovery tests it.
+
+        Where priors end too early, at the closest fit with wider ones. ``None`` where that cannot
+        be tested: of too few segments.
+        """
+        if self.searcher is None or self.widest is None:
+            return None
+        if self.widest.segments.inputs.num_segments < FEWEST_SEGMENTS:
+            return None
+        return self.searcher.look(self.widest).alarm
+
+    @property
+    def misfit(self) -> float:
+        """Residuals at the closest fit in units of the declared noise; one without any."""
+        if self.likelihood is None or not self.likelihood.is_noise_declared:
+            return 1.0
+        return math.sqrt(self.likelihood.misfit)
+
+    def with_features(self, embedding: str | Embedding | None) -> "Preparation":
+        """Returns the preparation with other features; ``"score"`` is made at the closest fit."""
+        if embedding == "score" and self.likelihood is not None:
+            embedding = score_embedding(self.likelihood)
+        return replace(self, options=replace(self.options, embedding=embedding))
+
+    def neighbourhood(self) -> GaussianMixture | None:
+        """Returns a normal density around the closest fit, wider than the posterior should be.
+
+        Its covariance is that of Laplace's approximation, and ``MARGIN`` of the prior's standard
+        deviations more in every direction, for what is not linear and for what the model lacks.
+        """
+        if self.likelihood is None:
+            return None
+        information = self.likelihood.information()
+        eye = torch.eye(len(information), dtype=torch.float64)
+        covariance = torch.linalg.inv(information + eye) + MARGIN**2 * eye
+        one = torch.ones(1, dtype=torch.float64)
+        return GaussianMixture.from_moments(one, self.likelihood.fit.z[None], covariance[None])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns JSON-serialisable values."""
+        length = self.options.steps(self.rollouts)
+        embedding = self.options.embedding
+        return {
+            "segment_length": length,
+            "segment_seconds": None if length is None else length * self.rollouts.time_step,
+            "initial_states": self.options.initial_state,
+            "embedding": embedding if isinstance(embedding, str) else repr(embedding),
+            "noise": self.noise,
+            "steps": "refined" if self.are_steps_coarse else "as the model has them",
+            "independent_share": None if self.likelihood is None else self.likelihood.share,
+            "priors_too_narrow": [str(end) for end in self.ends],
+        }
+
+    def sentence(self) -> str:
+        """Returns what was done with the recording in one line."""
+        length = self.options.steps(self.rollouts)
+        cut = (
+            "whole rollouts"
+            if length is None
+            else f"segments of {length} steps ({length * self.rollouts.time_step:.3g} s)"
+        )
+        starts = {
+            "uncertain": "estimated, uncertain initial states",
+            "estimated": "estimated initial states taken as true",
+            "recorded": "recorded initial states taken as true",
+        }[self.options.initial_state]
+        noise = "the model's own noise" if self.noise is None else "estimated noise"
+        steps = ", integration steps refined" if self.are_steps_coarse else ""
+        return f"Prepared: {cut}, {starts}, {noise}{steps}."
+
+
+def can_be_prepared(model: Callable[..., Any], data: Data, options: DataOptions) -> bool:
+    """Returns whether a model has a closest fit: one deterministic simulator, and rollouts.
+
+    A simulator inside plates has several sets of parameters along the same recording.
+    """
+    if not isinstance(data, Rollouts):
+        return False
+    inputs = options.with_certain_start().inputs(data)
+    boxes = [*Prior(model, (inputs,)).black_boxes.values()]
+    return (
+        len(boxes) == 1
+        and isinstance(boxes[0], SimulatorBlackBox)
+        and boxes[0].simulator.is_deterministic
+        and boxes[0].batch_shape == torch.Size()
+    )
+
+
+def prepare(
+    model: Callable[..., Any],
+    rollouts: Rollouts,
+    options: DataOptions,
+    *,
+    noise: Literal["auto", "model"] = "auto",
+    near: Mapping[str, Tensor] | None = None,
+    seed: int = 0,
+    progress: Step | None = None,
+) -> Preparation:
+    """Prepares a model and a recording for inference.
+
+    Args:
+        model: The Pyro model.
+        rollouts: The recording to be fitted; never the held-out one.
+        options: Segments, initial states, embedding and precision.
+        noise: ``"auto"`` gives a model without noise that of the closest fit; ``"model"`` takes
+            it as it is.
+        near: Parameters near which the closest fit is known to be.
+        seed: Seed of the search.
+        progress: Called with the fraction done and a short status.
+
+    Raises:
+        DataError: No parameters can be simulated along the recording, or the data do not fit.
+    """
+    is_declared = declares_noise(model, rollouts, options)
+    if options.initial_state != "uncertain" or not can_be_prepared(model, rollouts, options):
+        return _with_certain_starts(
+            model, rollouts, options, is_declared or noise == "model", seed, progress
+        )
+    length = options.steps(rollouts) or max(rollouts.lengths)
+    binding = replace(options, embedding=None, segment_length=length)
+    simulator = SegmentModel(model, rollouts, binding).simulator
+    # Wrong units are reported here; the search would only find that nothing fits.
+    rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
+    _try_out(model, rollouts, options)
+    searcher = Searcher(
+        model,
+        rollouts,
+        DiscoveryOptions(precision=options.precision, seed=seed),
+        binding=binding,
+    )
+    given = fit_base(model, rollouts, binding, near=near, seed=seed, progress=progress)
+    base = in_finer_steps(given, model, rollouts, binding)
+    searcher.model, searcher.are_steps_coarse = base.model, base.are_steps_coarse
+    wider = searcher.with_wider_priors(base.hypothesis)
+    ends = ()
+    if searcher.are_priors_widened:
+        ends = beyond(base.hypothesis.segments.prior.distributions, wider)
+    likelihood = _likelihood(base, is_declared)
+    estimated = every = None
+    if noise == "auto" and not is_declared:
+        scale = likelihood.fit.scale * math.sqrt(likelihood.variance)
+        segments = base.hypothesis.segments
+        estimated = dict(zip(segments.channel_names, scale.tolist(), strict=True))
+        every = {name: estimated.get(name, NEGLIGIBLE) for name in segments.sensor_names}
+    found = Preparation(
+        base.model if every is None else with_noise(base.model, every),
+        base.model,
+        rollouts,
+        replace(options, segment_length=length),
+        estimated,
+        every,
+        base.are_steps_coarse,
+        base.hypothesis,
+        likelihood,
+        wider,
+        ends,
+        searcher,
+    )
+    return found.with_features(options.embedding)
+
+
+def _try_out(model: Callable[..., Any], rollouts: Rollouts, options: DataOptions) -> None:
+    """Runs a model twice, as inference will, so that its own mistakes are reported first."""
+    options = replace(options.with_certain_start(), embedding=PLAIN_FEATURES)
+    bound = bind(model, rollouts, options)
+    with seeded(0, "try out"):
+        bound.prior.execute(bound.prior.sample(2))
+
+
+def held_out(prepared: Preparation, rollouts: Rollouts) -> SegmentLikelihood | None:
+    """Returns the likelihood of another recording, to judge a posterior by.
+
+    Scale and share of independent measurements are those of the recording that was fitted; initial
+    states are estimated along the motion that was found there.
+
+    Args:
+        prepared: The recording that was fitted.
+        rollouts: The other recording.
+
+    Returns:
+        ``None`` where the recording that was fitted has no likelihood either.
+    """
+    fitted = prepared.likelihood
+    if fitted is None:
+        return None
+    z, scale = fitted.fit.z, fitted.fit.scale
+    binding = replace(prepared.options, embedding=None, precision="float64")
+    segments = SegmentModel(prepared.plain_model, rollouts, binding)
+    starts = segments.estimated_starts(z, scale, rollouts)
+    if starts is not None:
+        segments = SegmentModel(prepared.plain_model, rollouts, binding, starts)
+    shape = segments.inputs.num_segments, segments.num_offsets
+    fit = SegmentFit(z, torch.zeros(shape, dtype=torch.float64), scale * fitted.variance**0.5)
+    now = segments.linearise(z, fit.offsets, fit.scale)
+    # The scale is that of the noise, as if it had been declared.
+    return SegmentLikelihood(segments, fit, now, fitted.share, is_noise_declared=True)
+
+
+def score_embedding(likelihood: SegmentLikelihood) -> Score:
+    """Returns the embedding that compresses trajectories into their score at the closest fit.
+
+    Initial states are integrated out.
+    """
+    segments, fit = likelihood.segments, likelihood.fit
+    now = likelihood.linearisation
+    # A parameter that does nothing has a score of zero.
+    deviation = now.information().diagonal().sqrt().clamp_min(1e-12)
+    weights = now.weights().unflatten(1, segments.observed.shape[1:]) / fit.scale[:, None]
+    mean = segments.simulate(fit.z[None], fit.offsets[None])[0]
+    return Score(mean, weights, deviation)
+
+
+def _with_certain_starts(
+    model: Callable[..., Any],
+    rollouts: Rollouts,
+    options: DataOptions,
+    keeps_noise: bool,
+    seed: int,
+    progress: Step | None,
+) -> Preparation:
+    """Prepares what has no closest fit with uncertain initial states."""
+    if options.embedding == "score":
+        options = replace(options, embedding=PLAIN_FEATURES)
+    if keeps_noise:
+        return Preparation(model, model, rollouts, options, None)
+    found = closest_fit(model, rollouts, options, seed=seed, progress=progress)
+    noisy = with_noise(model, found.noise)
+    return Preparation(noisy, model, rollouts, options, found.scale, found.noise, closest=found)
+
+
+def _likelihood(base: BaseFit, is_declared: bool) -> SegmentLikelihood:
+    """Returns the recording's likelihood, at the noise that the model declares where it does."""
+    found = base.hypothesis
+    scale = _declared_scale(base) if is_declared else None
+    if scale is None:
+        return found.likelihood
+    fit = fit_segments(found.segments, found.fit.z, offsets=found.fit.offsets, scale=scale)
+    now = found.segments.linearise(fit.z, fit.offsets, scale)
+    return SegmentLikelihood(found.segments, fit, now, found.share, is_noise_declared=True)
+
+
+def _declared_scale(base: BaseFit) -> Tensor | None:
+    """Returns the declared standard deviation of each measured channel, ``(C,)``.
+
+    ``None`` where the noise is a distribution of another kind than independent normal errors.
+    """
+    segments, z = base.hypothesis.segments, base.hypothesis.fit.z
+    boxes = Prior(base.model, (segments.inputs,)).black_boxes_at(z[None])
+    noise = next(iter(boxes.values())).noise
+    if noise is None or callable(noise):
+        return None
+    names = segments.channel_names
+    values = (
+        [noise[name] for name in names] if isinstance(noise, Mapping) else [noise] * len(names)
+    )
+    return torch.stack([torch.as_tensor(v).double().flatten()[0] for v in values])

@@ -1,0 +1,102 @@
+"""How measured data are prepared for inference: the options that all commands share."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+
+from npdr_ppl.embeddings import Embedding
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.segments import InitialState
+
+__all__ = [
+    "MAX_READINGS_PER_CHUNK",
+    "PLAIN_FEATURES",
+    "DataOptions",
+    "SegmentLength",
+    "default_segment_length",
+]
+
+MAX_READINGS_PER_CHUNK = 2_000_000
+"""Measurements that one chunk of simulations may hold, 16 MiB in float64: larger arrays leave the
+cache and are mapped afresh by the allocator every time, smaller ones pay the overhead of many
+calls."""
+
+SEGMENT_SECONDS = 0.2
+"""Default length of a segment: long compared with delays and lags, short compared with the time in
+which an unstable motion forgets its initial state."""
+
+FEWEST_STEPS, MOST_STEPS = 20, 200
+"""Bounds of a segment's default length in steps: shorter segments spend most of their measurements
+on their initial states, longer ones cost memory and say no more."""
+
+FEWEST_SEGMENTS = 8
+"""Segments that a recording is cut into where it is long enough; with fewer there is nothing to
+tell an effect from chance by."""
+
+PLAIN_FEATURES = "bayessim"
+"""Features where there is no closest fit at which a score could be taken."""
+
+SegmentLength = int | Literal["auto"] | None
+"""Steps between re-synchronisations: a number, ``"auto"`` for :func:`default_segment_length`, or
+``None`` for whole rollouts."""
+
+
+def default_segment_length(rollouts: Rollouts) -> int:
+    """Returns the default length of a segment in steps.
+
+    ``SEGMENT_SECONDS`` within ``FEWEST_STEPS`` and ``MOST_STEPS``, and less where a recording is
+    so short that it would have fewer than ``FEWEST_SEGMENTS`` segments: it is then cut into
+    twice as many.
+    """
+    length = round(SEGMENT_SECONDS / rollouts.time_step)
+    length, total = max(FEWEST_STEPS, min(MOST_STEPS, length)), sum(rollouts.lengths)
+    if total >= FEWEST_SEGMENTS * length:
+        return length
+    return max(2, min(length, total // (2 * FEWEST_SEGMENTS)))
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """How measured data are prepared for inference.
+
+    Attributes:
+        embedding: Maps trajectories to features: a name such as ``"bayessim"`` or ``"all/10"``,
+            an embedding of one's own, or ``"score"``, which
+            :func:`~npdr_ppl.posterior.prepare.prepare` makes for a recording. Plain functions
+            have none.
+        segment_length: Steps between re-synchronisations; see :data:`SegmentLength`.
+        initial_state: How the state at a segment's start is found: ``"uncertain"`` estimates it
+            and takes the estimate's error into account; ``"estimated"`` takes the estimate for the
+            truth, and ``"recorded"`` the measurement, which gives posteriors that are too narrow
+            and biased unless measurements have no noise.
+        precision: ``"float64"`` or ``"float32"``, of the simulation.
+    """
+
+    embedding: str | Embedding | None = "score"
+    segment_length: SegmentLength = "auto"
+    initial_state: InitialState = "uncertain"
+    precision: Literal["float64", "float32"] = "float64"
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision as torch's type."""
+        return {"float64": torch.float64, "float32": torch.float32}[self.precision]
+
+    def inputs(self, rollouts: Rollouts) -> Inputs:
+        """Returns the inputs of rollouts, prepared like this."""
+        length = self.steps(rollouts)
+        return rollouts.inputs(length, self.initial_state, dtype=self.dtype)
+
+    def steps(self, rollouts: Rollouts) -> int | None:
+        """Returns the length of a segment of rollouts; ``None`` for whole rollouts."""
+        if self.segment_length == "auto":
+            return default_segment_length(rollouts)
+        return self.segment_length
+
+    def with_certain_start(self) -> "DataOptions":
+        """Returns the options that start every simulation from the best estimate."""
+        if self.initial_state != "uncertain":
+            return self
+        return replace(self, initial_state="estimated")

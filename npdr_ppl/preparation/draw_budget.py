@@ -1,0 +1,55 @@
+"""How many simulated trajectories are held in memory at once."""
+
+from collections.abc import Iterator, Mapping
+
+from torch import Tensor
+
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.memory import release_freed_memory
+
+__all__ = ["BUDGET", "affordable_draws", "executed_in_parts"]
+
+BUDGET = 128 * 2**20
+"""Bytes of trajectories that are kept at once, at most. Statistics make several copies of them."""
+
+LEAST_DRAWS = 20
+"""Draws that are kept however long the recording is: fewer have no quantiles to speak of."""
+
+PER_PART = 4_000_000
+"""Readings that are simulated at once, 32 MB in double precision; engines and statistics make
+copies of them."""
+
+BYTES = 8
+"""Bytes of a reading in double precision, in which most is computed."""
+
+
+def affordable_draws(wanted: int, num_readings: int, *, budget: int = BUDGET) -> int:
+    """Returns how many draws of a trajectory are kept: all that are wanted, if memory allows it.
+
+    Args:
+        wanted: Number of draws if the recording is short.
+        num_readings: Readings of one draw.
+        budget: Bytes that the draws may take.
+    """
+    return min(wanted, max(LEAST_DRAWS, budget // (BYTES * max(1, num_readings))))
+
+
+def executed_in_parts(
+    prior: Prior, z: Tensor, num_readings: int
+) -> Iterator[tuple[Tensor, Mapping[str, Tensor]]]:
+    """Simulates a program at many points, of which only a part is in memory at a time.
+
+    Random numbers follow each other from torch's global stream.
+
+    Args:
+        prior: The program.
+        z: Points, ``(n, d)``.
+        num_readings: Readings of one simulation.
+
+    Yields:
+        Points and the sites' outputs at them.
+    """
+    release_freed_memory()
+    for part in z.split(max(1, PER_PART // max(1, num_readings))):
+        yield part, prior.execute(part)
+    release_freed_memory()

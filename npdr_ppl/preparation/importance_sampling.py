@@ -1,0 +1,225 @@
+"""Adaptive importance sampling of a posterior whose likelihood can be evaluated.
+
+Draws z_i of proposals q_t are weighted by p(recording | z) p(z) / Σ_t n_t/n q_t(z), the mixture of
+all proposals so far (deterministic mixture weights; Cornuet, Marin, Mira & Robert 2012). While the
+weights are too uneven, the next proposal is a kernel density estimate of the weighted draws, which
+follows ridges that bend. Pareto smoothing of the weights says whether they can be relied on
+(Vehtari, Simpson, Gelman, Yao & Gabry 2024).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.inference.base import Density
+from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
+from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, systematic
+from npdr_ppl.preparation.ridges import RidgeCoordinates
+from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
+from npdr_ppl.randomness import seeded
+
+__all__ = [
+    "ENOUGH_EFFECTIVE",
+    "RELIABLE_K",
+    "WeightedDraws",
+    "effective_size",
+    "heavy_tailed",
+    "sample_posterior",
+    "smoothed_weights",
+]
+
+DRAWS_PER_ITERATION = 512
+"""Draws of each iteration, every one a simulation of the recording."""
+
+MOST_ITERATIONS = 8
+"""Iterations after which sampling ends in any case."""
+
+RELIABLE_K = 0.7
+"""Shape of the weights' tail up to which estimates can be relied on (Vehtari et al. 2024)."""
+
+ENOUGH_EFFECTIVE = 200.0
+"""Effective sample size at which sampling ends: the ends of a 90 % interval are then known to a
+tenth of a standard deviation."""
+
+DRAWS_OF_LEARNT = 128
+"""Draws of each density that is given to begin with."""
+
+EFFECTIVE_PER_PARAMETER = 8.0
+"""Effective draws per parameter from which a proposal's covariance is estimated."""
+
+NUM_KERNELS = 64
+"""Components of a kernel density estimate that serves as a proposal."""
+
+TAILS = ((0.6, 1.0), (0.3, 3.0), (0.1, 10.0))
+"""Weights of a proposal's components and the factors of their covariances: a normal density whose
+tails are heavier than those of a posterior, so that no weight can be huge."""
+
+
+@dataclass(frozen=True)
+class WeightedDraws:
+    """Weighted draws of a posterior.
+
+    Attributes:
+        z: Reference coordinates, ``(n, d)``.
+        w: The same in coordinates in which ridges are straight, ``(n, d)``.
+        space: These coordinates.
+        log_weights: Logarithms of their weights, one in all, ``(n,)``.
+        k_hat: Shape of the tail of the weights; reliable up to ``RELIABLE_K``.
+        effective: Effective sample size.
+        iterations: Iterations that were needed.
+    """
+
+    z: Tensor
+    w: Tensor
+    space: RidgeCoordinates
+    log_weights: Tensor
+    k_hat: float
+    effective: float
+    iterations: int
+
+    @property
+    def weights(self) -> Tensor:
+        """The weights, ``(n,)``."""
+        return self.log_weights.exp()
+
+    @property
+    def is_reliable(self) -> bool:
+        """Whether the draws represent the posterior."""
+        return self.k_hat <= RELIABLE_K and self.effective >= 0.5 * ENOUGH_EFFECTIVE
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """Returns mean ``(d,)`` and covariance ``(d, d)``."""
+        mean = self.weights @ self.z
+        away = self.z - mean
+        return mean, (self.weights[:, None] * away).mT @ away
+
+
+def heavy_tailed(mean: Tensor, covariance: Tensor) -> GaussianMixture:
+    """Returns a density around a point with tails heavier than normal; see ``TAILS``.
+
+    Args:
+        mean: The point, ``(d,)``.
+        covariance: Covariance of the central component, ``(d, d)``.
+    """
+    weights, factors = (
+        torch.tensor(column, dtype=torch.float64) for column in zip(*TAILS, strict=True)
+    )
+    return GaussianMixture.from_moments(
+        weights, mean.expand(len(weights), -1), factors[:, None, None] * covariance
+    )
+
+
+def sample_posterior(
+    likelihood: SegmentLikelihood, proposals: Sequence[Density] = (), *, seed: int
+) -> WeightedDraws:
+    """Draws from the posterior of a recording by adaptive importance sampling.
+
+    Begins with Laplace's approximation at the closest fit, in coordinates in which ridges are
+    straight; see :mod:`npdr_ppl.preparation.ridges`.
+
+    Args:
+        likelihood: The recording's likelihood.
+        proposals: Further densities over reference coordinates to begin with, e.g. posteriors
+            that a backend has learnt.
+        seed: Seed of the draws.
+    """
+    prior = likelihood.segments.prior
+    space = RidgeCoordinates.of(likelihood, seed=seed)
+    own = [heavy_tailed(*space.moments())]
+    shares: list[int] = []
+    learnt = list(proposals)
+    z, w, target = (torch.empty(0) for _ in range(3))
+    result: WeightedDraws | None = None
+    for iteration in range(MOST_ITERATIONS):
+        with seeded(seed, "importance", iteration):
+            new_w = own[-1].sample(DRAWS_PER_ITERATION).double()
+            new_z, inside = space.to_reference(new_w)
+            if iteration == 0:
+                drawn = [density.sample(DRAWS_OF_LEARNT).double().cpu() for density in learnt]
+                new_z = torch.cat((new_z, *drawn))
+                new_w = torch.cat((new_w, *(space.from_reference(part) for part in drawn)))
+                inside = torch.cat((inside, inside.new_ones(len(new_z) - len(inside))))
+        new = torch.full((len(new_z),), -torch.inf, dtype=torch.float64)
+        at = new_z[inside]
+        if len(at):
+            new[inside] = likelihood.log_prob(at) + prior.log_prob(at)
+        first = iteration == 0
+        z = new_z if first else torch.cat((z, new_z))
+        w = new_w if first else torch.cat((w, new_w))
+        target = new if first else torch.cat((target, new))
+        shares.append(DRAWS_PER_ITERATION)
+        jacobian = space.log_jacobian(z)
+        rows = [
+            density.log_prob(w).double() + jacobian + math.log(share)
+            for density, share in zip(own, shares, strict=True)
+        ]
+        rows += [d.log_prob(z).double().cpu() + math.log(DRAWS_OF_LEARNT) for d in learnt]
+        log_mixture = torch.stack(rows).nan_to_num(-math.inf).logsumexp(0)
+        log_weights = (target - log_mixture).nan_to_num(-math.inf, -math.inf, -math.inf)
+        smoothed, k_hat = smoothed_weights(log_weights)
+        size = effective_size(smoothed)
+        result = WeightedDraws(z, w, space, smoothed, k_hat, size, iteration + 1)
+        if result.k_hat <= RELIABLE_K and result.effective >= ENOUGH_EFFECTIVE:
+            break
+        own.append(_adapted(w, log_weights, seed, iteration))
+    assert result is not None
+    return result
+
+
+def smoothed_weights(log_weights: Tensor) -> tuple[Tensor, float]:
+    """Returns Pareto-smoothed log weights, one in all, ``(n,)``, and the shape of their tail.
+
+    Where too few draws have a weight all count alike, and the shape is infinite.
+    """
+    from npdr_ppl.arviz_module import pareto_smoothed
+
+    smoothed, k_hat = pareto_smoothed(log_weights.numpy())
+    result = torch.from_numpy(smoothed)
+    if not bool(result.isfinite().any()):
+        result = torch.zeros(len(log_weights), dtype=torch.float64)
+    return result - result.logsumexp(0), k_hat
+
+
+def effective_size(log_weights: Tensor) -> float:
+    """Returns the effective sample size of log weights that sum to one."""
+    return float((-(2 * log_weights).logsumexp(0)).exp())
+
+
+def _adapted(y: Tensor, log_weights: Tensor, seed: int, iteration: int) -> GaussianMixture:
+    """Returns the next proposal: a kernel density estimate of the weighted draws.
+
+    The weights are tempered where hardly any draw has one, so that the proposal approaches the
+    posterior step by step.
+    """
+    d = y.shape[1]
+    exponent = longest_step(log_weights, 1.0, min(0.5, EFFECTIVE_PER_PARAMETER * d / len(y)))
+    tempered = torch.where(log_weights.isfinite(), exponent * log_weights, -torch.inf)
+    if not bool(tempered.isfinite().any()):
+        tempered = torch.zeros_like(tempered)
+    weights = tempered.softmax(0)
+    mean = weights @ y
+    away = y - mean
+    covariance = (weights[:, None] * away).mT @ away
+    covariance = covariance + 1e-10 * torch.diag(covariance.diagonal().clamp_min(1e-12))
+    with seeded(seed, "kernels", iteration):
+        centres = y[systematic(weights.log(), NUM_KERNELS)]
+    width = (4.0 / (d + 2) / NUM_KERNELS) ** (1.0 / (d + 4))  # Silverman's rule
+    shrunk = mean + math.sqrt(max(0.0, 1.0 - min(1.0, width) ** 2)) * (centres - mean)
+    return GaussianMixture.from_moments(
+        torch.cat(
+            (
+                torch.full((NUM_KERNELS,), TAILS[0][0] / NUM_KERNELS, dtype=torch.float64),
+                torch.tensor([weight for weight, _ in TAILS[1:]], dtype=torch.float64),
+            )
+        ),
+        torch.cat((shrunk, mean.expand(len(TAILS) - 1, -1))),
+        torch.cat(
+            (
+                (width**2 * covariance).expand(NUM_KERNELS, d, d),
+                torch.stack([factor * covariance for _, factor in TAILS[1:]]),
+            )
+        ),
+    )

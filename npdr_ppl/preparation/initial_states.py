@@ -1,0 +1,261 @@
+"""The states that segments start from, estimated with a fitted model's help.
+
+A smoother knows nothing of the commands: where they change, rates are kinked, and a polynomial
+through the readings is biased by what the command does, which is what a delay would look like.
+What a model leaves of the readings has no such kinks. So it is what is smoothed: the readings up
+to a segment's start less those that the model predicts from a state before it. Readings after the
+start are the segment's own, and say what they have to say there.
+"""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.language.effects import SensorEffect
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.simulator import Simulator
+from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.preparation.solving import is_invertible
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.segments import cut
+from npdr_ppl.rollouts.states import estimate_departures
+
+__all__ = ["Starts", "error_factors", "estimate_starts", "uncertain_components"]
+
+ROUNDS = 30
+"""Rounds of expectation maximisation; components that readings say little of hardly move."""
+
+FACTORS = 0.2, 10.0
+"""Least and greatest factor of the errors."""
+
+
+@dataclass(frozen=True)
+class Starts:
+    """What S segments start from, ``(S, channels)`` each.
+
+    Attributes:
+        values: Readings without their noise, in the channels' units.
+        rates: Their time derivatives, in units per second.
+        value_errors: Standard deviations of the values' errors.
+        rate_errors: Standard deviations of the rates' errors.
+    """
+
+    values: Tensor
+    rates: Tensor
+    value_errors: Tensor
+    rate_errors: Tensor
+
+    @classmethod
+    def of(cls, inputs: Inputs) -> "Starts | None":
+        """Returns what inputs start from; ``None`` unless that is uncertain."""
+        found = (
+            inputs.initial_values,
+            inputs.initial_rates,
+            inputs.initial_value_errors,
+            inputs.initial_rate_errors,
+        )
+        return None if any(part is None for part in found) else cls(*found)  # pyright: ignore
+
+    def scaled(self, inputs: Inputs, factors: Tensor) -> "Starts":
+        """Returns the same with larger or smaller errors.
+
+        Args:
+            inputs: Inputs with these starts.
+            factors: Of each component that is off; see :func:`uncertain_components`.
+        """
+        errors = {"initial_values": self.value_errors, "initial_rates": self.rate_errors}
+        errors = {name: error.clone() for name, error in errors.items()}
+        for (name, column, _), factor in zip(uncertain_components(inputs), factors, strict=True):
+            errors[name][:, column] *= factor
+        return Starts(self.values, self.rates, errors["initial_values"], errors["initial_rates"])
+
+    def segments(self, index: Tensor) -> "Starts":
+        """Returns what some of the segments start from."""
+        return Starts(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def replaced(self, rows: Tensor, new: "Starts", where: Tensor) -> "Starts":
+        """Returns the same with others in some rows, where a mask says so.
+
+        Args:
+            rows: Indices of the n segments.
+            new: The others, ``(n, channels)`` each.
+            where: The mask, ``(n, channels)``.
+        """
+        changed = {}
+        for field in fields(self):
+            table = getattr(self, field.name).clone()
+            table[rows] = torch.where(where, getattr(new, field.name).to(table), table[rows])
+            changed[field.name] = table
+        return Starts(**changed)
+
+    def put_into(self, inputs: Inputs) -> Inputs:
+        """Returns inputs that start from here."""
+        return replace(
+            inputs,
+            initial_values=self.values,
+            initial_rates=self.rates,
+            initial_value_errors=self.value_errors,
+            initial_rate_errors=self.rate_errors,
+        )
+
+
+def uncertain_components(inputs: Inputs) -> list[tuple[str, int, Tensor]]:
+    """Returns field, channel and standard deviations ``(S,)`` of what may be off at a start."""
+    found = []
+    for name, errors in (
+        ("initial_values", inputs.initial_value_errors),
+        ("initial_rates", inputs.initial_rate_errors),
+    ):
+        if errors is not None:
+            for column in range(errors.shape[-1]):
+                error = errors[..., column].double()
+                if bool((error > 0).any()):
+                    found.append((name, column, error))
+    return found
+
+
+def estimate_starts(box: SimulatorBlackBox, inputs: Inputs, rollouts: Rollouts) -> Starts | None:
+    """Estimates the states at segments' starts from what a model leaves of the readings there.
+
+    Rollouts' first states, which nothing comes before, stay as they are, as do those where the
+    model cannot be simulated.
+
+    Args:
+        box: The simulator and its parameters, those of a fit.
+        inputs: The segments, as cut from the rollouts and smoothed.
+        rollouts: The recording.
+
+    Returns:
+        ``None`` if the inputs' starts are certain.
+    """
+    known = Starts.of(inputs)
+    if known is None:
+        return None
+    length = inputs.num_steps
+    wanted = list(zip(inputs.rollout.tolist(), inputs.start.tolist(), strict=True))
+    layout = [
+        (rollout, max(0, start - length), start + 1)  # a step more, for the rates
+        for rollout, start in wanted
+    ]
+    around = cut(
+        rollouts,
+        layout,
+        initial_state="estimated",
+        history=inputs.past_actions.shape[-2],
+        dtype=inputs.actions.dtype,
+    )
+    places = inputs.start - around.start
+    predicted = _predicted(box.simulator, box.parameters, around)
+    rates = _predicted_rates(box, around, predicted, places)
+    row = torch.arange(len(places))
+    reported = {sensor.name for sensor in box.simulator.sensors}
+    is_reported = torch.tensor([name in reported for name in around.channel_names])
+    values, found = predicted[row, places], known
+    for index, readings in enumerate(rollouts.readings):
+        own = torch.nonzero((around.rollout == index) & (places > 0))[:, 0]
+        departure = estimate_departures(
+            readings,
+            [predicted[i, : places[i] + 1].numpy() for i in own],
+            around.start[own].numpy(),
+            inputs.start[own].numpy(),
+            rollouts.time_step,
+        )
+        shift, rate, error, rate_error = (
+            torch.from_numpy(part).to(values)
+            for part in (
+                departure.values,
+                departure.rates,
+                departure.value_errors,
+                departure.rate_errors,
+            )
+        )
+        new = Starts(values[own] + shift, rates[own] + rate, error, rate_error)
+        is_better = is_reported & (new.values + new.rates).isfinite()
+        found = found.replaced(own, new, is_better)
+    return found
+
+
+def _predicted(simulator: Simulator, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
+    """Returns the recorded channels from each segment's start on, ``(S, K + 1, channels)``.
+
+    Channels that the simulator has not are zero.
+    """
+    names = [sensor.name for sensor in simulator.sensors]
+    simulated = simulator.simulate(parameters, inputs).reshape(
+        inputs.num_segments, inputs.num_steps, len(names)
+    )
+    result = torch.zeros(inputs.num_segments, inputs.num_steps + 1, len(inputs.channel_names)).to(
+        simulated
+    )
+    for column, name in enumerate(inputs.channel_names):
+        if name in names:
+            result[:, 0, column] = inputs.initial_values[:, column]
+            result[:, 1:, column] = simulated[..., names.index(name)]
+    return result
+
+
+def _predicted_rates(
+    box: SimulatorBlackBox, inputs: Inputs, predicted: Tensor, places: Tensor
+) -> Tensor:
+    """Returns the rates of the recorded channels at one step of each segment, ``(S, channels)``.
+
+    The simulated velocity, where there is one and nothing else changes the position's readings;
+    otherwise half the difference between the readings after and before.
+    """
+    simulator = box.simulator
+    row = torch.arange(len(places))
+    last = inputs.mask.sum(-1)
+    after, before = (places + 1).minimum(last), (places - 1).clamp_min(0)
+    rates = (predicted[row, after] - predicted[row, before]) / (
+        (after - before)[:, None] * inputs.time_step
+    )
+    effects = [effect for effect in simulator.effects if isinstance(effect, SensorEffect)]
+    ports = [simulator.port(effect.port) for effect in effects]
+    if any(port.kind == "clock" for port in ports):
+        return rates
+    true = predicted
+    if effects:
+        plain = copy.copy(simulator)
+        plain.effects = tuple(e for e in simulator.effects if not isinstance(e, SensorEffect))
+        own = {name for effect in effects for name in effect.parameter_names}
+        rest = {name: value for name, value in box.parameters.items() if name not in own}
+        true = _predicted(plain, rest, inputs)
+    changed = {name for port in ports for name in port.channels}
+    reported = {sensor.name for sensor in simulator.sensors}
+    columns = {name: i for i, name in enumerate(inputs.channel_names)}
+    for state in simulator.states:
+        if state.rate_of in columns and state.rate_of not in changed:
+            if state.name in columns and state.name in reported:
+                rates[:, columns[state.rate_of]] = true[row, places, columns[state.name]]
+    return rates
+
+
+def error_factors(residual: Tensor, by_starts: Tensor) -> Tensor:
+    """Returns by how much the starts' errors are larger than was thought, by component, ``(m,)``.
+
+    The likeliest standard deviations of the offsets (expectation maximisation; Dempster, Laird &
+    Rubin 1977), all else being as fitted. Segments in which they cannot be computed, because the
+    simulation diverges, are left out.
+
+    Args:
+        residual: Whitened residuals with all offsets at zero, ``(S, N)``.
+        by_starts: Their derivatives by the offsets, ``(S, N, m)``.
+    """
+    information = by_starts.mT @ by_starts
+    score = (by_starts.mT @ residual[..., None])[..., 0]
+    eye = torch.eye(by_starts.shape[-1], dtype=torch.float64)
+    factors = torch.ones(by_starts.shape[-1], dtype=torch.float64)
+    # At the largest factors, where the unit matrix keeps least apart.
+    is_known = is_invertible(eye / FACTORS[1] ** 2 + information)
+    if not bool(is_known.any()):
+        return factors
+    information, score = information[is_known], score[is_known]
+    for _ in range(ROUNDS):
+        covariance = torch.linalg.inv(eye + factors[:, None] * information * factors)
+        mean = (covariance @ (factors * score)[..., None])[..., 0]
+        square = (mean.square() + covariance.diagonal(dim1=-2, dim2=-1)).mean(0)
+        factors = (factors * square.sqrt()).clamp(*FACTORS)
+    return factors

@@ -1,0 +1,307 @@
+"""Coordinates along a ridge of a posterior that bends.
+
+Where a motion determines fewer combinations than there are parameters, the posterior is a thin
+sheet: stiff directions, a thousand times narrower than the prior, across weak ones that are hardly
+narrower. Even a slight bend of the sheet defeats a normal approximation. With weak coordinates a
+and stiff coordinates b of the prior-whitened information, b = g(a) is traced by Newton steps with
+the Jacobian of the closest fit (the chord method), fitted by a polynomial, and subtracted. The
+shear (a, b) → (a, b − g(a)) keeps volumes, so densities need no correction for it.
+
+How far the ridge reaches is not to be seen from the closest fit: where it bends, the curvature
+there makes it look short. The traced points themselves tell: they are weighted by their density
+over that of the points tried, and the next are spread as these say (adaptive importance sampling
+along the ridge), until they say the same again.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.inference.parts.samplers.importance_weights import longest_step
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.preparation.sampling_coordinates import SamplingCoordinates
+from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
+from npdr_ppl.randomness import seeded
+
+__all__ = ["RidgeCoordinates"]
+
+FEWEST_POINTS, POINTS_PER_TERM = 96, 6
+"""Points at which a ridge is traced, and how many for each term of a quadratic in its weak
+coordinates; each costs a simulation of the recording per chord step."""
+
+CHORD_STEPS, MORE_STEPS = 5, 3
+"""Chord steps to each point, at first and where a polynomial already says about where it is."""
+
+TRIED = 20
+"""How many times as many points are drawn, of which those on the priors' support are kept."""
+
+FEWEST_FOUND = 0.3
+"""Share of the points that chord steps must find for the ridge to be followed any further."""
+
+ROUNDS = 8
+"""Times that a ridge is traced at most."""
+
+CLOSE = 1.0
+"""Log density that the median point may gain by chord steps from where the polynomial has it: the
+polynomial is then within the posterior's own width."""
+
+MOST_DEGREE, POINTS_PER_COEFFICIENT = 6, 3
+"""Greatest degree of the polynomial, and least number of points for each of its terms."""
+
+REACH = 2.0
+"""How far weak coordinates of these points are spread, in standard deviations."""
+
+GROWS = 1.3
+"""Ratio of variances from one tracing to the next from which a ridge may reach farther still."""
+
+EVEN_SHARE = 0.1
+"""Effective share of the traced points from which they are spread as the ridge is; with less the
+weights are tempered, and the next points go on from where these lead."""
+
+FARTHEST = 1.0
+"""Greatest chord step along a stiff direction, in prior standard deviations."""
+
+KEPT = 0.75
+"""Share of the points, those nearest to the recording, that the polynomial is fitted to; chord
+steps need not converge everywhere."""
+
+
+@dataclass(frozen=True)
+class RidgeCoordinates:
+    """Coordinates w of a posterior in which its ridges are straight and along axes.
+
+    Attributes:
+        space: The coordinates y that w are made of.
+        centre: The closest fit in them, ``(d,)``.
+        basis: Columns map w − shear to y − centre, ``(d, d)``.
+        information: Information of the recording in units of the prior's, ``(d,)`` ascending.
+        num_weak: How many of w are weak; they come first.
+        coefficients: Polynomial g in the weak ones, ``(terms, d − num_weak)``.
+        degree: Its degree, 0 where there is no bend to trace.
+        weak_mean: Mean of the posterior's weak coordinates, as far as tracing tells,
+            ``(num_weak,)``.
+        weak_covariance: Their covariance, ``(num_weak, num_weak)``.
+    """
+
+    space: SamplingCoordinates
+    centre: Tensor
+    basis: Tensor
+    information: Tensor
+    num_weak: int
+    coefficients: Tensor
+    degree: int
+    weak_mean: Tensor
+    weak_covariance: Tensor
+
+    @classmethod
+    def of(cls, likelihood: SegmentLikelihood, *, seed: int) -> "RidgeCoordinates":
+        """Finds the coordinates of a recording's posterior."""
+        space = SamplingCoordinates.of(likelihood.segments.prior)
+        z = likelihood.fit.z
+        slope = space.slope(z).clamp_min(1e-12)
+        spread = space.variance.sqrt()
+        scaled = likelihood.information() * (spread / slope)[:, None] * (spread / slope)
+        information, vectors = torch.linalg.eigh(0.5 * (scaled + scaled.mT))
+        information = information.clamp_min(0.0)
+        # A direction of width δ bends by about δ², in units of the prior; it is weak where that
+        # shows in the stiffest one.
+        num_weak = int((information**2 < information[-1]).sum())
+        straight = cls(
+            space,
+            space.from_reference(z[None])[0],
+            spread[:, None] * vectors,
+            information,
+            num_weak,
+            torch.zeros(1, len(z) - num_weak, dtype=torch.float64),
+            0,
+            torch.zeros(num_weak, dtype=torch.float64),
+            torch.diag(1.0 / (1.0 + information[:num_weak])),
+        )
+        if num_weak in (0, len(z)):
+            return straight
+        return straight._traced(likelihood, slope, seed)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Returns what the coordinates consist of beside the prior, to be written to disk."""
+        return {
+            "centre": self.centre,
+            "basis": self.basis,
+            "information": self.information,
+            "coefficients": self.coefficients,
+            "shape": torch.tensor([self.num_weak, self.degree]),
+            "weak_mean": self.weak_mean,
+            "weak_covariance": self.weak_covariance,
+        }
+
+    @classmethod
+    def of_tensors(cls, prior: Prior, tensors: Mapping[str, Tensor]) -> "RidgeCoordinates":
+        """Rebuilds coordinates of a prior from :meth:`tensors`."""
+        num_weak, degree = tensors["shape"].tolist()
+        return cls(
+            SamplingCoordinates.of(prior),
+            tensors["centre"],
+            tensors["basis"],
+            tensors["information"],
+            int(num_weak),
+            tensors["coefficients"],
+            int(degree),
+            tensors["weak_mean"],
+            tensors["weak_covariance"],
+        )
+
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """Returns about which mean ``(d,)`` and covariance ``(d, d)`` the posterior has in w."""
+        k, d = self.num_weak, len(self.centre)
+        mean = torch.zeros(d, dtype=torch.float64)
+        covariance = torch.diag(1.0 / (1.0 + self.information))
+        mean[:k], covariance[:k, :k] = self.weak_mean, self.weak_covariance
+        return mean, covariance
+
+    def from_reference(self, z: Tensor) -> Tensor:
+        """Maps reference coordinates ``(n, d)`` to w."""
+        away = self.space.from_reference(z) - self.centre
+        w = torch.linalg.solve(self.basis, away.mT).mT
+        weak = w[:, : self.num_weak]
+        return torch.cat((weak, w[:, self.num_weak :] - self._bend(weak)), dim=-1)
+
+    def to_reference(self, w: Tensor) -> tuple[Tensor, Tensor]:
+        """Maps w ``(n, d)`` to reference coordinates; also returns which lie on the support."""
+        weak = w[:, : self.num_weak]
+        moved = torch.cat((weak, w[:, self.num_weak :] + self._bend(weak)), dim=-1)
+        return self.space.to_reference(self.centre + moved @ self.basis.mT)
+
+    def log_jacobian(self, z: Tensor) -> Tensor:
+        """Returns log |∂w/∂z|, ``(n,)``."""
+        own = self.space.log_jacobian(z, self.space.from_reference(z))
+        return own - torch.linalg.slogdet(self.basis).logabsdet
+
+    def _bend(self, weak: Tensor) -> Tensor:
+        return _monomials(weak, self.degree) @ self.coefficients
+
+    def _traced(
+        self, likelihood: SegmentLikelihood, slope: Tensor, seed: int
+    ) -> "RidgeCoordinates":
+        """Returns the coordinates with the polynomial that the ridge follows."""
+        k, d, found = self.num_weak, len(self.centre), self
+        number = max(FEWEST_POINTS, POINTS_PER_TERM * _num_terms(k, 2))
+        points, values = torch.empty(0, d).double(), torch.empty(0).double()
+        for round_ in range(ROUNDS):
+            factor = REACH * torch.linalg.cholesky(found.weak_covariance)
+            with seeded(seed, "ridge", round_):
+                drawn = torch.randn(TRIED * number, k, dtype=torch.float64)
+            weak = found.weak_mean + drawn @ factor.mT
+            _, inside = found.to_reference(torch.cat((weak, weak.new_zeros(len(weak), d - k)), -1))
+            drawn, weak = drawn[inside][:number], weak[inside][:number]
+            if not len(weak):
+                break
+            steps = CHORD_STEPS if round_ == 0 else MORE_STEPS
+            w, predicted, log_density = found._followed(likelihood, weak, slope, steps)
+            is_found = log_density.isfinite()
+            if float(is_found.double().mean()) < FEWEST_FOUND:
+                break
+            missed = (log_density - predicted)[is_found].median()
+            points, values = torch.cat((points, w)), torch.cat((values, log_density))
+            found = found._bent_through(points, values)
+            log_weights = log_density + 0.5 * drawn.square().sum(-1)
+            exponent = longest_step(log_weights, 1.0, EVEN_SHARE)
+            weights = (exponent * log_weights).nan_to_num(-torch.inf).softmax(0)
+            mean = weights @ weak
+            away = weak - mean
+            # The little that is added keeps a direction in which few points have weight.
+            covariance = (weights[:, None] * away).mT @ away + 1e-6 * found.weak_covariance
+            grown = torch.linalg.eigvals(torch.linalg.solve(found.weak_covariance, covariance))
+            found = replace(found, weak_mean=mean, weak_covariance=covariance)
+            # Where it was expected and spread as before: there is no more to find.
+            if missed < CLOSE and exponent == 1.0 and float(grown.real.max()) < GROWS:
+                break
+        return found
+
+    def _followed(
+        self, likelihood: SegmentLikelihood, weak: Tensor, slope: Tensor, steps: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns the points of a ridge above weak coordinates ``(n, k)``.
+
+        Returns:
+            The points without the bend, ``(n, d)``; log densities up to a constant where the
+            polynomial has them, ``(n,)``, and at the points; minus infinity for those that were
+            not found.
+        """
+        k, d = self.num_weak, len(self.centre)
+        straight = replace(self, coefficients=torch.zeros(1, d - k).double(), degree=0)
+        by_w = self.basis / slope[:, None]  # ∂z/∂w at the closest fit
+        stiff = self.information[k:] + 1.0
+        w = torch.cat((weak, self._bend(weak)), dim=-1)
+        best, value = w.clone(), torch.full((len(w),), -torch.inf, dtype=torch.float64)
+        predicted, prior = value, likelihood.segments.prior
+        for step in range(steps + 1):
+            z, inside = straight.to_reference(w)
+            # Beyond the support nothing can be simulated: there the point has no score.
+            score, density = torch.full_like(w, torch.nan), torch.full_like(value, -torch.inf)
+            if bool(inside.any()):
+                at = z[inside]
+                score[inside], misfit = likelihood.scores(at)
+                density[inside] = (
+                    prior.log_prob(at).double() - 0.5 * misfit - straight.log_jacobian(at)
+                ).nan_to_num(-torch.inf, -torch.inf, -torch.inf)
+            if step == 0:
+                predicted = density
+            is_better = density > value
+            best[is_better], value[is_better] = w[is_better], density[is_better]
+            # The prior's own pull is that of a normal one of the same variance.
+            change = ((score @ by_w)[:, k:] - w[:, k:]) / stiff
+            w = w.clone()
+            w[:, k:] += change.nan_to_num(0.0).clamp(-FARTHEST, FARTHEST)
+        return best, predicted, value
+
+    def _bent_through(self, w: Tensor, log_density: Tensor) -> "RidgeCoordinates":
+        """Returns the coordinates with a polynomial through points of the ridge, ``(n, d)``.
+
+        Its degree is that of least leave-one-out error in standard deviations of the posterior.
+        """
+        k = self.num_weak
+        near = log_density.argsort(descending=True)[: int(KEPT * len(w))]
+        near = near[log_density[near].isfinite()]
+        # Points off the ridge by more than others say less of where it is.
+        excess = log_density[near].max() - log_density[near]
+        weight = (1.0 + excess / excess.median().clamp_min(0.5)).rsqrt()[:, None]
+        wanted = weight * w[near, k:]
+        least, found = torch.inf, self
+        for degree in range(1, MOST_DEGREE + 1):
+            if POINTS_PER_COEFFICIENT * _num_terms(k, degree) > len(near):
+                break
+            q, r = torch.linalg.qr(weight * _monomials(w[near, :k], degree))
+            leverage = q.square().sum(-1, keepdim=True).clamp(max=0.999)
+            left_out = (wanted - q @ (q.mT @ wanted)) / (1.0 - leverage)
+            error = float((left_out.square() @ (self.information[k:] + 1.0)).mean())
+            coefficients = torch.linalg.solve_triangular(r, q.mT @ wanted, upper=True)
+            if error < least and bool(coefficients.isfinite().all()):
+                least = error
+                found = replace(self, coefficients=coefficients, degree=degree)
+        return found
+
+
+def _num_terms(number: int, degree: int) -> int:
+    return sum(1 for _ in _exponents(number, degree))
+
+
+def _exponents(number: int, degree: int) -> list[tuple[int, ...]]:
+    """Returns which variables each monomial multiplies, the constant first."""
+    return [
+        chosen
+        for power in range(degree + 1)
+        for chosen in combinations_with_replacement(range(number), power)
+    ]
+
+
+def _monomials(values: Tensor, degree: int) -> Tensor:
+    """Returns all monomials of ``(n, k)`` variables up to a degree, ``(n, terms)``."""
+    columns = []
+    for chosen in _exponents(values.shape[1], degree):
+        column = torch.ones(len(values), dtype=torch.float64)
+        for index in chosen:
+            column = column * values[:, index]
+        columns.append(column)
+    return torch.stack(columns, dim=-1)

@@ -1,0 +1,128 @@
+"""The likelihood of a recording, with the segments' initial states integrated out.
+
+With whitened residuals r_s(z) of segment s, simulated from its estimated initial state, and their
+derivatives G_s by the initial state in standard deviations of its error, r_s is normal with
+covariance C_s = 1 + G_s G_sᵀ, and
+
+    log p(x | z) = −½ w Σ_s [ r_s(z)ᵀ C_s⁻¹ r_s(z) / v + log |C_s| + N_s log v + constants ]
+
+G is taken at the closest fit. The variance v is what the closest fit leaves, per degree of
+freedom, or one where the model declares its noise. The weight w is the share of measurements that
+are worth an independent one: correlated residuals say less than their number (composite
+likelihood; Ribatet, Cooley & Davison 2012).
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK
+from npdr_ppl.preparation.segment_fit import SegmentFit
+from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
+
+__all__ = ["SegmentLikelihood"]
+
+
+@dataclass(frozen=True)
+class SegmentLikelihood:
+    """The likelihood of a recording under a model with one simulator; S segments.
+
+    Attributes:
+        segments: The model along the recording.
+        fit: The closest fit, whose scale whitens the residuals.
+        linearisation: Residuals and derivatives there.
+        share: Share of measurements worth an independent one, in (0, 1].
+        is_noise_declared: Whether the fit's scale is noise that the model declares.
+    """
+
+    segments: SegmentModel
+    fit: SegmentFit
+    linearisation: Linearisation
+    share: float
+    is_noise_declared: bool
+
+    @property
+    def is_differentiable(self) -> bool:
+        """Whether :meth:`log_prob` has gradients."""
+        return self.segments.simulator.is_differentiable
+
+    @cached_property
+    def num_measurements(self) -> Tensor:
+        """Number of measurements of each segment, ``(S,)``."""
+        return self.segments.inputs.mask.sum(-1).double() * len(self.segments.channel_names)
+
+    @cached_property
+    def _inner(self) -> Tensor:
+        """1 + Gᵀ G, ``(S, m, m)``."""
+        by_start = self.linearisation.by_starts
+        return torch.eye(by_start.shape[-1], dtype=torch.float64) + by_start.mT @ by_start
+
+    @cached_property
+    def misfit(self) -> float:
+        """Misfit per degree of freedom at the closest fit: one where noise is all that is left."""
+        now = self.linearisation
+        residual = now.residual + (now.by_starts @ self.fit.offsets[..., None])[..., 0]
+        freedom = float(self.num_measurements.sum()) - len(self.fit.z)
+        return float(self._squares(residual[None]).sum()) / max(1.0, freedom)
+
+    @property
+    def variance(self) -> float:
+        """Variance v of the whitened residuals."""
+        return 1.0 if self.is_noise_declared else max(self.misfit, 1e-12)
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        """Returns log p(recording | z), ``(n,)`` float64, at points ``(n, d)``.
+
+        Minus infinity where a simulation fails.
+        """
+        return self.by_segment(z).sum(-1)
+
+    def by_segment(self, z: Tensor) -> Tensor:
+        """Returns log p(segment | z), ``(n, S)`` float64, at points ``(n, d)``."""
+        squares = torch.cat([self._squares(residual) for residual in self._residuals(z)])
+        log_scale = self.segments.inputs.mask.sum(-1) * self.fit.scale.log().sum()
+        constant = (
+            torch.linalg.slogdet(self._inner).logabsdet
+            + self.num_measurements * math.log(2.0 * math.pi * self.variance)
+            + 2.0 * log_scale
+        )
+        result = -0.5 * self.share * (squares / self.variance + constant)
+        return torch.where(result.isfinite(), result, -torch.inf)
+
+    def information(self) -> Tensor:
+        """Returns the Fisher information of the parameters at the closest fit, ``(d, d)``."""
+        return self.share * self.linearisation.information() / self.variance
+
+    def scores(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns scores and misfits at points ``(n, d)``, for derivatives as at the closest fit.
+
+        The score is Jᵀ C⁻¹ r of the residuals r there, ``(n, d)``, and the misfit rᵀ C⁻¹ r,
+        ``(n,)``, both in units of the variance and weighted by the share.
+        """
+        weights = self.linearisation.weights()
+        scores, misfits = [], []
+        for residual in self._residuals(z):
+            scores.append(torch.einsum("snd,bsn->bd", weights, residual))
+            misfits.append(self._squares(residual).sum(-1))
+        factor = self.share / self.variance
+        return factor * torch.cat(scores), factor * torch.cat(misfits)
+
+    def _residuals(self, z: Tensor) -> Iterator[Tensor]:
+        """Yields whitened residuals ``(n, S, N)`` with unmoved initial states, in chunks."""
+        together = max(1, MAX_READINGS_PER_CHUNK // max(1, self.segments.observed.numel()))
+        offsets = self.fit.offsets[None]
+        moved = (self.linearisation.by_starts @ self.fit.offsets[..., None])[..., 0]
+        for points in z.double().split(together):
+            starts = offsets.expand(len(points), -1, -1)
+            yield self.segments.residuals(points, starts, self.fit.scale) + moved
+
+    def _squares(self, residual: Tensor) -> Tensor:
+        """Returns rᵀ C⁻¹ r by segment, ``(n, S)``, for residuals ``(n, S, N)``."""
+        by_start = self.linearisation.by_starts
+        towards = torch.einsum("snm,bsn->bsm", by_start, residual)
+        taken = torch.linalg.solve(self._inner, towards[..., None])[..., 0]
+        return residual.square().sum(-1) - (towards * taken).sum(-1)

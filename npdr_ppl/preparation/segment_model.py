@@ -1,0 +1,412 @@
+"""A model with one black-box site along a recording, from initial states that may be off.
+
+The recording is cut into segments. Each starts from a state that is only known within the
+smoother's error, so that a simulation depends on the parameters, which all segments share, and on
+the offset of each segment's own initial state. Derivatives by both are finite differences, one
+batch of simulations for all parameters, all segments and all components of their initial states:
+the simulator stays a black box.
+"""
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.handlers import with_noise
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.simulator import Simulator
+from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.initial_states import (
+    Starts,
+    error_factors,
+    estimate_starts,
+    uncertain_components,
+)
+from npdr_ppl.preparation.solving import is_invertible, solve_or_zero
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["Linearisation", "SegmentModel"]
+
+PARAMETER_STEP = 1e-2
+"""Half the width of finite differences, in standard deviations of the prior: more than what
+single precision and dry friction blur."""
+
+START_STEP = 0.1
+"""Half the width of finite differences of initial states, in standard deviations of the smoother's
+error."""
+
+START_LIMIT = 4.5
+"""How far from the prior's centre a fit may begin, in standard deviations: at the ends of a range
+a parameter hardly moves in reference coordinates."""
+
+LEAST_SCALE = 1e-6
+"""Least scale of a channel's residuals as a share of its largest measurement. Files and
+simulations in single precision hold no more digits, and with less noise than that the initial
+states of a simulated, noise-free recording could not be integrated out in double precision."""
+
+SMALLEST = 1e-9
+"""The same of a channel that is zero throughout, in its unit."""
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Residuals and their derivatives; S segments of N readings, d parameters, m offsets.
+
+    Attributes:
+        residual: What was measured less what was simulated, ``(S, N)``.
+        by_parameters: Derivative of the simulation by parameters, ``(S, N, d)``.
+        by_starts: Derivative by the offsets of each segment's own initial state, ``(S, N, m)``.
+    """
+
+    residual: Tensor
+    by_parameters: Tensor
+    by_starts: Tensor
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the simulation succeeded at the point and everywhere beside it.
+
+        Squares, of which sums are made, are to be finite too: what diverges takes a few steps more
+        to be infinite itself.
+        """
+        parts = self.residual, self.by_parameters, self.by_starts
+        return all(bool(part.square().sum().isfinite()) for part in parts)
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether it is finite and the initial states of every segment can be integrated out.
+
+        They cannot where derivatives by the offsets are so large that 1 + Gᵀ G is singular to
+        working precision: there the simulation diverges beside the point.
+        """
+        return self.is_finite and bool(is_invertible(self._inner).all())
+
+    @property
+    def _inner(self) -> Tensor:
+        """1 + Gᵀ G, ``(S, m, m)``."""
+        eye = torch.eye(self.by_starts.shape[-1], dtype=torch.float64)
+        return self.by_starts.mT @ self.by_starts + eye
+
+    def weights(self) -> Tensor:
+        """Returns C⁻¹ J, ``(S, N, d)``, with the initial states integrated out.
+
+        J is the derivative by the parameters and C = 1 + G Gᵀ the covariance of the residuals,
+        with the derivative G by the offsets, which are standard normal. Zero in segments where C
+        cannot be inverted, which say nothing about the parameters.
+        """
+        taken_back, is_solved = self._solved()
+        weights = self.by_parameters - self.by_starts @ taken_back
+        return torch.where(is_solved[:, None, None], weights, 0.0)
+
+    def taken_back(self) -> Tensor:
+        """Returns how much of each parameter's change the offsets take back, ``(S, m, d)``.
+
+        Zero in segments where that cannot be computed; see :attr:`is_regular`.
+        """
+        return self._solved()[0]
+
+    def _solved(self) -> tuple[Tensor, Tensor]:
+        """Returns what the offsets take back, and in which segments it was found, ``(S,)``."""
+        inner = self._inner
+        taken_back, is_solved = solve_or_zero(inner, self.by_starts.mT @ self.by_parameters)
+        is_solved &= is_invertible(inner)
+        return torch.where(is_solved[:, None, None], taken_back, 0.0), is_solved
+
+    def information(self) -> Tensor:
+        """Returns the Fisher information Jᵀ C⁻¹ J of the parameters, ``(d, d)``."""
+        return (self.by_parameters.mT @ self.weights()).sum(0)
+
+
+class SegmentModel:
+    """A model with one black-box site, simulated along a recording from shifted initial states.
+
+    Args:
+        model: The Pyro model.
+        rollouts: The recording.
+        options: Segments, initial states and precision; where initial states are ``"uncertain"``
+            they can be shifted, otherwise m is zero.
+        starts: What the segments start from, if better known than by the smoother.
+
+    Attributes:
+        prior: The model's prior.
+        inputs: The segments.
+        sensor_names: The channels that the simulator reports.
+        measured: The C of them that were measured, as the simulator declares them.
+        channel_names: Their names.
+        observed: What was measured, ``(S, K, C)``.
+        starts: What the segments start from, where that was given.
+        steps_per_average: Steps whose whitened readings are averaged; see :meth:`averaged`.
+    """
+
+    steps_per_average = 1
+
+    def __init__(
+        self,
+        model: Callable[..., Any],
+        rollouts: Rollouts,
+        options: DataOptions,
+        starts: Starts | None = None,
+    ) -> None:
+        self.inputs = options.inputs(rollouts)
+        self.prior = Prior(with_noise(model, None), (self.inputs,))
+        boxes = self.prior.black_boxes
+        if len(boxes) != 1:
+            raise DataError(f"The model has {len(boxes)} black-box sites; expected one.")
+        self._site, box = next(iter(boxes.items()))
+        if not isinstance(box, SimulatorBlackBox):
+            raise DataError(f"Site {self._site!r} is a plain function and has no trajectory.")
+        self.sensor_names = names = tuple(sensor.name for sensor in box.simulator.sensors)
+        self.measured = tuple(s for s in box.simulator.sensors if s.name in rollouts.channel_names)
+        self.channel_names = tuple(sensor.name for sensor in self.measured)
+        if not self.measured:
+            raise DataError(
+                f"None of the recording's columns {', '.join(rollouts.channel_names)} is a sensor "
+                f"of the model, {', '.join(names)}; rename them."
+            )
+        self._columns = [names.index(name) for name in self.channel_names]
+        self.observed = rollouts.observation(self.inputs, channels=self.channel_names)
+        self._smoothed = _with_lagging_rates(self.inputs, rollouts, box.simulator.rate_lag)
+        self._start_from(starts)
+
+    def estimated_starts(self, z: Tensor, scale: Tensor, rollouts: Rollouts) -> Starts | None:
+        """Estimates what the segments start from along a fitted motion, and how well.
+
+        Args:
+            z: Parameters, ``(d,)``.
+            scale: Standard deviation of each channel's residuals, ``(C,)``.
+            rollouts: The recording.
+
+        Returns:
+            ``None`` if what the segments start from is certain, or where simulations from what was
+            estimated fail.
+        """
+        starts = estimate_starts(self.black_box(z[None]), self._smoothed, rollouts)
+        if starts is None:
+            return None
+        segments = copy.copy(self)
+        segments._start_from(starts)
+        unmoved = torch.zeros(self.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
+        now = segments.linearise(z, unmoved, scale, is_rough=True)
+        if not now.is_finite:
+            return None
+        return starts.scaled(segments.inputs, error_factors(now.residual, now.by_starts))
+
+    def along(self, index: Tensor) -> "SegmentModel":
+        """Returns the model along some of the segments.
+
+        Args:
+            index: Their indices.
+        """
+        part = copy.copy(self)
+        part.__dict__.pop("least_scale", None)
+        part.observed = self.observed[index]
+        part._smoothed = self._smoothed.segments(index)
+        part._start_from(None if self.starts is None else self.starts.segments(index))
+        return part
+
+    def averaged(self, most: int, fewest: int) -> "SegmentModel":
+        """Returns the model with fewer whitened readings, where a recording has very many.
+
+        Each average of w steps is multiplied by √w. White noise then keeps unit variance, and slow
+        changes stay as detectable as before; what is faster than the average is lost.
+
+        Args:
+            most: Readings that are few enough; more are left where segments are short.
+            fewest: Averages that a segment keeps at least; those of less than twice as many steps
+                stay as they are.
+        """
+        readings = int(self.inputs.mask.sum()) * len(self.measured)
+        part = copy.copy(self)
+        part.steps_per_average = min(-(-readings // most), self.inputs.num_steps // fewest)
+        return part if part.steps_per_average > 1 else self
+
+    def _start_from(self, starts: Starts | None) -> None:
+        self.starts = starts
+        self.inputs = self._smoothed if starts is None else starts.put_into(self._smoothed)
+        self._offsets = uncertain_components(self.inputs)
+
+    @cached_property
+    def least_scale(self) -> Tensor:
+        """Least scale of each channel's residuals, in its unit, ``(C,)``."""
+        largest = (self.observed * self.inputs.mask[..., None]).abs().amax((0, 1)).double()
+        return (LEAST_SCALE * largest).clamp_min(SMALLEST)
+
+    @property
+    def num_offsets(self) -> int:
+        """Number m of components of an initial state that are uncertain."""
+        return len(self._offsets)
+
+    def simulate(self, z: Tensor, offsets: Tensor) -> Tensor:
+        """Returns readings after each step, ``(n, S, K, C)``.
+
+        Args:
+            z: Parameters, ``(n, d)``.
+            offsets: Offsets of the initial states, ``(n, S, m)``.
+        """
+        box = self.black_box(z)
+        return self.run(box.simulator, box.parameters, offsets)
+
+    @property
+    def simulator(self) -> Simulator:
+        """The model's simulator, effects included."""
+        box = self.prior.black_boxes[self._site]
+        assert isinstance(box, SimulatorBlackBox)
+        return box.simulator
+
+    @property
+    def dented_coordinates(self) -> Tensor:
+        """Which coordinates the misfit has dents along, a mask ``(d,)``; see ``has_hits``."""
+        dented = torch.zeros(self.prior.num_parameters, dtype=torch.bool)
+        names = {
+            name
+            for effect in self.simulator.effects
+            if effect.has_hits
+            for name in effect.parameter_names
+        }
+        for site in self.prior.sites:
+            if site.name in names:
+                dented[site.coordinates] = True
+        return dented
+
+    def place_of(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns reference coordinates from which a fit may begin, ``(d,)``.
+
+        Args:
+            parameters: Parameters by latent site; the others are in the middle of their priors.
+        """
+        z = torch.zeros(self.prior.num_parameters, dtype=torch.float64)
+        if not parameters:
+            return z
+        middle = self.prior.to_parameters(z[None])
+        known = {name: torch.as_tensor(value)[None] for name, value in parameters.items()}
+        z = self.prior.to_reference({name: known.get(name, v) for name, v in middle.items()})
+        return z[0].nan_to_num(0.0).clamp(-START_LIMIT, START_LIMIT)
+
+    def black_box(self, z: Tensor) -> SimulatorBlackBox:
+        """Returns the black-box site as the model makes it at n points, ``(n, d)``."""
+        box = self.prior.black_boxes_at(z)[self._site]
+        assert isinstance(box, SimulatorBlackBox)
+        return box
+
+    def run(
+        self, simulator: Simulator, parameters: Mapping[str, Tensor], offsets: Tensor
+    ) -> Tensor:
+        """Returns readings of a simulator along the recording, ``(n, S, K, C)``.
+
+        Args:
+            simulator: The model's own, or one with further effects.
+            parameters: Parameters by name, ``(n,)`` each, or fewer that broadcast to n.
+            offsets: Offsets of the initial states, ``(n, S, m)``.
+        """
+        simulated = simulator.simulate(parameters, self._shifted(offsets))[..., self._columns]
+        num = torch.broadcast_shapes(simulated.shape[:-3], offsets.shape[:1])
+        return simulated.expand(*num, *self.observed.shape)
+
+    def residuals(self, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
+        """Returns whitened residuals, ``(n, S, N)`` float64, zero where nothing was measured.
+
+        N is K · C, or ⌈K / w⌉ · C where w steps are averaged.
+
+        Args:
+            z: Parameters, ``(n, d)``.
+            offsets: Offsets of the initial states, ``(n, S, m)``.
+            scale: Standard deviation of each channel's residuals, ``(C,)``.
+        """
+        return self.whitened(self.observed - self.simulate(z, offsets), scale)
+
+    def whitened(self, difference: Tensor, scale: Tensor) -> Tensor:
+        """Returns a difference of readings ``(…, S, K, C)`` in scales, as :meth:`residuals`."""
+        # One product: of a long recording every copy takes a hundred megabytes.
+        whitened = difference.double() * (self.inputs.mask[..., None] / scale)
+        width = self.steps_per_average
+        if width > 1:
+            missing = -self.inputs.num_steps % width
+            steps = pad(whitened, (0, 0, 0, missing)).unflatten(-2, (-1, width))
+            counts = pad(self.inputs.mask.double(), (0, missing)).unflatten(-1, (-1, width))
+            whitened = steps.sum(-2) / counts.sum(-1).clamp_min(1.0).sqrt()[..., None]
+        return whitened.flatten(-2)
+
+    def root_mean_square(self, difference: Tensor) -> Tensor:
+        """Returns the size of a difference of readings ``(S, K, C)`` per channel, ``(C,)``."""
+        square = difference.double().square() * self.inputs.mask[..., None]
+        return (square.sum((0, 1)) / self.inputs.mask.sum()).sqrt()
+
+    def scale_of(self, z: Tensor, offsets: Tensor) -> Tensor:
+        """Returns the root-mean-square residual per channel, ``(C,)``, at ``(d,)``, ``(S, m)``."""
+        residual = self.observed - self.simulate(z[None], offsets[None])[0]
+        return self.root_mean_square(residual).maximum(self.least_scale)
+
+    def linearise(
+        self, z: Tensor, offsets: Tensor, scale: Tensor, *, is_rough: bool = False
+    ) -> Linearisation:
+        """Returns residuals and derivatives at one point.
+
+        Args:
+            z: Parameters, ``(d,)``.
+            offsets: Offsets of the initial states, ``(S, m)``.
+            scale: Standard deviation of each channel's residuals, ``(C,)``.
+            is_rough: Whether one-sided differences will do, at half the price.
+        """
+        d, m = len(z), self.num_offsets
+        shifts = PARAMETER_STEP * torch.eye(d, dtype=torch.float64)
+        moves = START_STEP * torch.eye(m, dtype=torch.float64)[:, None]
+        signs = (1.0,) if is_rough else (1.0, -1.0)
+        num = len(signs)
+        points = torch.cat([sign * shifts for sign in signs])
+        starts = torch.cat([sign * moves for sign in signs]).reshape(num * m, 1, m)
+        residual = self.residuals(
+            z + torch.cat((points, torch.zeros(num * m + 1, d, dtype=torch.float64))),
+            offsets + torch.cat((torch.zeros(num * d, 1, m), starts, torch.zeros(1, 1, m))),
+            scale,
+        )
+        by_z, by_start, here = residual.split((num * d, num * m, 1))
+        if is_rough:
+            down, right = here.expand_as(by_z), here.expand_as(by_start)
+            up, left = by_z, by_start
+        else:
+            up, down, left, right = by_z[:d], by_z[d:], by_start[:m], by_start[m:]
+        return Linearisation(
+            here[0],
+            ((down - up) / (num * PARAMETER_STEP)).permute(1, 2, 0),
+            ((right - left) / (num * START_STEP)).permute(1, 2, 0),
+        )
+
+    def _shifted(self, offsets: Tensor) -> Inputs:
+        """Returns the inputs with their initial states shifted, a batch of n."""
+        changed = {
+            "initial_values": self.inputs.initial_values,
+            "initial_rates": self.inputs.initial_rates,
+        }
+        for k, (name, column, error) in enumerate(self._offsets):
+            value = changed[name]
+            assert value is not None
+            shift = torch.zeros_like(value)
+            shift[..., column] = 1.0
+            changed[name] = value + shift * (offsets[..., k] * error).to(value)[..., None]
+        return replace(self.inputs, **changed, initial_value_errors=None, initial_rate_errors=None)
+
+
+def _with_lagging_rates(inputs: Inputs, rollouts: Rollouts, lag: float) -> Inputs:
+    """Returns inputs whose initial rates may be off by as much as they change during a lag.
+
+    Rates are estimated as derivatives; a simulator may have its own between the steps.
+
+    Args:
+        inputs: The segments.
+        rollouts: What they were made of.
+        lag: Part of a time step.
+    """
+    if lag == 0.0 or inputs.initial_rate_errors is None:
+        return inputs
+    errors = inputs.initial_rate_errors
+    return replace(
+        inputs, initial_rate_errors=errors.hypot(errors.new_tensor(lag * rollouts.rate_changes))
+    )

@@ -1,0 +1,357 @@
+"""Parquet, NPZ, NetCDF and xarray: exact, with units, and without pickles."""
+
+import json
+import zipfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.rollouts import rollout_checks
+from npdr_ppl.rollouts.collection import stacked
+from npdr_ppl.rollouts.io.atomic_files import replacing
+from npdr_ppl.rollouts.io.csv_files import read_csv
+from npdr_ppl.rollouts.io.tables import from_table, to_table
+from npdr_ppl.rollouts.recording import Recording
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = [
+    "from_xarray",
+    "load",
+    "read_netcdf",
+    "read_npz",
+    "read_parquet",
+    "to_xarray",
+    "write_netcdf",
+    "write_npz",
+    "write_parquet",
+]
+
+AnyPath = str | PathLike[str]
+
+_METADATA_KEY = b"npdr_ppl"
+_NPZ_ARRAYS = {  # name of each array and its number of dimensions
+    "readings": 3,
+    "actions": 3,
+    "time": 2,
+    "lengths": 1,
+    "time_step": 0,
+    "channel_names": 1,
+    "action_names": 1,
+    "channel_units": 1,
+    "action_units": 1,
+}
+
+
+def load(path: AnyPath) -> Recording:
+    """Reads rollouts in the format that the suffix names; see :meth:`Rollouts.load`."""
+    readers = {
+        ".csv": lambda file: read_csv(file, None),
+        ".parquet": lambda file: read_parquet(file, None),
+        ".npz": read_npz,
+        ".nc": read_netcdf,
+    }
+    rollout_checks.check_file(path)
+    suffix = Path(path).suffix.lower()
+    if suffix not in readers:
+        with rollout_checks.named(path):
+            raise DataError(
+                f"the suffix {rollout_checks.shown(suffix)} is unknown; rollouts are read from "
+                f"{', '.join(readers)} files."
+            )
+    return readers[suffix](path)
+
+
+@contextmanager
+def _refusing(format_name: str) -> Iterator[None]:
+    """Turns whatever a file library raises over a malformed file into one sentence."""
+    try:
+        yield
+    except DataError:
+        raise
+    except MemoryError:
+        raise DataError(f"the {format_name} file does not fit into memory.") from None
+    # Decoders of corrupt bytes raise nearly anything; all of it means the same to the caller.
+    except Exception as error:
+        raise DataError(f"not a readable {format_name} file ({type(error).__name__}).") from None
+
+
+# -- Parquet ---------------------------------------------------------------------------------
+
+
+def write_parquet(rollouts: Recording, path: AnyPath) -> None:
+    """Writes a table; see :meth:`Rollouts.to_parquet`."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = {
+        name: pa.array(values, from_pandas=True) for name, values in to_table(rollouts).items()
+    }
+    units = dict(zip(rollouts.channel_names, rollouts.channel_units, strict=True))
+    units |= dict(zip(rollouts.action_names, rollouts.action_units, strict=True))
+    metadata = {_METADATA_KEY: json.dumps({"units": units, "time_step": rollouts.time_step})}
+    with replacing(path) as temporary:
+        pq.write_table(pa.table(columns).replace_schema_metadata(metadata), temporary)
+
+
+def read_parquet(path: AnyPath, actions: Sequence[str] | None) -> Recording:
+    """Reads a table; see :meth:`Rollouts.from_parquet`."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = rollout_checks.check_file(path)
+    with rollout_checks.named(path):
+        columns: dict[str, NDArray[np.float64]] = {}
+        with _refusing("Parquet"):
+            # One file object, not a path: a path may be taken for a data set of many files.
+            with path.open("rb") as file:
+                table = pq.ParquetFile(file).read()
+            rollout_checks.check_names(table.column_names, "column")
+            for name, column in zip(table.column_names, table.columns, strict=True):
+                kind = column.type
+                if not (pa.types.is_floating(kind) or pa.types.is_integer(kind)):
+                    raise DataError(f"{name} is of type {kind}, but numbers are needed.")
+                columns[name] = np.asarray(column.to_numpy(), dtype=np.float64)
+            metadata = json.loads((table.schema.metadata or {}).get(_METADATA_KEY, b"{}"))
+            units = {str(key): str(unit) for key, unit in metadata.get("units", {}).items()}
+            time_step = metadata.get("time_step")
+        rollouts = from_table(columns, actions, units=units)
+        return rollouts if time_step is None else _with_time_step(rollouts, time_step)
+
+
+def _with_time_step(rollouts: Recording, time_step: Any) -> Recording:
+    """Restores the exact time step, which time stamps carry only up to rounding."""
+    if not isinstance(time_step, float):
+        raise DataError("the time step in the file's metadata is not a number.")
+    return replace(rollouts, time_step=time_step)
+
+
+# -- NPZ -------------------------------------------------------------------------------------
+
+
+def write_npz(rollouts: Recording, path: AnyPath) -> None:
+    """Writes padded arrays; see :meth:`Rollouts.to_npz`."""
+    readings, actions, _ = stacked(rollouts)
+    arrays: dict[str, Any] = {
+        "readings": readings,
+        "actions": actions,
+        "time": _padded(rollouts.time, 0.0),
+        "lengths": np.array(rollouts.lengths),
+        "time_step": np.array(rollouts.time_step),
+        "channel_names": np.array(rollouts.channel_names, dtype=np.str_),
+        "action_names": np.array(rollouts.action_names, dtype=np.str_),
+        "channel_units": np.array(rollouts.channel_units, dtype=np.str_),
+        "action_units": np.array(rollouts.action_units, dtype=np.str_),
+    }
+    if rollouts.rewards is not None:
+        arrays["rewards"] = _padded(rollouts.rewards, 0.0)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def read_npz(path: AnyPath) -> Recording:
+    """Reads padded arrays; see :meth:`Rollouts.from_npz`."""
+    path = rollout_checks.check_file(path)
+    with rollout_checks.named(path):
+        with _refusing("NPZ"):
+            arrays = _npz_arrays(path)
+            lengths = arrays["lengths"].tolist()
+            for name, dimensions in _NPZ_ARRAYS.items():
+                if arrays[name].ndim != dimensions:
+                    raise DataError(
+                        f"the array {name} has {arrays[name].ndim} dimensions, but {dimensions} "
+                        "are needed."
+                    )
+            if any(not 1 <= n < arrays["readings"].shape[1] for n in lengths):
+                raise DataError("the array lengths does not fit the array readings.")
+
+            def cut(name: str, extra: int) -> list[NDArray[Any]]:
+                return [
+                    values[: n + extra] for values, n in zip(arrays[name], lengths, strict=True)
+                ]
+
+            def words(name: str) -> list[str]:
+                return [str(word) for word in arrays[name].tolist()]
+
+            parts = {name: cut(name, extra) for name, extra in (("readings", 1), ("time", 1))}
+            commands = cut("actions", 0)
+            rewards = cut("rewards", 0) if "rewards" in arrays else None
+            names = {name: words(name) for name in arrays if name.endswith(("_names", "_units"))}
+        return Recording.from_arrays(
+            parts["readings"],
+            commands,
+            channel_names=names["channel_names"],
+            action_names=names["action_names"],
+            time_step=float(arrays["time_step"]),
+            rewards=rewards,
+            time=parts["time"],
+            channel_units=names["channel_units"],
+            action_units=names["action_units"],
+        )
+
+
+def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Returns the arrays of an NPZ file after checking that none expands without bounds."""
+    with zipfile.ZipFile(path) as archive:
+        total = sum(member.file_size for member in archive.infolist())
+        if total > rollout_checks.MAX_FILE_BYTES:
+            raise DataError(
+                f"the arrays take {total / 2**30:.1f} GiB, more than the "
+                f"{rollout_checks.MAX_FILE_BYTES / 2**30:.0f} GiB that are read."
+            )
+        present = {member.filename.removesuffix(".npy") for member in archive.infolist()}
+        missing = [name for name in _NPZ_ARRAYS if name not in present]
+        if missing:
+            raise DataError(f"there is no array {missing[0]}, which to_npz would have written.")
+        wanted = [name for name in (*_NPZ_ARRAYS, "rewards") if name in present]
+        arrays = {}
+        for name in wanted:
+            size = archive.getinfo(f"{name}.npy").file_size
+            with archive.open(f"{name}.npy") as file:
+                # The header states the size that the reader would allocate before reading on.
+                version = np.lib.format.read_magic(file)
+                reader = {
+                    (1, 0): np.lib.format.read_array_header_1_0,
+                    (2, 0): np.lib.format.read_array_header_2_0,
+                }[version]
+                shape, _, dtype = reader(file)
+                if dtype.hasobject or dtype.kind not in "fiuU":
+                    raise DataError(f"the array {name} is of type {dtype}.")
+                needed = int(np.prod([float(n) for n in shape])) * dtype.itemsize
+                if needed > size:
+                    raise DataError(f"the array {name} is shorter than its header says.")
+            with archive.open(f"{name}.npy") as file:
+                arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
+        return arrays
+
+
+# -- xarray and NetCDF -----------------------------------------------------------------------
+
+
+def to_xarray(rollouts: Recording) -> "xr.Dataset":
+    """Returns a data set; see :meth:`Rollouts.to_xarray`."""
+    import xarray as xr
+
+    dimensions = ("rollout", "step")
+    readings = _padded(rollouts.readings, np.nan)
+    longest = max(rollouts.lengths)
+    actions = np.full((len(rollouts), longest + 1, len(rollouts.action_names)), np.nan)
+    for index, values in enumerate(rollouts.actions):
+        actions[index, : len(values)] = values
+    variables: dict[str, Any] = {
+        "num_steps": ("rollout", np.array(rollouts.lengths), {"kind": "length"})
+    }
+    for kind, names, units, values in (
+        ("channel", rollouts.channel_names, rollouts.channel_units, readings),
+        ("action", rollouts.action_names, rollouts.action_units, actions),
+    ):
+        for index, name in enumerate(names):
+            attributes = {"kind": kind, "units": units[index], "position": index}
+            variables[name] = (dimensions, values[:, :, index], attributes)
+    if rollouts.rewards is not None:
+        rewards = np.full((len(rollouts), longest + 1), np.nan)
+        for index, values in enumerate(rollouts.rewards):
+            rewards[index, : len(values)] = values
+        variables["reward"] = (dimensions, rewards, {"kind": "reward"})
+    return xr.Dataset(
+        variables,
+        coords={
+            "rollout": np.arange(len(rollouts)),
+            "time": (dimensions, _padded(rollouts.time, np.nan), {"units": "s"}),
+        },
+        attrs={"time_step": rollouts.time_step},
+    )
+
+
+def from_xarray(dataset: "xr.Dataset") -> Recording:
+    """Converts a data set; see :meth:`Rollouts.from_xarray`."""
+    for name in ("num_steps", "time"):
+        if name not in dataset.variables:
+            raise DataError(f"the data set has no variable {name}.")
+    lengths = np.asarray(dataset["num_steps"].values).astype(int).ravel().tolist()
+    columns: dict[str, list[tuple[int, str]]] = {"channel": [], "action": [], "reward": []}
+    arrays: dict[str, NDArray[np.float64]] = {}
+    for name, variable in dataset.variables.items():
+        name = str(name)
+        kind = str(variable.attrs.get("kind", ""))
+        if kind not in columns and name != "time":
+            continue
+        if variable.dims != ("rollout", "step"):
+            raise DataError(f"{name} has the dimensions {variable.dims}, not (rollout, step).")
+        if variable.dtype.kind not in "fiu":
+            raise DataError(f"{name} is of type {variable.dtype}, but numbers are needed.")
+        arrays[name] = np.asarray(variable.values, dtype=np.float64)
+        if kind in columns:
+            columns[kind].append((int(variable.attrs.get("position", 0)), name))
+    size = dataset.sizes.get("step", 0)
+    if len(lengths) != dataset.sizes.get("rollout") or any(not 1 <= n < size for n in lengths):
+        raise DataError("num_steps does not fit the dimensions rollout and step.")
+    names = {kind: [name for _, name in sorted(entries)] for kind, entries in columns.items()}
+
+    def matrices(kind: str, extra: int) -> list[NDArray[np.float64]]:
+        stacked = (
+            np.stack([arrays[name] for name in names[kind]], axis=-1)
+            if names[kind]
+            else (np.zeros((len(lengths), size, 0)))
+        )
+        return [values[: n + extra] for values, n in zip(stacked, lengths, strict=True)]
+
+    units = {name: str(dataset[name].attrs.get("units", "")) for name in arrays}
+    rewards = [values[:, 0] for values in matrices("reward", 0)] if names["reward"] else None
+    time_step = dataset.attrs.get("time_step")
+    return Recording.from_arrays(
+        matrices("channel", 1),
+        matrices("action", 0),
+        channel_names=names["channel"],
+        action_names=names["action"],
+        time_step=None if time_step is None else float(time_step),
+        rewards=rewards,
+        time=[values[: n + 1] for values, n in zip(arrays["time"], lengths, strict=True)],
+        channel_units=[units[name] for name in names["channel"]],
+        action_units=[units[name] for name in names["action"]],
+    )
+
+
+def write_netcdf(rollouts: Recording, path: AnyPath) -> None:
+    """Writes a NetCDF4 file; see :meth:`Rollouts.to_netcdf`."""
+    dataset = to_xarray(rollouts)
+    compressed = {str(name): {"zlib": True} for name in dataset.data_vars if name != "num_steps"}
+    with replacing(path) as temporary:
+        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=compressed)
+
+
+def read_netcdf(path: AnyPath) -> Recording:
+    """Reads a NetCDF4 file; see :meth:`Rollouts.from_netcdf`."""
+    import h5py
+    import xarray as xr
+
+    path = rollout_checks.check_file(path)
+    with rollout_checks.named(path), _refusing("NetCDF"):
+        # h5netcdf begins like this, and where it fails leaves an object that complains at its end.
+        with h5py.File(path, "r") as file:
+            dict(file.attrs)
+        # Seconds since nothing in particular: no calendar is to be applied.
+        with xr.open_dataset(
+            path, engine="h5netcdf", decode_times=False, decode_timedelta=False
+        ) as dataset:
+            if dataset.nbytes > rollout_checks.MAX_FILE_BYTES:
+                raise DataError("the variables are too large to be read.")
+            loaded = dataset.load()
+        return from_xarray(loaded)
+
+
+def _padded(arrays: Sequence[NDArray[np.float64]], padding: float) -> NDArray[np.float64]:
+    """Stacks arrays of different lengths, ``(R, longest, …)``."""
+    shape = (len(arrays), max(len(values) for values in arrays), *arrays[0].shape[1:])
+    result = np.full(shape, padding)
+    for index, values in enumerate(arrays):
+        result[index, : len(values)] = values
+    return result

@@ -1,0 +1,382 @@
+"""Reads pickles of arrays and plain records without running anything they contain.
+
+A pickle is a program for a stack machine that may call any function. The machine below knows the
+instructions that build numbers, text, containers, arrays and records, and calls nothing: a class
+is a name, an instance is a :class:`Record`, and the few functions that pickled arrays need are
+recognised by name and computed here. Everything else is refused.
+"""
+
+import io
+import math
+import pickletools
+import struct
+import warnings
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.rollouts.rollout_checks import shown
+
+__all__ = ["Record", "read_pickle"]
+
+_JOBLIB_ARRAY = "joblib.numpy_pickle NumpyArrayWrapper"
+_NDARRAY = "numpy ndarray"
+_DTYPE = "numpy dtype"
+_FUNCTIONS = frozenset(
+    {
+        _DTYPE,
+        "__builtin__ bytes",
+        "_codecs encode",
+        "builtins bytes",
+        "collections OrderedDict",
+        "numpy.core.multiarray _reconstruct",
+        "numpy.core.multiarray scalar",
+        "numpy._core.multiarray _reconstruct",
+        "numpy._core.multiarray scalar",
+    }
+)
+_DTYPES = frozenset(("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"))
+_LABEL_DTYPES = frozenset(("O", "O8"))  # accepted for arrays of text only
+_MAX_DIMENSIONS = 8
+_MAX_INSTRUCTIONS = 5_000_000
+
+
+@dataclass
+class Record:
+    """An instance of some class, reduced to its name and its fields; it has no behaviour.
+
+    Attributes:
+        kind: Module and name of the class, separated by a space.
+        arguments: What its constructor would have been given, e.g. a named tuple's entries.
+        fields: The instance's attributes.
+    """
+
+    kind: str
+    arguments: tuple[Any, ...] = ()
+    fields: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Global:
+    """A module and a name, separated by a space, as in a pickle; never looked up."""
+
+    name: str
+
+
+@dataclass
+class _PickledArray:
+    """An array whose shape, type and bytes follow in a BUILD instruction.
+
+    Attributes:
+        is_joblib: Whether the bytes follow behind the instruction instead, as joblib puts them.
+        values: The array once it is built.
+    """
+
+    is_joblib: bool = False
+    values: NDArray[Any] | None = None
+
+
+@dataclass
+class _PickledDtype:
+    code: str
+    byte_order: str = "="
+
+
+class _Mark:
+    """The marker that ends a run of stack entries."""
+
+
+def read_pickle(data: bytes, records: Collection[str]) -> Any:
+    """Returns the object that a pickle describes, built of inert parts only.
+
+    Arrays may be pickled by NumPy or written by joblib, with or without its alignment padding.
+
+    Args:
+        data: The pickle.
+        records: Classes that may occur, as ``"module name"``; they come back as :class:`Record`.
+
+    Raises:
+        DataError: The pickle is damaged or asks for anything else than data.
+    """
+    try:
+        with warnings.catch_warnings():
+            # How the standard library answers a damaged escape sequence in an old string.
+            warnings.simplefilter("error", DeprecationWarning)
+            return _Machine(io.BytesIO(data), len(data), frozenset(records)).run()
+    except DataError:
+        raise
+    # A malformed program ends in whatever its operands provoke; all of it means "damaged".
+    except (
+        AttributeError,
+        DeprecationWarning,
+        EOFError,
+        IndexError,
+        KeyError,
+        OverflowError,
+        RecursionError,
+        struct.error,
+        TypeError,
+        UnicodeError,
+        ValueError,
+    ) as error:
+        raise DataError(f"the pickle is damaged or incomplete ({type(error).__name__}).") from None
+
+
+class _Machine:
+    """One run of the stack machine.
+
+    Attributes:
+        file: The pickle, read as far as the present instruction.
+        size: Bytes of the whole file.
+        records: Classes that may occur.
+        is_nested: Whether this pickle lies inside another one.
+        stack: Operands.
+        memo: Objects that later instructions refer to by number.
+    """
+
+    def __init__(
+        self, file: io.BytesIO, size: int, records: frozenset[str], *, is_nested: bool = False
+    ) -> None:
+        self.file = file
+        self.size = size
+        self.records = records
+        self.is_nested = is_nested
+        self.stack: list[Any] = []
+        self.memo: dict[int, Any] = {}
+
+    def run(self) -> Any:
+        constants = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
+        containers: dict[str, Callable[[], Any]] = {
+            "EMPTY_DICT": dict,
+            "EMPTY_LIST": list,
+            "EMPTY_TUPLE": tuple,
+            "MARK": _Mark,
+        }
+        # genops decodes one instruction at a time and leaves the file right behind it, which is
+        # where joblib puts the raw bytes of an array.
+        for count, (opcode, operand, _) in enumerate(pickletools.genops(self.file)):
+            argument: Any = operand
+            if count > _MAX_INSTRUCTIONS:
+                raise DataError("the pickle has too many instructions for a rollout.")
+            name = opcode.name
+            if name in ("PROTO", "FRAME"):
+                continue
+            if name == "STOP":
+                return _plain(self.stack.pop())
+            if name in constants:
+                self.stack.append(constants[name])
+            elif name in containers:
+                self.stack.append(containers[name]())
+            elif name in _LITERALS:
+                self.stack.append(argument)
+            elif name in ("BINPUT", "LONG_BINPUT"):
+                self.memo[argument] = self.stack[-1]
+            elif name == "MEMOIZE":
+                self.memo[len(self.memo)] = self.stack[-1]
+            elif name in ("BINGET", "LONG_BINGET"):
+                self.stack.append(self.memo[argument])
+            elif name in _STEPS:
+                _STEPS[name](self)
+            elif name == "GLOBAL":
+                self.stack.append(self.named(argument))
+            else:
+                raise DataError(f"the pickle uses the instruction {name}, which data do not need.")
+        raise EOFError
+
+    def named(self, name: str) -> _Global:
+        """Returns a stand-in for a module's member, if it is one that data need."""
+        if name in _FUNCTIONS or name in self.records or name in (_JOBLIB_ARRAY, _NDARRAY):
+            return _Global(name)
+        raise DataError(
+            f"the pickle refers to {shown(name.replace(' ', '.'))}, which is no array and no "
+            "known record; nothing of it was run."
+        )
+
+    def pop_mark(self) -> list[Any]:
+        """Removes and returns the entries above the topmost marker."""
+        entries: list[Any] = []
+        while not isinstance(entry := self.stack.pop(), _Mark):
+            entries.append(entry)
+        return entries[::-1]
+
+    def tuple_of(self, count: int | None) -> None:
+        if count is None:
+            entries = self.pop_mark()
+        else:
+            entries = [self.stack.pop() for _ in range(count)][::-1]
+        self.stack.append(tuple(_plain(entry) for entry in entries))
+
+    def append(self, entries: list[Any]) -> None:
+        if not isinstance(self.stack[-1], list):
+            raise TypeError
+        self.stack[-1].extend(_plain(entry) for entry in entries)
+
+    def set_items(self, entries: list[Any]) -> None:
+        target = self.stack[-1]
+        if not isinstance(target, dict) or len(entries) % 2:
+            raise TypeError
+        for key, value in zip(entries[::2], entries[1::2], strict=True):
+            # Nested tuples as keys would take exponential time to hash.
+            if not isinstance(key, str | int | float | bool | None):
+                raise DataError(f"the pickle has a dictionary key of type {type(key).__name__}.")
+            target[key] = _plain(value)
+
+    def stack_global(self) -> None:
+        name, module = self.stack.pop(), self.stack.pop()
+        if not isinstance(name, str) or not isinstance(module, str):
+            raise TypeError
+        self.stack.append(self.named(f"{module} {name}"))
+
+    def new_object(self) -> None:
+        arguments, cls = self.stack.pop(), self.stack.pop()
+        if not isinstance(cls, _Global) or cls.name in _FUNCTIONS or cls.name == _NDARRAY:
+            raise TypeError
+        if not isinstance(arguments, tuple):
+            raise TypeError
+        if cls.name == _JOBLIB_ARRAY:
+            self.stack.append(_PickledArray(is_joblib=True))
+        else:
+            self.stack.append(Record(cls.name, arguments))
+
+    def reduce(self) -> None:
+        arguments, function = self.stack.pop(), self.stack.pop()
+        name = function.name if isinstance(function, _Global) else ""
+        if name not in _FUNCTIONS or not isinstance(arguments, tuple):
+            raise DataError(
+                f"the pickle calls {shown(name.replace(' ', '.') or type(function).__name__)}; "
+                "nothing of it was run."
+            )
+        member = name.split()[1]
+        if member == "dtype":
+            code = arguments[0]
+            if not isinstance(code, str) or code not in _DTYPES | _LABEL_DTYPES:
+                raise DataError(f"the pickle has an array of type {shown(code)}, not of numbers.")
+            self.stack.append(_PickledDtype(code))
+        elif member == "_reconstruct":
+            if not isinstance(arguments[0], _Global) or arguments[0].name != _NDARRAY:
+                raise TypeError
+            self.stack.append(_PickledArray())
+        elif member == "scalar":
+            dtype, content = arguments
+            self.stack.append(_array(content, (), dtype, "C")[()])
+        elif member == "encode":
+            text, encoding = arguments
+            if encoding not in ("latin1", "latin-1"):
+                raise DataError("the pickle encodes text in an unexpected way.")
+            self.stack.append(text.encode("latin-1"))
+        elif arguments == ():
+            self.stack.append(b"" if member == "bytes" else {})
+        else:
+            raise DataError(f"the pickle makes a {member} of arguments.")
+
+    def build(self) -> None:
+        """Gives the topmost object its state; an array of joblib's then follows in the file."""
+        state, target = self.stack.pop(), self.stack[-1]
+        if isinstance(target, _PickledDtype):
+            if (
+                state[1] not in ("<", ">", "|", "=")
+                or state[2] is not None
+                or state[3] is not None
+            ):
+                raise DataError("the pickle has an array that is not of plain numbers.")
+            target.byte_order = state[1]
+        elif isinstance(target, _PickledArray) and target.is_joblib:
+            target.values = self.read_joblib_array(state)
+        elif isinstance(target, _PickledArray):
+            _, shape, dtype, is_fortran, content = state
+            target.values = _array(content, shape, dtype, "F" if is_fortran else "C")
+        elif isinstance(target, Record):
+            if not isinstance(state, dict) or not all(isinstance(key, str) for key in state):
+                raise TypeError
+            target.fields.update(state)
+        else:
+            raise DataError(f"the pickle sets the state of a {type(target).__name__}.")
+
+    def read_joblib_array(self, fields: dict[str, Any]) -> NDArray[Any]:
+        subclass = fields["subclass"]
+        if not isinstance(subclass, _Global) or subclass.name != _NDARRAY:
+            raise TypeError
+        shape, dtype = fields["shape"], fields["dtype"]
+        if isinstance(dtype, _PickledDtype) and dtype.code in _LABEL_DTYPES:
+            # joblib puts a whole pickle of such an array here; it gets no more rights than this
+            # one, and may not nest further.
+            if self.is_nested:
+                raise TypeError
+            return _Machine(self.file, self.size, self.records, is_nested=True).run()
+        if fields.get("numpy_array_alignment_bytes") is not None:
+            self.file.seek(self.file.read(1)[0], io.SEEK_CUR)
+        num_bytes = _num_bytes(shape, dtype)
+        content = self.file.read(num_bytes) if num_bytes <= self.size else b""
+        return _array(content, shape, dtype, fields["order"])
+
+
+_LITERALS = frozenset(
+    {
+        "BINBYTES",
+        "BINBYTES8",
+        "BINFLOAT",
+        "BININT",
+        "BININT1",
+        "BININT2",
+        "BINUNICODE",
+        "BINUNICODE8",
+        "LONG1",
+        "LONG4",
+        "SHORT_BINBYTES",
+        "SHORT_BINUNICODE",
+    }
+)
+
+_STEPS: dict[str, Callable[[_Machine], None]] = {
+    "APPEND": lambda machine: machine.append([machine.stack.pop()]),
+    "APPENDS": lambda machine: machine.append(machine.pop_mark()),
+    "BUILD": _Machine.build,
+    "NEWOBJ": _Machine.new_object,
+    "REDUCE": _Machine.reduce,
+    "SETITEM": lambda machine: machine.set_items([machine.stack.pop(), machine.stack.pop()][::-1]),
+    "SETITEMS": lambda machine: machine.set_items(machine.pop_mark()),
+    "STACK_GLOBAL": _Machine.stack_global,
+    "TUPLE": lambda machine: machine.tuple_of(None),
+    "TUPLE1": lambda machine: machine.tuple_of(1),
+    "TUPLE2": lambda machine: machine.tuple_of(2),
+    "TUPLE3": lambda machine: machine.tuple_of(3),
+}
+
+
+def _plain(value: Any) -> Any:
+    """Returns the array behind a finished array's stand-in, anything else as it is."""
+    if isinstance(value, _Mark) or (isinstance(value, _PickledArray) and value.values is None):
+        raise TypeError
+    return value.values if isinstance(value, _PickledArray) else value
+
+
+def _num_bytes(shape: Any, dtype: Any) -> int:
+    if not isinstance(dtype, _PickledDtype) or not isinstance(shape, tuple):
+        raise TypeError
+    if len(shape) > _MAX_DIMENSIONS or not all(type(n) is int and n >= 0 for n in shape):
+        raise DataError(f"the pickle has an array of the impossible shape {shown(shape)}.")
+    return math.prod(shape) * np.dtype(dtype.code).itemsize
+
+
+def _array(content: Any, shape: Any, dtype: Any, order: Any) -> NDArray[Any]:
+    """Returns an array made of bytes, or of labels, that are already in memory."""
+    if isinstance(dtype, _PickledDtype) and dtype.code in _LABEL_DTYPES:
+        is_text = isinstance(content, list) and all(isinstance(entry, str) for entry in content)
+        if not is_text or shape != (len(content),):
+            raise DataError("the pickle has an array of objects that are not text.")
+        return np.array(content, dtype=np.str_)
+    num_bytes = _num_bytes(shape, dtype)
+    if not isinstance(content, bytes) or order not in ("C", "F"):
+        raise TypeError
+    if len(content) != num_bytes:
+        raise DataError(
+            f"the pickle has an array of shape {shown(shape)} with {len(content)} bytes, but it "
+            f"needs {shown(num_bytes)}."
+        )
+    return np.frombuffer(content, dtype=f"{dtype.byte_order}{dtype.code}").reshape(
+        shape, order=order
+    )

@@ -1,0 +1,103 @@
+"""Imports rollouts recorded with SimuRLacra, without running their pickles."""
+
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from typing import Any, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.rollouts import rollout_checks
+from npdr_ppl.rollouts.container import Rollouts
+from npdr_ppl.rollouts.io.inert_pickle import Record, read_pickle
+
+__all__ = ["load_simurlacra"]
+
+_ROLLOUT = "pyrado.sampling.step_sequence StepSequence"
+_SPECIFICATION = "pyrado.utils.data_types EnvSpec"
+_BOX = "pyrado.spaces.box BoxSpace"
+
+
+def load_simurlacra(path: str | PathLike[str], names: Mapping[str, str] | None = None) -> Rollouts:
+    """Reads a rollout, or a list of rollouts, that SimuRLacra saved.
+
+    The pickle is read by a machine that builds arrays and inert records and calls nothing, so a
+    file from an untrusted source does no harm. States become channels (observations, where no
+    states were saved), the applied actions become actions (the commanded ones, where no applied
+    ones were saved).
+
+    Args:
+        path: A ``.pkl`` file.
+        names: New names for the file's own ones, e.g. ``{"theta": "arm_angle"}``.
+
+    Raises:
+        DataError: The file is damaged, holds something else, or asks for code to be run.
+
+    References:
+        F. Muratore, SimuRLacra, https://github.com/famura/SimuRLacra (class ``StepSequence``).
+    """
+    path = rollout_checks.check_file(path)
+    with rollout_checks.named(path):
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise DataError(f"cannot be read ({error.strerror}).") from None
+        content = read_pickle(data, (_ROLLOUT, _SPECIFICATION, _BOX))
+        episodes = content if isinstance(content, list) else [content]
+        if not episodes or not all(_is(episode, _ROLLOUT) for episode in episodes):
+            raise DataError("the pickle holds no SimuRLacra rollout.")
+        parts = [_rollout(episode.fields, names or {}) for episode in episodes]
+        return parts[0].concatenate(*parts[1:])
+
+
+def _rollout(fields: Mapping[str, Any], names: Mapping[str, str]) -> Rollouts:
+    bounds = fields.get("_rollout_bounds")
+    if isinstance(bounds, np.ndarray) and bounds.size > 2:
+        raise DataError("the rollouts are joined end to end; save them as a list instead.")
+    spaces = _spaces(fields)
+    kind = "states" if "states" in fields else "observations"
+    readings = _matrix(fields, kind)
+    actions = _matrix(fields, "actions_applied" if "actions_applied" in fields else "actions")
+    rewards = _matrix(fields, "rewards")[:, 0] if "rewards" in fields else None
+    time = _matrix(fields, "time")[:, 0]
+    channels = _labels(spaces.get(kind), readings.shape[1], kind.removesuffix("s"))
+    commands = _labels(spaces.get("actions"), actions.shape[1], "action")
+    return Rollouts.from_arrays(
+        [readings],
+        [actions],
+        channel_names=[names.get(name, name) for name in channels],
+        action_names=[names.get(name, name) for name in commands],
+        rewards=None if rewards is None else [rewards],
+        time=[time],
+    )
+
+
+def _spaces(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the declared spaces, which carry the columns' names."""
+    info = fields.get("rollout_info")
+    specification = info.get("env_spec") if isinstance(info, dict) else None
+    if not _is(specification, _SPECIFICATION):
+        return {}
+    return dict(zip(("observations", "actions", "states"), specification.arguments, strict=False))
+
+
+def _labels(space: Any, count: int, fallback: str) -> Sequence[str]:
+    labels = space.fields.get("_labels") if _is(space, _BOX) else None
+    if isinstance(labels, np.ndarray) and labels.shape == (count,) and labels.dtype.kind == "U":
+        return [str(label) for label in labels]
+    return [f"{fallback}_{index}" for index in range(count)]
+
+
+def _matrix(fields: Mapping[str, Any], name: str) -> NDArray[np.float64]:
+    """Returns a field as float64 ``(rows, columns)``."""
+    values = fields.get(name)
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
+        raise DataError(f"the rollout has no numbers called {name}.")
+    if values.ndim not in (1, 2):
+        raise DataError(f"{name} has {values.ndim} dimensions.")
+    return values.astype(np.float64).reshape(len(values), -1)
+
+
+def _is(value: Any, kind: str) -> TypeGuard[Record]:
+    return isinstance(value, Record) and value.kind == kind

@@ -1,0 +1,212 @@
+"""Recorded or simulated episodes as arrays that fit each other: what readers return."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.rollouts import rollout_checks, states
+from npdr_ppl.rollouts.arrays import Array, as_arrays, frozen
+from npdr_ppl.rollouts.states import StateEstimate
+
+__all__ = ["Recording"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Recording:
+    """R recorded or simulated episodes with the same columns and the same time step.
+
+    Episodes may differ in length: T below is the number of steps of one of them. The readings
+    need not be the whole state, e.g. a position without its velocity.
+
+    Attributes:
+        readings: What the sensors reported before each step and after the last, one
+            ``(T + 1, C)`` per rollout, in ``channel_units``.
+        actions: Commands, each held for one step, one ``(T, A)`` per rollout, in ``action_units``.
+        channel_names: Names of the C channels.
+        action_names: Names of the A actions.
+        time_step: Seconds between readings.
+        rewards: Rewards of the steps, one ``(T,)`` per rollout, or ``None``.
+        time: Time stamps in s, one ``(T + 1,)`` per rollout; ``k·time_step`` if not given.
+        channel_units: Units of the channels, ``""`` where unknown.
+        action_units: Units of the actions, ``""`` where unknown.
+
+    Raises:
+        DataError: Columns are named wrongly, shapes do not fit each other, values are not finite,
+            or the sampling is not constant.
+    """
+
+    readings: tuple[Array, ...]
+    actions: tuple[Array, ...]
+    channel_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+    time_step: float
+    rewards: tuple[Array, ...] | None = None
+    time: tuple[Array, ...] = ()
+    channel_units: tuple[str, ...] = ()
+    action_units: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Copies the arrays, makes them read-only and checks them."""
+        freeze = object.__setattr__
+        for field in ("channel_names", "action_names", "channel_units", "action_units"):
+            freeze(self, field, tuple(getattr(self, field)))
+        _check_columns(self)
+        freeze(self, "time_step", float(self.time_step))
+        if not self.time:
+            lengths = (len(values) for values in self.readings)
+            freeze(self, "time", tuple(self.time_step * np.arange(n) for n in lengths))
+        for field in ("readings", "actions", "time", "rewards"):
+            values = getattr(self, field)
+            freeze(self, field, values and tuple(frozen(v) for v in values))
+        freeze(self, "channel_units", self.channel_units or ("",) * len(self.channel_names))
+        freeze(self, "action_units", self.action_units or ("",) * len(self.action_names))
+        _check_arrays(self)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        readings: ArrayLike | Tensor | Sequence[Any],
+        actions: ArrayLike | Tensor | Sequence[Any] | None = None,
+        *,
+        channel_names: Sequence[str],
+        action_names: Sequence[str] = (),
+        time_step: float | None = None,
+        rewards: ArrayLike | Tensor | Sequence[Any] | None = None,
+        time: ArrayLike | Tensor | Sequence[Any] | None = None,
+        channel_units: Sequence[str] = (),
+        action_units: Sequence[str] = (),
+    ) -> Self:
+        """Makes a recording of arrays or tensors.
+
+        Args:
+            readings: ``(R, T + 1, C)``, or a list of ``(T + 1, C)`` of different lengths.
+            actions: ``(R, T, A)`` or a list of ``(T, A)``; ``None`` where nothing is commanded.
+            channel_names: Names of the C channels.
+            action_names: Names of the A actions.
+            time_step: Seconds between readings; may be left out where ``time`` is given.
+            rewards: ``(R, T)`` or a list of ``(T,)``.
+            time: Time stamps in s, ``(R, T + 1)`` or a list of ``(T + 1,)``.
+            channel_units: Units of the channels.
+            action_units: Units of the actions.
+
+        Raises:
+            DataError: The arrays do not fit each other or are not valid data.
+        """
+        values = as_arrays(readings, "readings")
+        times = () if time is None else as_arrays(time, "time")
+        if time_step is None:
+            if not times or min(len(t) for t in times) < 2:
+                raise DataError("give a time step or time stamps of at least two readings.")
+            time_step = rollout_checks.canonical_time_step(times)
+        if actions is None:
+            commands = tuple(np.zeros((max(len(v) - 1, 0), 0)) for v in values)
+        else:
+            commands = as_arrays(actions, "actions")
+        return cls(
+            readings=values,
+            actions=commands,
+            channel_names=tuple(channel_names),
+            action_names=tuple(action_names),
+            time_step=time_step,
+            rewards=None if rewards is None else as_arrays(rewards, "rewards"),
+            time=times,
+            channel_units=tuple(channel_units),
+            action_units=tuple(action_units),
+        )
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Number of steps T of each rollout."""
+        return tuple(len(actions) for actions in self.actions)
+
+    def __len__(self) -> int:
+        return len(self.readings)
+
+    @cached_property
+    def estimates(self) -> dict[tuple[tuple[int, int, int], ...], StateEstimate]:
+        """Estimated states at the starts of segments, by the segments, as far as they were made.
+
+        Smoothing costs as much as hundreds of simulations, and every model of a recording starts
+        from the same states.
+        """
+        return {}
+
+    @cached_property
+    def rate_changes(self) -> Array:
+        """By how much each channel's rate changes in a time step, root mean square, ``(C,)``."""
+        return states.rate_changes(self.readings, self.time_step)
+
+
+def _check_columns(recording: "Recording") -> None:
+    """Raises a DataError where names, units, or the time step are wrong."""
+    names = (*recording.channel_names, *recording.action_names)
+    rollout_checks.check_names(names, "column")
+    taken = set(rollout_checks.RESERVED_NAMES) & set(names)
+    if taken:
+        raise DataError(f"{min(taken)} is a reserved name, not a channel's or an action's.")
+    if not recording.channel_names:
+        raise DataError("the data have no channels, only actions.")
+    if not recording.readings:
+        raise DataError("the data have no rollouts.")
+    if not (math.isfinite(recording.time_step) and recording.time_step > 0):
+        raise DataError(f"the time step is {recording.time_step} s, but it must be positive.")
+    for field, units, columns in (
+        ("channel_units", recording.channel_units, recording.channel_names),
+        ("action_units", recording.action_units, recording.action_names),
+    ):
+        if len(units) not in (0, len(columns)):
+            raise DataError(f"{field} has {len(units)} entries for {len(columns)} columns.")
+
+
+def _check_arrays(recording: "Recording") -> None:
+    """Raises a DataError where shapes do not fit, values are not finite, or time is not even."""
+    per_rollout: dict[str, Sequence[Array] | None] = {
+        "actions": recording.actions,
+        "time": recording.time,
+        "rewards": recording.rewards,
+    }
+    for name, arrays in per_rollout.items():
+        if arrays is not None and len(arrays) != len(recording.readings):
+            raise DataError(
+                f"there are {len(recording.readings)} rollouts of readings, but {len(arrays)} of "
+                f"{name}."
+            )
+    for index, readings in enumerate(recording.readings):
+        where = f"rollout {index}"
+        steps = len(readings) - 1
+        if steps < 1:
+            raise DataError(
+                f"{where} has {steps + 1} row, but at least two are needed for one step."
+            )
+        actions, time = recording.actions[index], recording.time[index]
+        wanted = {
+            "readings": (readings, (steps + 1, len(recording.channel_names))),
+            "actions": (actions, (steps, len(recording.action_names))),
+            "time": (time, (steps + 1,)),
+        }
+        if recording.rewards is not None:
+            wanted["rewards"] = (recording.rewards[index], (steps,))
+        for name, (values, shape) in wanted.items():
+            if values.shape != shape:
+                raise DataError(
+                    f"{name} of {where} should have shape {shape}, got {values.shape}."
+                )
+        rollout_checks.check_finite(readings, recording.channel_names, where)
+        rollout_checks.check_finite(actions, recording.action_names, where)
+        rollout_checks.check_finite(time[:, None], ("time",), where)
+        if recording.rewards is not None:
+            rollout_checks.check_finite(recording.rewards[index][:, None], ("reward",), where)
+        rollout_checks.check_time(time, where)
+    found = rollout_checks.canonical_time_step(recording.time)
+    if abs(found - recording.time_step) > rollout_checks.MAX_RATE_DIFFERENCE * recording.time_step:
+        raise DataError(
+            f"time stamps are {found:.6g} s apart, but the time step is said to be "
+            f"{recording.time_step:.6g} s."
+        )

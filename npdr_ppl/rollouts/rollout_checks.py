@@ -1,0 +1,200 @@
+"""Checks of names, values, time stamps and files; each failure is one sentence."""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from difflib import get_close_matches
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.errors import DataError
+
+__all__ = [
+    "RESERVED_NAMES",
+    "canonical_time_step",
+    "check_file",
+    "check_finite",
+    "check_names",
+    "check_time",
+    "named",
+    "shown",
+]
+
+RESERVED_NAMES = ("rollout", "time", "reward", "step")
+"""Names with a meaning of their own in every file format."""
+
+MAX_FILE_BYTES = 2**30
+"""Larger files are refused before they are read: a day at 1 kHz with ten channels is below it."""
+
+MAX_MAGNITUDE = 1e100
+"""No reading in SI units is larger, and its square is still a finite float64."""
+
+MAX_STEP_JITTER = 0.1
+"""Deviation of a time step from the median step that still counts as constant sampling; time
+stamps rounded to milliseconds at 30 Hz deviate by 0.03."""
+
+MAX_RATE_DIFFERENCE = 0.01
+"""Relative difference between the time steps of two rollouts that a clock may explain."""
+
+_FORBIDDEN_IN_NAMES = re.compile(r"[,;\"'/\\]")
+_MAX_NAME_LENGTH = 100
+
+
+def shown(value: object, limit: int = 40) -> str:
+    """Returns a printable, shortened form of anything, for messages."""
+    is_text = isinstance(value, str | bytes)
+    shown_whole = repr(value) if is_text else str(value)
+    if not shown_whole.isprintable():
+        shown_whole = ascii(shown_whole)
+    if len(shown_whole) <= limit:
+        return shown_whole
+    return shown_whole[: limit - 2] + "…" + (shown_whole[-1] if is_text else "")
+
+
+@contextmanager
+def named(path: str | PathLike[str]) -> Iterator[None]:
+    """Puts a file's name before the message of every DataError raised inside the block."""
+    try:
+        yield
+    except DataError as error:
+        # The folder "." has no name.
+        name = Path(path).name or str(path)
+        raise DataError(f"{name if name.isprintable() else ascii(name)}: {error}") from None
+
+
+def check_file(path: str | PathLike[str]) -> Path:
+    """Returns ``path`` if it names a file of acceptable size.
+
+    Raises:
+        DataError: It is missing, a directory, not a regular file, unreadable, empty or huge.
+    """
+    path = Path(path)
+    with named(path):
+        try:
+            status = path.stat()
+            is_file, is_directory = path.is_file(), path.is_dir()
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else None
+            raise DataError(
+                f"cannot be opened ({reason or 'not a path'}).{_neighbour(path)}"
+            ) from None
+        if is_directory:
+            raise DataError("is a directory, but a file is needed.")
+        if not is_file:
+            raise DataError("is not a regular file.")
+        if status.st_size == 0:
+            raise DataError("the file is empty.")
+        if status.st_size > MAX_FILE_BYTES:
+            raise DataError(
+                f"the file has {status.st_size / 2**30:.1f} GiB, more than the "
+                f"{MAX_FILE_BYTES / 2**30:.0f} GiB that are read."
+            )
+    return path
+
+
+def _neighbour(path: Path) -> str:
+    """Returns a question for a file of nearly the same name, if there is one."""
+    try:
+        beside = [other.name for other in path.parent.iterdir()]
+    except (OSError, ValueError):
+        return ""
+    close = get_close_matches(path.name, beside, n=1)
+    return f" Did you mean {path.with_name(close[0])}?" if close else ""
+
+
+def check_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
+    """Returns column names as a tuple after checking that every format can carry them.
+
+    Args:
+        names: Names of columns.
+        kind: What they name, for the message: ``"channel"``, ``"action"`` or ``"column"``.
+
+    Raises:
+        DataError: A name is empty, repeated, or has characters that a format cannot carry.
+    """
+    seen: set[str] = set()
+    for position, name in enumerate(names, start=1):
+        if not isinstance(name, str) or not name.strip():
+            raise DataError(f"{kind} {position} has no name.")
+        is_plain = name.isprintable() and name.strip() == name
+        if (
+            not (name[0].isalpha() or name[0] == "_")
+            or not is_plain
+            or _FORBIDDEN_IN_NAMES.search(name)
+            or len(name) > _MAX_NAME_LENGTH
+        ):
+            raise DataError(
+                f"{kind} {position} is called {shown(name)}, but names begin with a letter, have "
+                f"at most {_MAX_NAME_LENGTH} characters and no comma, semicolon, quote or slash."
+            )
+        if name in seen:
+            raise DataError(f"the {kind} {shown(name)} appears twice.")
+        seen.add(name)
+    return tuple(names)
+
+
+def check_finite(values: NDArray[np.float64], names: Sequence[str], where: str) -> None:
+    """Raises a DataError where values ``(T, len(names))`` are not finite or absurdly large."""
+    with np.errstate(invalid="ignore"):
+        is_bad = ~(np.abs(values) <= MAX_MAGNITUDE)
+    if is_bad.any():
+        step, column = np.argwhere(is_bad)[0]
+        raise DataError(
+            f"{names[column]} is {values[step, column]} at step {step} of {where}, which is not "
+            "a finite number of plausible size."
+        )
+
+
+def check_time(time: NDArray[np.float64], where: str) -> None:
+    """Raises a DataError unless time stamps ``(T + 1,)``, in s, rise in equal steps."""
+    steps = np.diff(time)
+    if (steps <= 0).any():
+        at = int(np.argmax(steps <= 0))
+        raise DataError(
+            f"time goes from {time[at]:.9g} to {time[at + 1]:.9g} s in {where}; it must increase."
+        )
+    usual = float(np.sort(steps)[(len(steps) - 1) // 2])
+    is_off = np.abs(steps - usual) > MAX_STEP_JITTER * usual
+    if is_off.any():
+        at = int(np.argmax(is_off))
+        raise DataError(
+            f"the step from {time[at]:.9g} to {time[at + 1]:.9g} s in {where} differs from the "
+            f"usual {usual:.6g} s; resample the data to constant sampling."
+        )
+
+
+def canonical_time_step(times: Sequence[NDArray[np.float64]]) -> float:
+    """Returns the one time step, in s, behind the time stamps of all rollouts.
+
+    Time stamps ``k·Δt`` give back exactly ``Δt``; others give the mean step of the longest
+    rollout, rounded to 12 digits so that the rounding of the stamps does not show.
+
+    Args:
+        times: Time stamps of each rollout, ``(T + 1,)``, in s.
+
+    Raises:
+        DataError: The rollouts were sampled at different rates, or the step is absurd.
+    """
+    longest = max(times, key=len)
+    num_steps = len(longest) - 1
+    first = float(longest[1] - longest[0])
+    grid = longest[0] + first * np.arange(num_steps + 1)
+    rounding = 4 * np.finfo(np.float64).eps * float(np.max(np.abs(longest)))
+    if np.max(np.abs(grid - longest)) <= rounding:
+        time_step = first
+    else:
+        time_step = float(f"{(longest[-1] - longest[0]) / num_steps:.12g}")
+    if not 1e-9 <= time_step <= 1e9:
+        raise DataError(f"the time step is {time_step:.6g} s, which is implausible.")
+    for index, time in enumerate(times):
+        own = float(time[-1] - time[0]) / (len(time) - 1)
+        allowed = max(MAX_RATE_DIFFERENCE, MAX_STEP_JITTER / (len(time) - 1)) * time_step
+        if abs(own - time_step) > allowed:
+            raise DataError(
+                f"rollout {index} has a time step of {own:.6g} s, but another one has "
+                f"{time_step:.6g} s; give each sampling rate its own file."
+            )
+    return time_step

@@ -1,0 +1,162 @@
+"""Checks that a recording fits a simulator: its columns, their units, no rollout twice."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.channels import Channel
+from npdr_ppl.rollouts.recording import Recording
+
+__all__ = ["OTHER_UNITS", "check_channels", "check_duplicates", "check_units"]
+
+OTHER_UNITS = {"rad": ("degrees", 180 / math.pi), "m": ("millimetres", 1000.0)}
+"""What people record instead of SI units, and how many of them one SI unit has."""
+
+
+def check_duplicates(rollouts: Recording) -> None:
+    """Raises a DataError where two rollouts are the same to the last bit.
+
+    Two recordings of a device never are; the same file was probably added twice.
+    """
+    seen: dict[bytes, int] = {}
+    for index, (readings, actions) in enumerate(
+        zip(rollouts.readings, rollouts.actions, strict=True)
+    ):
+        key = readings.tobytes() + actions.tobytes()
+        if key in seen:
+            raise DataError(
+                f"rollouts {seen[key]} and {index} are identical; was one recording added twice?"
+            )
+        seen[key] = index
+
+
+def check_channels(
+    rollouts: Recording,
+    channels: Sequence[Channel],
+    actions: Sequence[Channel],
+    *,
+    allow_extra: bool = False,
+) -> None:
+    """Checks that the data have the columns a simulator needs, and no others.
+
+    A rate may be missing where the channel that it is the rate of was recorded: its value at a
+    segment's start is then estimated.
+
+    Args:
+        rollouts: The data.
+        channels: Expected state or sensor channels.
+        actions: Expected actions.
+        allow_extra: Accept channels that are not expected; extra actions never are.
+
+    Raises:
+        DataError: A column is missing, extra, or an action was read as a channel.
+    """
+    recorded = set(rollouts.channel_names)
+    for action in actions:
+        if action.name in recorded and action.name not in rollouts.action_names:
+            raise DataError(
+                f"{action.name} is an action, but its cells in the last row of each rollout are "
+                "not empty; empty them if that row is the reading after the last step, otherwise "
+                f"append such a row (or, in Python, read with actions=[{action.name!r}])."
+            )
+    missing = [a.name for a in actions if a.name not in rollouts.action_names]
+    missing += [c.name for c in channels if c.name not in recorded and c.rate_of not in recorded]
+    found = ", ".join((*rollouts.channel_names, *rollouts.action_names))
+    if missing:
+        raise DataError(f"the column {', '.join(missing)} is missing; the data have {found}.")
+    expected_actions = {action.name for action in actions}
+    extra = [name for name in rollouts.action_names if name not in expected_actions]
+    if not allow_extra:
+        expected = {channel.name for channel in channels}
+        extra += [name for name in rollouts.channel_names if name not in expected]
+    if extra:
+        raise DataError(
+            f"the column {', '.join(extra)} is not expected; remove it, or rename it to what it "
+            f"is: the model knows {', '.join(c.name for c in (*channels, *actions))}."
+        )
+
+
+def check_units(rollouts: Recording, channels: Sequence[Channel]) -> None:
+    """Looks for columns in other units than declared, degrees or millimetres, or of wrong sign.
+
+    Two things tell: a range that leaves the declared bounds by the factor between the units, and
+    a position whose derivative is so many times the reading of its own rate. Declared units are
+    compared where the data carry units.
+
+    Args:
+        rollouts: The data.
+        channels: State, sensor or action channels with units, bounds and ``rate_of``.
+
+    Raises:
+        DataError: A column is probably in another unit.
+    """
+    units = dict(zip(rollouts.channel_names, rollouts.channel_units, strict=True))
+    units |= dict(zip(rollouts.action_names, rollouts.action_units, strict=True))
+    for channel in channels:
+        own = units.get(channel.name, "")
+        if own and channel.unit and own != channel.unit:
+            raise DataError(f"{channel.name} is in {own}, but {channel.unit} is expected.")
+    for channel in channels:
+        if channel.name in units:
+            _check_range(rollouts, channel)
+    for channel in channels:
+        if channel.name in rollouts.channel_names and channel.rate_of in rollouts.channel_names:
+            unit = channel.unit.removesuffix("/s")
+            _check_rate(rollouts, channel.name, channel.rate_of, unit)
+
+
+def _column(rollouts: Recording, name: str) -> list[NDArray[np.float64]]:
+    if name in rollouts.channel_names:
+        index = rollouts.channel_names.index(name)
+        return [readings[:, index] for readings in rollouts.readings]
+    index = rollouts.action_names.index(name)
+    return [actions[:, index] for actions in rollouts.actions]
+
+
+def _check_range(rollouts: Recording, channel: Channel) -> None:
+    largest = max(float(np.max(np.abs(values))) for values in _column(rollouts, channel.name))
+    bound = max(abs(channel.lower), abs(channel.upper))
+    # A few per cent of overshoot is a sensor's business, several times the bound is not.
+    if math.isfinite(bound) and largest > 3 * bound:
+        other, factor = OTHER_UNITS.get(channel.unit.removesuffix("/s"), ("", 0.0))
+        is_other = largest <= 1.1 * bound * factor
+        reason = f"are these {other}?" if is_other else "check the unit."
+        raise DataError(
+            f"{channel.name} reaches {largest:.4g} {channel.unit}, far beyond its bound of "
+            f"{bound:.4g} {channel.unit}; {reason}"
+        )
+
+
+def _check_rate(rollouts: Recording, rate: str, position: str, unit: str) -> None:
+    """Compares how far the position went with the integral of its rate.
+
+    Net displacements over a window are insensitive to quantisation and to a driver's low-pass,
+    both of which spoil a comparison of derivatives sample by sample.
+    """
+    window = max(1, round(0.1 / rollouts.time_step))
+    moved: list[NDArray[np.float64]] = []
+    integrated: list[NDArray[np.float64]] = []
+    for positions, rates in zip(_column(rollouts, position), _column(rollouts, rate), strict=True):
+        stride = min(window, len(positions) - 1)
+        area = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2)])
+        moved.append(positions[stride::stride] - positions[:-stride:stride])
+        integrated.append((area[stride::stride] - area[:-stride:stride]) * rollouts.time_step)
+    x, y = np.concatenate(integrated), np.concatenate(moved)
+    size = float(np.linalg.norm(x)) * float(np.linalg.norm(y))
+    # Without agreement in shape the ratio says nothing about units.
+    if size == 0 or abs(float(x @ y)) < 0.7 * size:
+        return
+    if float(x @ y) < 0:
+        raise DataError(f"{position} falls where {rate} says that it rises; one sign is wrong.")
+    ratio = float(np.linalg.norm(y) / np.linalg.norm(x))
+    si = {"rad": "radians", "m": "metres"}.get(unit, "")
+    other, factor = OTHER_UNITS.get(unit, ("", 0.0))
+    for one, two, times in ((other, si, factor), (si, other, 1 / factor if factor else 0.0)):
+        if 0.7 * times < ratio < 1.4 * times:
+            raise DataError(
+                f"the derivative of {position} is {ratio:.3g} times {rate}: {position} seems to "
+                f"be in {one} and {rate} in {two} per second."
+            )

@@ -1,0 +1,182 @@
+"""Files of every run's folder: JSON and tensors, what a run was, and whether a folder holds it."""
+
+import functools
+import inspect
+import json
+import math
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from pyro.poutine.messenger import Messenger
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.language.wider_priors import ModelWithWiderPriors
+from npdr_ppl.rollouts.io.atomic_files import replacing
+
+__all__ = [
+    "engine_settings",
+    "holds_this_run",
+    "load_tensors",
+    "make_folder",
+    "plain",
+    "read_json",
+    "save_tensors",
+    "source_text",
+    "versions",
+    "write_json",
+]
+
+IN_WORDS = {
+    "binding": "how the data are prepared",
+    "fingerprint": "the data or what is read from them",
+    "model": "the model's source",
+    "num_simulations": "the number of simulations",
+    "num_steps": "the number of steps",
+}
+"""What the keys of descriptions mean to whoever gave a command."""
+
+_PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder for results if there is none.
+
+    Raises:
+        DataError: A file is in the way.
+    """
+    for place in (path, *path.parents):
+        if place.exists():
+            if not place.is_dir():
+                raise DataError(f"{path} cannot be a folder for results: {place} is a file.")
+            break
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
+    """Returns whether a run is described already.
+
+    The description of another run that never got as far as a result counts for nothing: whoever
+    repairs what stopped it gives the same command again.
+
+    Args:
+        file: JSON with the description, which is not written here.
+        description: What the run at hand is to be.
+
+    Raises:
+        DataError: The folder holds results of another run.
+    """
+    if not file.exists():
+        return False
+    present = read_json(file)
+    differing = [str(k) for k, value in plain(description).items() if present.get(k) != value]
+    if not differing:
+        return True
+    inputs = {file, *file.parent.glob("data_*")}
+    if not any(entry not in inputs for entry in file.parent.iterdir()):
+        return False
+    words = ", ".join(dict.fromkeys(IN_WORDS.get(key, key) for key in differing))
+    raise DataError(
+        f"{file.parent} holds a run that differs in {words}; choose another folder, or remove it."
+    )
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes JSON in one step."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON object.
+
+    Raises:
+        DataError: The file is not JSON.
+    """
+    try:
+        value = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} is not readable JSON: {error}.") from error
+    if not isinstance(value, dict):
+        raise DataError(f"{path} should hold a JSON object.")
+    return value
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions that a result depends on."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def source_text(model: Any) -> str:
+    """Returns the source of a model, and what was attached to it."""
+    if isinstance(model, ModelWithEffects):
+        attached = "\n".join(f"# with {effect!r}" for effect, _ in model.effects)
+        return f"{source_text(model.base)}\n{attached}"
+    if (
+        isinstance(model, functools.partial)
+        and model.args
+        and isinstance(model.args[0], Messenger)
+    ):
+        # Pyro's way to keep a model under a handler: both are arguments of the partial.
+        return f"{source_text(model.args[-1])}\n# under {type(model.args[0]).__name__}"
+    if isinstance(model, ModelWithFinerSteps | ModelWithWiderPriors):
+        return f"{source_text(model.base)}\n# {model!r}"
+    try:
+        return inspect.getsource(model)
+    except (OSError, TypeError):
+        return repr(model)
+
+
+def engine_settings(prior: Prior) -> dict[str, Any]:
+    """Returns the settings of the simulators' engines by site, where there are any."""
+    settings = {
+        name: box.simulator.recorded_settings()
+        for name, box in prior.black_boxes.items()
+        if isinstance(box, SimulatorBlackBox)
+    }
+    return {name: values for name, values in settings.items() if values}
+
+
+def plain(value: Any) -> Any:
+    """Turns tensors, tuples and mappings into what JSON has; NaN and infinity become null."""
+    if isinstance(value, Tensor):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(v) for v in value]
+    if hasattr(value, "item") and not isinstance(value, str):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Writes tensors in one step."""
+    with replacing(path) as temporary:
+        save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary)
+
+
+def load_tensors(path: Path) -> dict[str, Tensor]:
+    """Reads tensors.
+
+    Raises:
+        DataError: The file is not safetensors.
+    """
+    try:
+        return load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise DataError(f"{path} is not a readable safetensors file: {error}.") from error

@@ -1,0 +1,100 @@
+"""How sure parameters are: weighted draws where the normal approximation bends."""
+
+import pytest
+import torch
+from hidden_rigs import make_case
+from torch.distributions import MultivariateNormal
+
+import npdr_ppl as npdr
+from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.proof.parameter_intervals import Draws, estimates, posterior_draws
+from npdr_ppl.models.effects import Spring
+from npdr_ppl.preparation.ridges import RidgeCoordinates
+from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
+
+
+def fitted(effects):
+    """A pendulum that lacks nothing, fitted with effects that it does not have."""
+    case = make_case("pendulum", "null", (), seed=2001)
+    binding = npdr.DiscoveryOptions().binding(case.fit)
+    return fit_hypothesis(case.model, case.fit, binding, effects=effects)
+
+
+def test_where_the_model_is_linear_they_are_those_of_laplaces_approximation():
+    hypothesis = fitted(())
+    draws = posterior_draws(hypothesis, seed=0)
+    eye = torch.eye(len(hypothesis.fit.z), dtype=torch.float64)
+    expected = torch.linalg.inv(hypothesis.likelihood.information() + eye)
+    away = draws.z - draws.weights @ draws.z
+    covariance = (draws.weights[:, None] * away).mT @ away
+    # The variance of 400 independent draws is known to 7 %.
+    assert torch.allclose(covariance.diagonal(), expected.diagonal(), rtol=0.25)
+
+
+def test_draws_follow_a_ridge_that_bends():
+    # Of a spring that is hardly there, stiffness times rest is known, and neither of them.
+    hypothesis = fitted((Spring("hinge"),))
+    likelihood, centre = hypothesis.likelihood, hypothesis.fit.z
+    draws = posterior_draws(hypothesis, seed=0)
+    eye = torch.eye(len(centre), dtype=torch.float64)
+    torch.manual_seed(0)
+    normal = MultivariateNormal(centre, precision_matrix=likelihood.information() + eye)
+    best = likelihood.log_prob(centre[None])
+    drawn = 2.0 * (best - likelihood.log_prob(draws.z))
+    straight = 2.0 * (best - likelihood.log_prob(normal.sample((200,))))
+    # A posterior's draws are about as far from the best fit as there are parameters.
+    assert float(draws.weights @ drawn) < 1.5 * len(centre)
+    assert float(straight.mean()) > 1.3 * float(draws.weights @ drawn)
+
+
+def test_draws_are_taken_as_often_as_they_weigh():
+    torch.manual_seed(0)
+    draws = Draws(
+        torch.arange(4.0)[:, None].double(), torch.tensor([0.5, 0.0, 0.25, 0.25]).double()
+    )
+    taken = draws.resampled(400)[:, 0]
+    assert torch.bincount(taken.long(), minlength=4).tolist() == [200, 0, 100, 100]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_intervals_hold_the_mass_they_say(seed):
+    hypothesis = fitted(())
+    found = estimates(hypothesis, posterior_draws(hypothesis, seed=seed), {})
+    for estimate in found.values():
+        low, high = estimate.hdi_94
+        # Of a normal distribution, 94 % lie within 1.881 standard deviations.
+        assert (high - low) / (2.0 * estimate.sd) == pytest.approx(1.881, rel=0.1)
+        assert 0.5 * (low + high) == pytest.approx(estimate.mean, abs=0.2 * estimate.sd)
+
+
+def test_draws_that_cannot_be_simulated_do_not_count(monkeypatch):
+    hypothesis = fitted(())
+    log_prob, most = SegmentLikelihood.log_prob, float(hypothesis.fit.z[0])
+
+    def fails_beyond(self, z):
+        return torch.where(z[:, 0] > most, -torch.inf, log_prob(self, z))
+
+    monkeypatch.setattr(SegmentLikelihood, "log_prob", fails_beyond)
+    draws = posterior_draws(hypothesis, seed=0)
+    assert float(draws.weights.sum()) == pytest.approx(1.0)
+    assert float(draws.z[:, 0].max()) <= most
+
+
+def test_a_ridge_is_traced_inside_the_support(monkeypatch):
+    hypothesis, simulated = fitted((Spring("hinge"),)), []
+    scores, to_reference = SegmentLikelihood.scores, RidgeCoordinates.to_reference
+
+    def leaving(self, w):
+        z, inside = to_reference(self, w)
+        # As if the first chord step had carried every second point off the support.
+        return (z, inside & (torch.arange(len(z)) % 2 == 0)) if simulated else (z, inside)
+
+    def seen(self, z):
+        simulated.append(len(z))
+        return scores(self, z)
+
+    monkeypatch.setattr(RidgeCoordinates, "to_reference", leaving)
+    monkeypatch.setattr(SegmentLikelihood, "scores", seen)
+    space = RidgeCoordinates.of(hypothesis.likelihood, seed=0)
+    assert simulated[1] == (simulated[0] + 1) // 2
+    assert bool(space.coefficients.isfinite().all())

@@ -1,0 +1,179 @@
+"""Figures are drawn for every shape of posterior, and say what they show."""
+
+import dataclasses
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+import npdr_ppl as npdr
+from npdr_ppl.display.plots import (
+    plot_bands,
+    plot_bands_by_backend,
+    plot_heatmaps,
+    plot_marginals,
+    plot_overlaid_marginals,
+    plot_pair,
+    plot_rounds,
+    plot_seconds,
+    save_figure,
+)
+from npdr_ppl.display.plots.bands import nominal_line
+from npdr_ppl.display.plots.comparison_figures import most_informative
+from npdr_ppl.models.pendulum import Pendulum, pendulum
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.evaluation import replay
+from npdr_ppl.rollouts import Rollouts
+
+rng = np.random.default_rng(0)
+PRIOR = {"mass": rng.uniform(0, 1, 500), "length": rng.uniform(1, 2, 500)}
+POSTERIORS = {
+    "broad": {"mass": rng.uniform(0.2, 0.8, 400), "length": rng.uniform(1.2, 1.8, 400)},
+    "at the edge": {
+        "mass": 1 - 1e-6 * rng.uniform(0, 1, 400), "length": 1 + 1e-6 * rng.uniform(0, 1, 400)
+    },
+    "a point": {"mass": np.full(400, 0.5), "length": np.full(400, 1.5)},
+}  # fmt: skip
+
+
+def legend(figure):
+    return {text.get_text() for found in figure.legends for text in found.get_texts()}
+
+
+@pytest.mark.parametrize("kind", POSTERIORS)
+def test_marginals_and_pairs(kind, tmp_path):
+    marks = {"truth": {"length": 1.5}}
+    for plot in (plot_marginals, plot_pair):
+        figure = plot(POSTERIORS[kind], PRIOR, marks=marks)
+        assert {"prior", "truth"} <= legend(figure)
+        assert save_figure(figure, tmp_path / "new folder" / "figure.png").stat().st_size > 5_000
+
+
+def test_bands_have_every_channel():
+    time = np.linspace(0, 1, 50)
+    measured = np.stack([np.sin(time), np.cos(time)], -1)
+    figure = plot_bands(
+        time, measured, measured + 0.1 * rng.standard_normal((20, 50, 2)),
+        channel_names=("x", "y"), units=("m", ""), lines={"nominal": measured + 0.1},
+        resets=np.array([0.0, 0.5]),
+    )  # fmt: skip
+    assert [axis.get_ylabel() for axis in figure.axes] == ["x\n[m]", "y"]
+    assert {"measured", "nominal", "posterior 90%", "posterior 50%"} == legend(figure)
+    # A line that is far off does not squeeze the recording.
+    figure = plot_bands(
+        time, measured, measured[None], channel_names=("x", "y"),
+        lines={"nominal": measured + 1e6},
+    )  # fmt: skip
+    assert figure.axes[0].get_ylim()[1] < 2
+
+
+def recorded(num_steps=60):
+    """A pendulum's swing in columns without units, as a CSV file has them."""
+    time = 0.02 * np.arange(num_steps + 1)
+    readings = np.stack([np.sin(3 * time), 3 * np.cos(3 * time)], -1)
+    return Rollouts.from_arrays(
+        readings=[readings], actions=[np.zeros((num_steps, 1))], time_step=0.02,
+        channel_names=("angle", "velocity"), action_names=("torque",),
+    )  # fmt: skip
+
+
+OPTIONS = DataOptions(None, 20, "recorded", "float64")
+
+
+def test_the_nominal_line_is_the_simulators_own_prediction():
+    """Semi-implicit Euler of the zoo's pendulum: 1 kg, 1 m, from each segment's first reading."""
+    rollouts = recorded()
+    readings, expected = rollouts.readings[0], []
+    for step in range(60):
+        if step % 20 == 0:
+            angle, velocity = readings[step]
+        expected.append([angle, velocity])
+        velocity = velocity - 0.02 * 3.0 * 9.81 / 2.0 * np.sin(angle)
+        angle = angle + 0.02 * velocity
+    (line,) = nominal_line(pendulum, rollouts, OPTIONS).values()
+    np.testing.assert_allclose(line, expected, atol=1e-6)
+
+
+def test_a_model_without_nominal_parameters_has_no_such_line():
+    def other(inputs):
+        mass = pyro.sample("weight", dist.Uniform(0.3, 1.7))
+        return npdr.simulate("trajectory", Pendulum(), {"mass": mass}, inputs)
+
+    assert nominal_line(other, recorded(), OPTIONS) == {}
+
+
+def test_units_that_a_recording_lacks_are_the_simulators():
+    nominal = {"mass": torch.ones(1), "length": torch.ones(1)}
+    assert replay(pendulum, recorded(), nominal, OPTIONS).units == ("rad", "rad/s")
+    named = dataclasses.replace(recorded(), channel_units=("turns", ""))
+    assert replay(pendulum, named, nominal, OPTIONS).units == ("turns", "rad/s")
+
+
+def test_rounds_share_their_axes():
+    figure = plot_rounds(
+        {"round 1": PRIOR, "round 2": POSTERIORS["broad"]}, "mass", "length",
+        ranges=((0, 1), (1, 2)), truth={"mass": 0.5, "length": 1.5}, units=("kg", "m"),
+    )  # fmt: skip
+    assert [axis.get_title() for axis in figure.axes] == ["round 1", "round 2"]
+    assert {axis.get_xlim() for axis in figure.axes} == {(0.0, 1.0)}
+
+
+def test_posteriors_lie_over_each_other(tmp_path):
+    figure = plot_overlaid_marginals(
+        POSTERIORS, PRIOR, marks={"truth": {"mass": 0.5}}, units={"mass": "kg"}
+    )
+    assert legend(figure) == {"prior", "truth", *POSTERIORS}
+    assert [axis.get_xlabel() for axis in figure.axes] == ["mass [kg]", "length"]
+    assert save_figure(figure, tmp_path / "figure.png").stat().st_size > 5_000
+
+
+def test_heatmaps_have_a_row_for_each_method():
+    figure = plot_heatmaps(
+        {"snpe-c": {"round 1": PRIOR, "NUTS": PRIOR}, "snpe-a": {"round 1": PRIOR}},
+        "mass", "length", ranges=((0, 1), (1, 2)), units=("kg", "m"), smoothing=1.0,
+    )  # fmt: skip
+    shown = [axis for axis in figure.axes if axis.get_visible()]
+    assert [axis.get_title() for axis in shown] == ["round 1", "NUTS", "round 1"]
+    assert [axis.get_ylabel() for axis in shown] == [
+        "snpe-c\nlength [m]", "", "snpe-a\nlength [m]"
+    ]  # fmt: skip
+    # The lowest panel of every column names the axis, also where another row is longer.
+    assert [axis.get_xlabel() for axis in shown] == ["", "mass [kg]", "mass [kg]"]
+
+
+def test_bands_have_a_column_for_each_backend():
+    time = np.linspace(0, 1, 50)
+    measured = np.stack([np.sin(time), np.cos(time)], -1)
+    draws = measured + 0.1 * rng.standard_normal((20, 50, 2))
+    draws[3, 10] = np.nan
+    predictives = {"a": draws, "b": draws + 100.0, "c": np.full_like(draws, np.nan)}
+    figure = plot_bands_by_backend(
+        time, measured, predictives, channel_names=("x", "y"), units=("m", ""),
+        lines={"nominal": measured + 100.0}, resets=np.array([0.0, 0.5]),
+    )  # fmt: skip
+    assert legend(figure) == {"measured", "nominal", "posterior 90%", "posterior 50%"}
+    assert [axis.get_title() for axis in figure.axes] == ["a", "b", "c", "", "", ""]
+    assert [axis.get_ylabel() for axis in figure.axes] == ["x\n[m]", "", "", "y", "", ""]
+    # Two bands; failed draws are left out, and where all failed there is nothing to draw.
+    assert [len(axis.collections) for axis in figure.axes[:3]] == [2, 2, 0]
+    # A prediction that is far off does not squeeze the recording.
+    assert figure.axes[0].get_ylim()[1] < 2
+
+
+def test_seconds_have_a_bar_for_each_backend():
+    figure = plot_seconds({
+        "a": {"simulate": 1.0, "train": 2.0, "sample": 0.5}, "b": {"train": 0.25}
+    })  # fmt: skip
+    (axis,) = figure.axes
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["a", "b"]
+    assert [text.get_text().strip() for text in axis.texts] == ["3.5 s", "0.25 s"]
+    assert legend(figure) == {"simulate", "train", "sample"}
+
+
+def test_the_most_contracted_parameters_are_chosen_in_the_models_order():
+    prior = {name: rng.normal(0, 1, 500) for name in "abc"}
+    spread = {"a": 0.5, "b": 0.9, "c": 0.1}
+    posterior = {name: rng.normal(0, spread[name], 500) for name in prior}
+    assert most_informative({"q": posterior}, prior) == ("a", "c")

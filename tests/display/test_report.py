@@ -1,0 +1,128 @@
+"""Reports: what they say, that they stand alone, and that nothing in a run becomes markup."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import plotly.graph_objects as go
+import pytest
+
+from npdr_ppl.display.reports import read_run, write_report
+from npdr_ppl.display.reports.content import DiffPart, FindingsPart
+from npdr_ppl.display.reports.meanings import findings
+from npdr_ppl.display.reports.page import MAX_BYTES
+from npdr_ppl.errors import DataError
+
+KINDS = ("fit", "compare", "train", "discover")
+
+
+class Elements(HTMLParser):
+    """Collects elements and what they refer to."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags, self.links = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("src", "href", "srcset")]
+
+
+@pytest.fixture(scope="session")
+def pages(runs, tmp_path_factory):
+    """The written files by kind."""
+    folder = tmp_path_factory.mktemp("pages")
+    return {kind: write_report(runs[kind], folder / f"{kind}.html") for kind in KINDS}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_page_stands_alone(pages, kind):
+    text = pages[kind].read_text()
+    assert len(text.encode()) < MAX_BYTES
+    assert text.count("* plotly.js v") == 1
+    page = Elements()
+    page.feed(text)
+    assert all(link.startswith(("#", "data:")) for link in page.links), page.links
+    assert "default-src 'none'" in text
+    assert "prefers-color-scheme: dark" in text
+    assert text.index('class="verdict') < text.index('class="figures') < text.index("<section")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_charts_are_what_plotly_understands(runs, kind):
+    charts = [
+        part for s in read_run(runs[kind]).sections for part in s.parts if part.kind == "chart"
+    ]
+    assert charts
+    assert len({chart.name for chart in charts}) == len(charts)
+    for chart in charts:
+        go.Figure({"data": list(chart.data), "layout": dict(chart.layout)})
+
+
+@pytest.mark.slow
+def test_a_fit_says_what_its_json_says(runs, pages):
+    result = json.loads((runs["fit"] / "fit.json").read_text())
+    text = pages["fit"].read_text()
+    assert f"<strong>{result['diagnosis']['decision']}</strong>" in text
+    for name, row in result["parameters"].items():
+        assert name in text
+        assert format(row["mean"], ".4g") in text
+    assert "def pendulum(inputs" in text
+    assert re.search(r"<td>[0-9a-f]{64}</td>", text)
+
+
+@pytest.mark.slow
+def test_labels_of_a_run_are_no_markup(pages):
+    assert "<b>abc" not in pages["compare"].read_text()
+    assert "&lt;b&gt;abc" in pages["compare"].read_text()
+    assert "&#39;&lt;script&gt;&#39;" in pages["discover"].read_text()
+
+
+@pytest.mark.slow
+def test_training_shows_every_decision(runs, pages):
+    iterations = json.loads((runs["train"] / "train.json").read_text())["iterations"]
+    parts = [p for s in read_run(runs["train"]).sections for p in s.parts]
+    decisions = next(part for part in parts if isinstance(part, FindingsPart))
+    shown = sum(len(row["decisions"]) + len(row.get("checks", ())) for row in iterations)
+    assert len(decisions.findings) == shown
+
+
+@pytest.mark.slow
+def test_discovery_shows_what_changed(runs):
+    report = read_run(runs["discover"])
+    assert "coulomb_friction at hinge" in report.verdict.word
+    assert "93% in rmse" in report.verdict.sentence
+    (diff,) = [part for s in report.sections for part in s.parts if isinstance(part, DiffPart)]
+    assert [line for line in diff.lines if line[0] == "+"][1:] == ["+    friction = '<script>'"]
+
+
+@pytest.mark.parametrize("verdict", ["none", "named", "ambiguous", "unknown"])
+def test_a_discovery_of_little_is_shown_too(tmp_path, verdict):
+    (tmp_path / "discovery.json").write_text(json.dumps({"verdict": verdict}))
+    assert verdict in write_report(tmp_path).read_text() or verdict != "unknown"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "tone"),
+    [
+        ("r_hat", 1.01, "good"), ("r_hat", 1.5, "warn"), ("r_hat", None, "plain"),
+        ("ess", 2000, "good"), ("ess", 20, "warn"),
+        ("coverage_90", 0.9, "good"), ("coverage_90", 0.5, "bad"),
+        ("segment_p_value", 0.4, "good"), ("segment_p_value", 0.0, "bad"),
+    ],
+)  # fmt: skip
+def test_diagnostics_are_judged_as_diagnose_judges_them(name, value, tone):
+    order = ("r_hat", "ess", "coverage_90", "segment_p_value", "pit_deviation")
+    assert findings({name: value})[order.index(name)].tone == tone
+
+
+def test_a_folder_that_is_no_run_is_refused_with_a_sentence(tmp_path):
+    with pytest.raises(DataError, match="not a folder"):
+        read_run(tmp_path / "absent")
+    with pytest.raises(DataError, match="holds none of"):
+        read_run(tmp_path)
+    (tmp_path / "fit.json").write_text("{}")
+    with pytest.raises(DataError, match="not what npdr writes"):
+        read_run(tmp_path)

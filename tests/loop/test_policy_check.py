@@ -1,0 +1,324 @@
+"""The check before deploying: what it asks for, what the loop does then, and what is on disk."""
+
+import dataclasses
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+import npdr_ppl as npdr
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.channels import Channel
+from npdr_ppl.loop import npdr_loop
+from npdr_ppl.loop.domains import domains_at
+from npdr_ppl.loop.loop_options import Action, LoopOptions
+from npdr_ppl.loop.next_excitation import chosen_excitation, proposed_excitation
+from npdr_ppl.loop.npdr_loop import train
+from npdr_ppl.loop.policy_check import Check, NextStep, check_policy, decide
+from npdr_ppl.loop.risk import MeanReturn, TailMean
+from npdr_ppl.models.effects import CoulombFriction
+from npdr_ppl.models.pendulum import Pendulum, pendulum
+from npdr_ppl.policies.playback import Playback, Sinusoid
+from npdr_ppl.posterior.diagnostics import Decision, Diagnosis
+from npdr_ppl.run_files import load_tensors
+from tests.helpers.small_loop import HandmadePendulum, small_options, small_task
+
+SINUSOID = Sinusoid("torque", parameters=torch.tensor([3.0, 2.0, 0.0]))
+
+
+def hard_task(**changed):
+    """A task that no policy can succeed at: 40 steps earn at most 40."""
+    return dataclasses.replace(small_task(excitation=SINUSOID), success=1e9, **changed)
+
+
+@pytest.fixture(autouse=True)
+def accepted(monkeypatch):
+    """Diagnoses accept, so that every further decision is the check's."""
+    decisions = []
+
+    def diagnose(data, thresholds=None, *, rounds_left=0, rollouts_left=1):
+        decision = decisions.pop(0) if decisions else Decision.ACCEPT
+        return Diagnosis(decision, "scripted", 1.0, 9.0, {}, {}, 0.9, 0.1, 0.5, (0.0, 1.0), 0.1)
+
+    monkeypatch.setattr(npdr_loop, "diagnose", diagnose)
+    return decisions
+
+
+@pytest.fixture
+def searches(monkeypatch):
+    """What every policy search was told, in order: its domains and its risk."""
+    noted = []
+    optimise = npdr_loop.optimise_policy
+
+    def noting(task, domains, *args, risk=None, **kwargs):
+        noted.append((domains, risk))
+        return optimise(task, domains, *args, risk=risk, **kwargs)
+
+    monkeypatch.setattr(npdr_loop, "optimise_policy", noting)
+    return noted
+
+
+def run(folder, options, task=None, **kwargs):
+    model = kwargs.pop("model", pendulum)
+    task = task or small_task()
+    return train(model, HandmadePendulum(), task, options, out=folder, progress=False, **kwargs)
+
+
+def verdicts(result, iteration=0):
+    return [check["decision"] for check in result.iterations[iteration]["checks"]]
+
+
+def test_a_policy_that_fails_in_simulation_asks_for_a_rollout_then_trains_for_the_tail(
+    tmp_path, searches
+):
+    options = small_options(iterations=1, extra_rollouts=1, least_success=0.5, tail_share=0.4)
+    result = run(tmp_path / "run", options, hard_task())
+    assert verdicts(result) == [
+        NextStep.ANOTHER_ROLLOUT, NextStep.TRAIN_FOR_THE_TAIL, NextStep.DEPLOY,
+    ]  # fmt: skip
+    # The rollout is of the task's excitation, and inference has seen it.
+    assert len(result.rollouts) == 2
+    time = Pendulum.time_step * np.arange(40)
+    assert np.allclose(result.rollouts.actions[1][:, 0], 3 * np.sin(4 * math.pi * time), atol=1e-5)
+    assert len(next(iter(result.posterior.bound.data.values()))) == 2
+    record = result.iterations[0]
+    assert record["num_rollouts"] == 2 and len(record["real_returns"]) == 1
+    assert [decision["action"] for decision in record["decisions"]] == [
+        Action.TRAINED, Action.ANOTHER_ROLLOUT, Action.TRAINED,
+    ]  # fmt: skip
+    # On the prior, on each posterior, and for the tail of the second one.
+    assert [risk for _, risk in searches] == [MeanReturn()] * 3 + [TailMean(0.4)]
+    written = json.loads((tmp_path / "run/train.json").read_text())["iterations"][0]
+    assert written["simulated_success"] == 0.0
+    assert written["simulated_return"]["cvar"] < written["simulated_return"]["mean"] < 40.0
+    reasons = [check["reason"] for check in written["checks"]]
+    assert reasons[0].startswith(
+        "The policy succeeds in 0% of 20 draws, fewer than the 50% asked for: record a rollout"
+    )
+    assert "train for the worst 40% of the domains" in reasons[1]
+    assert "also after training for the worst 40%" in reasons[2]
+
+
+def test_a_policy_that_works_in_simulation_is_deployed_at_once(tmp_path, searches):
+    easy = dataclasses.replace(small_task(excitation=SINUSOID), success=0.0)
+    options = small_options(iterations=1, extra_rollouts=1, least_success=1.0)
+    result = run(tmp_path / "run", options, easy)
+    assert verdicts(result) == [NextStep.DEPLOY]
+    assert len(result.rollouts) == 1 and len(searches) == 2
+    assert result.iterations[0]["simulated_success"] == 1.0
+
+
+def test_the_better_of_both_policies_is_deployed(tmp_path):
+    options = small_options(iterations=1, least_success=0.5)
+    result = run(tmp_path / "run", options, hard_task())
+    checks = result.iterations[0]["checks"]
+    assert [check["decision"] for check in checks] == [
+        NextStep.TRAIN_FOR_THE_TAIL,
+        NextStep.DEPLOY,
+    ]
+    tails = [check["simulated_return"]["cvar"] for check in checks]
+    better = int(tails[1] > tails[0])
+    assert result.iterations[0]["simulated_return"] == checks[better]["simulated_return"]
+    saved = load_tensors(tmp_path / f"run/policy_1_{better}.safetensors")["parameters"]
+    torch.testing.assert_close(result.policy.parameters.double(), saved)
+
+
+def test_decisions_that_are_logged_only_check_and_deploy(tmp_path):
+    options = small_options(iterations=1, extra_rollouts=1, least_success=0.5)
+    options = dataclasses.replace(options, follows_decisions=False)
+    result = run(tmp_path / "run", options, hard_task())
+    assert verdicts(result) == [NextStep.DEPLOY]
+    assert "only logged" in result.iterations[0]["checks"][0]["reason"]
+
+
+def test_a_task_without_a_threshold_is_not_checked(tmp_path):
+    options = small_options(iterations=1, extra_rollouts=1, least_success=0.5)
+    task = dataclasses.replace(small_task(), success=None)
+    result = run(tmp_path / "run", options, task)
+    assert verdicts(result) == [NextStep.DEPLOY]
+    assert result.iterations[0]["simulated_success"] is None
+    assert result.iterations[0]["simulated_return"]["mean"] > 0.0
+    # Read from disk, it is the same.
+    assert run(tmp_path / "run", options, task).to_dict() == result.to_dict()
+
+
+def test_discovery_looks_again_at_what_a_check_asked_for(tmp_path, accepted):
+    accepted += [Decision.REVISE_MODEL, Decision.ACCEPT, Decision.REVISE_MODEL]
+    looks = []
+
+    def revise(model, rollouts, folder):
+        looks.append((folder.name, len(rollouts)))
+        return npdr.add_effect(pendulum, CoulombFriction("hinge"))
+
+    options = small_options(iterations=1, extra_rollouts=1, least_success=0.5)
+    result = run(tmp_path / "run", options, hard_task(), revise=revise)
+    assert looks == [("revision_0", 1), ("revision_0_1", 2)]
+    folders = sorted(path.name for path in (tmp_path / "run").glob("inference_*"))
+    assert folders == [f"inference_0_{attempt}" for attempt in range(4)]
+    # Resumed, the same folders are asked for, and nothing is trained again.
+    looks.clear()
+    again = run(tmp_path / "run", options, hard_task(), revise=revise)
+    assert looks == [("revision_0", 1), ("revision_0_1", 2)]
+    assert again.to_dict() == result.to_dict()
+
+
+def test_the_check_counts_draws_in_which_a_policy_succeeds(tmp_path):
+    options = small_options(iterations=1, num_checked=15)
+    trained = run(tmp_path / "run", options)
+    task, policy, posterior = small_task(), trained.policy, trained.posterior
+    seed = 5
+    states = task.initial_states(2, torch.Generator().manual_seed(seed))
+    domains = domains_at(posterior.prior, posterior.sample_mixture(15, seed=seed))
+    each = []
+    for number in range(15):
+        parameters = {name: value[number] for name, value in domains.parameters.items()}
+        episodes = [
+            Pendulum(compile="never").roll_out(
+                {name: value.float() for name, value in parameters.items()},
+                policy, state, 40, reward=task.reward,
+            ).returns
+            for state in states
+        ]  # fmt: skip
+        each.append(float(torch.stack(episodes).mean()))
+    middle = 0.5 * sum(sorted(each)[6:8])
+    divided = dataclasses.replace(task, success=middle)
+    found = check_policy(divided, policy, posterior, trained.domain, options, seed=seed)
+    assert found.success == pytest.approx(8 / 15)
+    assert found.mean_return == pytest.approx(np.mean(each), rel=1e-4)
+    assert found.tail_return == pytest.approx(np.mean(sorted(each)[:3]), rel=1e-4)
+    assert found.num_draws == 15
+
+
+def test_decisions_follow_the_share_of_successes():
+    options = LoopOptions(least_success=0.9)
+    good, bad = Check(0.9, 30.0, 20.0, 200), Check(0.895, 30.0, 20.0, 200)
+    assert decide(good, options, rollouts_left=1, is_for_tail=False)[0] is NextStep.DEPLOY
+    assert decide(bad, options, rollouts_left=1, is_for_tail=False)[0] is NextStep.ANOTHER_ROLLOUT
+    found = decide(bad, options, rollouts_left=0, is_for_tail=False)[0]
+    assert found is NextStep.TRAIN_FOR_THE_TAIL
+    assert decide(bad, options, rollouts_left=0, is_for_tail=True)[0] is NextStep.DEPLOY
+    assert good.is_better_than(bad) and not bad.is_better_than(good)
+    assert Check(0.9, 30.0, 21.0, 200).is_better_than(good)
+
+
+def test_options_out_of_range_are_refused():
+    with pytest.raises(ModelError, match="least_success must be at most 1; got 1.5"):
+        LoopOptions(least_success=1.5)
+    with pytest.raises(ModelError, match="tail_share must be above 0 and at most 1; got 0"):
+        LoopOptions(tail_share=0)
+    with pytest.raises(ModelError, match="num_checked must be at least 1; got 0"):
+        LoopOptions(num_checked=0)
+
+
+# The domains that reach the policy search.
+
+
+def trained_in(searches, accepted, folder, decision, **changed):
+    """Returns what the policy is trained in after a decision, and what was done about it."""
+    searches.clear()
+    accepted[:] = [decision]
+    options = small_options(iterations=1, num_domains=200, search_iterations=1, **changed)
+    result = run(folder, options)
+    return searches[-1][0].parameters["mass"], result.iterations[0]["decisions"][-1]["action"]
+
+
+def test_a_wrong_model_is_trained_in_wider_domains(tmp_path, searches, accepted):
+    def widths(decision, name):
+        """Returns how far domains are from the posterior's draws they were made of, relative."""
+        here = searches, accepted, tmp_path / f"{name}_spread", decision
+        spread, action = trained_in(*here, spread=0.1)
+        here = searches, accepted, tmp_path / f"{name}_plain", decision
+        plain, _ = trained_in(*here, spread=0.0)
+        return (spread / plain - 1.0).abs(), action
+
+    narrow, action = widths(Decision.ACCEPT, "accepted")
+    assert action == Action.TRAINED
+    wide, action = widths(Decision.REVISE_MODEL, "wrong")
+    assert action == Action.SPREAD
+    # Uniform numbers: half of the wider ones are beyond the narrower ones' end.
+    assert float(narrow.max()) <= 0.1 + 1e-5
+    assert float((wide > 0.1).double().mean()) == pytest.approx(0.5, abs=4 * 0.5 / 200**0.5)
+
+
+def test_a_widened_posterior_has_draws_of_the_prior(tmp_path, searches, accepted):
+    def masses(decision, name):
+        return trained_in(searches, accepted, tmp_path / name, decision, prior_share=0.3)
+
+    (narrow, first), (mixed, second) = masses(Decision.ACCEPT, "a"), masses(Decision.WIDEN, "b")
+    assert (first, second) == (Action.TRAINED, Action.MIXED)
+    assert len(narrow) == len(mixed) == 200
+    # The prior is uniform, 1 ± 0.7 kg: 60 draws have a standard deviation of 0.4 kg ± 10 %.
+    assert float(mixed[140:].std()) == pytest.approx(0.4, rel=0.3)
+    # The posterior of one short rollout has 0.28 kg; 1.25 is two standard errors of the ratio.
+    assert float(mixed[140:].std()) > 1.25 * float(narrow.std())
+
+
+# Excitations.
+
+
+class NarrowPendulum(Pendulum):
+    """A pendulum that may not be moved by more than 0.2 rad from 0.5 rad."""
+
+    states = (Channel("angle", "rad", 0.3, 0.7), Pendulum.states[1])
+
+
+def narrow_pendulum(inputs):
+    parameters = {
+        "mass": pyro.sample("mass", dist.Uniform(0.3, 1.7)),
+        "length": pyro.sample("length", dist.Uniform(0.3, 1.7)),
+    }
+    return npdr.simulate("trajectory", NarrowPendulum(), parameters, inputs)
+
+
+def experiment(excitation, amplitude):
+    return {"excitation": excitation, "amplitude": {"torque": amplitude}}
+
+
+def test_the_experiment_that_discovery_proposes_is_what_is_recorded():
+    found = proposed_excitation(experiment("reversals", 2.0), Pendulum.actions, 0.02)
+    assert isinstance(found, Playback) and found.actions == ("torque",)
+    commands = found.commands[:, 0]
+    assert len(commands) == 4.0 / 0.02 + 1
+    assert set(commands[:-1].abs().tolist()) <= {0.0, 2.0} and float(commands.abs().sum()) > 300
+    assert float(commands[-1]) == 0.0
+    assert proposed_excitation(None, Pendulum.actions, 0.02) is None
+    assert proposed_excitation(experiment(None, 2.0), Pendulum.actions, 0.02) is None
+
+
+def test_an_experiment_that_the_device_would_not_last_is_not_recorded(tmp_path):
+    task = small_task(excitation=SINUSOID)
+    proposal = proposed_excitation(experiment("slow_ramp", 2.0), Pendulum.actions, 0.02)
+    chosen = {}
+    for model in (pendulum, narrow_pendulum):
+        posterior = run(tmp_path / model.__name__, small_options(iterations=1), model=model)
+        choose = task, task.policy, proposal, posterior.posterior
+        chosen[model] = chosen_excitation(*choose, seed=0)
+    assert chosen[pendulum] is proposal
+    assert chosen[narrow_pendulum] is SINUSOID
+    # Nor before anything is known of the device.
+    assert chosen_excitation(task, task.policy, proposal, None, seed=0) is SINUSOID
+    bare = dataclasses.replace(task, excitation=None)
+    assert chosen_excitation(bare, task.policy, None, None, seed=0) is task.policy
+
+
+@pytest.mark.slow
+def test_a_run_that_asks_for_rollouts_and_trains_for_the_tail_survives_kills(tmp_path):
+    found = subprocess.run(
+        [sys.executable, "-m", "tests.helpers.kill_runs", str(tmp_path), "10", "0", "check"],
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert found.returncode == 0, found.stdout + found.stderr
+    summary = json.loads(found.stdout.splitlines()[-1])
+    assert summary["kills"] == 10 and summary["stages"] >= 3
+    record = json.loads((tmp_path / "undisturbed/run/train.json").read_text())["iterations"][0]
+    assert [check["decision"] for check in record["checks"]] == [
+        NextStep.ANOTHER_ROLLOUT, NextStep.TRAIN_FOR_THE_TAIL, NextStep.DEPLOY,
+    ]  # fmt: skip

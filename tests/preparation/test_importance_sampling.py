@@ -1,0 +1,134 @@
+"""Weighted draws agree with integration on a grid, and their coordinates with their densities."""
+
+import pytest
+import torch
+
+from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
+from npdr_ppl.models.pendulum import pendulum
+from npdr_ppl.posterior.estimator_check import check_estimator
+from npdr_ppl.posterior.prepare import prepare
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.importance_sampling import sample_posterior
+from npdr_ppl.preparation.ridges import RidgeCoordinates
+from tests.helpers.pendulum_recordings import product, swinging
+
+
+@pytest.fixture(scope="module")
+def likelihood():
+    return prepare(pendulum, swinging(rollouts=1, steps=200), DataOptions()).likelihood
+
+
+@pytest.fixture(scope="module")
+def ridge():
+    return prepare(product, swinging(rollouts=1, steps=200), DataOptions()).likelihood
+
+
+def on_a_grid(likelihood, wide=6.0, num=41):
+    """Returns mean and covariance of the posterior by summation, ``(2,)`` and ``(2, 2)``."""
+    eye = torch.eye(2, dtype=torch.float64)
+    covariance = torch.linalg.inv(likelihood.information() + eye)
+    root = torch.linalg.cholesky(covariance)
+    axis = torch.linspace(-wide, wide, num, dtype=torch.float64)
+    z = likelihood.fit.z + torch.cartesian_prod(axis, axis) @ root.mT
+    weights = (likelihood.log_prob(z) + likelihood.segments.prior.log_prob(z)).softmax(0)
+    mean = weights @ z
+    away = z - mean
+    return mean, (weights[:, None] * away).mT @ away
+
+
+def test_weighted_draws_agree_with_a_grid(likelihood):
+    found = sample_posterior(likelihood, seed=0)
+    assert found.is_reliable
+    mean, covariance = on_a_grid(likelihood)
+    sd = covariance.diagonal().sqrt()
+    own = found.weights @ found.z
+    spread = (found.weights @ (found.z - own).square()).sqrt()
+    # Four standard errors at the effective sample size.
+    error = 4.0 / found.effective**0.5
+    assert bool(((own - mean).abs() < error * sd).all())
+    assert bool(((spread / sd - 1.0).abs() < error).all())
+
+
+def test_a_ridge_is_followed_to_the_ends_of_the_prior(ridge):
+    found = sample_posterior(ridge, seed=0)
+    assert found.is_reliable
+    assert found.space.num_weak == 1
+    values = ridge.segments.prior.to_parameters(found.z)
+    mass = values["density"].double() * values["volume"].double()
+    mean = found.weights @ mass
+    assert float(((found.weights @ (mass - mean).square()) ** 0.5) / mean) < 0.01
+    # A product of about 1.1 allows factors from 0.55 to 2: the whole of it is drawn.
+    density = values["density"].double()
+    likely = density[found.weights > found.weights.max() * 1e-3]
+    assert float(likely.min()) < 0.65
+    assert float(likely.max()) > 1.8
+
+
+def test_coordinates_along_a_ridge_and_back(ridge):
+    space = RidgeCoordinates.of(ridge, seed=0)
+    torch.manual_seed(0)
+    z = ridge.fit.z + 0.1 * torch.randn(20, 3, dtype=torch.float64)
+    w = space.from_reference(z)
+    back, inside = space.to_reference(w)
+    assert bool(inside.all())
+    torch.testing.assert_close(back, z, rtol=0, atol=1e-4)  # the sites are in single precision
+    again = RidgeCoordinates.of_tensors(ridge.segments.prior, space.tensors())
+    assert torch.equal(again.from_reference(z), w)
+
+
+def test_the_volume_of_the_coordinates_is_that_of_finite_differences(ridge):
+    space = RidgeCoordinates.of(ridge, seed=0)
+    z = ridge.fit.z
+    width = 1e-2
+    steps = width * torch.eye(3, dtype=torch.float64)
+    columns = (space.from_reference(z + steps) - space.from_reference(z - steps)) / (2 * width)
+    expected = torch.linalg.slogdet(columns).logabsdet
+    torch.testing.assert_close(space.log_jacobian(z[None])[0], expected, rtol=0, atol=0.01)
+
+
+def test_a_posterior_that_is_right_is_kept_and_one_that_is_off_is_corrected(likelihood):
+    mean, covariance = on_a_grid(likelihood)
+    one = torch.ones(1, dtype=torch.float64)
+    right = GaussianMixture.from_moments(one, mean[None], covariance[None])
+    check, correction = check_estimator([right], likelihood, seed=0, corrects=True)
+    assert correction is None
+    assert check.is_reliable
+    assert check.learnt_effective_share > 0.9
+    sd = covariance.diagonal().sqrt()
+    off = GaussianMixture.from_moments(one, (mean + 8.0 * sd)[None], covariance[None])
+    check, correction = check_estimator([off], likelihood, seed=0, corrects=True)
+    assert check.learnt_pareto_k > 0.7 or check.learnt_effective_share < 0.9
+    assert correction is not None
+    assert check.is_reliable
+    torch.manual_seed(0)
+    draws = torch.cat([density.sample(1_000).double() for density in correction.densities])
+    assert bool(((draws.mean(0) - mean).abs() < 0.3 * sd).all())
+    # A few draws far away are enough to spoil leave-one-out weights.
+    far = GaussianMixture.from_moments(
+        torch.tensor([0.95, 0.05]).double(),
+        mean.expand(2, -1),
+        torch.stack((covariance, 100.0 * covariance)),
+    )
+    assert check_estimator([far], likelihood, seed=0, corrects=True)[1] is not None
+    # Left as it is where correcting is not wanted, and told.
+    check, correction = check_estimator([off], likelihood, seed=0, corrects=False)
+    assert correction is None
+    assert not check.is_reliable
+
+
+def test_the_likelihood_of_other_starts_is_that_of_one_normal_distribution(likelihood):
+    """With C = 1 + G Gᵀ written out, as the closed form would have it."""
+    z = likelihood.fit.z[None] + torch.tensor([[0.0, 0.0], [0.01, -0.02]], dtype=torch.float64)
+    now, segments = likelihood.linearisation, likelihood.segments
+    offsets = likelihood.fit.offsets[None].expand(2, -1, -1)
+    residual = segments.residuals(z, offsets, likelihood.fit.scale)
+    residual = residual + (now.by_starts @ likelihood.fit.offsets[..., None])[..., 0]
+    assert bool(segments.inputs.mask.all())
+    size = residual.shape[-1]
+    covariance = torch.eye(size, dtype=torch.float64) + now.by_starts @ now.by_starts.mT
+    normal = torch.distributions.MultivariateNormal(
+        torch.zeros(size, dtype=torch.float64), likelihood.variance * covariance
+    )
+    scale = segments.inputs.num_steps * likelihood.fit.scale.log().sum()
+    expected = likelihood.share * (normal.log_prob(residual) - scale)
+    torch.testing.assert_close(likelihood.by_segment(z), expected)
