@@ -35,7 +35,7 @@ from npdr_ppl.discovery.proof.held_out_gap import prove
 from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
 from npdr_ppl.discovery.screening.candidate_effects import candidates_at
 from npdr_ppl.discovery.screening.projection import Projection
-from npdr_ppl.discovery.search.search import Searcher
+from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
 from npdr_ppl.preparation.segment_model import SegmentModel

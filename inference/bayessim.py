@@ -31,7 +31,7 @@ from npdr_ppl.inference.base import Problem
 from npdr_ppl.inference.parts.mixtures.mixture_backend import MixtureBackend
 from npdr_ppl.inference.parts.mixtures.mixture_density import MixtureDensityNetwork
 from npdr_ppl.inference.parts.samplers.fourier import KERNELS, FourierFeatures, median_distance
-from npdr_ppl.inference.parts.training.neural import NeuralState, Simulations
+from npdr_ppl.inference.parts.training.neural_backend import NeuralState, Simulations
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
 
 __all__ = ["BayesSim"]

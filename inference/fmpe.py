@@ -41,9 +41,9 @@ from npdr_ppl.inference.base import Density, Problem, State
 from npdr_ppl.inference.parts.flows.flows import load_member
 from npdr_ppl.inference.parts.flows.velocity import VelocityDensity, VelocityNetwork, end_angle
 from npdr_ppl.inference.parts.training.embedding_network import build_embedding
-from npdr_ppl.inference.parts.training.neural import Simulations
+from npdr_ppl.inference.parts.training.ensemble_training import LogProb, Loss
+from npdr_ppl.inference.parts.training.neural_backend import Simulations
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
-from npdr_ppl.inference.parts.training.training import LogProb, Loss
 from npdr_ppl.inference.parts.training.truncated import TruncatedBackend
 from npdr_ppl.randomness import seeded
 

@@ -31,6 +31,7 @@ from npdr_ppl.inference.parts.flows.flows import (
     build_networks,
     load_member,
 )
+from npdr_ppl.inference.parts.training.ensemble_training import Loss
 from npdr_ppl.inference.parts.training.likelihood_backend import (
     LearnedLogLikelihood,
     LikelihoodBackend,
@@ -39,9 +40,8 @@ from npdr_ppl.inference.parts.training.likelihood_preconditioning import (
     LikelihoodPreconditioner,
     fit_likelihood_preconditioner,
 )
-from npdr_ppl.inference.parts.training.neural import NeuralState, Simulations
+from npdr_ppl.inference.parts.training.neural_backend import NeuralState, Simulations
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
-from npdr_ppl.inference.parts.training.training import Loss
 
 __all__ = ["NLE"]
 
@@ -64,7 +64,7 @@ class NLE(LikelihoodBackend):
             hierarchical one above all, reaches the ends of uniform ranges.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.training.neural.NeuralBackend`.
+    :class:`~npdr_ppl.inference.parts.training.neural_backend.NeuralBackend`.
     """
 
     name: ClassVar[str] = "nle"

@@ -33,13 +33,13 @@ import torch
 from torch import Tensor, nn
 
 from npdr_ppl.inference.base import Problem, State
+from npdr_ppl.inference.parts.training.ensemble_training import LogProb, Loss
 from npdr_ppl.inference.parts.training.likelihood_backend import (
     LearnedLogLikelihood,
     LikelihoodBackend,
 )
-from npdr_ppl.inference.parts.training.neural import NeuralState, Simulations
+from npdr_ppl.inference.parts.training.neural_backend import NeuralState, Simulations
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
-from npdr_ppl.inference.parts.training.training import LogProb, Loss
 from npdr_ppl.randomness import seeded
 
 __all__ = ["NRE", "RatioNetwork", "RatioPreconditioner", "contrastive_loss"]
@@ -138,7 +138,7 @@ class NRE(LikelihoodBackend):
         gamma: Odds of the right one being among them.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.training.neural.NeuralBackend`.
+    :class:`~npdr_ppl.inference.parts.training.neural_backend.NeuralBackend`.
     """
 
     name: ClassVar[str] = "nre"

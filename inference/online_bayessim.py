@@ -23,7 +23,7 @@ from typing import ClassVar
 from npdr_ppl.inference.base import Problem
 from npdr_ppl.inference.bayessim import BayesSim
 from npdr_ppl.inference.parts.mixtures.mixture_density import MixtureDensityNetwork
-from npdr_ppl.inference.parts.training.neural import NeuralState, Simulations
+from npdr_ppl.inference.parts.training.neural_backend import NeuralState, Simulations
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
 
 __all__ = ["OnlineBayesSim"]

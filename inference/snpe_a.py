@@ -25,7 +25,7 @@ from typing import ClassVar
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Problem
 from npdr_ppl.inference.parts.mixtures.mixture_backend import MixtureBackend
-from npdr_ppl.inference.parts.training.neural import NeuralState
+from npdr_ppl.inference.parts.training.neural_backend import NeuralState
 
 __all__ = ["SNPEA"]
 

@@ -49,9 +49,13 @@ from npdr_ppl.inference.parts.flows.flows import (
 )
 from npdr_ppl.inference.parts.flows.stacked_flow import stacked_log_prob
 from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
-from npdr_ppl.inference.parts.training.neural import NeuralBackend, NeuralState, Simulations
+from npdr_ppl.inference.parts.training.ensemble_training import Evaluator, LogProb, Loss
+from npdr_ppl.inference.parts.training.neural_backend import (
+    NeuralBackend,
+    NeuralState,
+    Simulations,
+)
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, whiten_unseen
-from npdr_ppl.inference.parts.training.training import Evaluator, LogProb, Loss
 from npdr_ppl.inference.parts.training.truncated import TruncatedBackend
 
 __all__ = ["SNPEC", "atomic_loss"]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import ModelError
-from npdr_ppl.policies.search import (
+from npdr_ppl.policies.policy_search import (
     PolicySearch,
     SearchSpace,
     SearchState,

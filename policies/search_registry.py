@@ -1,14 +1,14 @@
 """The registry of policy searches.
 
 Other packages add theirs by an entry point of group ``npdr_ppl.policy_searches``: its name selects
-the search, its value is a subclass of :class:`~npdr_ppl.policies.search.PolicySearch`.
+the search, its value is a subclass of :class:`~npdr_ppl.policies.policy_search.PolicySearch`.
 """
 
 from importlib.metadata import entry_points
 from typing import Any
 
 from npdr_ppl.errors import ModelError
-from npdr_ppl.policies.search import PolicySearch
+from npdr_ppl.policies.policy_search import PolicySearch
 from npdr_ppl.registry import Registry
 
 __all__ = ["policy_search", "policy_search_class", "policy_searches"]

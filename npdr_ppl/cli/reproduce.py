@@ -79,13 +79,13 @@ def reproduce(
     chosen = split_candidates(backends) if backends else None
     with resumable(f"the same command again continues the experiment in {out}."):
         if experiment is Experiment.PENDULUM:
-            from npdr_ppl.display.plots.pendulum import write_pendulum_figures
+            from npdr_ppl.display.plots.pendulum_figure import write_pendulum_figures
             from npdr_ppl.reproduction.pendulum_ridge import reproduce_pendulum
 
             ridges, result = reproduce_pendulum(out, backends=chosen, seed=seed, progress=progress)
             write_pendulum_figures(ridges, out)
         elif experiment is Experiment.MINI_GOLF:
-            from npdr_ppl.display.plots.mini_golf import write_mini_golf_figures
+            from npdr_ppl.display.plots.mini_golf_figure import write_mini_golf_figures
             from npdr_ppl.reproduction.mini_golf_table import reproduce_mini_golf
             from npdr_ppl.rollouts import Rollouts
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from npdr_ppl.inference.base import Backend
     from npdr_ppl.language.effects import Effect
     from npdr_ppl.loop.control_task import ControlTask
-    from npdr_ppl.policies.search import PolicySearch
+    from npdr_ppl.policies.policy_search import PolicySearch
     from npdr_ppl.targets.base import TargetDomain
 
 __all__ = [

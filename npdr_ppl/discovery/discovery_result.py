@@ -18,8 +18,8 @@ from npdr_ppl.discovery.revised_model import revised_source
 from npdr_ppl.discovery.screening.alarm import Alarm
 from npdr_ppl.discovery.screening.encoder_resolution import Count
 from npdr_ppl.discovery.screening.screening import Screened
+from npdr_ppl.discovery.search.effect_search import Search
 from npdr_ppl.discovery.search.prior_ends import PriorEnd
-from npdr_ppl.discovery.search.search import Search
 from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.rollouts.io.atomic_files import replacing
 from npdr_ppl.run_files import write_json

@@ -25,10 +25,10 @@ from npdr_ppl.discovery.proof.residual_map import Spot, worst_windows
 from npdr_ppl.discovery.screening.encoder_resolution import counts
 from npdr_ppl.discovery.screening.equivalents import equivalents
 from npdr_ppl.discovery.search.alternatives import Added
+from npdr_ppl.discovery.search.effect_search import LEADING, Round, Search, Searcher, explained
 from npdr_ppl.discovery.search.evidence import SURVIVES
 from npdr_ppl.discovery.search.limits import limits
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
-from npdr_ppl.discovery.search.search import LEADING, Round, Search, Searcher, explained
 from npdr_ppl.discovery.search.trials import PLAINLY
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.preparation.data_options import DataOptions

@@ -10,7 +10,7 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.errors import ModelError
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.loop.risk import MeanReturn, Risk, TailMean
-from npdr_ppl.policies.search import PolicySearch
+from npdr_ppl.policies.policy_search import PolicySearch
 from npdr_ppl.posterior.diagnostics import Thresholds
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts

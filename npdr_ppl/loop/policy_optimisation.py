@@ -12,7 +12,7 @@ from npdr_ppl.loop.control_task import ControlTask
 from npdr_ppl.loop.domains import Domains
 from npdr_ppl.loop.risk import MeanReturn, Risk
 from npdr_ppl.policies.base import Policy
-from npdr_ppl.policies.search import PolicySearch, SearchState
+from npdr_ppl.policies.policy_search import PolicySearch, SearchState
 from npdr_ppl.randomness import derived_seed
 
 __all__ = ["OptimisedPolicy", "optimise_policy", "returns_of"]

@@ -17,8 +17,8 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.alarm import Alarm
 from npdr_ppl.discovery.search.base_fit import BaseFit, fit_base, in_finer_steps
+from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
-from npdr_ppl.discovery.search.search import Searcher
 from npdr_ppl.embeddings import Embedding
 from npdr_ppl.embeddings.score import Score
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture

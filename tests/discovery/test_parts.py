@@ -27,8 +27,8 @@ from npdr_ppl.discovery.screening.latent_force import latent_force, responses
 from npdr_ppl.discovery.screening.permutation_tests import LargestStatistic
 from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
+from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.evidence import weigh
-from npdr_ppl.discovery.search.search import Searcher
 from npdr_ppl.discovery.search.side_by_side import side_by_side
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.errors import DataError

@@ -9,8 +9,8 @@ import npdr_ppl as npdr
 from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.display.plots.discovery_figures import write_discovery_figures
 from npdr_ppl.display.plots.discovery_panels import plot_gap, plot_ranking, plot_separation
-from npdr_ppl.display.plots.latent_force import AFTER, BEFORE, plot_latent_force
-from npdr_ppl.display.plots.residual_map import plot_residual_map
+from npdr_ppl.display.plots.latent_force_figure import AFTER, BEFORE, plot_latent_force
+from npdr_ppl.display.plots.residual_map_figure import plot_residual_map
 from npdr_ppl.errors import ShapeError
 from npdr_ppl.models.effects.forces import Bias
 from npdr_ppl.models.effects.friction import CoulombFriction

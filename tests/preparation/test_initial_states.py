@@ -6,7 +6,7 @@ import torch
 from hidden_rigs import RIGS
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.search.search import Searcher
+from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.preparation.initial_states import error_factors
 from npdr_ppl.rollouts.states import ERROR_RATIOS, estimate_departures
 from tests.helpers.rig_recordings import recording_of

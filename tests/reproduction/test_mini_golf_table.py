@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from npdr_ppl import metrics
-from npdr_ppl.display.plots.mini_golf import measured_shifts, write_mini_golf_figures
+from npdr_ppl.display.plots.mini_golf_figure import measured_shifts, write_mini_golf_figures
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.mini_golf import MiniGolf, mini_golf
 from npdr_ppl.models.mini_golf.course import OBSTACLES

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from npdr_ppl.display.plots.pendulum import write_pendulum_figures
+from npdr_ppl.display.plots.pendulum_figure import write_pendulum_figures
 from npdr_ppl.errors import DependencyError
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.posterior.comparison.compared_backends import Candidate, available

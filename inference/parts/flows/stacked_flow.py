@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from zuko.transforms import MonotonicAffineTransform
 
 from npdr_ppl.inference.parts.flows.flows import FlowNetwork, Spline
-from npdr_ppl.inference.parts.training.training import LogProb
+from npdr_ppl.inference.parts.training.ensemble_training import LogProb
 
 __all__ = ["stacked_log_prob"]
 

@@ -38,14 +38,14 @@ from npdr_ppl.inference.parts.mixtures.proposal_correction import (
     whiten_forms,
 )
 from npdr_ppl.inference.parts.training.embedding_network import build_embedding
-from npdr_ppl.inference.parts.training.neural import (
+from npdr_ppl.inference.parts.training.ensemble_training import Loss
+from npdr_ppl.inference.parts.training.neural_backend import (
     MIN_SIMULATIONS,
     NeuralBackend,
     NeuralState,
     Simulations,
 )
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, refit_regression
-from npdr_ppl.inference.parts.training.training import Loss
 from npdr_ppl.randomness import seeded
 
 __all__ = ["MixtureBackend", "ProposedSimulations"]
@@ -82,7 +82,7 @@ class MixtureBackend(NeuralBackend):
             the posterior itself, ``"mixture"``.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.training.neural.NeuralBackend`.
+    :class:`~npdr_ppl.inference.parts.training.neural_backend.NeuralBackend`.
     """
 
     amortises: ClassVar[bool] = True

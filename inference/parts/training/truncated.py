@@ -18,7 +18,7 @@ from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem, State
 from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
-from npdr_ppl.inference.parts.training.neural import NeuralBackend, NeuralState
+from npdr_ppl.inference.parts.training.neural_backend import NeuralBackend, NeuralState
 from npdr_ppl.inference.parts.training.proposals import log_density_bound, sample_truncated_prior
 
 __all__ = ["TruncatedBackend"]
@@ -36,7 +36,7 @@ class TruncatedBackend(NeuralBackend):
         outside: Posterior mass epsilon outside the region of truncated proposals.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.training.neural.NeuralBackend`.
+    :class:`~npdr_ppl.inference.parts.training.neural_backend.NeuralBackend`.
     """
 
     outside: float = 1e-2

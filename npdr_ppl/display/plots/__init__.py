@@ -2,7 +2,7 @@
 
 from npdr_ppl.display.plots.bands import plot_bands
 from npdr_ppl.display.plots.calibration import plot_coverage, plot_ranks
-from npdr_ppl.display.plots.comparison import (
+from npdr_ppl.display.plots.comparison_panels import (
     plot_bands_by_backend,
     plot_overlaid_marginals,
     plot_seconds,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from npdr_ppl.display.plots.bands import nominal_line
-from npdr_ppl.display.plots.comparison import (
+from npdr_ppl.display.plots.comparison_panels import (
     plot_bands_by_backend,
     plot_overlaid_marginals,
     plot_seconds,

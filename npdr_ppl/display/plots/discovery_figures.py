@@ -10,11 +10,11 @@ from npdr_ppl.discovery.discovery_folder import STAGES, Stage
 from npdr_ppl.discovery.discovery_view import short_name
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.proof.parameter_intervals import Draws, posterior_draws
-from npdr_ppl.display.plots.comparison import plot_overlaid_marginals
+from npdr_ppl.display.plots.comparison_panels import plot_overlaid_marginals
 from npdr_ppl.display.plots.discovery_panels import plot_gap, plot_ranking, plot_separation
 from npdr_ppl.display.plots.fit_figures import scalar_columns
-from npdr_ppl.display.plots.latent_force import AFTER, BEFORE, plot_latent_force
-from npdr_ppl.display.plots.residual_map import plot_residual_map
+from npdr_ppl.display.plots.latent_force_figure import AFTER, BEFORE, plot_latent_force
+from npdr_ppl.display.plots.residual_map_figure import plot_residual_map
 from npdr_ppl.drawing.theme import save_figure
 from npdr_ppl.randomness import seeded
 

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.display.plots.discovery_figures import write_discovery_figures
-from npdr_ppl.display.plots.latent_force import AFTER, BEFORE, LOOKS
+from npdr_ppl.display.plots.latent_force_figure import AFTER, BEFORE, LOOKS
 from npdr_ppl.display.plots.marginals import add_legend
 from npdr_ppl.drawing.theme import COLORS, save_figure, theme
 from npdr_ppl.models.furuta import Furuta

@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from npdr_ppl.display.reports.comparison import comparison_report
+from npdr_ppl.display.reports.comparison_report import comparison_report
 from npdr_ppl.display.reports.content import Report
-from npdr_ppl.display.reports.demo import demo_report
-from npdr_ppl.display.reports.discovery import discovery_report
-from npdr_ppl.display.reports.fit import fit_report
+from npdr_ppl.display.reports.demo_report import demo_report
+from npdr_ppl.display.reports.discovery_report import discovery_report
+from npdr_ppl.display.reports.fit_report import fit_report
 from npdr_ppl.display.reports.page import render
-from npdr_ppl.display.reports.training import training_report
+from npdr_ppl.display.reports.training_report import training_report
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts.io.atomic_files import replacing
 

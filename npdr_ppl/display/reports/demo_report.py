@@ -15,8 +15,8 @@ from npdr_ppl.display.reports.content import (
     Verdict,
     number,
 )
-from npdr_ppl.display.reports.discovery import discovery_report
-from npdr_ppl.display.reports.training import training_report
+from npdr_ppl.display.reports.discovery_report import discovery_report
+from npdr_ppl.display.reports.training_report import training_report
 from npdr_ppl.run_files import read_json
 
 __all__ = ["demo_report"]

@@ -16,19 +16,19 @@ from torch import Tensor, nn
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
-from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
-from npdr_ppl.inference.parts.training.simulation_checks import (
-    check_problem,
-    check_restored,
-    finite_rows,
-)
-from npdr_ppl.inference.parts.training.training import (
+from npdr_ppl.inference.parts.training.ensemble_training import (
     Evaluator,
     Loss,
     TrainingOptions,
     in_turn,
     train,
     vectorised,
+)
+from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
+from npdr_ppl.inference.parts.training.simulation_checks import (
+    check_problem,
+    check_restored,
+    finite_rows,
 )
 
 __all__ = ["NeuralBackend", "NeuralState", "Simulations"]

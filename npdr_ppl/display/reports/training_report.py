@@ -20,7 +20,7 @@ from npdr_ppl.display.reports.content import (
     Verdict,
     number,
 )
-from npdr_ppl.display.reports.fit import parameters_table
+from npdr_ppl.display.reports.fit_report import parameters_table
 from npdr_ppl.display.reports.meanings import findings
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
 from npdr_ppl.loop.policy_check import NextStep
