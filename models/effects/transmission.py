@@ -163,7 +163,7 @@ class Backlash(_Transmission):
     parameters = (Parameter("play", "{coordinate}", 0.0, "half width g of the gap"), _SHARE)
     strength = ("play",)
     is_smooth = False
-    has_hits = True
+    has_local_minima = True
     law = "motor ahead of the link by up to ±g"
     excitation = "reversals"
     reference = TAO_1996

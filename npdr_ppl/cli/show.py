@@ -178,7 +178,7 @@ def _advice(experiment: Mapping[str, Any]) -> str:
     kind = experiment["excitation"]
     limits = ", ".join(f"{name} up to {v:.3g}" for name, v in experiment["amplitude"].items())
     sentence = (
-        f"{kind.replace('_', ' ')} with {limits}, which sets the survivors "
+        f"{kind.replace('_', ' ')} with {limits}, which sets the alternatives "
         f"{experiment['separations'][kind]:.0f} standard deviations apart"
     )
     return f"{sentence}; {words}" if words else f"{sentence}."

@@ -15,7 +15,7 @@ from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.effective_share import effective_share
-from npdr_ppl.preparation.initial_states import Starts
+from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
@@ -104,7 +104,7 @@ class Hypothesis:
             )
         return self._linearised
 
-    def estimated_starts(self, rollouts: Rollouts) -> Starts | None:
+    def estimated_starts(self, rollouts: Rollouts) -> InitialStates | None:
         """Estimates what the segments start from along the fitted motion, and how well."""
         return self.segments.estimated_starts(self.fit.z, self.fit.scale, rollouts)
 
@@ -189,7 +189,7 @@ def fit_hypothesis(
     effects: tuple[Effect, ...] = (),
     start: Mapping[str, Tensor] | None = None,
     offsets: Tensor | None = None,
-    starts: Starts | None = None,
+    starts: InitialStates | None = None,
     held: Mapping[str, float] | None = None,
     max_steps: int = 12,
     is_rough: bool = False,

@@ -221,12 +221,12 @@ class Investigation:
         added = next(a for a in search.added if a.effect.name == name)
         likeliest = sorted(added.alternatives, key=lambda n: added.alternatives[n], reverse=True)
         names = [n for n in likeliest[:TOLD_APART] if added.alternatives[n] >= SURVIVES]
-        survivors = [search.trials[added.place, n] for n in names]
-        if len(survivors) < 2:
+        alternatives = [search.trials[added.place, n] for n in names]
+        if len(alternatives) < 2:
             return None
         ids = {name.rsplit(".", 1)[1] for name in names}
         classes = [g for g in added.effect.equivalence if len(ids & set(g.members)) > 1]
-        return next_experiment(survivors, self.rollouts, self._binding, classes)
+        return next_experiment(alternatives, self.rollouts, self._binding, classes)
 
     def conclude(self) -> Discovery:
         """Returns what all stages came to."""
@@ -323,7 +323,7 @@ def _judge(
     if (is_heard and unexplained > MOST_UNEXPLAINED) or (is_plain and unexplained > MOST_UNHEARD):
         return "unknown", (
             f"What was found leaves {unexplained:.0%} of the disagreement unexplained, most of it "
-            f"in {left.loudest}."
+            f"in {left.strongest}."
         )
     explains = sum(f.share for f in effects)
     strained = [f for f in effects if f.at_edge and f.share > MINOR * explains]
@@ -345,13 +345,13 @@ def _finding(
     added: Added, search: Search, every: dict[str, Estimate], at_edge: tuple[str, ...]
 ) -> Finding:
     effect = added.effect
-    survivors = [
+    alternatives = [
         name
         for name, probability in added.alternatives.items()
         if (probability >= SURVIVES or name in added.fitting) and name != effect.name
     ]
     known = equivalents(effect, search.final.names)
-    ids = dict.fromkeys([name.rsplit(".", 1)[1] for name in survivors] + list(known))
+    ids = dict.fromkeys([name.rsplit(".", 1)[1] for name in alternatives] + list(known))
     return Finding(
         effect,
         added.probability,

@@ -70,8 +70,8 @@ class Effect(ABC):
             are not, sensitivities take finite steps of the size that :meth:`probe` gives.
         is_resonant: Whether it swings at a rate that its strength sets, a time constant. Of two
             sizes none is more of the other, so that a search tries many.
-        has_hits: Whether parts hit each other. A hit a sample earlier makes another motion, so
-            that the misfit has dents, and a fit leaps besides following slopes.
+        has_local_minima: Whether the misfit has local minima along its parameters, as where parts
+            hit each other: a hit one sample earlier makes another motion. Fits then also restart.
         is_noise: Whether it only scatters readings about the truth. No search asks for such an
             effect: a fit that simulates the scatter follows it by chance.
         wave: Name of the parameter that is the frequency in Hz of a wave in time, empty if none
@@ -90,7 +90,7 @@ class Effect(ABC):
     strength: ClassVar[tuple[str, ...]] = ()
     is_smooth: ClassVar[bool] = True
     is_resonant: ClassVar[bool] = False
-    has_hits: ClassVar[bool] = False
+    has_local_minima: ClassVar[bool] = False
     is_noise: ClassVar[bool] = False
     wave: ClassVar[str] = ""
     incidental: ClassVar[tuple[str, ...]] = ()

@@ -238,7 +238,7 @@ class _Reading:
             return (
                 Decision.REVISE_MODEL,
                 f"No parameters explain the recording (p = {model['p_value']:.2g} at the best "
-                f"ones, clearest in {model['loudest']}): an effect is missing in the model. "
+                f"ones, clearest in {model['strongest']}): an effect is missing in the model. "
                 f"`npdr discover` looks for it.{priors}",
             )
         ratio = _number(model.get("misfit"))

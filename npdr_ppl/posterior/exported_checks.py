@@ -42,7 +42,7 @@ def checks_of(
     result["model"] = {
         "p_value": alarm.p_value,
         "fired": alarm.fired,
-        "loudest": alarm.loudest,
+        "strongest": alarm.strongest,
         "misfit": preparation.misfit if math.isfinite(preparation.misfit) else None,
     }
     return result

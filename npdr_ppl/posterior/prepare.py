@@ -29,7 +29,7 @@ from npdr_ppl.preparation.binding import Data, bind
 from npdr_ppl.preparation.closest_fit import ClosestFit, closest_fit
 from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS, PLAIN_FEATURES, DataOptions
 from npdr_ppl.preparation.evaluation import declares_noise
-from npdr_ppl.preparation.initial_states import Starts
+from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.segment_model import SegmentModel
@@ -83,7 +83,7 @@ class Preparation:
     closest: ClosestFit | None = None
 
     @property
-    def starts(self) -> Starts | None:
+    def starts(self) -> InitialStates | None:
         """The segments' estimated initial states."""
         return None if self.hypothesis is None else self.hypothesis.segments.starts
 

@@ -34,7 +34,7 @@ from npdr_ppl.language.prior import Prior
 from npdr_ppl.posterior.estimator_check import Correction
 from npdr_ppl.posterior.prepare import Preparation
 from npdr_ppl.preparation.binding import BoundModel
-from npdr_ppl.preparation.initial_states import Starts
+from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import (
     engine_settings,
@@ -74,7 +74,7 @@ class SavedPreparation:
         num_finer_steps: How often the model's integration steps were refined.
     """
 
-    starts: Starts | None = None
+    starts: InitialStates | None = None
     score: Score | None = None
     noise: Mapping[str, float] | None = None
     num_finer_steps: int = 0
@@ -165,7 +165,7 @@ class RunFolder:
 
         starts, score = part("starts_"), part("score_")
         return SavedPreparation(
-            Starts(**starts) if starts else None,
+            InitialStates(**starts) if starts else None,
             Score(**score) if score else None,
             record["noise"],
             int(record["num_finer_steps"]),

@@ -16,7 +16,7 @@ from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
 from npdr_ppl.preparation.data_options import PLAIN_FEATURES, DataOptions
-from npdr_ppl.preparation.initial_states import Starts
+from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.preparation.linear_regression import regression_of
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.randomness import seeded
@@ -85,7 +85,7 @@ class BoundModel:
     observations: Mapping[str, Observation]
     data: Mapping[str, Rollouts | Tensor]
     options: DataOptions
-    starts: Starts | None = None
+    starts: InitialStates | None = None
     likelihood: SegmentLikelihood | None = None
 
     def features(self, outputs: Mapping[str, Tensor]) -> Tensor:
@@ -127,7 +127,7 @@ def bind(
     options: DataOptions,
     device: str | torch.device = "cpu",
     *,
-    starts: Starts | None = None,
+    starts: InitialStates | None = None,
     likelihood: SegmentLikelihood | None = None,
 ) -> BoundModel:
     """Binds a model to measured data.

@@ -23,7 +23,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import cut
 from npdr_ppl.rollouts.states import estimate_departures
 
-__all__ = ["Starts", "error_factors", "estimate_starts", "uncertain_components"]
+__all__ = ["InitialStates", "error_factors", "estimate_starts", "uncertain_components"]
 
 ROUNDS = 30
 """Rounds of expectation maximisation; components that readings say little of hardly move."""
@@ -33,7 +33,7 @@ FACTORS = 0.2, 10.0
 
 
 @dataclass(frozen=True)
-class Starts:
+class InitialStates:
     """What S segments start from, ``(S, channels)`` each.
 
     Attributes:
@@ -49,7 +49,7 @@ class Starts:
     rate_errors: Tensor
 
     @classmethod
-    def of(cls, inputs: Inputs) -> "Starts | None":
+    def of(cls, inputs: Inputs) -> "InitialStates | None":
         """Returns what inputs start from; ``None`` unless that is uncertain."""
         found = (
             inputs.initial_values,
@@ -59,7 +59,7 @@ class Starts:
         )
         return None if any(part is None for part in found) else cls(*found)  # pyright: ignore
 
-    def scaled(self, inputs: Inputs, factors: Tensor) -> "Starts":
+    def scaled(self, inputs: Inputs, factors: Tensor) -> "InitialStates":
         """Returns the same with larger or smaller errors.
 
         Args:
@@ -70,13 +70,15 @@ class Starts:
         errors = {name: error.clone() for name, error in errors.items()}
         for (name, column, _), factor in zip(uncertain_components(inputs), factors, strict=True):
             errors[name][:, column] *= factor
-        return Starts(self.values, self.rates, errors["initial_values"], errors["initial_rates"])
+        return InitialStates(
+            self.values, self.rates, errors["initial_values"], errors["initial_rates"]
+        )
 
-    def segments(self, index: Tensor) -> "Starts":
+    def segments(self, index: Tensor) -> "InitialStates":
         """Returns what some of the segments start from."""
-        return Starts(*(getattr(self, field.name)[index] for field in fields(self)))
+        return InitialStates(*(getattr(self, field.name)[index] for field in fields(self)))
 
-    def replaced(self, rows: Tensor, new: "Starts", where: Tensor) -> "Starts":
+    def replaced(self, rows: Tensor, new: "InitialStates", where: Tensor) -> "InitialStates":
         """Returns the same with others in some rows, where a mask says so.
 
         Args:
@@ -89,7 +91,7 @@ class Starts:
             table = getattr(self, field.name).clone()
             table[rows] = torch.where(where, getattr(new, field.name).to(table), table[rows])
             changed[field.name] = table
-        return Starts(**changed)
+        return InitialStates(**changed)
 
     def put_into(self, inputs: Inputs) -> Inputs:
         """Returns inputs that start from here."""
@@ -117,7 +119,9 @@ def uncertain_components(inputs: Inputs) -> list[tuple[str, int, Tensor]]:
     return found
 
 
-def estimate_starts(box: SimulatorBlackBox, inputs: Inputs, rollouts: Rollouts) -> Starts | None:
+def estimate_starts(
+    box: SimulatorBlackBox, inputs: Inputs, rollouts: Rollouts
+) -> InitialStates | None:
     """Estimates the states at segments' starts from what a model leaves of the readings there.
 
     Rollouts' first states, which nothing comes before, stay as they are, as do those where the
@@ -131,7 +135,7 @@ def estimate_starts(box: SimulatorBlackBox, inputs: Inputs, rollouts: Rollouts) 
     Returns:
         ``None`` if the inputs' starts are certain.
     """
-    known = Starts.of(inputs)
+    known = InitialStates.of(inputs)
     if known is None:
         return None
     length = inputs.num_steps
@@ -172,7 +176,7 @@ def estimate_starts(box: SimulatorBlackBox, inputs: Inputs, rollouts: Rollouts) 
                 departure.rate_errors,
             )
         )
-        new = Starts(values[own] + shift, rates[own] + rate, error, rate_error)
+        new = InitialStates(values[own] + shift, rates[own] + rate, error, rate_error)
         is_better = is_reported & (new.values + new.rates).isfinite()
         found = found.replaced(own, new, is_better)
     return found

@@ -25,7 +25,7 @@ from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.initial_states import (
-    Starts,
+    InitialStates,
     error_factors,
     estimate_starts,
     uncertain_components,
@@ -153,7 +153,7 @@ class SegmentModel:
         model: Callable[..., Any],
         rollouts: Rollouts,
         options: DataOptions,
-        starts: Starts | None = None,
+        starts: InitialStates | None = None,
     ) -> None:
         self.inputs = options.inputs(rollouts)
         self.prior = Prior(with_noise(model, None), (self.inputs,))
@@ -176,7 +176,9 @@ class SegmentModel:
         self._smoothed = _with_lagging_rates(self.inputs, rollouts, box.simulator.rate_lag)
         self._start_from(starts)
 
-    def estimated_starts(self, z: Tensor, scale: Tensor, rollouts: Rollouts) -> Starts | None:
+    def estimated_starts(
+        self, z: Tensor, scale: Tensor, rollouts: Rollouts
+    ) -> InitialStates | None:
         """Estimates what the segments start from along a fitted motion, and how well.
 
         Args:
@@ -228,7 +230,7 @@ class SegmentModel:
         part.steps_per_average = min(-(-readings // most), self.inputs.num_steps // fewest)
         return part if part.steps_per_average > 1 else self
 
-    def _start_from(self, starts: Starts | None) -> None:
+    def _start_from(self, starts: InitialStates | None) -> None:
         self.starts = starts
         self.inputs = self._smoothed if starts is None else starts.put_into(self._smoothed)
         self._offsets = uncertain_components(self.inputs)
@@ -263,12 +265,12 @@ class SegmentModel:
 
     @property
     def dented_coordinates(self) -> Tensor:
-        """Which coordinates the misfit has dents along, a mask ``(d,)``; see ``has_hits``."""
+        """Mask ``(d,)`` of coordinates along which the misfit has local minima."""
         dented = torch.zeros(self.prior.num_parameters, dtype=torch.bool)
         names = {
             name
             for effect in self.simulator.effects
-            if effect.has_hits
+            if effect.has_local_minima
             for name in effect.parameter_names
         }
         for site in self.prior.sites:

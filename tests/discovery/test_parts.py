@@ -152,11 +152,11 @@ def test_what_rings_is_heard_at_its_frequency(quiet):
 
     from_which_on = RINGING_SHARE * npdr.DiscoveryOptions().false_alarm_rate
     assert heard(Projection(quiet))[0] > from_which_on
-    p_value, loudest = heard(ringing)
+    p_value, strongest = heard(ringing)
     assert p_value <= from_which_on
     (true,) = hidden.truth
     frequency = 1.0 / (2.0 * math.pi * true.parameters["time_constant"])
-    found = float(loudest.removeprefix("angle: ringing at ").removesuffix(" Hz"))
+    found = float(strongest.removeprefix("angle: ringing at ").removesuffix(" Hz"))
     # The next frequency that is tried is a ninth away.
     assert found == pytest.approx(frequency, rel=0.15)
 

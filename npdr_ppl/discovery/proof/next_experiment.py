@@ -1,7 +1,7 @@
-"""The experiment that would tell the survivors apart.
+"""The experiment that would tell the alternatives apart.
 
-One survivor makes a recording under each excitation, the others are refitted to it: the experiment
-to do is the one whose smallest separation, over all pairs, is largest.
+One alternative makes a recording under each excitation, the others are refitted to it: the
+experiment to do is the one whose smallest separation, over all pairs, is largest.
 """
 
 import math
@@ -37,10 +37,10 @@ class NextExperiment:
 
     Attributes:
         excitation: The kind of excitation; ``None`` where none that was tried helps.
-        separations: Smallest separation of any two survivors, in standard deviations of the
+        separations: Smallest separation of any two alternatives, in standard deviations of the
             readings, by excitation; NaN where the simulation failed.
-        amplitude: Greatest command, by action.
-        separated_by: What would tell the survivors apart in words, where they are a known class.
+        amplitude: Greatest command, by action. separated_by: What would tell the alternatives
+        apart in words, where they are a known class.
     """
 
     excitation: Excitation | None
@@ -64,15 +64,15 @@ ENOUGH = 5.0
 
 
 def next_experiment(
-    survivors: Sequence[Hypothesis],
+    alternatives: Sequence[Hypothesis],
     rollouts: Rollouts,
     options: DataOptions,
     classes: Sequence[EquivalenceClass],
 ) -> NextExperiment:
-    """Compares excitations by how far they would set the survivors apart.
+    """Compares excitations by how far they would set the alternatives apart.
 
     Args:
-        survivors: Fitted hypotheses that the recording cannot tell apart.
+        alternatives: Fitted hypotheses that the recording cannot tell apart.
         rollouts: The recording; its greatest commands bound the excitations.
         options: Its segments.
         classes: Equivalence classes of the effects in question.
@@ -80,12 +80,12 @@ def next_experiment(
     largest = np.max([np.abs(actions).max(0) for actions in rollouts.actions], axis=0)
     shapes = excitation_commands(rollouts.time_step)
     commands = SAFE_SHARE * largest * np.stack(list(shapes.values()))[..., None]
-    made = [_made(survivor, rollouts, commands) for survivor in survivors]
+    made = [_made(alternative, rollouts, commands) for alternative in alternatives]
     works = np.all([np.isfinite(readings).all((1, 2)) for readings in made], axis=0)
     smallest = np.where(works, math.inf, math.nan)
-    for a, readings in zip(survivors, made, strict=True) if works.any() else ():
+    for a, readings in zip(alternatives, made, strict=True) if works.any() else ():
         recorded = _recorded(a, rollouts, readings[works], commands[works])
-        for b in survivors:
+        for b in alternatives:
             if a is not b:
                 found = _separations(a, b, recorded, options)
                 smallest[works] = np.minimum(smallest[works], found)

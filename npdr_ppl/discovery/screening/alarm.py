@@ -38,14 +38,14 @@ class Alarm:
     Attributes:
         p_value: Probability of as large a disagreement by chance, all searching counted.
         fired: Whether it is below the rate of false alarms that was asked for.
-        loudest: What disagrees most: an effect's name, or that of a law outside the catalogue.
+        strongest: What disagrees most: an effect's name, or that of a law outside the catalogue.
         gain: Greatest reduction of the misfit by one candidate or law.
         p_values: The same probability for each candidate and law, by name.
     """
 
     p_value: float
     fired: bool
-    loudest: str
+    strongest: str
     gain: float
     p_values: dict[str, float]
 
@@ -110,12 +110,12 @@ def sound_alarm(
     if not values:
         return Alarm(1.0, False, "", 0.0, {}), ranking
     p_value = min(values.values())
-    loudest = [name for name, p in values.items() if p == p_value]
+    strongest = [name for name, p in values.items() if p == p_value]
     alarm = Alarm(
         p_value,
         # Every effect that was added is one more look.
         p_value <= options.false_alarm_rate / (1 + num_looks),
-        min(loudest, key=lambda name: (-gains.get(name, 0.0), name)),
+        min(strongest, key=lambda name: (-gains.get(name, 0.0), name)),
         max(gains.values(), default=0.0),
         values,
     )

@@ -3,14 +3,14 @@
 Everything that inflates a naive p-value is part of it: the parameters and initial states that were
 fitted to the same data, the readings' correlation within a segment, outliers, a wrong scale, and
 the search over a hundred candidates. Under the hypothesis that nothing is missing, the residuals
-of a segment have nothing to do with what an effect would have done there. So they are dealt out
+of a segment have nothing to do with what an effect would have done there. So they are permuted
 anew: every segment gets the residuals of another one, with a random sign, and the largest of all
 candidates' statistics is noted (a permutation test with Westfall and Young's maximum, 1993).
-Residuals are scaled by each segment's own spread before they are dealt, since fast segments have
-larger ones, and neighbours go together as long as there are enough, since coloured noise and the
-smoother's windows reach across a boundary.
+Residuals are scaled by each segment's own spread before they are permuted, since fast segments
+have larger ones, and neighbours go together as long as there are enough, since coloured noise and
+the smoother's windows reach across a boundary.
 
-Where something is missing, it is among what is dealt, and would hide behind its own size. So no
+Where something is missing, it is among what is permuted, and would hide behind its own size. So no
 segment keeps its own residuals, and the variance of each deal's score is that of what the
 candidate, fitted to the deal, leaves.
 """
@@ -77,7 +77,7 @@ class LargestStatistic:
         order = _derangements(draws, self._blocks, generator)
         signs = torch.randint(0, 2, order.shape, generator=generator).double() * 2.0 - 1.0
         order[0], signs[0] = torch.arange(self._blocks), 1.0
-        # The entry of every block and what it is dealt, (draws, blocks · blocks).
+        # The entry of every block and what it is permuted, (draws, blocks · blocks).
         entries = torch.arange(self._blocks) * self._blocks + order
         rows = torch.arange(draws).repeat_interleave(self._blocks)
         self._deals = torch.sparse_coo_tensor(
@@ -125,8 +125,8 @@ class LargestStatistic:
         expected = torch.einsum("bnpk,cnpl->pbckl", weights, signals)
         covariance = torch.einsum("pbci,pbcj->pij", scores, scores) / self._blocks
         towards = torch.einsum("pbckl,pbek->pcel", expected, scores)
-        dealt = self._dealt(torch.cat((scores, towards), dim=-1))
-        total, aligned = dealt[..., :size], dealt[..., size:]
+        permuted = self._permuted(torch.cat((scores, towards), dim=-1))
+        total, aligned = permuted[..., :size], permuted[..., size:]
         inverse = torch.linalg.pinv(covariance, hermitian=True)
         direction = total @ inverse  # (P, draws, k)
         statistic = (direction * total).sum(-1)
@@ -140,7 +140,7 @@ class LargestStatistic:
         left = (1.0 - taken / statistic.clamp_min(1e-300)).clamp_min(1e-6)
         return _log_tail(statistic / left, size, self._blocks - size)
 
-    def _dealt(self, table: Tensor) -> Tensor:
+    def _permuted(self, table: Tensor) -> Tensor:
         """Returns a table's sums in every deal, ``(P, b, c, Q)`` to ``(P, draws, Q)``."""
         rows = table.permute(1, 2, 0, 3).flatten(0, 1).flatten(1)
         return torch.sparse.mm(self._deals, rows).unflatten(1, table.shape[::3]).transpose(0, 1)

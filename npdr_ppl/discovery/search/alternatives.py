@@ -1,4 +1,4 @@
-"""Rivals: what else could stand in the place of an effect, all others being there."""
+"""Alternatives: what else could stand in the place of an effect, all others being there."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,14 @@ from npdr_ppl.discovery.search.evidence import INDISTINCT, closest, weigh
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.language.effects import Effect
 
-__all__ = ["Added", "Rivals", "find_rivals", "log_prior", "tried_before", "weigh_rivals"]
+__all__ = [
+    "Added",
+    "Alternatives",
+    "find_alternatives",
+    "log_prior",
+    "tried_before",
+    "weigh_alternatives",
+]
 
 STRAIN = 0.02
 """Share of what it explains by which a law that fits only in a limit of its shape must be ahead of
@@ -51,7 +58,7 @@ class Added:
 
 
 @dataclass(frozen=True)
-class Rivals:
+class Alternatives:
     """What could stand in an effect's place.
 
     Attributes:
@@ -66,12 +73,12 @@ class Rivals:
     others: dict[str, Hypothesis]
 
 
-def find_rivals(
+def find_alternatives(
     current: Hypothesis,
     effect: Effect,
     trials: Trials,
     options: DiscoveryOptions,
-) -> Rivals | None:
+) -> Alternatives | None:
     """Fits the model with others in an effect's place.
 
     Args:
@@ -93,15 +100,15 @@ def find_rivals(
     tried = {effect.name: current} | trials.extended(without, ranking)
     tried = trials.converged(tried, done=effect.name)
     others = {name: h for name, h in tried.items() if name != effect.name}
-    return Rivals(without, current, trials.apart_from_waves_in_step(others))
+    return Alternatives(without, current, trials.apart_from_waves_in_step(others))
 
 
 def tried_before(
     current: Hypothesis,
     effect: Effect,
     seen: Sequence[tuple[Hypothesis, Mapping[str, Hypothesis]]],
-) -> Rivals | None:
-    """Returns the rivals of an effect if they were tried already, when it was added last.
+) -> Alternatives | None:
+    """Returns the alternatives of an effect if they were tried already, when it was added last.
 
     Args:
         current: The model with the effect.
@@ -112,34 +119,37 @@ def tried_before(
     for hypothesis, tried in seen:
         if set(hypothesis.names) == rest and effect.name in tried:
             others = {name: trial for name, trial in tried.items() if name != effect.name}
-            return Rivals(hypothesis, tried[effect.name], others)
+            return Alternatives(hypothesis, tried[effect.name], others)
     return None
 
 
-def weigh_rivals(
-    base: Hypothesis, current: Hypothesis, effect: Effect, rivals: Rivals | None
+def weigh_alternatives(
+    base: Hypothesis, current: Hypothesis, effect: Effect, alternatives: Alternatives | None
 ) -> tuple[Hypothesis, Added]:
-    """Asks which of the rivals it is.
+    """Asks which of the alternatives it is.
 
     Args:
         base: The model in question.
         current: The model with the effect.
         effect: The effect.
-        rivals: What could stand in its place.
+        alternatives: What could stand in its place.
 
     Returns:
         The model with the likeliest, and what that is.
     """
-    if rivals is None:
+    if alternatives is None:
         return current, Added(effect, effect.name, 1.0, {effect.name: 1.0})
-    without, trials = rivals.without, {effect.name: rivals.with_it} | rivals.others
+    without, trials = (
+        alternatives.without,
+        {effect.name: alternatives.with_it} | alternatives.others,
+    )
     prior = [
         log_prior(trial) - strain
         for trial, strain in zip(trials.values(), _strains(trials, without), strict=True)
     ]
     weights = weigh(list(trials.values()), prior, seed=0)
-    alternatives = dict(zip(trials, weights, strict=True))
-    best = max(alternatives, key=lambda name: alternatives[name])
+    probabilities = dict(zip(trials, weights, strict=True))
+    best = max(probabilities, key=lambda name: probabilities[name])
     swapped = trials[best]
     chosen = next(e for e in swapped.effects if e.name == best)
     scale = closest([base, swapped]).fit.scale
@@ -147,7 +157,7 @@ def weigh_rivals(
     share = max(0.0, lost) / max(whole, 1e-12)
     fitting = _fitting(trials, best)
     swapped = current if best == effect.name else swapped
-    return swapped, Added(chosen, effect.name, share, alternatives, fitting)
+    return swapped, Added(chosen, effect.name, share, probabilities, fitting)
 
 
 def log_prior(hypothesis: Hypothesis) -> float:

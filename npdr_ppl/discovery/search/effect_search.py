@@ -17,11 +17,11 @@ from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.screening.separation import separation_matrix
 from npdr_ppl.discovery.search.alternatives import (
     Added,
-    Rivals,
-    find_rivals,
+    Alternatives,
+    find_alternatives,
     log_prior,
     tried_before,
-    weigh_rivals,
+    weigh_alternatives,
 )
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps
 from npdr_ppl.discovery.search.evidence import SURVIVES, closest, weigh
@@ -229,7 +229,9 @@ class Searcher:
                 f"{fastest:.3g} Hz shows"
             )
         best = ", ".join(s.name for s in ranking[:3]) or "none"
-        self._report(f"p = {alarm.p_value:.2g} ({alarm.loudest}); the best candidates are {best}")
+        self._report(
+            f"p = {alarm.p_value:.2g} ({alarm.strongest}); the best candidates are {best}"
+        )
         self._last = Round(hypothesis, averaged, alarm, ranking, separation, found)
         return self._last
 
@@ -289,34 +291,41 @@ class Searcher:
             rounds: What was seen on the way to it.
 
         Returns:
-            The model at last, its effects, and the models with each rival; see :class:`Search`.
+            The model at last, its effects, and the models with each alternative; see
+            :class:`Search`.
         """
         added: list[Added] = []
         trials: dict[tuple[str, str], Hypothesis] = {}
         waiting = current.effects
         while waiting:
             asked = current
-            for effect, rivals in zip(waiting, self._rivals(asked, waiting, rounds), strict=True):
+            for effect, alternatives in zip(
+                waiting, self._alternatives(asked, waiting, rounds), strict=True
+            ):
                 waiting = waiting[1:]
-                current, found = weigh_rivals(rounds[0].hypothesis, asked, effect, rivals)
+                current, found = weigh_alternatives(
+                    rounds[0].hypothesis, asked, effect, alternatives
+                )
                 probability = found.alternatives[effect.name]
                 self._report(f"{effect.name}: probability {probability:.2f}")
                 added.append(found)
-                tried = {effect.name: asked} | ({} if rivals is None else rivals.others)
+                tried = {effect.name: asked} | (
+                    {} if alternatives is None else alternatives.others
+                )
                 trials |= {(effect.name, name): trial for name, trial in tried.items()}
                 if current is not asked:
                     current = self.trials.with_own_starts(current)
-                    break  # the rivals of the others are to be found beside what was swapped in
+                    break  # the other effects are compared beside the one that was swapped in
         return current, added, trials
 
-    def _rivals(
+    def _alternatives(
         self, current: Hypothesis, effects: Sequence[Effect], rounds: list[Round]
-    ) -> Iterator[Rivals | None]:
-        """Yields the rivals of each effect, in their order."""
+    ) -> Iterator[Alternatives | None]:
+        """Yields the alternatives of each effect, in their order."""
         seen = [(r.hypothesis, r.trials) for r in rounds]
         known = {effect.name: tried_before(current, effect, seen) for effect in effects}
         new = [effect for effect in effects if known[effect.name] is None]
-        function = partial(find_rivals, current, trials=self.trials, options=self.options)
+        function = partial(find_alternatives, current, trials=self.trials, options=self.options)
         number = num_processes(current.simulator)
         # With fewer of them than processes, each search had better use all.
         found = side_by_side(function, new, number if len(new) >= number else 1)

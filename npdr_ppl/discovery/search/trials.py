@@ -16,7 +16,7 @@ from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.preparation.data_options import DataOptions
-from npdr_ppl.preparation.initial_states import Starts
+from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["PLAINLY", "SHORTLIST", "Trials"]
@@ -66,7 +66,7 @@ class _Fit:
     effects: tuple[Effect, ...]
     start: Mapping[str, Tensor]
     offsets: Tensor
-    starts: Starts | None
+    starts: InitialStates | None
     is_trial: bool = False
     held: Mapping[str, float] | None = None
 
@@ -187,7 +187,7 @@ class Trials:
         (found,) = self._fits(
             [_Fit(current.effects, current.parameters, unmoved, starts)], current.simulator
         )
-        # Starts that are told badly may be such that simulations from beside them fail.
+        # Initial states that are told badly may be such that simulations from beside them fail.
         return current if found is None or not found.can_be_linearised else found
 
     def holding(
