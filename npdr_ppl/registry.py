@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 from npdr_ppl.errors import NpdrError
 
-__all__ = ["Registry"]
+__all__ = ["Registry", "hint"]
 
 T = TypeVar("T")
 
@@ -34,8 +34,8 @@ class Registry(Generic[T]):
         """Returns the class called ``name``; raises ``error`` if it is unknown or broken."""
         locations = self.locations()
         if name not in locations:
-            hint = _hint(name.lower().replace("_", "-"), locations)
-            raise self.error(f"There is no {self.kind} {name!r}; {hint}")
+            known = hint(name.lower().replace("_", "-"), locations)
+            raise self.error(f"There is no {self.kind} {name!r}; {known}")
         label = f"{self.kind.capitalize()} {name!r}"
         module, _, attribute = locations[name].partition(":")
         try:
@@ -63,12 +63,12 @@ class Registry(Generic[T]):
             if option not in known:
                 raise self.error(
                     f"{self.kind.capitalize()} {name!r} has no option {option!r}; "
-                    f"{_hint(option, known)}"
+                    f"{hint(option, known)}"
                 )
         return cls(**options)
 
 
-def _hint(word: str, known: Iterable[str]) -> str:
+def hint(word: str, known: Iterable[str]) -> str:
     """Returns the known word that was probably meant, or all of them."""
     known = list(known)
     close = get_close_matches(word, known, n=1)

@@ -1,16 +1,37 @@
 """`npdr models`, `npdr backends`, `npdr targets` and so on: what there is to choose from."""
 
 import json
+import shutil
+import textwrap
 from collections.abc import Sequence
+from typing import Annotated
 
 import typer
 
 from npdr_ppl.cli.manners import AsJson
+from npdr_ppl.cli.names import (
+    complete_backend,
+    complete_effect,
+    complete_model,
+    complete_search,
+    complete_target,
+    complete_task,
+)
+from npdr_ppl.errors import DataError
+from npdr_ppl.registry import hint
 
 __all__ = ["backends", "effects", "models", "searches", "targets", "tasks"]
 
+DETAILS = "Show all that is known of this one."
 
-def models(as_json: AsJson = False) -> None:
+
+def models(
+    name: Annotated[
+        str | None,
+        typer.Argument(help=DETAILS, autocompletion=complete_model),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """List the models of the zoo.
 
     Example: npdr models
@@ -18,11 +39,11 @@ def models(as_json: AsJson = False) -> None:
     from npdr_ppl.models import zoo
 
     rows = []
-    for name, entry in zoo().items():
+    for key, entry in zoo().items():
         simulator = entry.simulator()
         rows.append(
             {
-                "name": name,
+                "name": key,
                 "summary": entry.summary,
                 "parameters": [f"{p.name} [{p.unit}]" for p in simulator.parameters],
                 "channels": [f"{c.name} [{c.unit}]" for c in simulator.sensors],
@@ -30,20 +51,32 @@ def models(as_json: AsJson = False) -> None:
                 "ports": [f"{p.name} ({p.kind})" for p in simulator.ports],
             }
         )
-    _show(rows, as_json)
+    _show("models", rows, name, as_json)
 
 
-def backends(as_json: AsJson = False) -> None:
+def backends(
+    name: Annotated[
+        str | None,
+        typer.Argument(help=DETAILS, autocompletion=complete_backend),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """List the inference backends.
 
     Example: npdr backends
     """
     from npdr_ppl.inference.registry import backends as registered
 
-    _show([{"name": n, "summary": s} for n, s in registered().items()], as_json)
+    _show("backends", [{"name": n, "summary": s} for n, s in registered().items()], name, as_json)
 
 
-def effects(as_json: AsJson = False) -> None:
+def effects(
+    name: Annotated[
+        str | None,
+        typer.Argument(help=DETAILS, autocompletion=complete_effect),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """List the catalogue of effects.
 
     Example: npdr effects --json
@@ -52,19 +85,25 @@ def effects(as_json: AsJson = False) -> None:
 
     rows = [
         {
-            "name": name,
+            "name": key,
             "summary": effect.law or _first_line(effect),
             "attaches to": list(effect.port_kinds),
             "parameters": [f"{p.name} [{_unit(p.unit)}]" for p in effect.parameters],
-            "not told from": [c.name for c in effect.equivalence],
+            "may be confused with": [c.name for c in effect.equivalence],
             "revealed by": effect.excitation,
         }
-        for name, effect in catalogue().items()
+        for key, effect in catalogue().items()
     ]
-    _show(rows, as_json)
+    _show("effects", rows, name, as_json)
 
 
-def targets(as_json: AsJson = False) -> None:
+def targets(
+    name: Annotated[
+        str | None,
+        typer.Argument(help=DETAILS, autocompletion=complete_target),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """List the target domains of the zoo.
 
     Example: npdr targets
@@ -72,21 +111,27 @@ def targets(as_json: AsJson = False) -> None:
     from npdr_ppl.models import targets as registered
 
     rows = []
-    for name, entry in registered().items():
+    for key, entry in registered().items():
         target = entry.make()
         rows.append(
             {
-                "name": name,
+                "name": key,
                 "summary": entry.summary,
                 "channels": [f"{c.name} [{c.unit}]" for c in target.sensors],
                 "actions": [f"{c.name} [{c.unit}]" for c in target.actions],
                 "time step": f"{target.time_step:g} s",
             }
         )
-    _show(rows, as_json)
+    _show("targets", rows, name, as_json)
 
 
-def tasks(as_json: AsJson = False) -> None:
+def tasks(
+    name: Annotated[
+        str | None,
+        typer.Argument(help=DETAILS, autocompletion=complete_task),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """List what policies can be trained to do.
 
     Example: npdr tasks
@@ -94,11 +139,11 @@ def tasks(as_json: AsJson = False) -> None:
     from npdr_ppl.loop.control_task import control_task, control_tasks
 
     rows = []
-    for name in control_tasks():
-        task = control_task(name)
+    for key in control_tasks():
+        task = control_task(key)
         rows.append(
             {
-                "name": name,
+                "name": key,
                 "summary": _first_line(task.policy),
                 "reads": list(task.policy.observations),
                 "commands": list(task.policy.actions),
@@ -106,17 +151,28 @@ def tasks(as_json: AsJson = False) -> None:
                 "success": "–" if task.success is None else f"return above {task.success:g}",
             }
         )
-    _show(rows, as_json)
+    _show("tasks", rows, name, as_json)
 
 
-def searches(as_json: AsJson = False) -> None:
+def searches(
+    name: Annotated[
+        str | None,
+        typer.Argument(help=DETAILS, autocompletion=complete_search),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """List the policy searches.
 
     Example: npdr searches
     """
     from npdr_ppl.policies.search_registry import policy_searches
 
-    _show([{"name": n, "summary": s} for n, s in policy_searches().items()], as_json)
+    _show(
+        "searches",
+        [{"name": n, "summary": s} for n, s in policy_searches().items()],
+        name,
+        as_json,
+    )
 
 
 def _unit(template: str) -> str:
@@ -128,17 +184,51 @@ def _first_line(documented: object) -> str:
     return (documented.__doc__ or "").strip().partition("\n")[0]
 
 
-def _show(rows: Sequence[dict[str, object]], as_json: bool) -> None:
+def _show(
+    command: str, rows: Sequence[dict[str, object]], name: str | None, as_json: bool
+) -> None:
+    """Prints names with a line about each, or all that is known of one.
+
+    Args:
+        command: The command that lists them.
+        rows: What is known of each; ``name`` is the word to type.
+        name: Whose details to show; ``None`` lists all.
+        as_json: Whether to print all details as JSON.
+
+    Raises:
+        DataError: There is no such name.
+    """
+    if name is not None:
+        chosen = [row for row in rows if row["name"] == name]
+        if not chosen:
+            known = [str(row["name"]) for row in rows]
+            raise DataError(f"`npdr {command}` lists no {name!r}; {hint(name, known)}")
+        rows = chosen
     if as_json:
         typer.echo(json.dumps(rows, indent=2, ensure_ascii=False))
-        return
-    from rich.console import Console
-    from rich.table import Table
+    elif name is not None:
+        typer.echo(_details(rows[0]))
+    else:
+        for row in rows:
+            typer.echo(f"{row['name']}\n{_wrapped(str(row['summary']))}")
+        if set(rows[0]) > {"name", "summary"}:
+            typer.echo(f"\nDetails: npdr {command} {rows[0]['name']}")
 
-    table = Table(show_lines=True)
-    for column in rows[0]:
-        table.add_column(column)
-    for row in rows:
-        cells = ("\n".join(v) if isinstance(v, list) else str(v) for v in row.values())
-        table.add_row(*cells)
-    Console().print(table)
+
+def _details(row: dict[str, object]) -> str:
+    """Returns all that is known of one, a heading for each kind of fact."""
+    lines = [str(row["name"]), _wrapped(str(row["summary"]))]
+    for key, value in row.items():
+        if key in ("name", "summary"):
+            continue
+        values = [str(v) for v in value] if isinstance(value, list) else [str(value)]
+        lines += [f"{key}:", *(_wrapped(v) for v in values or ["none"])]
+    return "\n".join(lines)
+
+
+def _wrapped(text: str) -> str:
+    """Returns a text in lines that fit the terminal, indented below its name."""
+    width = max(40, shutil.get_terminal_size().columns)
+    return textwrap.fill(
+        text, width, initial_indent="    ", subsequent_indent="    ", break_long_words=False
+    )

@@ -199,9 +199,20 @@ def test_listings(monkeypatch, capsys, command):
     rows = json.loads(text)
     assert code == 0
     assert all(row["summary"] for row in rows)
-    code, table, _ = run(monkeypatch, capsys, command)
+    monkeypatch.setenv("COLUMNS", "80")
+    code, text, _ = run(monkeypatch, capsys, command)
     assert code == 0
-    assert rows[0]["name"][:8] in table
+    # Each name stands on a line of its own, as it is to be typed.
+    assert {row["name"] for row in rows} <= set(text.splitlines())
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_a_listing_shows_the_details_of_one_name(monkeypatch, capsys):
+    code, text, _ = run(monkeypatch, capsys, "models", "cart_pole")
+    assert code == 0
+    assert "    cart_damping [N s/m]" in text.splitlines()
+    code, _, err = run(monkeypatch, capsys, "models", "cartpole")
+    assert code == 2 and "did you mean 'cart_pole'?" in err
 
 
 @pytest.mark.skipif(not RECORDING.exists(), reason=f"the recordings {RECORDING} are absent")
