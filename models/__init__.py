@@ -1,4 +1,7 @@
-"""The model zoo: simulators, their Pyro models, target domains, and the catalogue of effects."""
+"""The model zoo: simulators, their Pyro models, target domains, and the catalogue of effects.
+
+May import: engines, targets, language. Start reading at ``pendulum.py``, the smallest model.
+"""
 
 import importlib
 from collections.abc import Callable

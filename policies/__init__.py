@@ -1,1 +1,4 @@
-"""Policies and policy search, one file each."""
+"""Policies and policy search, one file each.
+
+May import: engines.common, language. Start reading at ``base.py``, then ``power.py``.
+"""

@@ -1,4 +1,7 @@
-"""The catalogue of effects: physical causes that a simulator may miss."""
+"""The catalogue of effects: physical causes that a simulator may miss.
+
+May import: language. Start reading at ``friction.py``.
+"""
 
 from npdr_ppl.models.effects.actuation import (
     ActuatorGain,

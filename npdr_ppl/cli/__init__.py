@@ -1,1 +1,4 @@
-"""The command line."""
+"""The command line ``npdr``: a file per command, thin wrappers of the Python functions.
+
+May import: everything. Start reading at ``main.py``.
+"""

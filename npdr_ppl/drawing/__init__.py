@@ -1,1 +1,5 @@
-"""What values show of themselves in a notebook, and the look that all figures share."""
+"""Drawing primitives: colours, panels, marginals, HTML tables.
+
+Objects that show themselves in notebooks use them, so this package imports only errors. Start
+reading at ``theme.py``.
+"""

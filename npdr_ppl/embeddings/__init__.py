@@ -1,4 +1,7 @@
-"""Embeddings: from trajectories to the features that a backend conditions on."""
+"""Embeddings: from trajectories to the features that a backend conditions on.
+
+May import: language. Start reading at ``base.py``, then ``score.py``, the default features.
+"""
 
 from npdr_ppl.embeddings.base import Embedding
 from npdr_ppl.embeddings.networks import Convolutional, Linear, Recurrent

@@ -1,1 +1,5 @@
-"""The language: channels, simulators, black-box sample sites, priors and effects."""
+"""Declare a model: simulators, black-box sample sites, effects, priors and the handlers on them.
+
+May import: errors, randomness, registry. Start reading at ``sites.py`` (``npdr.simulate``), then
+``simulator.py`` (what a simulator is) and ``effects.py`` (what an effect is).
+"""

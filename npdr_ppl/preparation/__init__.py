@@ -1,1 +1,5 @@
-"""preparation."""
+"""Bind a model to a recording: data options, segments, initial states, likelihood, closest fit.
+
+May import: inference, engines, rollouts, language. Start reading at ``binding.py``, then
+``segment_model.py`` (a model along a recording) and ``closest_fit.py`` (the best parameters).
+"""

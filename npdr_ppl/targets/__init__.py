@@ -1,4 +1,8 @@
-"""Target domains: the devices, other engines and recordings that policies are run on."""
+"""Target domains: the devices, other engines and recordings that policies are run on.
+
+May import: engines, rollouts, language. Start reading at ``base.py``, then ``hardware.py``, the
+template for a physical device.
+"""
 
 from npdr_ppl.targets.base import (
     Controller,

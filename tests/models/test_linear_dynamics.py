@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from npdr_ppl.engines.ode.simulator import ODESimulator
 from npdr_ppl.language.effects import LinearForceEffect
 from npdr_ppl.language.linear_dynamics import Motion
 from npdr_ppl.models import zoo
@@ -10,9 +11,11 @@ from npdr_ppl.models.effects import effects
 
 NUM_STATES = 7
 LINEAR = [effect for effect in effects().values() if issubclass(effect, LinearForceEffect)]
-SIMULATORS = {
-    entry.simulator: entry for entry in zoo().values() if entry.simulator.inverse_dynamics
-}
+SIMULATORS = [
+    entry.simulator
+    for entry in zoo().values()
+    if issubclass(entry.simulator, ODESimulator) and entry.simulator.inverse_dynamics
+]
 
 
 @pytest.fixture(params=SIMULATORS, ids=lambda cls: cls.__name__)

@@ -1,1 +1,1 @@
-"""flows."""
+"""Normalising flows and velocity networks as conditional densities. Start at ``flows.py``."""

@@ -1,1 +1,1 @@
-"""samplers."""
+"""Samplers, importance weights and conjugate regression. Start at ``tempering.py``."""

@@ -1,4 +1,7 @@
-"""Figures: each function draws on matplotlib axes and returns the figure."""
+"""Figures: each function draws on matplotlib axes and returns the figure.
+
+May import: everything but reports and the command line. Start reading at ``fit_figures.py``.
+"""
 
 from npdr_ppl.display.plots.bands import plot_bands
 from npdr_ppl.display.plots.calibration import plot_coverage, plot_ranks

@@ -1,4 +1,7 @@
-"""Reports: a finished run as one HTML file that opens from disk, without a network."""
+"""Reports: a finished run as one HTML file that opens from disk, without a network.
+
+May import: everything but the command line. Start reading at ``run_report.py``.
+"""
 
 from npdr_ppl.display.reports.run_report import read_run, write_report
 

@@ -1,4 +1,7 @@
-"""PyBullet as a simulator: scenes from URDF files or code, one simulation at a time on workers."""
+"""PyBullet as a simulator: scenes from URDF files or code, one simulation at a time on workers.
+
+May import: engines.common, engines.pooled, language. Start reading at ``simulator.py``.
+"""
 
 from npdr_ppl.engines.bullet.channels import Command, Sensor
 from npdr_ppl.engines.bullet.scene import Builder, Scene, Urdf

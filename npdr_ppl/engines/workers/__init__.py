@@ -1,4 +1,8 @@
-"""A pool for engines that run one simulation at a time; faults cost only the draws they hit."""
+"""A pool for engines that run one simulation at a time; faults cost only the draws they hit.
+
+May import: errors, randomness. Start reading at ``session.py`` (``npdr.workers``), then
+``pool.py``.
+"""
 
 from npdr_ppl.engines.workers.faults import Faults
 from npdr_ppl.engines.workers.options import Executor, WorkerOptions
