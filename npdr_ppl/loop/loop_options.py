@@ -67,6 +67,10 @@ class LoopOptions:
             last posterior. Backends that cannot start elsewhere start from the prior.
         search: The policy search; one with options of its own if it is no name.
         search_iterations: Iterations of the policy search, each time.
+        search_restarts: Times that the search begins anew where its policy fails in nearly all
+            draws of the posterior. The cause is then a local optimum of the search, and not that
+            parameters are uncertain. Two sufficed on eight hidden rigs with a delay that were
+            used for tuning.
         domains: Whether the policy is trained in draws of the posterior or at its most likely
             sample.
         num_domains: Domains that the policy is trained in.
@@ -122,6 +126,7 @@ class LoopOptions:
     start: Literal["prior", "closest fit", "posterior"] = "closest fit"
     search: str | PolicySearch[Any] = "power"
     search_iterations: int = 20
+    search_restarts: int = 2
     domains: Literal["posterior", "most likely"] = "posterior"
     num_domains: int = 50
     num_initial_states: int = 4

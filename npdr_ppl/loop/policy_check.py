@@ -26,6 +26,7 @@ class NextStep(StrEnum):
     """What to do with a new policy."""
 
     DEPLOY = "deploy"
+    SEARCH_AGAIN = "search again"
     ANOTHER_ROLLOUT = "another rollout"
     TRAIN_FOR_THE_TAIL = "train for the worst domains"
 
@@ -106,13 +107,19 @@ def check_policy(
 
 
 def decide(
-    check: Check, options: LoopOptions, *, rollouts_left: int, is_for_tail: bool
+    check: Check,
+    options: LoopOptions,
+    *,
+    searches_left: int,
+    rollouts_left: int,
+    is_for_tail: bool,
 ) -> tuple[NextStep, str]:
     """Returns what to do with a policy, and why in a sentence.
 
     Args:
         check: What it reached in simulation.
         options: The share of successes that is asked for.
+        searches_left: Searches for a policy that can still be begun anew.
         rollouts_left: Rollouts that can still be recorded.
         is_for_tail: Whether it has been trained for the worst domains.
     """
@@ -128,6 +135,11 @@ def decide(
         return NextStep.DEPLOY, (
             f"{shown}, fewer than {least}, also after training for the worst "
             f"{options.tail_share:.0%} of the domains, and no rollout is left to ask for."
+        )
+    if 1.0 - check.success >= options.least_success and searches_left > 0:
+        return NextStep.SEARCH_AGAIN, (
+            f"{shown}: it fails whatever the parameters are within their uncertainty, so that a "
+            "better policy is searched for from another start."
         )
     if rollouts_left > 0:
         return NextStep.ANOTHER_ROLLOUT, (

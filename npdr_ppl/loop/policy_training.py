@@ -92,7 +92,7 @@ class LoopTraining:
         """
         options = self.options
         best: tuple[Check, Tensor, Figures] | None = None
-        risk = options.risk
+        risk, searches_left = options.risk, options.search_restarts
         while True:
             number = index + 1, len(checks)
             saved = self.folder.policy(*number)
@@ -104,7 +104,11 @@ class LoopTraining:
             parameters, figures = saved[0], dict(saved[1])
             check = Check.of(figures.pop("check"))
             verdict, reason = decide(
-                check, options, rollouts_left=rollouts_left, is_for_tail=best is not None
+                check,
+                options,
+                searches_left=searches_left,
+                rollouts_left=rollouts_left,
+                is_for_tail=risk is not options.risk,
             )
             checks.append({**check.to_dict(), "decision": verdict.value, "reason": reason})
             if verdict is NextStep.ANOTHER_ROLLOUT:
@@ -113,7 +117,11 @@ class LoopTraining:
                 best = check, parameters, figures
             if verdict is NextStep.DEPLOY:
                 break
-            start, risk = parameters, options.tail
+            if verdict is NextStep.SEARCH_AGAIN:
+                # From the policy as it came: the search before ended in a local optimum.
+                start, searches_left = self.task.policy.parameters.double(), searches_left - 1
+            else:
+                start, risk = best[1], options.tail
         check, parameters, figures = best
         self.folder.save_policy(index + 1, parameters, figures)
         return Trained(parameters, {**figures, **check.to_dict()})

@@ -219,7 +219,7 @@ def test_a_listing_shows_the_details_of_one_name(monkeypatch, capsys):
 def test_table2_has_both_columns_beside_the_papers(monkeypatch, capsys, tmp_path):
     from npdr_ppl.reproduction import table2
 
-    # Two rounds of few simulations: the machinery, not the figure; see docs/reproduction.md.
+    # One round of few simulations, not the figure of docs/reproduction/table2_furuta.md.
     monkeypatch.setattr(table2, "ROUNDS", 1)
     monkeypatch.setattr(table2, "NUM_SIMULATIONS", 100)
     code, text, _ = run(

@@ -144,6 +144,7 @@ def small_options(**changed):
         "binding": DataOptions("all/10", 20, "recorded", "float64"),
         "search": policy_search("power", population=8, memory=4),
         "search_iterations": 2,
+        "search_restarts": 0,
         "num_domains": 5,
         "num_initial_states": 2,
         "least_success": 0.0,

@@ -74,6 +74,33 @@ def verdicts(result, iteration=0):
     return [check["decision"] for check in result.iterations[iteration]["checks"]]
 
 
+def test_a_policy_that_fails_in_all_draws_is_searched_for_again_from_its_first_parameters(
+    tmp_path, monkeypatch
+):
+    begun = []
+    optimise = npdr_loop.optimise_policy
+
+    def noting(task, domains, search, start, **kwargs):
+        begun.append((start.double(), kwargs["seed"]))
+        return optimise(task, domains, search, start, **kwargs)
+
+    monkeypatch.setattr(npdr_loop, "optimise_policy", noting)
+    task = hard_task()
+    result = run(tmp_path / "run", small_options(iterations=1, search_restarts=2), task)
+    assert verdicts(result) == [NextStep.DEPLOY], "nothing is asked of the policy"
+    options = small_options(iterations=1, search_restarts=2, least_success=0.9)
+    result = run(tmp_path / "strict", options, task)
+    assert verdicts(result) == [
+        NextStep.SEARCH_AGAIN, NextStep.SEARCH_AGAIN, NextStep.TRAIN_FOR_THE_TAIL, NextStep.DEPLOY,
+    ]  # fmt: skip
+    own = begun[-4:]
+    assert all(torch.equal(start, task.policy.parameters.double()) for start, _ in own[1:3])
+    assert len({seed for _, seed in own}) == 4
+    # The best of all drafts is what the run goes on with.
+    returns = [check["simulated_return"]["cvar"] for check in result.iterations[0]["checks"]]
+    assert result.iterations[0]["simulated_return"]["cvar"] == max(returns)
+
+
 def test_a_policy_that_fails_in_simulation_asks_for_a_rollout_then_trains_for_the_tail(
     tmp_path, searches
 ):
@@ -198,11 +225,20 @@ def test_the_check_counts_draws_in_which_a_policy_succeeds(tmp_path):
 def test_decisions_follow_the_share_of_successes():
     options = LoopOptions(least_success=0.9)
     good, bad = Check(0.9, 30.0, 20.0, 200), Check(0.895, 30.0, 20.0, 200)
-    assert decide(good, options, rollouts_left=1, is_for_tail=False)[0] is NextStep.DEPLOY
-    assert decide(bad, options, rollouts_left=1, is_for_tail=False)[0] is NextStep.ANOTHER_ROLLOUT
-    found = decide(bad, options, rollouts_left=0, is_for_tail=False)[0]
-    assert found is NextStep.TRAIN_FOR_THE_TAIL
-    assert decide(bad, options, rollouts_left=0, is_for_tail=True)[0] is NextStep.DEPLOY
+
+    def step(check, *, searches=1, rollouts=1, is_for_tail=False):
+        left = {"searches_left": searches, "rollouts_left": rollouts}
+        return decide(check, options, **left, is_for_tail=is_for_tail)[0]
+
+    assert step(good) is NextStep.DEPLOY
+    assert step(bad) is NextStep.ANOTHER_ROLLOUT
+    assert step(bad, rollouts=0) is NextStep.TRAIN_FOR_THE_TAIL
+    assert step(bad, rollouts=0, is_for_tail=True) is NextStep.DEPLOY
+    # A policy that fails in nearly all draws is not helped by knowing the parameters better.
+    hopeless = Check(0.1, 3.0, 2.0, 200)
+    assert step(hopeless) is NextStep.SEARCH_AGAIN
+    assert step(hopeless, searches=0) is NextStep.ANOTHER_ROLLOUT
+    assert step(Check(0.105, 3.0, 2.0, 200)) is NextStep.ANOTHER_ROLLOUT
     assert good.is_better_than(bad) and not bad.is_better_than(good)
     assert Check(0.9, 30.0, 21.0, 200).is_better_than(good)
 
