@@ -1,4 +1,5 @@
 # Two commands matter: `make demo` and `make test`. Both make .venv first, if it is not there.
+# `make test-fast` runs the tests that take less than about a second each.
 
 PYTHON ?= python3
 VENV := .venv
@@ -7,7 +8,7 @@ WORKERS ?= 2
 # A worker per core: torch's own threads would only get in each other's way.
 TEST_ENV := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 NPDR_NUM_THREADS=1
 
-.PHONY: demo test style types docs dist bench clean
+.PHONY: demo test test-fast style types docs dist bench clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@echo "==> making $(VENV) with $$($(PYTHON) --version)"
@@ -24,6 +25,10 @@ demo: $(VENV)/installed
 test: style
 	@echo "==> tests on $(WORKERS) workers"
 	$(TEST_ENV) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --durations=15
+
+test-fast: style
+	@echo "==> quick tests on $(WORKERS) workers"
+	$(TEST_ENV) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow" --quiet
 
 style: $(VENV)/installed
 	@echo "==> style and layers"

@@ -19,6 +19,7 @@ def fleet():
     return module
 
 
+@pytest.mark.slow
 def test_the_fleet_learns_a_likelihood_and_samples_hyper_parameters(fleet):
     inputs = fleet.chirp()
     learnt = fleet.learn(inputs, num_simulations=1000, seed=0)

@@ -59,6 +59,7 @@ def nominal_furuta(inputs):
     return torch.stack(readings, dim=1)
 
 
+@pytest.mark.slow
 def test_the_nominal_column_of_the_papers_table():
     """Table 2: RMSE 0.384 ± 0.003, DTW 1430 ± 30."""
     if not RECORDING.is_file():
@@ -209,6 +210,7 @@ def test_pit_by_hand_and_masked_coverage():
     assert metrics.coverage(values, [0.1, 0.8], mask).tolist() == pytest.approx([0.5, 1.0])
 
 
+@pytest.mark.slow
 def test_c2st_is_half_for_equals_and_one_for_strangers():
     torch.manual_seed(0)
     first, second = torch.randn(500, 2), torch.randn(500, 2)

@@ -23,6 +23,7 @@ def short(name, duration=1.0):
     return replace(subject, rig=replace(subject.rig, duration=duration))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIG_SUBJECTS)
 def test_a_replay_of_the_true_parameters_is_the_recording(name):
     """The recorder's own integrator has other code, and drives the rig in a closed loop."""
@@ -37,6 +38,7 @@ def test_a_replay_of_the_true_parameters_is_the_recording(name):
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_separation_is_the_least_distance():
     """SciPy minimises the same sum of squares by another route."""
     subject = short("pendulum")

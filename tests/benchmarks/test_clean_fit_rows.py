@@ -52,6 +52,7 @@ def test_intervals_are_central_and_the_truth_is_in_or_out():
     assert flat["mass"]["width"] == pytest.approx(1.0, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_fit_is_read_from_its_two_files(tmp_path):
     fit = {
         "most_likely": {"mass": 2.0, "length": 1.0},
@@ -97,6 +98,7 @@ def test_a_command_has_no_options_that_a_new_user_would_not_give(tmp_path):
     assert [word for word in words if word.startswith("--")] == ["--data", "--holdout", "--out"]
 
 
+@pytest.mark.slow
 def test_what_a_command_takes_is_its_own():
     # This process holds torch, some hundred MiB that are not the command's.
     size = 150 * 2**20
@@ -111,6 +113,7 @@ def test_what_a_command_takes_is_its_own():
     assert 0.5 <= outcome.cpu_seconds < 1.0 <= outcome.seconds
 
 
+@pytest.mark.slow
 def test_memory_and_time_of_a_commands_own_processes_count():
     child = (
         "import time; block = bytearray(100 << 20); block[::4096] = b'x' * len(block[::4096]);"

@@ -99,6 +99,7 @@ def test_the_truth_has_converged(name):
     assert subject.rig.time_step / subject.rig.substeps <= 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIG_SUBJECTS)
 def test_the_motion_is_within_limits_and_the_noise_small(name):
     subject = RIG_SUBJECTS[name]

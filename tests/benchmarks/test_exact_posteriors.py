@@ -85,6 +85,7 @@ def test_gaussian_mixture_on_a_grid(x: list[float]) -> None:
     check_means(draws, on_grid("gaussian_mixture", observation, observation, 6.0))
 
 
+@pytest.mark.slow
 def test_gaussian_linear_by_importance() -> None:
     """Draws of the prior weighted by the likelihood have the same moments."""
     torch.manual_seed(2)
@@ -120,6 +121,7 @@ def test_slcp_by_importance(number: int) -> None:
     check_means(draws, *weighted_means(proposed, log_weight))
 
 
+@pytest.mark.slow
 def test_slcp_likelihood_is_that_of_the_simulator() -> None:
     """Simulations have the likelihood's mean score, zero, at their parameters."""
     torch.manual_seed(4)

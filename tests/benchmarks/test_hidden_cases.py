@@ -30,6 +30,7 @@ def test_a_case_is_whole_and_quick(name):
     assert not inside
 
 
+@pytest.mark.slow
 def test_the_seed_decides_everything_but_the_strength():
     first, again = (make_case("pendulum", "one", ONE, seed=4) for _ in range(2))
     assert first.fit == again.fit
@@ -47,6 +48,7 @@ def test_the_seed_decides_everything_but_the_strength():
     assert np.quantile(difference, 0.9) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("condition", CONDITIONS)
 def test_conditions(condition):
     number = len(places("emps", condition))
@@ -79,6 +81,7 @@ def test_what_comes_to_the_same_is_said():
     assert case.alternatives == (("carriage.coulomb_friction", "carriage.bias"),)
 
 
+@pytest.mark.slow
 def test_faults_spoil_the_data_as_they_say():
     sound = make_case("pendulum", "null", seed=0).fit
     by_kind = {

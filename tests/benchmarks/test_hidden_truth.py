@@ -127,6 +127,7 @@ _TOLERANCE = {"stribeck_friction": 0.1}
 _MUJOCO_TOLERANCE = 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "port", "effect_id"), LAWS)
 def test_laws_mean_what_the_catalogue_means(name, port, effect_id):
     """With the true parameters the catalogue's effect explains the recording."""
@@ -146,6 +147,7 @@ def test_laws_mean_what_the_catalogue_means(name, port, effect_id):
         assert left < tolerance * without
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effect_id", "strength"), [("backlash", 0.005), ("joint_elasticity", 0.05)]
 )

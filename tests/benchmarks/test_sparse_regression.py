@@ -28,6 +28,7 @@ def biased():
     return case, fitted(case)
 
 
+@pytest.mark.slow
 def test_the_residual_force_is_the_hidden_one_in_newton_metres(biased):
     case, hypothesis = biased
     found = residual_forces(hypothesis, case.fit)

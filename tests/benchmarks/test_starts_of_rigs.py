@@ -8,6 +8,7 @@ from npdr_ppl.rollouts.states import estimate_states
 from tests.helpers.rig_recordings import recording_of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pendulum", "emps", "cart_pole", "furuta"])
 def test_estimated_states_are_as_far_off_as_they_say(name):
     rig = RIGS[name]

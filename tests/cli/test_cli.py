@@ -44,6 +44,7 @@ def recording(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_fit_writes_what_the_documentation_promises(monkeypatch, capsys, tmp_path, recording):
     out = tmp_path / "fit"
     words = [
@@ -83,6 +84,7 @@ def test_report_writes_one_file(monkeypatch, capsys, tmp_path):
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_fit_takes_a_models_file_and_effects(monkeypatch, capsys, tmp_path, recording):
     file = tmp_path / "json.py"  # must not take the standard library's place
     file.write_text(
@@ -105,6 +107,7 @@ def test_fit_takes_a_models_file_and_effects(monkeypatch, capsys, tmp_path, reco
     assert sys.modules["json"] is json
 
 
+@pytest.mark.slow
 def test_compare_writes_what_the_documentation_promises(monkeypatch, capsys, tmp_path, recording):
     out = tmp_path / "comparison"
     words = [
@@ -215,6 +218,7 @@ def test_a_listing_shows_the_details_of_one_name(monkeypatch, capsys):
     assert code == 2 and "did you mean 'cart_pole'?" in err
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not RECORDING.exists(), reason=f"the recordings {RECORDING} are absent")
 def test_table2_has_both_columns_beside_the_papers(monkeypatch, capsys, tmp_path):
     from npdr_ppl.reproduction import table2

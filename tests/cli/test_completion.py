@@ -69,5 +69,6 @@ def test_what_is_no_name_is_left_to_the_shell():
     assert completed("fit", "path/to/mi")[0] == []
 
 
+@pytest.mark.slow
 def test_completion_is_quick():
     assert min(completed("fit", "fur")[1] for _ in range(3)) < 1.0

@@ -40,6 +40,7 @@ def told(tmp_path_factory):
     return out, text
 
 
+@pytest.mark.slow
 def test_the_story_is_printed_and_written(told):
     out, text = told
     for words in ("policy from the prior earns", "revise the model", "sensor_low_pass at"):
@@ -61,6 +62,7 @@ def test_the_filter_of_the_rates_is_found_on_the_rig(told):
     assert set(result["returns"]) == {"policy from the prior", "policy from the revised model"}
 
 
+@pytest.mark.slow
 def test_told_again_it_is_the_same_story(told):
     out, _ = told
     first = json.loads((out / "demo.json").read_text())

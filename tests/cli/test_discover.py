@@ -77,6 +77,7 @@ def finished(words):
     return Path(words[-1]), text
 
 
+@pytest.mark.slow
 def test_it_names_what_is_missing(finished):
     folder, text = finished
     found = json.loads((folder / "discovery.json").read_text())
@@ -104,6 +105,7 @@ def test_it_draws_its_figures(finished):
     assert all(file.stat().st_size > 1_000 for file in folder.glob("*.png"))
 
 
+@pytest.mark.slow
 def test_other_commands_accept_the_revised_model(finished, recording, tmp_path):
     folder, _ = finished
     model = f"{folder}/revised_model.py:revised_model"
@@ -132,6 +134,7 @@ def test_a_finished_discovery_is_not_repeated(finished, words, monkeypatch):
     assert code == 2 and "differs in seed" in err
 
 
+@pytest.mark.slow
 def test_stages_stop_where_they_are_told_and_an_unfinished_run_goes_on(words, tmp_path):
     words = [*words[:-1], tmp_path / "stages", "--stage"]
     folder = tmp_path / "stages"

@@ -60,6 +60,7 @@ def small_fit(recording, out):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_help_is_quick_and_groups_commands():
     took = []
     for _ in range(3):
@@ -102,6 +103,7 @@ def test_a_word_almost_right_gets_a_suggestion(monkeypatch, capsys, words, hint)
     assert hint in " ".join(err.replace("│", " ").split())
 
 
+@pytest.mark.slow
 def test_no_color_is_respected():
     coloured = npdr("--help", FORCE_COLOR="1", NO_COLOR="")
     plain = npdr("--help", FORCE_COLOR="1", NO_COLOR="1")
@@ -109,6 +111,7 @@ def test_no_color_is_respected():
     assert "\x1b[3" not in plain.stdout and "\x1b[1;3" not in plain.stdout
 
 
+@pytest.mark.slow
 def test_completion_is_there_for_the_common_shells():
     for shell in ("bash", "zsh", "fish"):
         shown = npdr("--show-completion", shell, _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")

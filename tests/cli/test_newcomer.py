@@ -150,6 +150,7 @@ def test_a_mistake_in_an_option(monkeypatch, capsys, words, sentence):
     assert err.startswith("npdr: ") and err.count("\n") == 1, err
 
 
+@pytest.mark.slow
 def test_the_same_command_works_once_the_recording_is_repaired(monkeypatch, capsys, tmp_path):
     data, out = tmp_path / "measured.csv", tmp_path / "found"
     words = ["discover", "pendulum", "--data", data, "--out", out, "--stage", "check"]
@@ -165,6 +166,7 @@ def test_the_same_command_works_once_the_recording_is_repaired(monkeypatch, caps
     assert code == 2 and "differs in" in err, "results of another recording are not overwritten"
 
 
+@pytest.mark.slow
 def test_results_cannot_go_into_a_file(monkeypatch, capsys, tmp_path):
     data = tmp_path / "measured.csv"
     data.write_text("\n".join([HEADER, *map(",".join, rows())]))

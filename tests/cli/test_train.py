@@ -66,6 +66,7 @@ def recording(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
     out = tmp_path / "run"
     words = [
@@ -100,6 +101,7 @@ def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
     assert (out / "learning_curve.png").exists()
 
 
+@pytest.mark.slow
 def test_what_the_model_lacks_is_looked_for_where_that_is_asked_for(
     monkeypatch, capsys, tmp_path, rig
 ):

@@ -41,6 +41,7 @@ def test_readings_that_are_not_counted_have_no_count(motion):
     assert count_of(mixed) is None
 
 
+@pytest.mark.slow
 def test_counts_are_told_and_not_searched_for():
     case = make_case("pendulum", "null", (), seed=2000)
     options = npdr.DiscoveryOptions()
@@ -54,6 +55,7 @@ def test_counts_are_told_and_not_searched_for():
     assert found["angle"].share == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_who_searches_for_counts_is_told():
     case = make_case("pendulum", "null", (), seed=2000)
     options = npdr.DiscoveryOptions(effects=(ViscousFriction("hinge"), Quantisation("angle")))

@@ -69,6 +69,7 @@ def covers(finding, name, true):
     return low - 0.25 * width <= true <= high + 0.25 * width
 
 
+@pytest.mark.slow
 def test_a_resonance_is_found_wherever_it_is():
     """There is no slope towards it from another: it lies between the sizes of a plain probe."""
     place = ("hinge", "joint_elasticity")
@@ -81,6 +82,7 @@ def test_a_resonance_is_found_wherever_it_is():
     assert found.gap["rmse"].after < found.gap["rmse"].before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "parameter", "strength"),
     [
@@ -102,6 +104,7 @@ def test_one_effect_at_each_kind_of_port(place, parameter, strength):
     assert gap.closed > 0.5
 
 
+@pytest.mark.slow
 def test_an_effect_of_the_environment_in_an_mjcf():
     few = (
         Payload("payload"),
@@ -124,6 +127,7 @@ def test_an_effect_of_the_environment_in_an_mjcf():
     assert found.gap["rmse"].after < found.gap["rmse"].before
 
 
+@pytest.mark.slow
 def test_a_pair_of_effects():
     places = (("hinge", "spring"), ("torque", "dead_zone"))
     few = (
@@ -135,6 +139,7 @@ def test_a_pair_of_effects():
     assert found.gap["rmse"].closed > 0.75
 
 
+@pytest.mark.slow
 def test_an_inseparable_pair_is_reported_as_a_class():
     case, found = discover("pendulum", "inseparable", (("gravity", "tilt"),), strength=0.3)
     (finding,) = found.effects
@@ -145,6 +150,7 @@ def test_an_inseparable_pair_is_reported_as_a_class():
     assert found.next_experiment.separated_by
 
 
+@pytest.mark.slow
 def test_a_law_that_contains_another_is_named_where_it_shows_and_else_reported():
     few = CoulombFriction("hinge"), PreslidingFriction("hinge"), ViscousFriction("hinge")
 
@@ -163,6 +169,7 @@ def test_a_law_that_contains_another_is_named_where_it_shows_and_else_reported()
     assert "coulomb_friction" not in bent.equivalent_to
 
 
+@pytest.mark.slow
 def test_nothing_is_found_where_nothing_is_missing():
     _, found = discover("pendulum", "null", ())
     assert found.verdict == "none"
@@ -170,6 +177,7 @@ def test_nothing_is_found_where_nothing_is_missing():
     assert found.gap["rmse"].after == found.gap["rmse"].before
 
 
+@pytest.mark.slow
 def test_an_effect_outside_the_catalogue_is_unknown():
     place = ("hinge", "cross_term")
     _, found = discover("pendulum", "outside", (place,), strength=0.15, max_effects=2)
@@ -177,6 +185,7 @@ def test_an_effect_outside_the_catalogue_is_unknown():
     assert found.remainder.fired
 
 
+@pytest.mark.slow
 def test_a_silent_alarm_does_not_hide_what_is_plainly_left():
     place = ("hinge", "bouc_wen_hysteresis")
     case = make_case("pendulum", "outside", (place,), strength=0.276, seed=2003)
@@ -185,6 +194,7 @@ def test_a_silent_alarm_does_not_hide_what_is_plainly_left():
     assert found.verdict == "unknown" and "unexplained" in found.reason
 
 
+@pytest.mark.slow
 def test_a_resonance_without_its_entry_is_unknown():
     """Play is as like it as anything, and explains a part."""
     effects = (
@@ -197,6 +207,7 @@ def test_a_resonance_without_its_entry_is_unknown():
     assert "ringing" in found.remainder.strongest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hidden", "strength", "instead", "shape"),
     [
@@ -239,6 +250,7 @@ def test_friction_of_one_of_two_joints_among_the_whole_catalogue(rig, port, shor
     assert covers(finding, "magnitude", true.parameters["magnitude"])
 
 
+@pytest.mark.slow
 def test_a_law_whose_shape_shows_is_named():
     # The same law as above, where the recording does tell it from a constant.
     few = tuple(law("hinge") for law in (PeriodicDisturbance, CoulombFriction, Bias, Wind))
@@ -296,6 +308,7 @@ def _rollouts(readings, actions):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_coarse_steps_are_no_discovery_and_hide_none():
     # One Euler step per sample is off by half a sample: a delay of 10 ms, if one believed it.
     few = (InputDelay("torque"), CoulombFriction("hinge"), ViscousFriction("hinge"))
@@ -312,6 +325,7 @@ def test_coarse_steps_are_no_discovery_and_hide_none():
     assert "with_finer_steps(revised_model)" in found.source()
 
 
+@pytest.mark.slow
 def test_coarse_steps_of_an_engine_are_no_discovery():
     text = ROD.format(friction=0.0, step=Pendulum.time_step, integrator="Euler")
     simulator = MujocoSimulator(
@@ -331,6 +345,7 @@ def test_coarse_steps_of_an_engine_are_no_discovery():
     assert "the revised model takes finer ones" in found.reason
 
 
+@pytest.mark.slow
 def test_a_recording_made_in_coarse_steps_is_left_to_them():
     rng = np.random.default_rng(SEED)
     h, readings, actions = Pendulum.time_step, [], []
@@ -349,6 +364,7 @@ def test_a_recording_made_in_coarse_steps_is_left_to_them():
     assert found.search.final.model is pendulum
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["degrees", "one_in_degrees", "misaligned"])
 def test_bad_data_come_before_physics(kind):
     # Each fault has an effect beside it that explains a part of it.

@@ -36,6 +36,7 @@ def proofs():
     ]
 
 
+@pytest.mark.slow
 def test_the_proof_is_of_the_held_out_rollouts(proofs):
     clean, noisy = (proof.gap for proof in proofs)
     assert clean["rmse"].closed > 0.5 and 0.8 < clean["coverage"].after <= 1.0

@@ -3,6 +3,7 @@
 import dataclasses
 import types
 
+import pytest
 import torch
 from hidden_rigs import make_case
 
@@ -39,6 +40,7 @@ def test_bursts_of_force_stand_out():
     assert found.gain > SHAPES * MOST  # what chance explains in as many segments
 
 
+@pytest.mark.slow
 def test_coloured_noise_and_outliers_resemble_no_force():
     assert moments(*seen("null")).p_value > HEARD
     assert moments(*seen("null_coloured")).p_value > HEARD
@@ -62,6 +64,7 @@ def test_a_kick_in_one_segment_is_heard_and_as_large_an_error_of_the_readings_is
     assert with_residual(error).p_value > HEARD
 
 
+@pytest.mark.slow
 def test_outliers_are_seldom_taken_for_forces():
     """Where all forces end, a part of an outlier lies along what they change."""
     projection, found = seen("null", rig="cart_pole")

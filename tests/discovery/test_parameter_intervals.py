@@ -31,6 +31,7 @@ def test_where_the_model_is_linear_they_are_those_of_laplaces_approximation():
     assert torch.allclose(covariance.diagonal(), expected.diagonal(), rtol=0.25)
 
 
+@pytest.mark.slow
 def test_draws_follow_a_ridge_that_bends():
     # Of a spring that is hardly there, stiffness times rest is known, and neither of them.
     hypothesis = fitted((Spring("hinge"),))

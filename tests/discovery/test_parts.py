@@ -137,6 +137,7 @@ def test_errors_of_a_sensor_that_depend_on_its_reading_are_no_chance(quiet):
     assert min(values) < 0.01
 
 
+@pytest.mark.slow
 def test_what_rings_is_heard_at_its_frequency(quiet):
     hidden = make_case(
         "pendulum", "one", (("hinge", "joint_elasticity"),), strength=1.0, seed=2001
@@ -236,6 +237,7 @@ def test_the_revised_source_keeps_priors_that_were_given(tmp_path):
     assert "# The prior given to hinge.bias.offset has no source: put it here." in path.read_text()
 
 
+@pytest.mark.slow
 def test_saving_writes_json_with_the_names_of_the_architecture(tmp_path):
     case = make_case("pendulum", "null", (), seed=2001)
     options = npdr.DiscoveryOptions(effects=(QuadraticDrag("hinge"),))
@@ -253,6 +255,7 @@ def test_an_infinite_estimate_is_null_in_json():
     assert estimate.to_dict() == {"mean": None, "sd": 1.0, "hdi_94": [0.0, None], "unit": "m"}
 
 
+@pytest.mark.slow
 def test_the_same_seed_finds_the_same():
     place = ("hinge", "quadratic_drag")
     case = make_case("pendulum", "one", (place,), strength=0.3, seed=2001)
@@ -263,6 +266,7 @@ def test_the_same_seed_finds_the_same():
     assert first.alarm == second.alarm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "seed"),
     [(0, 1040), (1, 1040), (1, 1041)],
@@ -369,6 +373,7 @@ def test_candidates_far_behind_what_was_found_are_not_tried(dragged):
     assert all(4.0 * gains[name] < gains["hinge.quadratic_drag"] for name in missed)
 
 
+@pytest.mark.slow
 def test_every_effect_gets_its_own_rivals(dragged):
     case, _ = dragged
     three = QuadraticDrag("hinge"), CoulombFriction("hinge"), Bias("hinge")
@@ -390,6 +395,7 @@ def test_every_effect_gets_its_own_rivals(dragged):
     assert added[0].share > 0.5 > added[2].share
 
 
+@pytest.mark.slow
 def test_two_processes_find_what_one_finds(dragged):
     case, _ = dragged
     effects = (QuadraticDrag("hinge"), CoulombFriction("hinge"))

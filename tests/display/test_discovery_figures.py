@@ -38,6 +38,7 @@ def without_display():
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_the_latent_force_is_the_friction_and_is_gone_afterwards(found):
     first, last = found.search.rounds[0], found.search.rounds[-1]
     figure = plot_latent_force(first, last, {"velocity": "rad/s"})
@@ -104,6 +105,7 @@ def test_a_discovery_shows_itself_in_a_notebook(found):
     assert MISSING in html and "named" in html and "N m" in html
 
 
+@pytest.mark.slow
 def test_all_figures_are_drawn_and_small_enough_for_a_report(found, tmp_path):
     paths = write_discovery_figures(found, tmp_path)
     assert {path.stem for path in paths} == {
@@ -112,6 +114,7 @@ def test_all_figures_are_drawn_and_small_enough_for_a_report(found, tmp_path):
     assert sum(path.stat().st_size for path in paths) < 500_000
 
 
+@pytest.mark.slow
 def test_a_discovery_that_adds_nothing_has_figures_too(tmp_path):
     rollouts = pendulum_recording(num_rollouts=2)
     options = npdr.DiscoveryOptions(effects=(Bias("hinge"),), max_effects=0)

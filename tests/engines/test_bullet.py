@@ -70,6 +70,7 @@ def tensors(**values):
     return {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
 
 
+@pytest.mark.slow
 def test_a_urdf_pendulum_is_the_zoo_s_pendulum(urdf):
     parameters = tensors(mass=[0.5, 1.0, 1.5], damping=[0.0, 0.1, 0.3])
     for substeps in (1, 4):
@@ -105,6 +106,7 @@ def test_parameters_and_ports_are_read_from_the_scene(urdf):
     assert simulator.recorded_settings()["substeps"] == 1
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_workers_or_on_earlier_simulations(urdf):
     simulator = bullet_pendulum(urdf)
     parameters = tensors(mass=np.linspace(0.4, 1.6, 12).tolist(), damping=0.1)

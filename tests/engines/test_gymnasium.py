@@ -111,6 +111,7 @@ def test_channels_and_nominal_values_are_the_environments():
     assert plain.recorded_settings()["environment"] == "Pendulum-v1"
 
 
+@pytest.mark.slow
 def test_trajectories_are_the_environments_own():
     simulator = pendulum()
     commands = 2.5 * np.sin(0.4 * np.arange(50))

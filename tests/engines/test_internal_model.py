@@ -50,6 +50,7 @@ class ByMass(Policy):
         return (constants,), memory
 
 
+@pytest.mark.slow
 def test_simulators_on_workers_take_it_too(tmp_path):
     masses = torch.tensor([0.2, 0.4], dtype=torch.float64)
     start = torch.tensor([0.5, 0.0], dtype=torch.float64)

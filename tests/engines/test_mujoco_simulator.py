@@ -410,6 +410,7 @@ def test_a_file_without_actuators_swings_by_itself():
 # In a Pyro model.
 
 
+@pytest.mark.slow
 def test_inference_end_to_end():
     simulator = arm(parameters={"hand": "body hand mass", "damping": "joint elbow damping"})
 

@@ -38,6 +38,7 @@ def inputs(actions):
     return single
 
 
+@pytest.mark.slow
 def test_every_element_of_a_batch_gets_its_own_parameters_and_inputs():
     actions = torch.randn(2, 1, 5, 1, generator=torch.Generator().manual_seed(0)).double()
     single = inputs(actions[0, 0])
@@ -52,6 +53,7 @@ def test_every_element_of_a_batch_gets_its_own_parameters_and_inputs():
     torch.testing.assert_close(found, expected)
 
 
+@pytest.mark.slow
 def test_random_simulators_follow_the_global_seed_and_nothing_else():
     simulator = Drift(noise=1.0)
     given = inputs(torch.zeros(4, 1, dtype=torch.float64))

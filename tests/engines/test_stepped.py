@@ -82,6 +82,7 @@ def doubles(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
+@pytest.mark.slow
 def test_episodes_are_those_of_a_loop_written_out():
     out = Cart().roll_out(
         {"mass": doubles(2.0)[0]}, feedback(), doubles(0.5, 1.0), 30, reward=near_zero, record=True
@@ -124,6 +125,7 @@ def test_an_episode_ends_where_a_state_leaves_its_bounds_and_records_are_zero_af
     assert bool((out.commands[:4] == 3).all())
 
 
+@pytest.mark.slow
 def test_playback_is_open_loop(urdf):
     simulator = bullet_pendulum(urdf).with_effects(
         InputDelay("torque"), EncoderBias("angle"), ViscousFriction("hinge")
@@ -163,6 +165,7 @@ def test_bullet_agrees_with_the_equation(urdf):
     torch.testing.assert_close(found.commands[0], expected.commands[0])
 
 
+@pytest.mark.slow
 def test_random_simulators_follow_the_seed_and_nothing_else():
     class Noisy(Cart):
         is_deterministic = False

@@ -69,6 +69,7 @@ def test_results_depend_on_nothing_but_draws_and_seed(options):
     assert reports[-1] == 1.0
 
 
+@pytest.mark.slow
 def test_faults_cost_only_the_draws_they_hit():
     rates = FaultRates(crash=0.06, hang=0.03, nan=0.06)
     with Pool(WorkerOptions("threads", 2, time_limit=TIME_LIMIT)) as pool:
@@ -145,6 +146,7 @@ def test_draws_are_consumed_as_they_are_needed():
         stream.close()
 
 
+@pytest.mark.slow
 def test_an_executor_that_breaks_is_replaced():
     with Pool(WorkerOptions("loky", 2, chunk_size=2)) as pool:
         template = int(pool.run(Parent(), [None]).values[0][0])

@@ -115,6 +115,7 @@ def assert_exact_moments(z, *, num_independent=None, learning=TRAINING_TOLERANCE
     assert ((z.T.cov() - covariance).abs() < limit).all()
 
 
+@pytest.mark.slow
 def test_recovers_a_linear_gaussian_posterior_in_every_round(method):
     problem = make_problem()
     state = method.init(problem)
@@ -159,6 +160,7 @@ def test_log_prob_is_differentiable(brief):
     assert gradient.isfinite().all() and gradient.abs().sum() > 0
 
 
+@pytest.mark.slow
 def test_same_seed_same_result_also_after_resumption(brief, tmp_path):
     problem = make_problem()
     state, _ = run_round(brief, problem, brief.init(problem), 0, n=200)
@@ -185,6 +187,7 @@ def test_initial_state_survives_writing(brief):
     assert state.round == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in sorted(backends()) if backend_class(n).amortises])
 def test_amortised_states_hold_at_every_observation(name):
     method = backend(name)

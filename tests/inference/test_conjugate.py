@@ -49,6 +49,7 @@ def integrated(problem, points):
     return mean, covariance, (weight[:, None] * density).sum(0)
 
 
+@pytest.mark.slow
 def test_inferred_noise_agrees_with_integration(problem):
     points = torch.tensor([[1.0, -0.5], [0.8, -0.3], [1.2, 0.5]], dtype=torch.float64)
     mean, covariance, density = integrated(problem, points)

@@ -75,6 +75,7 @@ def make_problem():
     )
 
 
+@pytest.mark.slow
 def test_covers_what_few_simulations_leave_unknown():
     # Noise whose size depends on the parameters, which a regression does not see.
     def simulate(z):

@@ -97,6 +97,7 @@ def test_solver_converges_with_the_fourth_order():
     assert errors[1] < errors[0] / 8
 
 
+@pytest.mark.slow
 def test_learns_a_bimodal_posterior_in_rounds():
     # x = (z_1^2, z_2) + noise: the posterior given x_1 = 1 has modes at z_1 = -1 and 1.
     problem, method = make_problem(2, torch.tensor([1.0, 0.5])), FMPE()

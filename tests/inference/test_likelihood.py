@@ -70,6 +70,7 @@ def test_contrastive_loss_equals_its_definition_written_as_loops():
             assert loss[member, k].item() == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_contrastive_loss_is_least_at_the_ratio_whatever_the_proposal():
     # z ~ N(1, 0.5^2) and x = z + e: h must be log N(x; z, 1) - log N(x; 1, 1.25).
     with seeded(1):
@@ -169,6 +170,7 @@ def distance_at_the_end_of_a_range(coordinates):
     return float(0.5 * (p - q).abs().sum())
 
 
+@pytest.mark.slow
 def test_bounded_coordinates_learn_what_happens_at_the_end_of_a_range():
     bounded = distance_at_the_end_of_a_range("bounded")
     assert bounded < 0.1

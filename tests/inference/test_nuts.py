@@ -22,6 +22,7 @@ def gain_model(noise):
     return npdr.simulate("x", lambda gain: torch.log(gain)[:, None], {"gain": gain}, noise=noise)
 
 
+@pytest.mark.slow
 def test_samples_a_function_with_declared_noise():
     # log gain ~ N(0, 1) and x = log gain + 0.5 e: N(x / 1.25, 0.2).
     posterior = npdr.infer(

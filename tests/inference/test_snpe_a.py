@@ -34,6 +34,7 @@ def posterior(method, problem, simulate, rounds, n, seed=0):
     return Mixture(method.densities(problem, state))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("proposals", ["gaussian", "mixture"])
 def test_three_rounds_recover_a_narrow_posterior_far_from_the_priors_mean(proposals):
     # x = z + 0.1 e with x_o two prior standard deviations out: proposals a hundredth of the
@@ -52,6 +53,7 @@ def test_three_rounds_recover_a_narrow_posterior_far_from_the_priors_mean(propos
     assert ((z.T.cov() - sd**2 * torch.eye(2)).abs() < limit).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("proposals", ["gaussian", "mixture"])
 def test_learns_both_modes_in_rounds(proposals):
     problem = make_problem(2, torch.tensor([1.0, 0.5]))
@@ -102,6 +104,7 @@ def test_resumes_with_several_mixture_proposals():
         assert torch.equal(ours.log_prob(points), theirs.log_prob(points))
 
 
+@pytest.mark.slow
 def test_embedding_network_is_trained_in_rounds():
     time = torch.linspace(0, 1, 20)[:, None]
     problem = make_problem(

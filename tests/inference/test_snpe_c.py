@@ -85,6 +85,7 @@ def test_atomic_loss_is_least_at_the_posterior_whatever_the_proposal():
         assert blocks.mean() > 3 * blocks.std() / len(blocks) ** 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("proposals", ["truncated", "atomic"])
 @pytest.mark.parametrize("flow", ["nsf", "maf"])
 def test_learns_a_bimodal_or_curved_posterior_in_rounds(flow, proposals):
@@ -129,6 +130,7 @@ class Recurrent(nn.Module):
         return self.gru(x)[1][0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "build",
     [

@@ -138,6 +138,7 @@ def test_errors_of_the_program_itself_stay_what_they_are(recording):
         infer(broken, recording)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["another_size", "indexed_from_the_left"])
 def test_the_command_line_says_it_in_one_line(model, recording, tmp_path):
     recording.to_csv(tmp_path / "data.csv")

@@ -195,6 +195,7 @@ def test_nuts_on_a_black_box_with_noise_matches_the_closed_form():
     assert abs(draws.std() * precision**0.5 - 1) < 4 / (2 * 200) ** 0.5
 
 
+@pytest.mark.slow
 def test_svi_runs_on_a_black_box_with_noise():
     conditioned = pyro.condition(linear_model(0.5), data={"x": torch.tensor([0.5, 1.5])})
     pyro.set_rng_seed(0)

@@ -39,6 +39,7 @@ def finished(tmp_path_factory):
     return folder, options, run(folder, options)
 
 
+@pytest.mark.slow
 def test_friction_that_the_model_lacks_is_found_before_anything_is_inferred(finished):
     folder, _, result = finished
     record = json.loads((folder / "train.json").read_text())["iterations"][0]
@@ -82,6 +83,7 @@ def test_a_resumed_run_reads_what_was_found(finished, monkeypatch):
     assert _sites(again.posterior.prior) == _sites(result.posterior.prior)
 
 
+@pytest.mark.slow
 def test_after_a_diagnosis_the_model_as_it_was_has_a_posterior_too(tmp_path):
     result = run(tmp_path / "run", discovering_options("after diagnosis", extra_rounds=0))
     decisions = result.iterations[0]["decisions"]

@@ -250,6 +250,7 @@ def test_more_iterations_continue_a_finished_run(tmp_path):
     assert longer.to_dict() == at_once.to_dict()
 
 
+@pytest.mark.slow
 def test_the_best_measured_policy_is_deployed(tmp_path):
     measured = run(tmp_path / "measured", small_options(iterations=3))
     returns = [record["real_return"] for record in measured.iterations]
@@ -270,6 +271,7 @@ def test_the_best_measured_policy_is_deployed(tmp_path):
     assert found.deployed is None
 
 
+@pytest.mark.slow
 def test_inference_may_start_from_the_last_posterior_or_the_closest_fit(tmp_path):
     options = small_options(iterations=2, num_simulations=200, start="prior")
     anew = run(tmp_path / "anew", options)

@@ -223,6 +223,7 @@ def test_backlash_lets_the_link_fly_for_as_long_as_the_motor_takes_across_the_ga
     torch.testing.assert_close(velocity[-1], rigid[-1], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_gap_is_crossed_within_a_step_as_in_short_ones():
     """So is what damping takes meanwhile from the link, which coasts and has gone less far."""
     play, share, push = 2e-7, 0.35, 2.0

@@ -105,6 +105,7 @@ class StiffRig(FurutaRig):
         return model
 
 
+@pytest.mark.slow
 def test_dry_friction_of_the_rig_yields_and_is_the_law_where_it_does_not():
     magnitudes = {"arm": 1e-3, "pole": 1e-4}
     base = Furuta(integrator="rk4", substeps=4)

@@ -181,6 +181,7 @@ def test_strikes_do_not_depend_on_what_was_simulated_before(scene):
     other.close()
 
 
+@pytest.mark.slow
 def test_prior_draws_are_finite_and_the_same_in_batches_and_alone():
     inputs = swing(120)
     prior = Prior(mini_golf, (inputs,))

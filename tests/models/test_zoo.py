@@ -40,6 +40,7 @@ def test_effects_declare_units_and_a_priors_for_every_parameter(name):
     assert all(parameter.unit and parameter.description for parameter in effect.parameters)
 
 
+@pytest.mark.slow
 def test_importing_the_zoo_imports_no_engine():
     code = "import sys, npdr_ppl.models; sys.exit('mujoco' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -59,6 +59,7 @@ def test_policy_and_reward_reproduce_the_recordings():
     assert all(965.0 < value < 975.0 for value in returns)
 
 
+@pytest.mark.slow
 def test_default_gains_return_the_published_value():
     reward = SwingUpReward(arm_angle_weight=1.0)
     out = Furuta().roll_out({}, FurutaSwingUp(), starts(20), 2500, reward=reward)

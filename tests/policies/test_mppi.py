@@ -53,6 +53,7 @@ def draws(num_draws, spread=0.1):
     return {"mass": noise[0], "length": noise[1]}
 
 
+@pytest.mark.slow
 def test_furuta_is_kept_upright():
     start = torch.tensor([0.1, math.pi - 0.15, 0.0, 0.0])
     out = Furuta().roll_out({}, furuta_policy(), start, 500, reward=SwingUpReward(), record=True)
@@ -63,6 +64,7 @@ def test_furuta_is_kept_upright():
     assert (fallen.readings[:, 1] - math.pi).abs().max() > math.radians(90.0)
 
 
+@pytest.mark.slow
 def test_pendulum_swings_up_though_too_weak_to_lift():
     # The hinge holds 4.9 N m at most, the motor gives half.
     class Weak(Pendulum):
@@ -173,6 +175,7 @@ def test_internal_model_knows_the_commands_on_their_way():
     assert (pushed > 0.1).all()
 
 
+@pytest.mark.slow
 def test_a_delay_is_overcome_by_a_model_that_has_it():
     delay = {"voltage.input_delay.delay": torch.tensor(0.03)}
     real = Furuta().with_effects(InputDelay("voltage"))

@@ -230,6 +230,7 @@ def test_power_explores_at_least_the_floor_in_every_direction():
     assert torch.linalg.eigvalsh(excess).min() > -1e-9
 
 
+@pytest.mark.slow
 def test_power_raises_the_return_of_the_swing_up():
     """The default gains reach 760 in 4 s; eight seeds out of eight ended between 1578 and 1631."""
     simulator, search, generator = Furuta(), PoWER(), seeded(0)

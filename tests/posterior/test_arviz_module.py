@@ -57,6 +57,7 @@ def exact_elpd(prior_mean=0.0):
     return norm.logpdf(OBSERVED, others, np.sqrt(1 + 1 / len(OBSERVED)))
 
 
+@pytest.mark.slow
 def test_the_release_decides_what_holds_the_groups():
     assert type(normal_mean()).__name__ == ("DataTree" if HAS_DATATREE else "InferenceData")
     assert HAS_DATATREE == (int(az.__version__.split(".")[0]) >= 1)
@@ -178,6 +179,7 @@ def test_comparison_ranks_by_closed_form():
     assert compare({"one": data, "other": data})["warning"].all()
 
 
+@pytest.mark.slow
 def test_files_come_back(tmp_path):
     data = normal_mean()
     path = tmp_path / "posterior.nc"
@@ -192,6 +194,7 @@ def test_files_come_back(tmp_path):
     assert loaded.attrs["backend"] == "exact"
 
 
+@pytest.mark.slow
 def test_a_posterior_is_exported_completely(noisy_pendulum, recording, quick, tmp_path):
     posterior = npdr.infer(
         noisy_pendulum, recording, backend=quick, num_simulations=60, segment_length=50,
@@ -235,6 +238,7 @@ def test_a_posterior_is_exported_completely(noisy_pendulum, recording, quick, tm
     assert np.isfinite(loo(from_netcdf(tmp_path / "posterior.nc")).elpd)
 
 
+@pytest.mark.slow
 def test_no_other_module_imports_arviz():
     root = Path(npdr_ppl.__file__).parent
     offenders = set()

@@ -102,6 +102,7 @@ def calibrated(method, **arguments):
     return npdr.calibrate(posterior_of(method), **arguments)
 
 
+@pytest.mark.slow
 def test_an_exact_posterior_passes():
     found = calibrated(Exact())
     assert found.passes(FALSE_ALARM)
@@ -113,6 +114,7 @@ def test_an_exact_posterior_passes():
             assert level.low <= level.nominal <= level.high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "sign"), [(0.6, 1), (1.6, -1)])
 def test_wrong_widths_fail_every_test(scale, sign):
     found = calibrated(Exact(scale=scale))
@@ -128,18 +130,21 @@ def test_wrong_widths_fail_every_test(scale, sign):
     assert abs(central.expected - expected) < 4 * math.sqrt(expected * (1 - expected) / 300)
 
 
+@pytest.mark.slow
 def test_a_bias_fails_every_test():
     found = calibrated(Exact(shift=0.7))
     assert set(found.failures(FALSE_ALARM)) == {"a", "b", "highest_density", "tarp"}
     assert found.ranks.mean() < found.num_draws / 2, "truths lie below a posterior shifted up"
 
 
+@pytest.mark.slow
 def test_only_tarp_sees_the_prior_in_place_of_the_posterior():
     found = calibrated(Exact(is_prior=True))
     assert set(found.failures(FALSE_ALARM)) == {"tarp"}
     assert found.tarp_deviation > 0.2
 
 
+@pytest.mark.slow
 def test_failed_simulations_are_dropped_and_counted():
     posterior = posterior_of(Exact(), failing=0.2)
     found = npdr.calibrate(posterior, num_datasets=400, num_draws=99, progress=False)
@@ -151,6 +156,7 @@ def test_failed_simulations_are_dropped_and_counted():
         npdr.calibrate(posterior_of(Exact(), failing=0.9), num_datasets=40, progress=False)
 
 
+@pytest.mark.slow
 def test_posteriors_of_one_observation_must_be_refitted():
     sequential = posterior_of(Exact(), rounds=2)
     with pytest.raises(BackendError, match=r"took 2 rounds.*refit=True.*after_round\(0\)"):
@@ -167,6 +173,7 @@ def test_posteriors_of_one_observation_must_be_refitted():
     assert "highest_density" in wrong.failures(FALSE_ALARM)
 
 
+@pytest.mark.slow
 def test_refits_learn_from_the_simulated_observation(linear):
     model, observed = linear
     tiny = backend("snpe-c", transforms=1, hidden=(8,), epochs=3, members=1)
@@ -181,6 +188,7 @@ def test_refits_learn_from_the_simulated_observation(linear):
     assert found.coverage((0.95,))[0].expected > 0.7
 
 
+@pytest.mark.slow
 def test_amortised_flows_are_evaluated_at_every_observation(linear, quick):
     model, observed = linear
     posterior = npdr.infer(
@@ -199,6 +207,7 @@ def test_amortised_flows_are_evaluated_at_every_observation(linear, quick):
     assert found.coverage((0.8,))[0].expected > 0.6
 
 
+@pytest.mark.slow
 def test_same_seed_same_ranks_and_the_callers_stream_is_left_alone():
     few = {"num_datasets": 20, "num_draws": 19}
     torch.manual_seed(3)

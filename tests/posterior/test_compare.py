@@ -93,6 +93,7 @@ def run(model, train, test, backends, **settings):
 NEAR, FAR = Fixed(0.0, 0.1), Fixed(1.5, 0.1)
 
 
+@pytest.mark.slow
 def test_the_better_posterior_wins_everywhere(recording, tmp_path):
     found = run(
         pendulum, recording[[0]], recording[[1]], {"far": FAR, "near": NEAR},
@@ -188,6 +189,7 @@ def test_the_likelihood_of_a_segment_is_its_weighted_readings(recording):
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_all_get_the_same_budget(recording):
     found = run(
         pendulum, recording, None,
@@ -199,6 +201,7 @@ def test_all_get_the_same_budget(recording):
     assert found.settings["elpd"] == "PSIS-LOO", "without held-out data each segment is left out"
 
 
+@pytest.mark.slow
 def test_failures_are_rows_unless_all_fail(recording, tmp_path):
     train, test = recording[[0]], recording[[1]]
     backends = {"failing": Failing(), "near": NEAR}
@@ -212,6 +215,7 @@ def test_failures_are_rows_unless_all_fail(recording, tmp_path):
         run(pendulum, train, test, {"failing": Failing()}, options=OPTIONS)
 
 
+@pytest.mark.slow
 def test_equal_backends_share_their_place(recording):
     backends = {"far": FAR, "b": NEAR, "a": replace(NEAR)}
     found = run(pendulum, recording[[0]], recording[[1]], backends, options=OPTIONS)
@@ -219,6 +223,7 @@ def test_equal_backends_share_their_place(recording):
     assert found.ranks == {"b": 1, "a": 1, "far": 3}
 
 
+@pytest.mark.slow
 def test_an_impossible_prediction_is_null_and_last(recording, tmp_path):
     def stops_at_the_edge(inputs):
         mass = pyro.sample("mass", dist.Uniform(0.3, 1.7))
@@ -255,6 +260,7 @@ def test_without_a_likelihood_the_crps_ranks(linear):
         _ = found.ensemble
 
 
+@pytest.mark.slow
 def test_the_mixtures_density_is_better_than_any_ones(recording):
     backends = {"low": Fixed(-0.4, 0.05), "high": Fixed(0.4, 0.05)}
     found = run(pendulum, recording[[0]], recording[[1]], backends, options=OPTIONS)
@@ -262,6 +268,7 @@ def test_the_mixtures_density_is_better_than_any_ones(recording):
     assert found.mixture.elpd.sum() >= best - 1e-6
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_figures_and_a_killed_run_continues(
     recording, quick, tmp_path, monkeypatch
 ):

@@ -45,6 +45,7 @@ def inside(posterior, name, value, mass=0.999):
     return low < value < high
 
 
+@pytest.mark.slow
 def test_defaults_find_the_truth_and_accept(found):
     for name, value in TRUTH.items():
         assert inside(found, name, value)
@@ -56,6 +57,7 @@ def test_defaults_find_the_truth_and_accept(found):
     assert "uncertain initial states" in found.preparation.sentence()
 
 
+@pytest.mark.slow
 def test_discovery_agrees_that_nothing_is_missing(clean, found):
     discovery = npdr.discover(pendulum, clean)
     assert discovery.verdict == "none", discovery.reason
@@ -64,6 +66,7 @@ def test_discovery_agrees_that_nothing_is_missing(clean, found):
     assert checks["priors"] == []
 
 
+@pytest.mark.slow
 def test_a_prior_that_excludes_the_truth_is_named(clean, quick):
     def narrow(inputs):
         mass = pyro.sample("mass", dist.Uniform(0.3, 1.7))
@@ -80,6 +83,7 @@ def test_a_prior_that_excludes_the_truth_is_named(clean, quick):
     assert "with_wider_priors(revised_model, ['length'])" in found.source()
 
 
+@pytest.mark.slow
 def test_hidden_dry_friction_asks_for_another_model(quick):
     rubbing = swinging(friction=0.15)
     diagnosis = npdr.diagnose(infer(pendulum, rubbing, quick).to_arviz())
@@ -87,6 +91,7 @@ def test_hidden_dry_friction_asks_for_another_model(quick):
     assert diagnosis.model_p_value < 0.01
 
 
+@pytest.mark.slow
 def test_a_parameter_that_does_nothing_asks_for_another_rollout(clean, quick):
     def with_idle(inputs):
         pyro.sample("idle", dist.Uniform(0.0, 1.0))
@@ -100,6 +105,7 @@ def test_a_parameter_that_does_nothing_asks_for_another_rollout(clean, quick):
     assert npdr.diagnose(data, rollouts_left=0).decision is Decision.ACCEPT
 
 
+@pytest.mark.slow
 def test_parameters_of_one_product_ask_for_another_excitation(clean, quick):
     posterior = infer(product, clean, quick)
     draws = posterior.sample(500)
@@ -110,6 +116,7 @@ def test_parameters_of_one_product_ask_for_another_excitation(clean, quick):
     assert "density and volume only in combination" in diagnosis.reason
 
 
+@pytest.mark.slow
 def test_declared_noise_that_is_too_small_is_told(clean, quick):
     model = npdr.with_noise(pendulum, {"angle": 0.001, "velocity": 0.005})
     diagnosis = npdr.diagnose(infer(model, clean, quick).to_arviz())
@@ -117,6 +124,7 @@ def test_declared_noise_that_is_too_small_is_told(clean, quick):
     assert "times as large as the declared noise" in diagnosis.reason
 
 
+@pytest.mark.slow
 def test_a_fit_spends_the_rounds_that_it_has_left(clean, quick, monkeypatch):
     from npdr_ppl.posterior import estimator_check
     from npdr_ppl.preparation import importance_sampling as posterior_sampling
@@ -135,6 +143,7 @@ def test_a_fit_spends_the_rounds_that_it_has_left(clean, quick, monkeypatch):
     assert len(posterior.provenance.rounds) == 2
 
 
+@pytest.mark.slow
 def test_checks_travel_with_the_exported_posterior(found, tmp_path):
     data = found.to_arviz()
     to_netcdf(data, tmp_path / "posterior.nc")

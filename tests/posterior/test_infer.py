@@ -28,6 +28,7 @@ def test_linear_gaussian_posterior(linear):
     assert difference.abs().median() < 0.2
 
 
+@pytest.mark.slow
 def test_same_seed_same_posterior_and_other_seed_another(linear, quick):
     model, observed = linear
     arguments = {"backend": quick, "rounds": 2, "num_simulations": 100, "progress": False}
@@ -48,6 +49,7 @@ def test_the_callers_random_stream_is_left_alone(linear, quick):
     assert torch.equal(torch.rand(3), expected)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_continues_to_the_same_result(linear, quick, tmp_path, monkeypatch):
     model, observed = linear
     arguments = {
@@ -81,6 +83,7 @@ def test_an_interrupted_run_continues_to_the_same_result(linear, quick, tmp_path
         npdr.infer(model, observed, checkpoint=tmp_path, **{**arguments, "seed": 9})
 
 
+@pytest.mark.slow
 def test_saved_posteriors_come_back_identical(noisy_pendulum, recording, quick, tmp_path):
     posterior = npdr.infer(
         noisy_pendulum, recording, backend=quick, num_simulations=60, segment_length=50,
@@ -95,6 +98,7 @@ def test_saved_posteriors_come_back_identical(noisy_pendulum, recording, quick, 
         npdr.Posterior.load(tmp_path, noisy_pendulum)
 
 
+@pytest.mark.slow
 def test_posterior_draws_lie_on_the_support(noisy_pendulum, recording, quick):
     posterior = npdr.infer(
         noisy_pendulum, recording, backend=quick, num_simulations=60, progress=False
@@ -110,6 +114,7 @@ def test_posterior_draws_lie_on_the_support(noisy_pendulum, recording, quick):
         posterior.log_prob({"mass": torch.ones(3)})
 
 
+@pytest.mark.slow
 def test_the_guide_drives_predictive(noisy_pendulum, recording, quick):
     posterior = npdr.infer(
         noisy_pendulum, recording, backend=quick, num_simulations=60, progress=False
@@ -174,6 +179,7 @@ def pendulum_simulator():
     return Pendulum()
 
 
+@pytest.mark.slow
 def test_a_sensor_that_sees_only_the_position(noisy_pendulum, recording, quick):
     positions = recording.select(["angle"])
     posterior = npdr.infer(

@@ -75,6 +75,7 @@ def test_log_prob_is_the_likelihood_up_to_a_function_of_the_value(learnt, measur
     )
 
 
+@pytest.mark.slow
 def test_nuts_and_svi_run_on_a_hierarchical_model(learnt, measured):
     # The exact posterior of the mean: each device's weighted average is sufficient.
     weights = torch.tensor([1.0, 0.5])

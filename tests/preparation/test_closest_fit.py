@@ -70,6 +70,7 @@ def rollouts():
     return record(NOISE)
 
 
+@pytest.mark.slow
 def test_initial_states_that_are_fitted_leave_only_noise(rollouts):
     found = prepare(model, rollouts, UNCERTAIN)
     assert NOISE * 0.8 < found.noise["angle"] < NOISE * 1.1
@@ -80,6 +81,7 @@ def test_initial_states_that_are_fitted_leave_only_noise(rollouts):
     assert estimated.scale["angle"] > 2 * found.noise["angle"]
 
 
+@pytest.mark.slow
 def test_a_fit_goes_on_from_what_is_known(rollouts):
     known = {"mass": torch.tensor(1.2), "length": torch.tensor(0.85)}
     found = prepare(model, rollouts, UNCERTAIN, near=known).hypothesis.parameters
@@ -123,6 +125,7 @@ def test_the_score_is_as_sharp_as_fisher_information_allows(rollouts):
     assert bound.observed_features().abs().max() < 0.5
 
 
+@pytest.mark.slow
 def test_a_score_posterior_covers_the_truth(rollouts):
     posterior = npdr.infer(
         prepare(model, rollouts, UNCERTAIN).model,

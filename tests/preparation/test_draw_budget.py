@@ -47,6 +47,7 @@ def test_short_recordings_keep_every_draw_that_is_wanted():
     assert affordable_draws(5, 10**9) == 5
 
 
+@pytest.mark.slow
 def test_parts_have_the_likelihood_of_the_whole(posterior, monkeypatch):
     """By the definition, from trajectories that are all in memory."""
     monkeypatch.setattr(draw_budget, "PER_PART", 1)  # one draw at a time

@@ -110,6 +110,7 @@ def test_noiseless_motion_gives_the_parameters_back(cls):
         torch.testing.assert_close(value.double(), values[name], rtol=1e-3, atol=0.0)
 
 
+@pytest.mark.slow
 def test_effects_add_columns():
     simulator = Emps(integrator="rk4").with_effects(
         CoulombFriction("carriage"),
@@ -136,6 +137,7 @@ def test_effects_add_columns():
         assert error < 0.05 * abs(value) + 3.0 * float(draws[name].std()), name
 
 
+@pytest.mark.slow
 def test_what_a_model_fixes_need_not_be_found():
     """With the masses and the damping fixed, three of the cart-pole's parameters remain."""
 
@@ -178,6 +180,7 @@ def test_noise_of_readings_shows_in_the_posterior():
         assert float(draws[name].std()) > 1e-5
 
 
+@pytest.mark.slow
 def test_posteriors_are_whole(tmp_path, caplog):
     """Saved, loaded, exported; draws on the support; the most likely one is the densest."""
     rollouts = record(Furuta(integrator="rk4"), TRUTH[Furuta], 0.002, 1500)
@@ -309,6 +312,7 @@ def test_nominal_values_off_the_prior_are_marked():
     assert form.determined.tolist() == [True, True, False]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not FURUTA.exists(), reason=f"the recordings {FURUTA} are absent")
 def test_the_real_furuta_pendulum_is_fitted_better_than_in_the_paper():
     rollouts = Rollouts.from_csv(FURUTA)

@@ -56,6 +56,7 @@ def test_fine_steps_end_where_nothing_is_left_to_gain(segments):
     assert objective(segments, rough.z, rough.offsets, fine.scale) < 1.01 * least
 
 
+@pytest.mark.slow
 def test_parameters_known_a_thousand_times_better_hold_up_no_other():
     place = ("arm", "stribeck_friction")
     case = make_case("furuta", "one", (place,), strength=1.0, seed=2001)
@@ -104,6 +105,7 @@ def test_a_segment_that_stands_out_stays_where_it_was_recorded():
     assert segments.num_offsets == 0 and found.offsets.shape == (12, 0)
 
 
+@pytest.mark.slow
 def test_most_fits_leap_out_of_the_dents_that_play_leaves_in_the_misfit(monkeypatch):
     case = make_case("pendulum", "one", (("hinge", "backlash"),), strength=0.72, seed=72)
     model = add_effect(case.model, Backlash("hinge"))

@@ -59,6 +59,7 @@ def strikes():
     return rollouts([np.vstack([resting[:1], one[0].numpy()]) for one in struck])
 
 
+@pytest.mark.slow
 def test_clocks_of_ball_and_arm_are_aligned(strikes):
     straight = strikes[[0]]  # nominal restitution, so that the simulation's clock is its own
     columns = [strikes.channel_names.index(name) for name in ("ball_x", "ball_y")]
@@ -83,6 +84,7 @@ def test_clocks_of_ball_and_arm_are_aligned(strikes):
         clocks_aligned(replace(straight, readings=(resting,)))
 
 
+@pytest.mark.slow
 def test_the_table_has_every_row_and_what_figure_4_shows(strikes, tmp_path, monkeypatch):
     monkeypatch.setattr(mini_golf_fit, "NUM_DRAWS", 200)  # of a posterior that knows little
     posteriors, result = reproduce_mini_golf(

@@ -175,6 +175,7 @@ def test_the_rank_is_that_of_unrelated_states():
     assert np.abs(blind / posterior.scales.max()).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("xml", [ARM, CART_POLE], ids=["arm", "cart-pole"])
 def test_recordings_of_positions_and_controls_do(xml):
     model = mujoco.MjModel.from_xml_string(xml)

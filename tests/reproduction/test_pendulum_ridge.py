@@ -45,6 +45,7 @@ def test_every_method_has_a_row_of_its_rounds_beside_nuts(short, tmp_path):
     assert figure.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_exact_posterior_lies_on_the_valley(short):
     rollouts = record(50)
     inputs = rollouts.inputs(initial_state="recorded")
@@ -69,6 +70,7 @@ def test_what_the_score_needs_is_missed_before_anything_is_fitted(tmp_path, monk
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_fits_are_kept_where_the_score_is_interrupted(short, tmp_path, monkeypatch):
     monkeypatch.setattr(pendulum_ridge, "DURATIONS", {"1 s": 50})
     monkeypatch.setattr(pendulum_ridge, "NUM_SAMPLES", 100)

@@ -66,6 +66,7 @@ def test_policies_that_need_no_rig_meet_it_only_to_be_judged(task, method):
     assert again.returns[0] < 0.5 * NUM_STEPS
 
 
+@pytest.mark.slow
 def test_returns_of_the_loop_are_of_fresh_episodes_on_the_rig(task):
     rig = Upright(num_honest=1)
     options = tiny_options()
@@ -107,6 +108,7 @@ def test_policies_are_trained_in_the_nominal_domain_or_in_draws_of_the_prior(tas
         assert bool((drawn[name] / expected[name] - 1.0).abs().max() < 1.0)
 
 
+@pytest.mark.slow
 def test_what_a_folder_holds_is_not_run_again(tmp_path, monkeypatch):
     short = replace(control_task("furuta-swing-up"), num_steps=NUM_STEPS)
     monkeypatch.setattr(rig_study, "control_task", lambda name: short)

@@ -47,6 +47,7 @@ def table(recording, tmp_path_factory):
     return comparison, result, out
 
 
+@pytest.mark.slow
 def test_methods_are_judged_on_the_rollouts_that_were_held_out(recording, table):
     comparison, result, _ = table
     figures = comparison.rows[METHOD].figures
@@ -64,6 +65,7 @@ def test_methods_are_judged_on_the_rollouts_that_were_held_out(recording, table)
     assert comparison.settings["evaluated_on"] == "held-out"
 
 
+@pytest.mark.slow
 def test_held_out_rollouts_have_no_say_in_the_fit(recording, table, tmp_path):
     comparison, _, _ = table
     readings = [r.copy() for r in recording.readings]

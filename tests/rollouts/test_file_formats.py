@@ -49,6 +49,7 @@ def bits(rollouts):
     return [values.tobytes() for group in groups for values in group]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format_name", FORMATS)
 @settings(
     max_examples=40,

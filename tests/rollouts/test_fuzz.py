@@ -22,6 +22,7 @@ def fuzz_csv():
     return module
 
 
+@pytest.mark.slow
 def test_malformed_files_are_read_or_refused_with_a_sentence(fuzz_csv):
     outcomes, sentences, failures = fuzz_csv.fuzz(seed=1, first=0, last=2000)
     assert not failures
