@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from npdr_ppl.inference.parts.samplers.linear_problem import LinearRegression
+from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.rollouts.differentiation import Smoothing
 
 __all__ = ["Backend", "Density", "Problem", "RoundInfo", "State"]

@@ -27,8 +27,8 @@ from torch import Tensor
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
+from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.inference.parts.samplers.conjugate import StudentT, linear_posterior
-from npdr_ppl.inference.parts.samplers.linear_problem import LinearRegression
 from npdr_ppl.inference.parts.training.simulation_checks import check_problem, finite_rows
 from npdr_ppl.rollouts.differentiation import Smoothing
 

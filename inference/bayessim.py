@@ -17,7 +17,7 @@ likelihood, and read off at the observation. The functions are
 
 Further rounds, with which Muratore et al. (2021) ran it, draw from the posterior and are corrected
 as in :mod:`npdr_ppl.inference.snpe_a`. The paper does so after training; see
-:mod:`npdr_ppl.inference.parts.mixtures.mixture_backend` for why we do it within.
+:mod:`npdr_ppl.inference.parts.bases.mixture_backend` for why we do it within.
 """
 
 from collections.abc import Sequence
@@ -28,10 +28,10 @@ from torch import nn
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.parts.mixtures.mixture_backend import MixtureBackend
+from npdr_ppl.inference.parts.bases.mixture_backend import MixtureBackend
+from npdr_ppl.inference.parts.bases.neural_backend import NeuralState, Simulations
 from npdr_ppl.inference.parts.mixtures.mixture_density import MixtureDensityNetwork
 from npdr_ppl.inference.parts.samplers.fourier import KERNELS, FourierFeatures, median_distance
-from npdr_ppl.inference.parts.training.neural_backend import NeuralState, Simulations
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
 
 __all__ = ["BayesSim"]
@@ -49,7 +49,7 @@ class BayesSim(MixtureBackend):
         kernel: Kernel of the Fourier features: ``"rbf"``, ``"matern-3/2"`` or ``"matern-5/2"``.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.mixtures.mixture_backend.MixtureBackend`.
+    :class:`~npdr_ppl.inference.parts.bases.mixture_backend.MixtureBackend`.
     """
 
     name: ClassVar[str] = "bayessim"

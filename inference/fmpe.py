@@ -27,7 +27,7 @@ I) - which the preconditioner, see :mod:`npdr_ppl.inference.parts.training.preco
 it for linear-Gaussian problems. A network that starts at zero starts at that posterior, and the
 solver's steps are spent on what is not Gaussian.
 
-Sequential rounds use truncated proposals, see :mod:`npdr_ppl.inference.parts.training.truncated`.
+Sequential rounds use truncated proposals, see :mod:`npdr_ppl.inference.parts.bases.truncated`.
 """
 
 from dataclasses import dataclass
@@ -38,13 +38,13 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem, State
+from npdr_ppl.inference.parts.bases.neural_backend import Simulations
+from npdr_ppl.inference.parts.bases.truncated import TruncatedBackend
 from npdr_ppl.inference.parts.flows.flows import load_member
 from npdr_ppl.inference.parts.flows.velocity import VelocityDensity, VelocityNetwork, end_angle
 from npdr_ppl.inference.parts.training.embedding_network import build_embedding
 from npdr_ppl.inference.parts.training.ensemble_training import LogProb, Loss
-from npdr_ppl.inference.parts.training.neural_backend import Simulations
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
-from npdr_ppl.inference.parts.training.truncated import TruncatedBackend
 from npdr_ppl.randomness import seeded
 
 __all__ = ["FMPE", "flow_matching_loss"]
@@ -66,7 +66,7 @@ class FMPE(TruncatedBackend):
         steps: Steps of the solver.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.training.truncated.TruncatedBackend`.
+    :class:`~npdr_ppl.inference.parts.bases.truncated.TruncatedBackend`.
     """
 
     name: ClassVar[str] = "fmpe"

@@ -24,6 +24,11 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Problem, State
+from npdr_ppl.inference.parts.bases.likelihood_backend import (
+    LearnedLogLikelihood,
+    LikelihoodBackend,
+)
+from npdr_ppl.inference.parts.bases.neural_backend import NeuralState, Simulations
 from npdr_ppl.inference.parts.flows.flows import (
     FLOWS,
     Flow,
@@ -32,15 +37,10 @@ from npdr_ppl.inference.parts.flows.flows import (
     load_member,
 )
 from npdr_ppl.inference.parts.training.ensemble_training import Loss
-from npdr_ppl.inference.parts.training.likelihood_backend import (
-    LearnedLogLikelihood,
-    LikelihoodBackend,
-)
 from npdr_ppl.inference.parts.training.likelihood_preconditioning import (
     LikelihoodPreconditioner,
     fit_likelihood_preconditioner,
 )
-from npdr_ppl.inference.parts.training.neural_backend import NeuralState, Simulations
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
 
 __all__ = ["NLE"]
@@ -64,7 +64,7 @@ class NLE(LikelihoodBackend):
             hierarchical one above all, reaches the ends of uniform ranges.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.training.neural_backend.NeuralBackend`.
+    :class:`~npdr_ppl.inference.parts.bases.neural_backend.NeuralBackend`.
     """
 
     name: ClassVar[str] = "nle"

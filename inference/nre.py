@@ -33,12 +33,12 @@ import torch
 from torch import Tensor, nn
 
 from npdr_ppl.inference.base import Problem, State
-from npdr_ppl.inference.parts.training.ensemble_training import LogProb, Loss
-from npdr_ppl.inference.parts.training.likelihood_backend import (
+from npdr_ppl.inference.parts.bases.likelihood_backend import (
     LearnedLogLikelihood,
     LikelihoodBackend,
 )
-from npdr_ppl.inference.parts.training.neural_backend import NeuralState, Simulations
+from npdr_ppl.inference.parts.bases.neural_backend import NeuralState, Simulations
+from npdr_ppl.inference.parts.training.ensemble_training import LogProb, Loss
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
 from npdr_ppl.randomness import seeded
 
@@ -138,7 +138,7 @@ class NRE(LikelihoodBackend):
         gamma: Odds of the right one being among them.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.training.neural_backend.NeuralBackend`.
+    :class:`~npdr_ppl.inference.parts.bases.neural_backend.NeuralBackend`.
     """
 
     name: ClassVar[str] = "nre"

@@ -8,7 +8,7 @@ network is trained further on them. Here a round
 1. draws from the present posterior, the prior at first,
 2. goes on from the networks of the round before, for few epochs, with the
    first round's preconditioner, without which their weights would lose their meaning,
-3. corrects for the proposals as :mod:`npdr_ppl.inference.parts.mixtures.mixture_backend`
+3. corrects for the proposals as :mod:`npdr_ppl.inference.parts.bases.mixture_backend`
 describes; by keeping
    the earlier simulations, each with its own proposal, we depart from the paper.
 
@@ -22,8 +22,8 @@ from typing import ClassVar
 
 from npdr_ppl.inference.base import Problem
 from npdr_ppl.inference.bayessim import BayesSim
+from npdr_ppl.inference.parts.bases.neural_backend import NeuralState, Simulations
 from npdr_ppl.inference.parts.mixtures.mixture_density import MixtureDensityNetwork
-from npdr_ppl.inference.parts.training.neural_backend import NeuralState, Simulations
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
 
 __all__ = ["OnlineBayesSim"]

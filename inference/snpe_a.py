@@ -14,7 +14,7 @@ conditional density estimation*, https://arxiv.org/abs/1605.06376. Each round r
 The prior is N(0, I), so that the quotient of Gaussians is known for every model. The division
 takes place inside the likelihood rather than after training, which makes it exact and proper
 whatever the network, and lets all rounds' simulations count: see
-:mod:`npdr_ppl.inference.parts.mixtures.mixture_backend`, also for how this differs from the paper.
+:mod:`npdr_ppl.inference.parts.bases.mixture_backend`, also for how this differs from the paper.
 It is the form in which Greenberg et al. (2019, https://arxiv.org/abs/1905.07488) train mixtures
 without atoms.
 """
@@ -24,8 +24,8 @@ from typing import ClassVar
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.parts.mixtures.mixture_backend import MixtureBackend
-from npdr_ppl.inference.parts.training.neural_backend import NeuralState
+from npdr_ppl.inference.parts.bases.mixture_backend import MixtureBackend
+from npdr_ppl.inference.parts.bases.neural_backend import NeuralState
 
 __all__ = ["SNPEA"]
 
@@ -35,7 +35,7 @@ class SNPEA(MixtureBackend):
     """Sequential neural posterior estimation, SNPE-A; see the module's text for the method.
 
     The options are those of
-    :class:`~npdr_ppl.inference.parts.mixtures.mixture_backend.MixtureBackend`.
+    :class:`~npdr_ppl.inference.parts.bases.mixture_backend.MixtureBackend`.
     """
 
     name: ClassVar[str] = "snpe-a"

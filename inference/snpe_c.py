@@ -14,7 +14,7 @@ Two kinds of proposals do that:
 * ``"truncated"`` (Deistler et al. 2022, https://arxiv.org/abs/2210.04815): the prior restricted to
   the region that holds all but a fraction epsilon of the present posterior's mass, where plain
   maximum likelihood, max sum_n log q(z_n | x_n), needs no correction; see
-  :mod:`npdr_ppl.inference.parts.training.truncated`.
+  :mod:`npdr_ppl.inference.parts.bases.truncated`.
 * ``"atomic"`` (Greenberg et al. 2019, Eqs. 4 and 6): the present posterior itself. A row's
   parameters z_n must be told from M - 1 others of the batch,
 
@@ -38,6 +38,12 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem, State
+from npdr_ppl.inference.parts.bases.neural_backend import (
+    NeuralBackend,
+    NeuralState,
+    Simulations,
+)
+from npdr_ppl.inference.parts.bases.truncated import TruncatedBackend
 from npdr_ppl.inference.parts.flows.flow_base import FlowBase, fit_base
 from npdr_ppl.inference.parts.flows.flows import (
     FLOWS,
@@ -50,13 +56,7 @@ from npdr_ppl.inference.parts.flows.flows import (
 from npdr_ppl.inference.parts.flows.stacked_flow import stacked_log_prob
 from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 from npdr_ppl.inference.parts.training.ensemble_training import Evaluator, LogProb, Loss
-from npdr_ppl.inference.parts.training.neural_backend import (
-    NeuralBackend,
-    NeuralState,
-    Simulations,
-)
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, whiten_unseen
-from npdr_ppl.inference.parts.training.truncated import TruncatedBackend
 
 __all__ = ["SNPEC", "atomic_loss"]
 
@@ -84,7 +84,7 @@ class SNPEC(TruncatedBackend):
             :mod:`npdr_ppl.inference.parts.flows.flow_base`.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.training.truncated.TruncatedBackend`.
+    :class:`~npdr_ppl.inference.parts.bases.truncated.TruncatedBackend`.
     """
 
     name: ClassVar[str] = "snpe-c"

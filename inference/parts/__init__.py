@@ -1,4 +1,4 @@
 """What backends are built from: flows, mixtures, training and samplers.
 
-May import: inference.base. Start reading at ``training/neural_backend.py``.
+May import: inference.base. Start reading at ``bases/neural_backend.py``.
 """

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import BackendError, ModelError, ShapeError
-from npdr_ppl.inference.parts.training.likelihood_backend import LikelihoodBackend
+from npdr_ppl.inference.parts.bases.likelihood_backend import LikelihoodBackend
 from npdr_ppl.language.handlers import LikelihoodMessenger
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox, SiteLikelihood

@@ -9,8 +9,8 @@ from scipy import linalg
 from torch import Tensor
 
 from npdr_ppl.errors import BackendError, DataError, ModelError, TooShortError
+from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.inference.parts.samplers.conjugate import row_noise
-from npdr_ppl.inference.parts.samplers.linear_problem import LinearRegression
 from npdr_ppl.language.effects import LinearForceEffect
 from npdr_ppl.language.linear_dynamics import InverseDynamics, Motion
 from npdr_ppl.language.prior import Prior

@@ -5,7 +5,6 @@ them), then ``container.py`` (what users call) and ``segments.py`` (what a simul
 """
 
 from npdr_ppl.rollouts.container import Rollouts
-from npdr_ppl.rollouts.io.simurlacra import load_simurlacra
 from npdr_ppl.rollouts.segments import stitch
 
-__all__ = ["Rollouts", "load_simurlacra", "stitch"]
+__all__ = ["Rollouts", "stitch"]

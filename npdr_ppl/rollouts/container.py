@@ -1,6 +1,6 @@
 """Rollouts: an immutable set of recorded or simulated episodes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -92,6 +92,29 @@ class Rollouts(Recording):
         from npdr_ppl.rollouts.io.file_formats import from_xarray
 
         return cls.of(from_xarray(dataset))
+
+    @classmethod
+    def from_simurlacra(cls, path: Path, names: Mapping[str, str] | None = None) -> "Rollouts":
+        """Reads a rollout, or a list of rollouts, that SimuRLacra saved.
+
+        The pickle is read by a machine that builds arrays and inert records and calls nothing, so
+        a file from an untrusted source does no harm. States become channels (observations, where
+        no states were saved), the applied actions become actions (the commanded ones, where no
+        applied ones were saved).
+
+        Args:
+            path: A ``.pkl`` file.
+            names: New names for the file's own ones, e.g. ``{"theta": "arm_angle"}``.
+
+        Raises:
+            DataError: The file is damaged, holds something else, or asks for code to be run.
+
+        References:
+            F. Muratore, SimuRLacra, https://github.com/famura/SimuRLacra (class ``StepSequence``).
+        """
+        from npdr_ppl.rollouts.io.simurlacra import read_simurlacra
+
+        return cls.of(read_simurlacra(path, names))
 
     @classmethod
     def load(cls, path: Path) -> "Rollouts":

@@ -29,8 +29,8 @@ from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.evidence import weigh
-from npdr_ppl.discovery.search.side_by_side import side_by_side
 from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.discovery.side_by_side import side_by_side
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import (
     AsymmetricCoulombFriction,

@@ -10,8 +10,8 @@ import torch
 
 from npdr_ppl.errors import BackendError, ShapeError
 from npdr_ppl.inference.base import Problem
+from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
-from npdr_ppl.inference.parts.samplers.linear_problem import LinearRegression
 from npdr_ppl.inference.registry import backend, backend_class, backends
 from npdr_ppl.randomness import seeded
 

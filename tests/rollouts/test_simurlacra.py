@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.rollouts import Rollouts, load_simurlacra
+from npdr_ppl.rollouts import Rollouts
 
 NAMES = {
     "theta": "arm_angle",
@@ -21,7 +21,7 @@ NAMES = {
 
 def test_an_original_recording(shared):
     """The same episode was exported to CSV with nine digits."""
-    rollouts = load_simurlacra(shared / "quanser_qube" / "original_rollout.pkl", NAMES)
+    rollouts = Rollouts.from_simurlacra(shared / "quanser_qube" / "original_rollout.pkl", NAMES)
     csv = Rollouts.load(shared / "quanser_qube" / "swing_up_500hz_5s.csv")[0]
     assert rollouts.channel_names == csv.channel_names
     assert rollouts.action_names == csv.action_names
@@ -30,7 +30,7 @@ def test_an_original_recording(shared):
     np.testing.assert_allclose(rollouts.actions[0], csv.actions[0], rtol=1e-8, atol=1e-12)
     assert rollouts.rewards is not None
     assert rollouts.rewards[0].sum() == pytest.approx(1017, abs=1)
-    again = load_simurlacra(shared / "quanser_qube" / "original_rollout.pkl")
+    again = Rollouts.from_simurlacra(shared / "quanser_qube" / "original_rollout.pkl")
     assert again.channel_names == tuple(NAMES)[:4]
 
 
@@ -40,7 +40,7 @@ def test_truncations_of_the_original(shared, tmp_path):
     for end in np.linspace(0, len(data) - 1, 40).astype(int):
         path.write_bytes(data[:end])
         with pytest.raises(DataError, match="cut.pkl: "):
-            load_simurlacra(path)
+            Rollouts.from_simurlacra(path)
 
 
 @pytest.fixture
@@ -72,7 +72,7 @@ def episode(steps=5, **changes):
 def test_lists_of_rollouts_without_states_or_labels(step_sequence, tmp_path):
     first, second = episode(5), episode(3)
     joblib.dump([step_sequence(**first), step_sequence(**second)], tmp_path / "x.pkl")
-    rollouts = load_simurlacra(tmp_path / "x.pkl")
+    rollouts = Rollouts.from_simurlacra(tmp_path / "x.pkl")
     assert rollouts.lengths == (5, 3)
     assert rollouts.channel_names == ("observation_0", "observation_1")
     assert rollouts.action_names == ("action_0",)
@@ -93,15 +93,15 @@ def test_lists_of_rollouts_without_states_or_labels(step_sequence, tmp_path):
 def test_wrong_rollouts(changes, sentence, step_sequence, tmp_path):
     joblib.dump(step_sequence(**episode(**changes)), tmp_path / "x.pkl")
     with pytest.raises(DataError, match=sentence):
-        load_simurlacra(tmp_path / "x.pkl")
+        Rollouts.from_simurlacra(tmp_path / "x.pkl")
 
 
 def test_other_files(shared, tmp_path):
     (tmp_path / "x.pkl").write_bytes(pickle.dumps({"a": 1}))
     with pytest.raises(DataError, match="holds no SimuRLacra rollout"):
-        load_simurlacra(tmp_path / "x.pkl")
+        Rollouts.from_simurlacra(tmp_path / "x.pkl")
     shutil.copy(shared / "quanser_qube" / "swing_up_500hz_5s.csv", tmp_path / "x.pkl")
     with pytest.raises(DataError, match="x.pkl: the pickle"):
-        load_simurlacra(tmp_path / "x.pkl")
+        Rollouts.from_simurlacra(tmp_path / "x.pkl")
     with pytest.raises(DataError, match="cannot be opened"):
-        load_simurlacra(tmp_path / "y.pkl")
+        Rollouts.from_simurlacra(tmp_path / "y.pkl")

@@ -1,1 +1,1 @@
-"""Training of ensembles of networks, round by round. Start at ``neural_backend.py``."""
+"""Training of ensembles of networks on preconditioned data. Start at ``ensemble_training.py``."""

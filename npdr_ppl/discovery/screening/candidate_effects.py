@@ -11,7 +11,7 @@ from npdr_ppl.discovery.screening.generic_laws import strongest_frequency
 from npdr_ppl.discovery.screening.latent_force import Responses
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.sensitivities import Variant, sensitivities
-from npdr_ppl.discovery.search.side_by_side import num_processes, side_by_side
+from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.models.effects import candidate_effects
 

@@ -26,8 +26,8 @@ from npdr_ppl.discovery.search.alternatives import (
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps
 from npdr_ppl.discovery.search.evidence import SURVIVES, closest, weigh
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
-from npdr_ppl.discovery.search.side_by_side import num_processes, side_by_side
 from npdr_ppl.discovery.search.trials import PLAINLY, Trials
+from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.memory import release_freed_memory
 from npdr_ppl.preparation.data_options import DataOptions

@@ -11,7 +11,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
 from npdr_ppl.discovery.screening.repetition import keeps_in_step
 from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.search.evidence import closest
-from npdr_ppl.discovery.search.side_by_side import num_processes, side_by_side
+from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.simulator import Simulator

@@ -9,34 +9,21 @@ from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.container import Rollouts
+from npdr_ppl.rollouts.collection import joined
 from npdr_ppl.rollouts.io.inert_pickle import Record, read_pickle
+from npdr_ppl.rollouts.recording import Recording
 
-__all__ = ["load_simurlacra"]
+__all__ = ["read_simurlacra"]
 
 _ROLLOUT = "pyrado.sampling.step_sequence StepSequence"
 _SPECIFICATION = "pyrado.utils.data_types EnvSpec"
 _BOX = "pyrado.spaces.box BoxSpace"
 
 
-def load_simurlacra(path: str | PathLike[str], names: Mapping[str, str] | None = None) -> Rollouts:
-    """Reads a rollout, or a list of rollouts, that SimuRLacra saved.
-
-    The pickle is read by a machine that builds arrays and inert records and calls nothing, so a
-    file from an untrusted source does no harm. States become channels (observations, where no
-    states were saved), the applied actions become actions (the commanded ones, where no applied
-    ones were saved).
-
-    Args:
-        path: A ``.pkl`` file.
-        names: New names for the file's own ones, e.g. ``{"theta": "arm_angle"}``.
-
-    Raises:
-        DataError: The file is damaged, holds something else, or asks for code to be run.
-
-    References:
-        F. Muratore, SimuRLacra, https://github.com/famura/SimuRLacra (class ``StepSequence``).
-    """
+def read_simurlacra(
+    path: str | PathLike[str], names: Mapping[str, str] | None = None
+) -> Recording:
+    """Reads rollouts; see :meth:`Rollouts.from_simurlacra`."""
     path = rollout_checks.check_file(path)
     with rollout_checks.named(path):
         try:
@@ -48,10 +35,10 @@ def load_simurlacra(path: str | PathLike[str], names: Mapping[str, str] | None =
         if not episodes or not all(_is(episode, _ROLLOUT) for episode in episodes):
             raise DataError("the pickle holds no SimuRLacra rollout.")
         parts = [_rollout(episode.fields, names or {}) for episode in episodes]
-        return parts[0].concatenate(*parts[1:])
+        return joined(parts)
 
 
-def _rollout(fields: Mapping[str, Any], names: Mapping[str, str]) -> Rollouts:
+def _rollout(fields: Mapping[str, Any], names: Mapping[str, str]) -> Recording:
     bounds = fields.get("_rollout_bounds")
     if isinstance(bounds, np.ndarray) and bounds.size > 2:
         raise DataError("the rollouts are joined end to end; save them as a list instead.")
@@ -63,7 +50,7 @@ def _rollout(fields: Mapping[str, Any], names: Mapping[str, str]) -> Rollouts:
     time = _matrix(fields, "time")[:, 0]
     channels = _labels(spaces.get(kind), readings.shape[1], kind.removesuffix("s"))
     commands = _labels(spaces.get("actions"), actions.shape[1], "action")
-    return Rollouts.from_arrays(
+    return Recording.from_arrays(
         [readings],
         [actions],
         channel_names=[names.get(name, name) for name in channels],

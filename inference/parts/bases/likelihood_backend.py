@@ -16,9 +16,9 @@ from torch import Tensor
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density, Problem, State
+from npdr_ppl.inference.parts.bases.neural_backend import NeuralBackend
 from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 from npdr_ppl.inference.parts.samplers.tempering import UnnormalisedDensity
-from npdr_ppl.inference.parts.training.neural_backend import NeuralBackend
 
 __all__ = ["LearnedLogLikelihood", "LikelihoodBackend"]
 

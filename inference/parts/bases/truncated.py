@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Density, Problem, State
+from npdr_ppl.inference.parts.bases.neural_backend import NeuralBackend, NeuralState
+from npdr_ppl.inference.parts.bases.proposals import log_density_bound, sample_truncated_prior
 from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
-from npdr_ppl.inference.parts.training.neural_backend import NeuralBackend, NeuralState
-from npdr_ppl.inference.parts.training.proposals import log_density_bound, sample_truncated_prior
 
 __all__ = ["TruncatedBackend"]
 
@@ -36,7 +36,7 @@ class TruncatedBackend(NeuralBackend):
         outside: Posterior mass epsilon outside the region of truncated proposals.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.training.neural_backend.NeuralBackend`.
+    :class:`~npdr_ppl.inference.parts.bases.neural_backend.NeuralBackend`.
     """
 
     outside: float = 1e-2

@@ -24,6 +24,12 @@ from torch import Tensor, nn
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density, Problem, RoundInfo, State
+from npdr_ppl.inference.parts.bases.neural_backend import (
+    MIN_SIMULATIONS,
+    NeuralBackend,
+    NeuralState,
+    Simulations,
+)
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.inference.parts.mixtures.mixture_density import (
     MixtureDensityNetwork,
@@ -39,12 +45,6 @@ from npdr_ppl.inference.parts.mixtures.proposal_correction import (
 )
 from npdr_ppl.inference.parts.training.embedding_network import build_embedding
 from npdr_ppl.inference.parts.training.ensemble_training import Loss
-from npdr_ppl.inference.parts.training.neural_backend import (
-    MIN_SIMULATIONS,
-    NeuralBackend,
-    NeuralState,
-    Simulations,
-)
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, refit_regression
 from npdr_ppl.randomness import seeded
 
@@ -82,7 +82,7 @@ class MixtureBackend(NeuralBackend):
             the posterior itself, ``"mixture"``.
 
     The other options are those of
-    :class:`~npdr_ppl.inference.parts.training.neural_backend.NeuralBackend`.
+    :class:`~npdr_ppl.inference.parts.bases.neural_backend.NeuralBackend`.
     """
 
     amortises: ClassVar[bool] = True
