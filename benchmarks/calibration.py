@@ -54,10 +54,12 @@ def measure(arguments: argparse.Namespace, variant: str) -> dict[str, Any]:
         rollouts,
         backend=backend("snpe-c", **VARIANTS[variant]),
         num_simulations=arguments.simulations,
-        embedding=arguments.embedding,
-        segment_length=200,
-        initial_state="recorded",
-        precision="float32",
+        options=npdr.DataOptions(
+            embedding=arguments.embedding,
+            segment_length=200,
+            initial_state="recorded",
+            precision="float32",
+        ),
         seed=arguments.seed,
         progress=False,
     )

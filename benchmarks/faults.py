@@ -141,9 +141,9 @@ def main() -> None:
                 rollouts,
                 backend=backend(options.backend),
                 num_simulations=options.simulations,
-                embedding=embedding,
-                segment_length=options.segment_length,
-                initial_state=start,
+                options=npdr.DataOptions(
+                    embedding=embedding, segment_length=options.segment_length, initial_state=start
+                ),
                 seed=seed,
                 progress=False,
             )

@@ -72,8 +72,7 @@ def fit_pendulum(size: int, name: str, options: dict[str, Any]) -> dict[str, Any
         record(DURATION),
         backend=backend(name, **options),
         num_simulations=size,
-        embedding="all~10",
-        precision="float32",
+        options=npdr.DataOptions(embedding="all~10", precision="float32"),
         progress=False,
     )
     return dict(posterior.provenance.infos[-1].losses)

@@ -127,9 +127,7 @@ def learn(inputs: npdr.Inputs, num_simulations: int, seed: int) -> npdr.Posterio
         # Rigs lie anywhere in their ranges, at the ends too.
         backend=NLE(coordinates="bounded"),
         num_simulations=num_simulations,
-        embedding="all",
-        segment_length=None,
-        initial_state="recorded",
+        options=npdr.DataOptions(embedding="all", segment_length=None, initial_state="recorded"),
         seed=seed,
     )
 

@@ -142,8 +142,8 @@ def fit(
                 resolve_segment_length(segment_length),
                 initial_state.value,
                 precision.value,
+                noise.value,
             ),
-            noise=noise.value,
             device=device,
             progress=report,
         )

@@ -51,7 +51,6 @@ def infer_posterior(
         model,
         rollouts,
         options.binding,
-        noise=options.noise,
         near=near,
         seed=seed,
         progress=report.stage("find the closest parameters"),

@@ -60,8 +60,6 @@ class LoopOptions:
         extra_rounds: Rounds that a diagnosis may ask for in each iteration.
         num_simulations: Simulations of each round.
         binding: How rollouts are prepared for inference.
-        noise: ``"auto"`` gives a model without noise that of the closest fit's residuals;
-            ``"model"`` takes it as it is.
         start: Where inference starts: from the prior; in the neighbourhood of the closest fit,
             where initial states are uncertain; or in later iterations, as in the paper, from the
             last posterior. Backends that cannot start elsewhere start from the prior.
@@ -122,7 +120,6 @@ class LoopOptions:
     binding: DataOptions = field(
         default_factory=lambda: DataOptions("score", 50, "uncertain", "float32")
     )
-    noise: Literal["auto", "model"] = "auto"
     start: Literal["prior", "closest fit", "posterior"] = "closest fit"
     search: str | PolicySearch[Any] = "power"
     search_iterations: int = 20

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -42,7 +42,6 @@ def fit(
     num_simulations: int = 1_000,
     seed: int = 0,
     options: DataOptions | None = None,
-    noise: Literal["auto", "model"] = "auto",
     device: str = "cpu",
     progress: bool | Reporter | None = None,
 ) -> tuple[Posterior, dict[str, Any]]:
@@ -60,8 +59,6 @@ def fit(
         num_simulations: Simulations of each round.
         seed: Seed of everything random.
         options: How the data are prepared.
-        noise: ``"auto"`` gives a model without noise the scale of
-            its closest fit; ``"model"`` takes it as it is.
         device: Where the backend trains.
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
@@ -74,7 +71,6 @@ def fit(
                 model,
                 train,
                 options or DataOptions(),
-                noise=noise,
                 seed=seed,
                 progress=report.stage("find the closest parameters"),
             )

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from npdr_ppl.embeddings import Embedding
 from npdr_ppl.engines.workers import collect_faults, report_progress
 from npdr_ppl.errors import BackendError, NpdrError
 from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
@@ -27,12 +26,10 @@ from npdr_ppl.preparation.data_options import (
     MAX_READINGS_PER_CHUNK,
     PLAIN_FEATURES,
     DataOptions,
-    SegmentLength,
 )
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.segments import InitialState
 
 __all__ = ["infer", "run_round", "simulate_features"]
 
@@ -50,11 +47,7 @@ def infer(
     rounds: int = 1,
     num_simulations: int = 1_000,
     seed: int = 0,
-    embedding: str | Embedding | None = "score",
-    segment_length: SegmentLength = "auto",
-    initial_state: InitialState = "uncertain",
-    noise: Literal["auto", "model"] = "auto",
-    precision: Literal["float64", "float32"] = "float64",
+    options: DataOptions | None = None,
     device: str | torch.device = "cpu",
     start: PosteriorBase | Density | None = None,
     checkpoint: str | PathLike[str] | None = None,
@@ -73,16 +66,7 @@ def infer(
             has its posterior after one.
         num_simulations: Simulations of each round.
         seed: Seed of everything random.
-        embedding: Maps trajectories to features; see :mod:`npdr_ppl.embeddings`. ``"score"`` is
-            that of :func:`~npdr_ppl.posterior.prepare.score_embedding`, made for the
-            recording.
-        segment_length: Steps between re-synchronisations: a number, ``"auto"``, or ``None`` for
-            whole rollouts.
-        initial_state: State at a segment's start: ``"uncertain"``, ``"estimated"`` or
-            ``"recorded"``; see :class:`~npdr_ppl.preparation.binding.DataOptions`.
-        noise: ``"auto"`` gives a model without noise, where initial states are uncertain, that of
-            its closest fit; ``"model"`` takes it as it is.
-        precision: Floating-point type of the simulation.
+        options: How the data are prepared; defaults if left out.
         device: Where trajectories are simulated and the backend trains.
         start: Posterior of the same model given other data, or another density over its
             reference coordinates. A backend that can correct for it simulates the prior in that
@@ -120,13 +104,14 @@ def infer(
     method = backend_by_name(backend) if isinstance(backend, str) else backend
     if not method.uses_simulations:
         rounds = 1
-    options = DataOptions(embedding, segment_length, initial_state, precision)
+    options = options or DataOptions()
     if preparation is None and isinstance(data, Rollouts):
-        kept: Literal["auto", "model"] = noise if initial_state == "uncertain" else "model"
-        preparation = prepare(model, data, options, noise=kept, seed=seed)
+        if options.initial_state != "uncertain":
+            options = replace(options, noise="model")
+        preparation = prepare(model, data, options, seed=seed)
     if preparation is not None:
         model, options = preparation.model, preparation.options
-    elif embedding == "score":
+    elif options.embedding == "score":
         options = replace(options, embedding=PLAIN_FEATURES)
     prepared = preparation if preparation is None or preparation.hypothesis else None
     bound = bind(

@@ -8,7 +8,7 @@ estimated; and features are chosen. ``fit``, ``compare``, ``train`` and ``discov
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -182,7 +182,6 @@ def prepare(
     rollouts: Rollouts,
     options: DataOptions,
     *,
-    noise: Literal["auto", "model"] = "auto",
     near: Mapping[str, Tensor] | None = None,
     seed: int = 0,
     progress: Step | None = None,
@@ -192,9 +191,7 @@ def prepare(
     Args:
         model: The Pyro model.
         rollouts: The recording to be fitted; never the held-out one.
-        options: Segments, initial states, embedding and precision.
-        noise: ``"auto"`` gives a model without noise that of the closest fit; ``"model"`` takes
-            it as it is.
+        options: How the data are prepared.
         near: Parameters near which the closest fit is known to be.
         seed: Seed of the search.
         progress: Called with the fraction done and a short status.
@@ -205,7 +202,7 @@ def prepare(
     is_declared = declares_noise(model, rollouts, options)
     if options.initial_state != "uncertain" or not can_be_prepared(model, rollouts, options):
         return _with_certain_starts(
-            model, rollouts, options, is_declared or noise == "model", seed, progress
+            model, rollouts, options, is_declared or options.noise == "model", seed, progress
         )
     length = options.steps(rollouts) or max(rollouts.lengths)
     binding = replace(options, embedding=None, segment_length=length)
@@ -228,7 +225,7 @@ def prepare(
         ends = beyond(base.hypothesis.segments.prior.distributions, wider)
     likelihood = _likelihood(base, is_declared)
     estimated = every = None
-    if noise == "auto" and not is_declared:
+    if options.noise == "auto" and not is_declared:
         scale = likelihood.fit.scale * math.sqrt(likelihood.variance)
         segments = base.hypothesis.segments
         estimated = dict(zip(segments.channel_names, scale.tolist(), strict=True))

@@ -72,12 +72,15 @@ class DataOptions:
             truth, and ``"recorded"`` the measurement, which gives posteriors that are too narrow
             and biased unless measurements have no noise.
         precision: ``"float64"`` or ``"float32"``, of the simulation.
+        noise: ``"auto"`` gives a model without noise that of its closest fit's residuals, where
+            initial states are uncertain; ``"model"`` takes the model as it is.
     """
 
     embedding: str | Embedding | None = "score"
     segment_length: SegmentLength = "auto"
     initial_state: InitialState = "uncertain"
     precision: Literal["float64", "float32"] = "float64"
+    noise: Literal["auto", "model"] = "auto"
 
     @property
     def dtype(self) -> torch.dtype:

@@ -95,9 +95,9 @@ class Budget:
             rounds=rounds,
             num_simulations=self.rounds * self.num_simulations // rounds,
             seed=self.seed,
-            embedding=embedding,
-            segment_length=None,
-            initial_state="recorded",
+            options=DataOptions(
+                embedding=embedding, segment_length=None, initial_state="recorded"
+            ),
             checkpoint=self.out / folder_name(label) / name,
             progress=self.progress,
         )

@@ -32,6 +32,7 @@ from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.posterior.comparison.compared_backends import Candidate, folder_name, requested
 from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.posterior import Posterior
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import write_json
@@ -177,9 +178,11 @@ def infer_mass_and_length(
         rounds=rounds,
         num_simulations=ROUNDS * NUM_SIMULATIONS // rounds,
         seed=seed,
-        embedding=candidate.embedding or EMBEDDING,
-        segment_length=None,
-        initial_state="recorded",
+        options=DataOptions(
+            embedding=candidate.embedding or EMBEDDING,
+            segment_length=None,
+            initial_state="recorded",
+        ),
         checkpoint=checkpoint,
         progress=progress,
     )

@@ -29,7 +29,7 @@ def swing(num_steps):
 def test_samples_that_were_lost_are_noticed():
     angle, velocity = (np.delete(values, slice(200, 230)) for values in swing(600))
     (problem,) = recording_problems(Pendulum().sensors, recording(angle, velocity))
-    assert "lost 1 times" in problem
+    assert "number of gaps: 1," in problem
     assert "1.99 s" in problem
 
 

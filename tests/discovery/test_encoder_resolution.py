@@ -59,5 +59,5 @@ def test_counts_are_told_and_not_searched_for():
 def test_who_searches_for_counts_is_told():
     case = make_case("pendulum", "null", (), seed=2000)
     options = npdr.DiscoveryOptions(effects=(ViscousFriction("hinge"), Quantisation("angle")))
-    with pytest.raises(ModelError, match="read off the recording"):
+    with pytest.raises(ModelError, match="read from the recording"):
         npdr.discover(case.model, case.fit, options=options)

@@ -227,7 +227,7 @@ def test_a_law_that_may_as_well_be_its_limit_is_not_named(hidden, strength, inst
     (finding,) = found.effects
     assert finding.effect.id == instead.id and finding.at_edge == (shape,)
     assert found.verdict == "unknown"
-    assert f"explains it with {shape} where hardly any device has it" in found.reason
+    assert f"explains the misfit with an implausible value of {shape}" in found.reason
 
 
 @pytest.mark.slow

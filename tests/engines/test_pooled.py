@@ -120,8 +120,8 @@ def test_inference_survives_faults_and_reports_them(recording, tmp_path):
     log = tmp_path / "faults"
     log.mkdir()
     options = {
-        "backend": backend("snpe-c", members=1), "num_simulations": 300, "embedding": "all/10",
-        "segment_length": None, "initial_state": "recorded", "seed": 1, "progress": False,
+        "backend": backend("snpe-c", members=1), "num_simulations": 300,
+        "options": npdr.DataOptions("all/10", None, "recorded"), "seed": 1, "progress": False,
     }  # fmt: skip
     with npdr.workers("threads", 2, time_limit=3.0) as used:
         clean = npdr.infer(model, rollouts, **options)

@@ -71,8 +71,9 @@ def test_a_run_folder_holds_what_the_simulator_was_made_from(tmp_path):
         channel_names=given.channel_names, action_names=given.action_names, time_step=0.02,
     )  # fmt: skip
     npdr.infer(
-        model, rollouts, backend="abc", num_simulations=200, embedding="all/10",
-        segment_length=None, initial_state="recorded", seed=0, progress=False,
+        model, rollouts, backend="abc", num_simulations=200,
+        options=npdr.DataOptions("all/10", None, "recorded"),
+        seed=0, progress=False,
         checkpoint=tmp_path / "run",
     )  # fmt: skip
     (tmp_path / "mine" / "robot.xml").write_text("<mujoco/>")

@@ -112,8 +112,9 @@ def recording():
 def infer(model, recording):
     quick = backend("snpe-c", transforms=1, hidden=(8,), epochs=1, members=1)
     return npdr.infer(
-        model, recording, backend=quick, rounds=1, num_simulations=20, segment_length=20,
-        initial_state="recorded", progress=False,
+        model, recording, backend=quick, rounds=1, num_simulations=20,
+        options=npdr.DataOptions(segment_length=20, initial_state="recorded"),
+        progress=False,
     )  # fmt: skip
 
 

@@ -197,8 +197,9 @@ def test_files_come_back(tmp_path):
 @pytest.mark.slow
 def test_a_posterior_is_exported_completely(noisy_pendulum, recording, quick, tmp_path):
     posterior = npdr.infer(
-        noisy_pendulum, recording, backend=quick, num_simulations=60, segment_length=50,
-        initial_state="estimated", embedding="all/10", progress=False,
+        noisy_pendulum, recording, backend=quick, num_simulations=60,
+        options=npdr.DataOptions(segment_length=50, initial_state="estimated", embedding="all/10"),
+        progress=False,
     )  # fmt: skip
     data = posterior.to_arviz(120)
     assert set(group_names(data)) == {

@@ -86,8 +86,9 @@ def test_an_interrupted_run_continues_to_the_same_result(linear, quick, tmp_path
 @pytest.mark.slow
 def test_saved_posteriors_come_back_identical(noisy_pendulum, recording, quick, tmp_path):
     posterior = npdr.infer(
-        noisy_pendulum, recording, backend=quick, num_simulations=60, segment_length=50,
-        embedding="all/10", progress=False,
+        noisy_pendulum, recording, backend=quick, num_simulations=60,
+        options=npdr.DataOptions(segment_length=50, embedding="all/10"),
+        progress=False,
     )  # fmt: skip
     posterior.save(tmp_path / "posterior")
     loaded = npdr.Posterior.load(tmp_path / "posterior", noisy_pendulum)
@@ -152,7 +153,8 @@ def test_trained_networks_see_raw_trajectories(noisy_pendulum, recording):
 
     tiny = backend("snpe-c", transforms=1, hidden=(16,), epochs=2, members=1)
     posterior = npdr.infer(
-        noisy_pendulum, recording, backend=tiny, num_simulations=50, embedding="gru/10",
+        noisy_pendulum, recording, backend=tiny, num_simulations=50,
+        options=npdr.DataOptions(embedding="gru/10"),
         progress=False,
     )  # fmt: skip
     assert torch.isfinite(posterior.sample(10)["mass"]).all()
@@ -187,7 +189,12 @@ def test_a_sensor_that_sees_only_the_position(noisy_pendulum, recording, quick):
     )
     assert posterior.bound.observations["trajectory"].channels == (0,)
     with pytest.raises(DataError, match="velocity was not recorded"):
-        npdr.infer(noisy_pendulum, positions, initial_state="recorded", progress=False)
+        npdr.infer(
+            noisy_pendulum,
+            positions,
+            options=npdr.DataOptions(initial_state="recorded"),
+            progress=False,
+        )
 
 
 def test_a_function_may_leave_torch(quick):
@@ -254,7 +261,9 @@ def test_bad_settings_are_refused(linear, recording):
     with pytest.raises(BackendError, match="rounds must be at least 1"):
         npdr.infer(model, observed, rounds=0, progress=False)
     with pytest.raises(ModelError, match="no embedding 'everything'"):
-        npdr.infer(pendulum, recording, embedding="everything", progress=False)
+        npdr.infer(
+            pendulum, recording, options=npdr.DataOptions(embedding="everything"), progress=False
+        )
     with pytest.raises(DataError, match="give rollouts, not a tensor"):
         npdr.infer(lambda _=None: pendulum(recording.inputs()), observed, progress=False)
     with pytest.raises(DataError, match="column torque is missing"):

@@ -133,9 +133,7 @@ def test_a_score_posterior_covers_the_truth(rollouts):
         rounds=3,
         num_simulations=300,
         backend=backend("snpe-c", members=1),
-        embedding="score",
-        segment_length=40,
-        initial_state="uncertain",
+        options=npdr.DataOptions(embedding="score", segment_length=40, initial_state="uncertain"),
         seed=0,
         progress=False,
     )

@@ -26,8 +26,9 @@ DRAWS = 30
 def posterior(request, quick, recording, noisy_pendulum):
     model = noisy_pendulum if request.param == "declared noise" else pendulum
     return npdr.infer(
-        model, recording, backend=quick, rounds=1, num_simulations=100, segment_length=25,
-        initial_state="recorded", seed=0, progress=False,
+        model, recording, backend=quick, rounds=1, num_simulations=100,
+        options=npdr.DataOptions(segment_length=25, initial_state="recorded"),
+        seed=0, progress=False,
     )  # fmt: skip
 
 
@@ -133,8 +134,9 @@ def test_only_steps_that_exist_and_channels_that_were_measured_are_scored(quick,
         channel_names=("angle",), channel_units=("",),
     )  # fmt: skip
     posterior = npdr.infer(
-        pendulum, angles, backend=quick, rounds=1, num_simulations=50, segment_length=30,
-        initial_state="estimated", seed=0, progress=False,
+        pendulum, angles, backend=quick, rounds=1, num_simulations=50,
+        options=npdr.DataOptions(segment_length=30, initial_state="estimated"),
+        seed=0, progress=False,
     )  # fmt: skip
     (observation,) = posterior.bound.observations.values()
     ((column, observed, counted),) = predictive_scores._columns(observation)

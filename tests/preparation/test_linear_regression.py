@@ -79,7 +79,7 @@ def regress(model, rollouts, **options):
         model,
         rollouts,
         backend=backend(NAME, **options),
-        initial_state="estimated",
+        options=npdr.DataOptions(initial_state="estimated"),
         progress=False,
     )
 
@@ -197,7 +197,8 @@ def test_posteriors_are_whole(tmp_path, caplog):
     loaded = npdr.Posterior.load(tmp_path / "saved", model)
     assert torch.equal(loaded.sample(50)["arm_mass"], posterior.sample(50)["arm_mass"])
     again = npdr.infer(
-        model, rollouts, backend=NAME, rounds=3, initial_state="estimated",
+        model, rollouts, backend=NAME, rounds=3,
+        options=npdr.DataOptions(initial_state="estimated"),
         checkpoint=tmp_path / "run", progress=False,
     )  # fmt: skip
     assert len(again.provenance.rounds) == 1

@@ -4,7 +4,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from torch import Tensor
 
@@ -46,7 +46,6 @@ def compare(
     num_simulations: int = 2_000,
     seed: int = 0,
     options: DataOptions | None = None,
-    noise: Literal["auto", "model"] = "auto",
     device: str = "cpu",
     out: Path | None = None,
     progress: bool | Reporter | None = None,
@@ -75,8 +74,6 @@ def compare(
         num_simulations: Simulations of each round.
         seed: Seed of everything random.
         options: How the data are prepared.
-        noise: ``"auto"`` gives a model without noise that of the closest parameters on the fitted
-            rollouts; ``"model"`` takes it as it is.
         device: Where the backends train.
         out: Folder for ``comparison.json`` and, for every backend, ``posterior.nc`` and the run,
             from which an interrupted comparison continues; nothing is written if ``None``.
@@ -109,7 +106,7 @@ def compare(
         "rounds": rounds,
         "num_simulations": num_simulations,
         "seed": seed,
-        "noise": noise,
+        "noise": options.noise,
         "binding": _described(options),
         "evaluated_on": "fitted" if test is None else "held-out",
         "elpd": "PSIS-LOO" if test is None else "held-out segments",
@@ -119,7 +116,6 @@ def compare(
             model,
             train,
             options,
-            noise=noise,
             seed=seed,
             progress=report.stage("find the closest parameters"),
         )
@@ -240,10 +236,9 @@ class _Run:
                 rounds=self.rounds,
                 num_simulations=self.num_simulations,
                 seed=seed,
-                embedding=self.options.embedding if own is None else own,
-                segment_length=self.options.segment_length,
-                initial_state=self.options.initial_state,
-                precision=self.options.precision,
+                options=self.options
+                if own is None
+                else dataclasses.replace(self.options, embedding=own),
                 preparation=prepared,
                 start=None if prepared is None else prepared.neighbourhood(),
                 corrects=False,

@@ -61,7 +61,6 @@ def find_error_model(
     train: Data,
     options: DataOptions,
     *,
-    noise: Literal["auto", "model"] = "auto",
     seed: int = 0,
     progress: Step | None = None,
 ) -> ErrorModel:
@@ -71,9 +70,8 @@ def find_error_model(
         model: The Pyro model.
         train: What is fitted; never the held-out recording. Observations of a plain function, and
             those of several sites, keep the model's own noise, and all their readings count.
-        options: Segments, initial states and precision.
-        noise: ``"auto"`` gives a model without noise the estimated scale; ``"model"`` fits it as
-            it is and estimates the scale for the comparison alone.
+        options: How the data are prepared. Where they keep a model without noise as it is, the
+            scale is estimated for the comparison alone.
         seed: Seed of the search.
         progress: Called with the fraction done and a short status.
 
@@ -82,8 +80,8 @@ def find_error_model(
     """
     if not isinstance(train, Rollouts):
         return ErrorModel(None, model, model, None, {})
-    found = prepare(model, train, options, seed=seed, progress=progress)
-    plain = prepare_as_it_is(found, noise)
+    found = prepare(model, train, replace(options, noise="auto"), seed=seed, progress=progress)
+    plain = prepare_as_it_is(found, options.noise)
     if found.likelihood is not None:
         names = found.likelihood.segments.channel_names
         share = dict.fromkeys(names, found.likelihood.share)
