@@ -1,9 +1,9 @@
-"""Problems of the data that no physics explains, to be ruled out first.
+"""Checks for errors in the recording itself, made before any effect is searched for.
 
-A recording in degrees, with a sign turned round or its commands stamped too late looks like a
+A recording in degrees, with an inverted sign or with late time stamps of its commands looks like a
 device with a missing effect, and a large catalogue will offer one. Each such problem has a remedy
-that can be tried: the recording is changed back and the model fitted again. A remedy that makes
-most of the misfit disappear names the problem.
+that can be tried: the recording is corrected and the model is fitted again. If a remedy removes
+most of the misfit, its problem is reported.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,38 +22,40 @@ from npdr_ppl.rollouts.simulator_checks import OTHER_UNITS, check_units
 __all__ = ["data_problems", "recording_problems"]
 
 GROSS = 0.1
-"""Residual in units of what a window's readings change by, above which remedies are tried."""
+"""Residual, relative to the change of a window's measurements, above which remedies are tried."""
 
 CURE = 0.5
-"""By which factor a remedy has to reduce the residual to name the problem."""
+"""A problem is reported if its remedy reduces the residual to less than this fraction."""
 
 SHIFTS = (1, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20)
-"""Steps by which commands may be stamped too late or too early."""
+"""Shifts of the commands' time stamps that are tried, in steps."""
 
 LONGEST_DELAY = 0.04
-"""Seconds that a device may take to answer a command; commands stamped too early look the same."""
+"""Longest time in seconds that a device takes to answer a command. Early time stamps of commands
+look the same, so only larger shifts are tried for them."""
 
 SPIKE = 12.0
-"""Jumps, in standard deviations of a channel's second differences, that tell lost samples."""
+"""Jump that indicates lost samples, in standard deviations of a channel's second differences."""
 
 RESTS = 0.01
-"""Change within a step, in a channel's root-mean-square change, below which the channel rests."""
+"""A channel rests in a step if it changes by less than this fraction of its root-mean-square
+change."""
 
 MIN_STEPS = 20
 
 MOST_LOST = 0.02
-"""Share of the steps above which jumps are how the device moves."""
+"""If more than this share of the steps are jumps, they are taken for the device's motion."""
 
 Array = NDArray[np.float64]
 
 
 def data_problems(hypothesis: Hypothesis, rollouts: Rollouts, options: DataOptions) -> list[str]:
-    """Returns problems of a recording, a sentence each.
+    """Returns the problems of a recording, one sentence each.
 
     Args:
         hypothesis: The model, fitted to the recording.
         rollouts: The recording.
-        options: Its segments.
+        options: How it is cut into segments.
     """
     return recording_problems(hypothesis.segments.measured, rollouts) or _wrong_readings(
         hypothesis, rollouts, options
@@ -61,10 +63,10 @@ def data_problems(hypothesis: Hypothesis, rollouts: Rollouts, options: DataOptio
 
 
 def recording_problems(sensors: Sequence[Channel], rollouts: Rollouts) -> list[str]:
-    """Returns problems that show without simulating, a sentence each.
+    """Returns the problems that are visible without a simulation, one sentence each.
 
     Args:
-        sensors: What the model says of the recorded channels.
+        sensors: The model's description of the recorded channels.
         rollouts: The recording.
     """
     problems = _lost_samples(rollouts, [sensor.name for sensor in sensors])
@@ -76,8 +78,8 @@ def recording_problems(sensors: Sequence[Channel], rollouts: Rollouts) -> list[s
 
 
 def _wrong_readings(hypothesis: Hypothesis, rollouts: Rollouts, options: DataOptions) -> list[str]:
-    # As remedies are tried, with states as the smoother sees them: along the fit they would be
-    # where the wrong readings have led it.
+    # Fitted like the remedies, from the smoother's initial states: those of the present fit have
+    # followed the wrong measurements.
     as_read = fit_hypothesis(hypothesis.model, rollouts, options, max_steps=6, is_rough=True)
     present = _relative_misfit(as_read)
     if present < GROSS:
@@ -96,7 +98,7 @@ def _wrong_readings(hypothesis: Hypothesis, rollouts: Rollouts, options: DataOpt
 
 
 def _relative_misfit(hypothesis: Hypothesis) -> float:
-    """Returns the residual in units of what windows' readings change by, the mean channel's."""
+    """Returns the residual relative to the measurements' change in windows, as a channel mean."""
     segments = hypothesis.segments
     mask = segments.inputs.mask[..., None]
     names = segments.inputs.channel_names
@@ -112,7 +114,7 @@ def _remedies(hypothesis: Hypothesis, rollouts: Rollouts) -> Iterator[tuple[str,
     units = {sensor.name: sensor.unit.removesuffix("/s") for sensor in sensors}
     pairs = [[s.rate_of, s.name] for s in sensors if s.rate_of in units]
     for group in [[name] for name in units] + pairs:
-        text = f"The sign of {' and '.join(group)} looks turned round."
+        text = f"The sign of {' and '.join(group)} looks inverted."
         yield text, _scaled(rollouts, group, -1.0)
     for si, (other, factor) in OTHER_UNITS.items():
         chosen = [name for name, unit in units.items() if unit == si]
@@ -122,16 +124,16 @@ def _remedies(hypothesis: Hypothesis, rollouts: Rollouts) -> Iterator[tuple[str,
             yield sentence, _scaled(rollouts, group, 1.0 / factor)
     for k, name in enumerate(rollouts.action_names):
         actions = [_column(a, k, lambda x: -x) for a in rollouts.actions]
-        text = f"The sign of {name} looks turned round."
+        text = f"The sign of {name} looks inverted."
         yield text, replace(rollouts, actions=tuple(actions))
     for steps in SHIFTS:
         if 4 * steps < min(rollouts.lengths):
             yield (
-                f"The commands look stamped about {steps} steps too late.",
+                f"The time stamps of the commands look about {steps} steps too late.",
                 _shifted(rollouts, steps),
             )
             if steps * rollouts.time_step > LONGEST_DELAY:
-                text = f"The commands look stamped about {steps} steps too early."
+                text = f"The time stamps of the commands look about {steps} steps too early."
                 yield text, _shifted(rollouts, -steps)
 
 
@@ -147,7 +149,7 @@ def _column(values: Array, k: int, change: Callable[[Array], Array]) -> Array:
 
 
 def _shifted(rollouts: Rollouts, steps: int) -> Rollouts:
-    """Returns the recording with every command given some steps earlier, or later if negative."""
+    """Returns the recording with all commands moved some steps earlier, or later if negative."""
     size = abs(steps)
 
     def moved(actions: Array) -> Array:
@@ -159,19 +161,19 @@ def _shifted(rollouts: Rollouts, steps: int) -> Rollouts:
 
 
 def _lost_samples(rollouts: Rollouts, channels: Sequence[str]) -> list[str]:
-    """Finds moments at which most channels jump at once and go on as if nothing had happened."""
+    """Finds times at which most channels jump at once and then continue as usual."""
     columns = [rollouts.channel_names.index(name) for name in channels]
     problems = []
     for index, readings in enumerate(rollouts.readings):
         first = np.diff(readings[:, columns], axis=0)
         second = np.abs(np.diff(first, axis=0))
         first = np.abs(first[1:])
-        # What is usual while the device moves: it may have stood still most of the time.
+        # Only steps in which the device moves: it may have rested most of the time.
         rests = first <= RESTS * np.sqrt(np.square(first).mean(0))
         moves = rests.mean(1) <= 0.5
         if moves.sum() < MIN_STEPS:
             continue
-        # Only what moves can jump; an encoder's count is no jump.
+        # Only moving channels can jump; a step of the encoder resolution is no jump.
         steady = np.median(first[moves], axis=0)
         spread = np.maximum(np.median(second[moves], axis=0) / 0.6745, 0.1 * steady)
         moving = steady > 0
@@ -183,7 +185,7 @@ def _lost_samples(rollouts: Rollouts, channels: Sequence[str]) -> list[str]:
         if 0 < count and together.mean() < MOST_LOST:
             begin = float(np.flatnonzero(together)[0] + 1) * rollouts.time_step
             problems.append(
-                f"Rollout {index} looks as if samples were lost {count} times, first at "
-                f"{begin:.3g} s."
+                f"Rollout {index} seems to have lost samples (number of gaps: {count}, the first "
+                f"at {begin:.3g} s)."
             )
     return problems

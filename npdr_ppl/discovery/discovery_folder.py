@@ -1,11 +1,11 @@
-"""The folder of a discovery: what was asked, and the results once they are complete.
+"""The folder of a discovery: its settings, and the results once they are complete.
 
     run.json            model, options, seed, versions, a checksum of the recordings
-    discovery.json      the results; written last, so that a folder that has it is complete
+    discovery.json      the results; written last, so a folder with this file is complete
     revised_model.py    the model with the effects that were missing
 
-A discovery that was killed leaves no ``discovery.json`` and begins anew when it is asked for
-again; one that is complete is not repeated.
+A discovery that was killed leaves no ``discovery.json``, and starts over when it is run again. A
+complete one is not repeated.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from npdr_ppl.run_files import (
 __all__ = ["STAGES", "DiscoveryFolder", "Stage", "findings_until"]
 
 Stage = Literal["check", "locate", "alarm", "name", "prove"]
-"""The stages, each of which includes those before."""
+"""The stages. Each includes those before it."""
 
 STAGES: tuple[Stage, ...] = get_args(Stage)
 
@@ -41,7 +41,7 @@ class DiscoveryFolder:
     """Reads and writes the folder of one discovery.
 
     Args:
-        path: The folder; it is made when something is written.
+        path: The folder; it is created when something is written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,10 +54,10 @@ class DiscoveryFolder:
         holdout: Rollouts | None,
         options: DiscoveryOptions,
     ) -> None:
-        """Describes the discovery, or checks that the folder holds this very one already.
+        """Writes ``run.json``, or checks that the folder already holds the same discovery.
 
         Raises:
-            DataError: The folder holds another one.
+            DataError: The folder holds another discovery.
         """
         settings = dataclasses.asdict(options)
         settings["effects"] = options.effects and [repr(e) for e in options.effects]
@@ -80,7 +80,7 @@ class DiscoveryFolder:
             write_json(file, description | {"versions": versions()})
 
     def finished(self, stage: Stage) -> dict[str, Any] | None:
-        """Returns the results up to a stage if they are here already."""
+        """Returns the results up to a stage, or ``None`` if the folder does not have them."""
         file = self.path / "discovery.json"
         if not file.exists():
             return None
@@ -93,7 +93,7 @@ class DiscoveryFolder:
 
         Args:
             found: The content of ``discovery.json``.
-            source: The revised model as Python source, once there is one.
+            source: The revised model as Python source, if there is one.
         """
         if source is not None:
             with replacing(self.path / "revised_model.py") as temporary:
@@ -108,10 +108,10 @@ def findings_until(
 
     Args:
         investigation: The investigation.
-        stage: The last stage.
+        stage: The last stage to run.
 
     Returns:
-        The content of ``discovery.json``, and all of the discovery if a verdict was reached.
+        The content of ``discovery.json``, and the whole discovery if a verdict was reached.
     """
     reached = STAGES.index(stage)
     if reached >= STAGES.index("name"):

@@ -1,4 +1,4 @@
-"""What discovery may be told."""
+"""Settings of a discovery."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -18,18 +18,18 @@ __all__ = ["DiscoveryOptions"]
 
 @dataclass(frozen=True)
 class DiscoveryOptions:
-    """How discovery searches.
+    """Settings of a search for missing effects.
 
     Attributes:
-        segment_length: Steps between re-synchronisations; ``None`` for
+        segment_length: Steps per segment; ``None`` for
             :func:`~npdr_ppl.preparation.binding.default_segment_length`.
         effects: The effects to search; ``None`` for every effect of the catalogue at every port
             where it makes sense.
         max_effects: Greatest number of effects to add.
         false_alarm_rate: Probability that an alarm fires although nothing is missing.
         confidence: Probability above which one cause is named.
-        precision: Of the simulation.
-        seed: Seed of everything random.
+        precision: Floating-point precision of the simulation.
+        seed: Seed of all random numbers.
     """
 
     segment_length: int | None = None
@@ -41,19 +41,19 @@ class DiscoveryOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Checks the numbers.
+        """Checks that the numbers are in range.
 
         Raises:
-            DataError: One makes no sense.
+            DataError: A number is out of range.
         """
         if self.segment_length is not None and self.segment_length < 2:
-            raise DataError(f"a segment has at least two steps, got {self.segment_length}.")
+            raise DataError(f"segment_length must be at least 2 steps, got {self.segment_length}.")
         if self.max_effects < 0:
-            raise DataError(f"the number of effects cannot be negative, got {self.max_effects}.")
+            raise DataError(f"max_effects must not be negative, got {self.max_effects}.")
         for name in ("false_alarm_rate", "confidence"):
             value = getattr(self, name)
             if not 0.0 < value < 1.0:
-                raise DataError(f"{name} lies between 0 and 1, got {value}.")
+                raise DataError(f"{name} must lie between 0 and 1, got {value}.")
 
     def binding(self, rollouts: Rollouts) -> DataOptions:
         """Returns how a recording is cut into segments.

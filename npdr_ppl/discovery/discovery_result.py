@@ -1,4 +1,4 @@
-"""What discovery found."""
+"""The result of a discovery."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,39 +27,39 @@ from npdr_ppl.run_files import write_json
 __all__ = ["Discovery", "Verdict", "describe_candidate"]
 
 Verdict = Literal["none", "named", "ambiguous", "unknown"]
-"""Nothing is missing; what is missing has a name; it has several names that the recording cannot
-tell apart; it is none of the catalogue."""
+"""``none``: no effect is missing. ``named``: the missing effects are known. ``ambiguous``: the
+recording cannot tell several causes apart. ``unknown``: the cause is none of the catalogue."""
 
 
 @dataclass(frozen=True)
 class Discovery:
-    """What discovery found.
+    """The result of a discovery.
 
     Attributes:
-        verdict: What the recording says of the model.
-        reason: The verdict in a sentence.
-        problems: What is wrong with the recording itself; nothing is named then.
-        narrow_priors: Priors outside which the revised model's parameters lie; the search was made
-            with wider ones.
-        alarm: Whether the model as it was and the recording disagree.
+        verdict: One word; see :data:`Verdict`.
+        reason: The reason for the verdict, in a sentence.
+        problems: Problems of the recording itself; if there are any, no effect is named.
+        narrow_priors: Priors that do not contain the revised model's parameters; the search used
+            wider ones.
+        alarm: Whether the original model and the recording disagree.
         remainder: The same for the revised model.
-        unexplained: Share of the misfit that the revised model leaves and something could explain.
-        where: The windows that the model as it was misses most, the worst first.
-        effects: What was missing, in the order of finding.
-        ranking: All candidates at the model as it was, by linear gain.
+        unexplained: Share of the misfit that the revised model leaves and one law could explain.
+        where: The windows in which the original model fits worst, the worst first.
+        effects: The missing effects, in the order in which they were found.
+        ranking: All candidates for the original model, by linear gain.
         separation: Distance between the leading candidates once parameters are refitted, in
-            standard deviations, ``(n, n)``; the diagonal is the distance from none.
-        separation_names: Their names.
+            standard deviations, ``(n, n)``; the diagonal is the distance from no effect.
+        separation_names: Names of the leading candidates.
         gap: Metrics on the held-out recording; empty without one.
-        next_experiment: What to record next, where candidates could not be told apart.
-        model: The model as it was.
+        next_experiment: What to record next, if candidates could not be told apart.
+        model: The original model.
         revised: The model with the effects.
-        parameters: All parameters' estimates in the revised model, by site.
+        parameters: Estimates of all parameters of the revised model, by site.
         draws: Draws of the revised model's posterior.
-        counts: Channels that are read in whole counts, as an encoder's, and what rounding makes
-            of what the revised model leaves there.
-        search: How it was found.
-        options: How it was searched.
+        counts: Encoder resolution by channel, where there is one, and the share of the revised
+            model's residual variance that rounding to it causes.
+        search: The course of the search.
+        options: Settings of the search.
         seconds: Time spent, by stage.
     """
 
@@ -87,7 +87,7 @@ class Discovery:
     seconds: dict[str, float]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns JSON-serialisable values; architecture's names, and more."""
+        """Returns JSON-serialisable values, the content of ``discovery.json``."""
         return {
             "verdict": self.verdict,
             "reason": self.reason,
@@ -125,10 +125,10 @@ class Discovery:
         return revised_source(self.model, effects, fitted)
 
     def save(self, folder: Path) -> None:
-        """Writes ``revised_model.py`` and then ``discovery.json``, which makes it count.
+        """Writes ``revised_model.py``, then ``discovery.json``, which marks the folder complete.
 
         Args:
-            folder: Where to; made if it is not there.
+            folder: The folder; created if it does not exist.
         """
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(folder / "revised_model.py") as temporary:
@@ -136,14 +136,14 @@ class Discovery:
         write_json(folder / "discovery.json", self.to_dict())
 
     def plot(self, axes: Any = None) -> Any:
-        """Draws the probabilities of what was missing and the gap on held-out rollouts.
+        """Draws the probabilities of the alternatives and the gap on held-out rollouts.
 
-        :func:`~npdr_ppl.display.plots.discovery_figures.write_discovery_figures` draws all the
-        rest.
+        :func:`~npdr_ppl.display.plots.discovery_figures.write_discovery_figures` draws all other
+        figures.
 
         Args:
-            axes: Where to draw: a panel for each effect, or one of what was tried where none was
-                added, and one for each metric that has a noise floor; ``None`` for a new figure.
+            axes: One for each effect, or one for the tried candidates if no effect was added, and
+                one for each metric that has a noise floor; ``None`` for a new figure.
 
         Returns:
             The axes, one per panel.

@@ -1,4 +1,4 @@
-"""What a discovery shows of itself in a notebook: its findings, and two small drawings."""
+"""How a discovery appears in a notebook: a table of findings and two small drawings."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 __all__ = ["discovery_html", "draw_gap", "draw_probabilities", "plot_discovery", "short_name"]
 
 MOST_BARS = 5
-"""Alternatives drawn of one effect."""
+"""Greatest number of alternatives drawn for one effect."""
 
 CHOSEN, OTHERS, BEFORE = COLORS["posterior"], COLORS["prior"], COLORS["nominal"]
 
 
 def short_name(name: str) -> str:
-    """Returns an effect's name in two lines: what it is, and the port."""
+    """Returns an effect's name in two lines: the effect and its port."""
     port, _, effect = name.rpartition(".")
     channels = port.split(",")
     where = ", ".join(channels) if len(channels) < 3 else f"{channels[0]} … {channels[-1]}"
@@ -37,12 +37,12 @@ def plot_discovery(
     gap: Mapping[str, Gap],
     axes: Any = None,
 ) -> Any:
-    """Draws what was found and the gap; see :meth:`Discovery.plot`.
+    """Draws the findings and the gap; see :meth:`Discovery.plot`.
 
     Args:
-        verdict: What the recording says of the model.
-        effects: What was missing.
-        weights: Probabilities of what was tried last, by name.
+        verdict: The verdict in one word.
+        effects: The effects that were found.
+        weights: Probabilities of the candidates that were tried last, by name.
         gap: Metrics on the held-out recording.
         axes: Axes to draw on; ``None`` makes a figure.
     """
@@ -64,8 +64,8 @@ def probabilities(
 ) -> list[tuple[str, Mapping[str, float], Sequence[str]]]:
     """Returns title, probabilities and the chosen name of each panel.
 
-    One panel for each effect that was found, with what could stand in its place; where none was
-    found, one with what was tried, if anything, ``""`` standing for none.
+    There is one panel for each effect that was found, with its alternatives. If none was found,
+    one panel has the candidates that were tried, if any; ``""`` stands for no effect.
     """
     if effects:
         return [
@@ -81,9 +81,9 @@ def draw_probabilities(
     """Draws probabilities as horizontal bars, the greatest on top.
 
     Args:
-        axis: Where to.
-        bars: Probabilities by name of the effect; ``""`` for none.
-        chosen: Names whose bars have the colour of what was chosen.
+        axis: Axis to draw on.
+        bars: Probabilities by name of the effect; ``""`` for no effect.
+        chosen: Names of the chosen effects, whose bars get a colour of their own.
         title: Title of the panel.
     """
     names = sorted(bars, key=lambda name: -bars[name])[:MOST_BARS]
@@ -101,12 +101,12 @@ def draw_probabilities(
 
 
 def draw_gap(axis: "Axes", metric: str, gap: Gap) -> None:
-    """Draws a metric on held-out rollouts before and after, and what it should come to.
+    """Draws a metric on held-out rollouts before and after, and its target.
 
     Args:
-        axis: Where to.
-        metric: Its name.
-        gap: Its values.
+        axis: Axis to draw on.
+        metric: The metric's name.
+        gap: The metric's values.
     """
     values = [gap.before, gap.after]
     axis.bar([0, 1], values, color=[BEFORE, CHOSEN], width=0.65)
@@ -114,7 +114,7 @@ def draw_gap(axis: "Axes", metric: str, gap: Gap) -> None:
         axis.axhline(gap.noise_floor, color="k", ls="--", lw=1.0, label="noise floor")
     elif metric == "coverage":
         axis.axhline(LEVEL, color="k", ls=":", lw=1.2, label="what it should be")
-    # Below the axis, where no line crosses the figures.
+    # Below the axis, where no line crosses the numbers.
     axis.set_xticks(
         [0, 1], [f"{w}\n{v:.3g}" for w, v in zip(("before", "after"), values, strict=True)]
     )
@@ -143,7 +143,7 @@ def discovery_html(
             for f in effects
             for k, (name, p) in enumerate(f.parameters.items())
         ]
-        head = ["effect", "probability", "parameter", "estimate", "not told from"]
+        head = ["effect", "probability", "parameter", "estimate", "indistinguishable from"]
         parts.append(table(head, rows))
     if gap:
         rows = [

@@ -15,13 +15,14 @@ class Finding:
 
     Attributes:
         effect: The effect.
-        probability: That it is this one, given all others found.
-        alternatives: Probabilities of what could stand in its place, itself included, by name.
-        equivalent_to: Ids of causes that the recording may not tell from it.
+        probability: Probability that it is this effect, given all other effects found.
+        alternatives: Probabilities of the effects that could stand in its place, itself included,
+            by name.
+        equivalent_to: Ids of causes that the recording may not distinguish from it.
         share: Share of the misfit that it explains.
         parameters: Its parameters' estimates by short name.
-        at_edge: Those that give it its shape and lie where their priors hardly go, or may as
-            well lie there: its law is then the limit of its own that another law may be.
+        at_edge: Names of shape parameters that have, or may as well have, an implausible value.
+            The law is then at a limit where it may be another law.
     """
 
     effect: Effect

@@ -24,32 +24,33 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["Hypothesis", "fit_hypothesis", "with_effects"]
 
 LEAST_PENALISED = -1.0
-"""Coordinate below which the prior no longer speaks against a hypothesis: that an effect is small
-is no reason to doubt it, and half-normal priors have zero strength at minus infinity."""
+"""Reference coordinate below which the prior penalty grows no further: a small effect is no less
+credible, and half-normal priors have zero strength at minus infinity."""
 
 MOST_READINGS = 100_000
-"""Number of readings above which neighbouring ones are averaged before candidates are tested: ten
-thousand candidate columns of as many readings take a minute. The benchmarks' recordings have
+"""Number of measurements above which neighbouring ones are averaged before candidates are tested.
+With this many, ten thousand candidate columns take a minute. The benchmarks' recordings have
 fewer."""
 
 FEWEST_AVERAGES = 40
 """Fewest averages per segment: four for each of its ten pulses of force."""
 
 EDGE = 3.0
-"""Coordinate beyond which a prior hardly goes: three standard deviations of a normal one."""
+"""Absolute reference coordinate above which a value is implausible: three standard deviations of a
+normal prior."""
 
 Model = Callable[..., Any]
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A model with effects, at its best along the recording.
+    """A model with effects, fitted to the recording.
 
     Attributes:
         model: The model, effects included.
-        effects: The effects that were added to the model in question, in the order of adding.
-        segments: The model along the recording.
-        fit: Parameters and initial states that leave least.
+        effects: The effects that were added to the original model, in the order of adding.
+        segments: The model on the recording's segments.
+        fit: Parameters and initial states with the smallest misfit.
     """
 
     model: Model
@@ -69,7 +70,7 @@ class Hypothesis:
 
     @cached_property
     def difference(self) -> Tensor:
-        """What was measured less what is simulated at the fit, ``(S, K, C)``."""
+        """Measurement minus simulation at the fit, ``(S, K, C)``."""
         simulated = self.segments.simulate(self.fit.z[None], self.fit.offsets[None])[0]
         return self.segments.observed - simulated
 
@@ -78,16 +79,16 @@ class Hypothesis:
         return self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
 
     def averaged(self) -> "Hypothesis":
-        """Returns the same with averages of neighbouring readings, where there are very many.
+        """Returns the hypothesis with neighbouring measurements averaged if there are very many.
 
-        For a :class:`Projection` only: a likelihood counts all readings.
+        For a :class:`Projection` only: a likelihood needs all measurements.
         """
         segments = self.segments.averaged(MOST_READINGS, FEWEST_AVERAGES)
         return self if segments is self.segments else replace(self, segments=segments)
 
     @property
     def can_be_linearised(self) -> bool:
-        """Whether the simulation succeeds at the fit and everywhere beside it."""
+        """Whether the simulation succeeds at the fit and close to it."""
         return self._linearised.is_regular
 
     @property
@@ -95,7 +96,7 @@ class Hypothesis:
         """Residuals and derivatives at the fit, whitened by its own scale.
 
         Raises:
-            DataError: Simulations fail beside the fit.
+            DataError: Simulations fail close to the fit.
         """
         if not self.can_be_linearised:
             raise DataError(
@@ -105,18 +106,18 @@ class Hypothesis:
         return self._linearised
 
     def estimated_starts(self, rollouts: Rollouts) -> InitialStates | None:
-        """Estimates what the segments start from along the fitted motion, and how well."""
+        """Estimates the segments' initial states and their errors along the fitted motion."""
         return self.segments.estimated_starts(self.fit.z, self.fit.scale, rollouts)
 
     @cached_property
     def parameters(self) -> dict[str, Tensor]:
-        """The parameters, ``site.shape`` by latent site."""
+        """The fitted parameters by latent site, each of shape ``site.shape``."""
         values = self.segments.prior.to_parameters(self.fit.z[None])
         return {name: value[0] for name, value in values.items()}
 
     @cached_property
     def share(self) -> float:
-        """Share of the readings that are worth an independent one."""
+        """Effective number of independent measurements, as a share of all measurements."""
         assert self.segments.steps_per_average == 1
         residual = self.segments.whitened(self.difference, self.fit.scale)
         mask = self.segments.inputs.mask
@@ -126,10 +127,10 @@ class Hypothesis:
 
     @cached_property
     def likelihood(self) -> SegmentLikelihood:
-        """The recording's likelihood with the noise that the fit leaves.
+        """The recording's likelihood, with the noise estimated from the fit's residuals.
 
         Raises:
-            DataError: Simulations fail beside the fit.
+            DataError: Simulations fail close to the fit.
         """
         return SegmentLikelihood(
             self.segments, self.fit, self.linearisation, self.share, is_noise_declared=False
@@ -139,16 +140,16 @@ class Hypothesis:
         """Returns minus the log density of each segment, up to a constant, ``(S,)``.
 
         Args:
-            scale: Standard deviation of the readings per channel, ``(C,)``.
+            scale: Standard deviation of the measurements per channel, ``(C,)``.
         """
         residual = self.segments.whitened(self.difference, scale)
         return 0.5 * (residual.square().sum(-1) + self.fit.offsets.square().sum(-1))
 
     def at_edge(self, effect: Effect) -> tuple[str, ...]:
-        """Returns the names of an effect's shapes that lie where their priors hardly go.
+        """Returns the names of an effect's shape parameters with an implausible value.
 
-        There a law is the limit of its own that another law may be: wind without a speed is drag.
-        Strengths may be as small or large as they are, and frequencies are looked for anywhere.
+        There the law is at a limit where it may be another law: wind without a speed is drag.
+        Strengths may have any size, and frequencies are searched everywhere.
         """
         shapes = {p.name for p in effect.parameters} - set(effect.strength) - {effect.wave}
         if not effect.strength:
@@ -163,11 +164,11 @@ class Hypothesis:
 
     @property
     def complexity(self) -> float:
-        """The loss that the priors and the number of the effects' parameters add to the evidence.
+        """The evidence's penalty for the priors and the number of the effects' parameters.
 
-        Half the squared coordinates, and half the log of the number of segments for each parameter
-        of an effect: the prior of each is worth one segment (Kass & Wasserman 1995). Priors as
-        wide as typical sizes would speak against every effect that is small and yet plain.
+        It is half the squared coordinates, plus half the log of the number of segments for each
+        parameter of an effect: each prior is worth one segment (Kass & Wasserman 1995). Priors as
+        wide as typical sizes would penalise every effect that is small but clearly detected.
         """
         z = self.fit.z.clamp_min(LEAST_PENALISED)
         num = sum(len(effect.parameters) for effect in self.effects)
@@ -197,19 +198,19 @@ def fit_hypothesis(
     """Fits a model with effects to a recording.
 
     Args:
-        model: The model in question.
+        model: The original model.
         rollouts: The recording.
-        options: Its segments.
+        options: How it is cut into segments.
         effects: Effects to add.
-        start: Parameters to begin with by site; the others begin in the middle of their priors.
-        offsets: Offsets of the initial states to begin with, ``(S, m)``.
-        starts: What the segments start from, if better known than by the smoother.
+        start: Initial guess by site; other parameters begin in the middle of their priors.
+        offsets: Initial guess of the offsets of the initial states, ``(S, m)``.
+        starts: The segments' initial states, if better known than from the smoother.
         held: Reference coordinates of sites that are not fitted.
-        max_steps: Greatest number of steps.
-        is_rough: Whether to leave it at rough steps.
+        max_steps: Greatest number of steps of the fit.
+        is_rough: Whether to take rough steps only.
 
     Raises:
-        DataError: The simulation fails at the start, or the data do not fit the model.
+        DataError: The simulation fails at the initial guess, or the data do not fit the model.
     """
     model = with_effects(model, effects)
     segments = SegmentModel(model, rollouts, options, starts)

@@ -1,4 +1,4 @@
-"""Discovery: is something wrong, where, what is it, and does adding it help?"""
+"""Discovery: finds which effect a model lacks, adds it and measures whether that helps."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -38,17 +38,19 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["Investigation", "discover"]
 
 MOST_UNEXPLAINED = 0.01
-"""Share of the misfit that may stay unexplained where what was found is to be called the cause."""
+"""Share of the misfit that may stay unexplained. If more is left and the alarm detects it, the
+verdict is ``unknown``."""
 
 MOST_UNHEARD = 0.05
-"""The same where the alarm takes what is left for chance, although it is worth as much evidence as
-settles which of two it is."""
+"""The same limit for a remainder that the alarm does not detect, although the evidence for it is
+larger than :data:`~npdr_ppl.discovery.search.trials.PLAINLY`."""
 
 MINOR = 0.1
-"""Share of the findings that may be in doubt where the rest is to be called named."""
+"""Share of the explained misfit. Uncertain effects that together explain no more than this do not
+prevent the verdict ``named``."""
 
 TOLD_APART = 3
-"""The likeliest, which the next experiment is to tell apart."""
+"""Greatest number of alternatives, the likeliest, that the next experiment should separate."""
 
 COARSE = (
     "The model's integration steps are too coarse for this recording; the revised model takes "
@@ -57,23 +59,23 @@ COARSE = (
 
 
 class Investigation:
-    """A model and a recording, examined stage by stage; each stage can be asked for alone.
+    """A model and a recording, examined stage by stage; each stage can be requested alone.
 
-    A stage does what it needs of the stages before, and nothing is done twice.
+    A stage first runs the earlier stages that it needs. No stage runs twice.
 
     Args:
-        model: A Pyro model with one black-box site; a simulator with ports is all it needs.
-        rollouts: The recording that effects are found and fitted on.
-        holdout: Rollouts to prove it on, of another excitation where there are some; never used
-            to choose or fit anything.
-        options: How to search.
+        model: A Pyro model with one black-box site, whose simulator has ports.
+        rollouts: The recording that is used to find and fit effects.
+        holdout: Rollouts that measure the improvement, best with another excitation. They are
+            never used to choose or fit anything.
+        options: Settings of the search.
         report: Called with a sentence at each step.
 
     Attributes:
         seconds: Time spent, by stage.
 
     Raises:
-        DataError: The held-out rollouts have other channels, or are none.
+        DataError: ``holdout`` is not a ``Rollouts``, or has other channels than the recording.
     """
 
     def __init__(
@@ -102,7 +104,7 @@ class Investigation:
 
     @cached_property
     def given(self) -> Hypothesis:
-        """The model as it is, fitted."""
+        """The original model, fitted to the recording."""
         with _timed(self.seconds, "fit"):
             try:
                 fitted = self._searcher.fit_base()
@@ -113,23 +115,23 @@ class Investigation:
                     raise
                 raise DataError(f"{error} {problems[0]}") from error
         for effect in self.options.effects or ():
-            # Screening leaves out what the simulator cannot have; who asks by name is told.
+            # Screening skips effects that the simulator cannot have; requested ones raise errors.
             fitted.simulator.with_effects(effect)
             if effect.is_noise:
                 raise ModelError(
-                    f"{effect.name} only scatters readings, so that no fit can find it; counts "
-                    "are read off the recording."
+                    f"{effect.name} only scatters measurements, so no fit can find it; the "
+                    "encoder resolution is read from the recording."
                 )
         return fitted
 
     @cached_property
     def start(self) -> Hypothesis:
-        """The same in finer steps and with wider priors, where the model's own do not suffice."""
+        """The fitted model, with finer steps and wider priors where its own do not suffice."""
         return self._start[0]
 
     @cached_property
     def _start(self) -> tuple[Hypothesis, Mapping[str, Distribution]]:
-        """The fit that the search begins with, and the priors that the model has itself."""
+        """The fit that the search begins with, and the model's original priors."""
         given = self.given
         with _timed(self.seconds, "choose steps"):
             found = self._searcher.with_finer_steps(given)
@@ -138,7 +140,7 @@ class Investigation:
 
     @cached_property
     def narrow_priors(self) -> tuple[PriorEnd, ...]:
-        """The priors outside which the parameters of the final fit lie."""
+        """The original priors that do not contain the parameters of the final fit."""
         final = self.search.final
         if not self._searcher.are_priors_widened:
             return ()
@@ -146,26 +148,26 @@ class Investigation:
 
     @cached_property
     def problems(self) -> tuple[str, ...]:
-        """What is wrong with the recording itself."""
+        """Problems of the recording itself."""
         start = self.start
         with _timed(self.seconds, "check data"):
             return tuple(data_problems(start, self.rollouts, self._binding))
 
     @cached_property
     def where(self) -> list[Spot]:
-        """The windows that the model as it is misses most, the worst first."""
+        """The windows in which the original model fits worst, the worst first."""
         return worst_windows(self.start, self.rollouts)
 
     @cached_property
     def first(self) -> Round:
-        """Alarm and ranking at the model as it is."""
+        """Alarm and ranking before any effect is added."""
         start = self.start
         with _timed(self.seconds, "screen"):
             return self._searcher.look(start)
 
     @cached_property
     def search(self) -> Search:
-        """The effects that were missing; none are looked for in a recording with problems."""
+        """The missing effects. A recording with problems is not searched."""
         problems, first = self.problems, self.first
         with _timed(self.seconds, "search"):
             return self._searcher.run(
@@ -174,7 +176,7 @@ class Investigation:
 
     @cached_property
     def _at_edge(self) -> list[tuple[str, ...]]:
-        """For each effect, the shapes that lie or may lie where their priors hardly go."""
+        """For each effect, the shape parameters that have, or may have, an implausible value."""
         search = self.search
         final, explains = search.final, sum(added.share for added in search.added)
         result = []
@@ -216,7 +218,7 @@ class Investigation:
             )
 
     def _advice(self, name: str) -> NextExperiment | None:
-        """Returns the experiment that would tell the likeliest in an effect's place apart."""
+        """Returns the experiment that would separate the likeliest alternatives to an effect."""
         search = self.search
         added = next(a for a in search.added if a.effect.name == name)
         likeliest = sorted(added.alternatives, key=lambda n: added.alternatives[n], reverse=True)
@@ -229,7 +231,7 @@ class Investigation:
         return next_experiment(alternatives, self.rollouts, self._binding, classes)
 
     def conclude(self) -> Discovery:
-        """Returns what all stages came to."""
+        """Runs all stages and returns the result."""
         search = self.search
         final = search.final
         unexplained = _unexplained(search)
@@ -282,19 +284,19 @@ def discover(
     options: DiscoveryOptions | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Discovery:
-    """Finds what a model misses in a recording, names it, adds it and proves that it helps.
+    """Finds the effects that a model lacks, adds them and measures the improvement.
 
     Args:
-        model: A Pyro model with one black-box site; a simulator with ports is all it needs.
-        rollouts: The recording that effects are found and fitted on.
-        holdout: Rollouts to prove it on, of another excitation where there are some; never used
-            to choose or fit anything.
-        options: How to search.
+        model: A Pyro model with one black-box site, whose simulator has ports.
+        rollouts: The recording that is used to find and fit effects.
+        holdout: Rollouts that measure the improvement, best with another excitation. They are
+            never used to choose or fit anything.
+        options: Settings of the search.
         report: Called with a sentence at each step.
 
     Raises:
         DataError: The recording is too short, or does not fit the model.
-        ModelError: The model cannot be inferred, or an effect to search for cannot be found.
+        ModelError: The model cannot be inferred, or no fit can find a requested effect.
     """
     return Investigation(
         model, rollouts, holdout=holdout, options=options, report=report
@@ -308,29 +310,29 @@ def _judge(
     unexplained: float,
     options: DiscoveryOptions,
 ) -> tuple[Verdict, str]:
-    """Returns the verdict and what it rests on."""
+    """Returns the verdict and the reason for it."""
     if problems:
-        return "unknown", f"The data come first: {problems[0]}"
+        return "unknown", f"The recording has a problem: {problems[0]}"
     if not effects:
         if not search.rounds[-1].alarm.fired:
-            return "none", "Nothing is missing that this recording could show."
+            return "none", "This recording shows no missing effect."
         return "unknown", "Simulation and recording disagree, and no effect explains it."
     left = search.rounds[-1].alarm
-    # Of one look, however many there were: it adds nothing, it only says that something is left.
+    # Not corrected for the number of rounds: this test only reports a remainder.
     is_heard = left.p_value <= options.false_alarm_rate
-    # The alarm allows for every kind of noise, and misses what shows in few segments.
+    # The alarm allows for every kind of noise, so it misses a remainder in only a few segments.
     is_plain = 0.5 * search.final.share * left.gain > PLAINLY
     if (is_heard and unexplained > MOST_UNEXPLAINED) or (is_plain and unexplained > MOST_UNHEARD):
         return "unknown", (
-            f"What was found leaves {unexplained:.0%} of the disagreement unexplained, most of it "
-            f"in {left.strongest}."
+            f"The effects that were found leave {unexplained:.0%} of the misfit unexplained. "
+            f"The strongest sign of it is {left.strongest}."
         )
     explains = sum(f.share for f in effects)
     strained = [f for f in effects if f.at_edge and f.share > MINOR * explains]
     if strained:
         return "unknown", (
-            f"{strained[0].effect.name} explains it with {strained[0].at_edge[0]} where "
-            "hardly any device has it, so the law is likely another that is alike there."
+            f"{strained[0].effect.name} explains the misfit with an implausible value of "
+            f"{strained[0].at_edge[0]}. Another law that is similar there is the likelier cause."
         )
     unsure = [f for f in effects if f.probability < options.confidence]
     sure = [f for f in effects if f.probability >= options.confidence]
@@ -338,7 +340,7 @@ def _judge(
         return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
     doubtful = _most_doubtful(effects, options)
     names = " or ".join(n for n, p in doubtful.alternatives.items() if p >= SURVIVES)
-    return "ambiguous", f"The recording cannot tell which it is: {names}."
+    return "ambiguous", f"The recording cannot tell which effect is missing: {names}."
 
 
 def _finding(
@@ -368,7 +370,7 @@ def _finding(
 
 
 def _unexplained(search: Search) -> float:
-    """Returns the share of the misfit that the last model leaves and one law could explain."""
+    """Returns the share of the misfit that the final model leaves and one law could explain."""
     done = explained(search.rounds[0].hypothesis, search.final)
     left = search.rounds[-1].alarm.gain
     return left / max(left + done, 1e-12)
@@ -384,7 +386,7 @@ def _units(hypothesis: Hypothesis) -> dict[str, str]:
 
 
 def _most_doubtful(effects: list[Finding], options: DiscoveryOptions) -> Finding:
-    """Returns the effect that explains most of those that are in doubt."""
+    """Returns the uncertain effect that explains most."""
     return max(
         (found for found in effects if found.probability < options.confidence),
         key=lambda found: found.share,
@@ -392,7 +394,7 @@ def _most_doubtful(effects: list[Finding], options: DiscoveryOptions) -> Finding
 
 
 def _like(binding: DataOptions, rollouts: Rollouts, holdout: Rollouts) -> DataOptions:
-    """Returns segments of the same duration at the held-out recording's rate."""
+    """Returns options for segments of the same duration at the held-out sampling rate."""
     length = binding.steps(rollouts)
     assert length is not None
     steps = round(length * rollouts.time_step / holdout.time_step)

@@ -24,13 +24,13 @@ def revised_source(
 ) -> str:
     """Returns Python source that defines ``revised_model``.
 
-    A model of an installed module is imported; one of a file is copied, so that the result stands
-    alone.
+    A model from an installed module is imported. A model from a file is copied, so that the result
+    needs no other file.
 
     Args:
-        model: The model in question.
+        model: The original model.
         effects: The effects to add.
-        fitted: Parameters of the closest fit by site, for readers.
+        fitted: Parameters of the closest fit by site, which the source lists for information.
     """
     base: Callable[..., Any] = model.base if isinstance(model, ModelWithEffects) else model
     present = [e for e, _ in model.effects] if isinstance(model, ModelWithEffects) else []
@@ -52,10 +52,10 @@ def revised_source(
     lines = [head.rstrip(), "", "", *imports, "", f"{FUNCTION} = {name}"]
     lines += [f"{FUNCTION} = with_finer_steps({FUNCTION})"] * num_finer
     if wider:
-        lines += ["# These priors ended before the recording's parameters.", *reversed(wider)]
+        lines += ["# These priors did not contain the best parameters.", *reversed(wider)]
     for effect in every:
         lines += _added(effect)
-    lines += ["", "# Where the model came closest to the recording."]
+    lines += ["", "# Parameters of the closest fit to the recording."]
     lines += ["CLOSEST_FIT = {"]
     lines += [f'    "{site}": {value:.6g},' for site, value in fitted.items()]
     return "\n".join([*lines, "}", ""])
@@ -78,7 +78,7 @@ def _added(effect: Effect) -> list[str]:
 
 
 def _distribution(prior: Distribution) -> str | None:
-    """Returns a distribution of Pyro's as source; None where its class does not say how."""
+    """Returns a Pyro distribution as source, or ``None`` if it cannot be written so."""
     name = type(prior).__name__
     if getattr(pyro.distributions, name, None) is not type(prior):
         return None
@@ -93,7 +93,7 @@ def _distribution(prior: Distribution) -> str | None:
 
 
 def _base(model: Callable[..., Any]) -> tuple[str, str]:
-    """Returns what defines a model, and its name."""
+    """Returns the source that defines a model, and the model's name."""
     module = inspect.getmodule(model)
     name = getattr(model, "__name__", type(model).__name__)
     if module is not None and _is_installed(module.__name__):
@@ -101,10 +101,10 @@ def _base(model: Callable[..., Any]) -> tuple[str, str]:
         return f"{doc}\n\nfrom {module.__name__} import {name}", name
     path = inspect.getsourcefile(model)
     if path is None:
-        return f"# {name} was defined where no source is: import it here.", name
+        return f"# The source of {name} was not found: import it here.", name
     return Path(path).read_text(encoding="utf-8"), name
 
 
 def _is_installed(module: str) -> bool:
-    # Not importlib.util.find_spec, which also finds what was loaded from a file by its path.
+    # importlib.util.find_spec would also find modules that were loaded from a file by path.
     return PathFinder.find_spec(module.partition(".")[0]) is not None

@@ -1,4 +1,4 @@
-"""A progress bar for a search whose length no one knows beforehand."""
+"""A progress bar for a search of unknown length."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,16 +14,16 @@ __all__ = ["sentences"]
 def sentences(
     options: DiscoveryOptions, show: bool | Reporter | None = None
 ) -> Iterator[Callable[[str], None]]:
-    """Shows a search's sentences beside a bar, and yields what is to be called with them.
+    """Shows a search's sentences beside a bar, and yields the function that takes them.
 
-    The bar is full when as many effects were added as may be; most searches end sooner.
+    The bar is full when ``max_effects`` effects were added; most searches end sooner.
 
     Args:
-        options: How the search goes.
+        options: Settings of the search.
         show: As :func:`~npdr_ppl.progress.reporter` takes it.
     """
-    # Two sentences at the model as it is; in each round the trials, one that is added, one look
-    # and, in the end, one probability.
+    # The original model has two sentences. Each effect has one for each trial, one when it is
+    # added, one for the next screening and one for its probability at the end.
     total = 2 + options.max_effects * (SHORTLIST + 3)
     said = 0
     with reporter(show) as bars:

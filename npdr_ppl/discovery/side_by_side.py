@@ -1,4 +1,4 @@
-"""Independent pieces of a search, in as many processes as there are workers."""
+"""Runs independent parts of a search in parallel processes, one per worker."""
 
 import logging
 import warnings
@@ -19,9 +19,9 @@ Result = TypeVar("Result")
 
 
 def num_processes(simulator: Simulator) -> int:
-    """Returns how many processes simulate side by side: those of the enclosing ``workers`` block.
+    """Returns the number of parallel processes: those of the enclosing ``workers`` block.
 
-    One where there is no such block, and where the simulator itself uses the workers.
+    It is one if there is no such block, or if the simulator itself uses the workers.
     """
     return 1 if isinstance(simulator, PooledSimulator) else num_local_processes()
 
@@ -29,20 +29,20 @@ def num_processes(simulator: Simulator) -> int:
 def side_by_side(
     function: Callable[[Item], Result], items: Sequence[Item], number: int
 ) -> Iterator[Result]:
-    """Yields the function of every item, in their order.
+    """Yields the function's result for every item, in the items' order.
 
     Args:
-        function: What to do; it travels to the processes, with what it refers to.
-        items: What to do it to.
-        number: Processes.
+        function: The function; it is sent to the processes, with all that it refers to.
+        items: Its arguments.
+        number: Number of processes.
     """
     done = 0
     if number > 1 and len(items) > 1:
         # Not at the top: joblib takes a quarter of a second to import.
         from joblib import Parallel, delayed
 
-        # A process whose memory has grown is replaced by a fresh one, with no harm to its work.
-        # For good: it is a thread of the executor's that warns, whenever that happens.
+        # A process whose memory has grown is replaced by a fresh one, and no result is lost. The
+        # filter stays, because a thread of the executor may warn at any time.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         parallel = Parallel(number, backend="loky", return_as="generator", max_nbytes=None)
         results = cast(
@@ -55,12 +55,12 @@ def side_by_side(
         except NpdrError:
             raise
         except GeneratorExit:
-            # Who has seen enough knows that the rest is given up.
+            # The caller needs no more results and expects that the others are dropped.
             with warnings.catch_warnings(action="ignore", category=UserWarning):
                 results.close()
             raise
         except Exception as error:
-            # A process was killed, or something cannot travel, such as a handle of an engine.
-            _LOGGER.warning("The search goes on in one process: %s", error)
+            # A process was killed, or something cannot be sent, such as a handle of an engine.
+            _LOGGER.warning("The search continues in one process: %s", error)
     for item in items[done:]:
         yield function(item)

@@ -1,4 +1,4 @@
-"""The alarm: whether anything is missing, whatever it may be."""
+"""The alarm: tests whether any effect is missing, in the catalogue or not."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ from npdr_ppl.language.effects import Effect
 __all__ = ["Alarm", "sound_alarm"]
 
 CATALOGUE_SHARE, LAW_SHARE, RINGING_SHARE, MOMENT_SHARE = 0.6, 0.2, 0.1, 0.1
-"""Shares of the false alarms that the catalogue's candidates, generic laws, what rings and forces
-at some moments may raise."""
+"""Shares of the false-alarm rate for the catalogue's candidates, generic laws, ringing, and forces
+at some moments."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Alarm:
     """Whether a fitted model and the recording disagree.
 
     Attributes:
-        p_value: Probability of as large a disagreement by chance, all searching counted.
-        fired: Whether it is below the rate of false alarms that was asked for.
-        strongest: What disagrees most: an effect's name, or that of a law outside the catalogue.
+        p_value: Probability of a disagreement this large by chance, corrected for the search.
+        fired: Whether it is low enough for the requested false-alarm rate.
+        strongest: Name of the effect, or of the law outside the catalogue, with the least p-value.
         gain: Greatest reduction of the misfit by one candidate or law.
-        p_values: The same probability for each candidate and law, by name.
+        p_values: P-value of each candidate and law, by name.
     """
 
     p_value: float
@@ -60,20 +60,20 @@ def sound_alarm(
 ) -> tuple[Alarm, list[Screened]]:
     """Tests a fitted hypothesis against every candidate and every generic law at once.
 
-    Every shape and size of a candidate that was tried counts, and every frequency of a wave.
-    Candidates and laws are looked at one after another, so that what they change need not fit into
-    memory together.
+    The test is corrected for every tried shape and size of a candidate, and every frequency of a
+    wave. Candidates and laws are processed one after another, so that their changes need not fit
+    into memory together.
 
     Args:
         projection: The fitted hypothesis.
-        variants: All candidates in all their shapes and sizes.
+        variants: All candidates, in all shapes and sizes.
         found: The responses to pulses of force.
         sensors: The simulator's sensors.
-        options: The rate of false alarms and the seed.
-        num_looks: How often the recording was looked at before.
+        options: The false-alarm rate and the seed.
+        num_looks: How often the recording was tested before.
 
     Returns:
-        The alarm, and the candidates that explain anything, the best first.
+        The alarm, and the candidates that explain a part of the misfit, the best first.
     """
     chance = LargestStatistic(projection, seed=options.seed)
     generic = generic_laws(found, sensors) + reading_laws(projection)
@@ -104,7 +104,7 @@ def sound_alarm(
     moments = forces_at_moments(projection, found)
     for moment in moments:
         values[moment.name] = min(1.0, len(moments) * moment.p_value / MOMENT_SHARE)
-    # Some segments stand out by chance: their gain counts only where that is unlikely.
+    # Some segments stand out by chance: their gain is used only where that is unlikely.
     unlikely = [moment for moment in moments if values[moment.name] <= options.false_alarm_rate]
     gains |= {moment.name: moment.gain for moment in unlikely}
     if not values:
@@ -113,7 +113,7 @@ def sound_alarm(
     strongest = [name for name, p in values.items() if p == p_value]
     alarm = Alarm(
         p_value,
-        # Every effect that was added is one more look.
+        # Every added effect means one more test of the same recording.
         p_value <= options.false_alarm_rate / (1 + num_looks),
         min(strongest, key=lambda name: (-gains.get(name, 0.0), name)),
         max(gains.values(), default=0.0),
@@ -125,9 +125,10 @@ def sound_alarm(
 def _screened(
     variants: Iterable[Variant], screening: Screening, effects: list[Effect]
 ) -> Iterator[Tensor]:
-    """Yields what candidates change, once each is screened; notes the effects they are of.
+    """Screens candidates and yields their changes; appends their effects to ``effects``.
 
-    Shapes that were found on the recording itself are screened only: chance would find others.
+    Shapes that were found on the recording itself are only screened: on permuted residuals, the
+    search would have found others.
     """
     for variant in variants:
         screening.add(variant)
@@ -139,11 +140,11 @@ def _screened(
 def _unexplained(
     laws: Iterable[GenericLaw], projection: Projection, gains: dict[str, float], names: list[str]
 ) -> Iterator[Tensor]:
-    """Yields what laws change that refitted parameters do not explain; notes gains and names."""
+    """Yields the changes of laws that refitted parameters cannot imitate; adds gains and names."""
     for law in laws:
         change = law.change
         scores = projection.scores(change)
-        # What is absorbed up to rounding errors leaves nothing to judge.
+        # A change that is absorbed up to rounding errors cannot be tested.
         if float(scores.absorbed.min()) < 1.0 - 1e-6:
             gains[law.name] = scores.gain(slice(None))
             names.append(law.name)

@@ -1,4 +1,4 @@
-"""The candidates at a hypothesis: which effects may be added, and what each would change."""
+"""The candidates for a hypothesis: which effects may be added, and what each would change."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -18,8 +18,8 @@ from npdr_ppl.models.effects import candidate_effects
 __all__ = ["candidates_at", "variants_of"]
 
 PARTS_PER_PROCESS = 4
-"""Parts of the candidates that each process takes one after another: the changes of a part are in
-memory together."""
+"""Parts of the candidates per process, which it computes one after another. The changes of a part
+are in memory together."""
 
 
 def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Effect, ...]:
@@ -39,12 +39,12 @@ def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Ef
 def variants_of(
     candidates: tuple[Effect, ...], projection: Projection, found: Responses
 ) -> Iterator[Variant]:
-    """Yields the candidates in all their shapes and sizes, waves at the strongest frequency too.
+    """Yields the candidates in all shapes and sizes, and waves also at the strongest frequency.
 
     Args:
         candidates: The effects.
         projection: The fitted hypothesis that they would be added to.
-        found: What pulses of force at the joints would change there.
+        found: The responses to pulses of force at the joints.
     """
     hypothesis = projection.hypothesis
     hints = {
@@ -59,7 +59,7 @@ def variants_of(
     # Every part holds effects of every kind.
     num_parts = min(len(candidates), PARTS_PER_PROCESS * number)
     parts = [candidates[k::num_parts] for k in range(num_parts)]
-    bare = replace(hypothesis)  # without what it has computed, which need not travel
+    bare = replace(hypothesis)  # without cached results, which need not be sent
     for part in side_by_side(partial(_listed, bare, hints=hints), parts, number):
         yield from part
 

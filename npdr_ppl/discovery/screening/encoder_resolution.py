@@ -1,8 +1,8 @@
-"""Encoders' counts, read off the readings themselves.
+"""The encoder resolution of each channel, determined from the measurements themselves.
 
-Rounding moves no reading in any direction on average, so it is noise to a fit. A fit that rounds
-its own simulation follows the noise instead: of many initial states some round in the recording's
-favour, by chance, and nothing that is inferred beside them is worth much.
+On average, rounding moves measurements in no direction, so a fit can treat it as noise. A fit that
+rounds its own simulation follows this noise instead: by chance, some of many initial states round
+as in the recording, and the parameters inferred with them are not reliable.
 """
 
 from dataclasses import asdict, dataclass
@@ -16,20 +16,21 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["Count", "count_of", "counts"]
 
 RESOLUTION = 5e-7
-"""Least step between readings relative to the greatest one; single precision has steps of 6e-8."""
+"""Smallest step that is considered, relative to the largest measurement. Single precision itself
+has steps of 6e-8."""
 
 NEARLY = 0.1
-"""Share of a count by which readings in whole counts may be off, as decimals are."""
+"""Greatest distance of a measurement from a whole multiple, as a fraction of the resolution.
+Measurements written as decimals are not exact multiples."""
 
 
 @dataclass(frozen=True)
 class Count:
-    """A channel's readings are whole multiples of something.
+    """The encoder resolution of a channel, whose measurements are whole multiples of it.
 
     Attributes:
-        size: Of what, in the channel's unit.
-        share: Share of the variance of what a model leaves in the channel that rounding to it
-            makes.
+        size: The resolution, in the channel's unit.
+        share: Share of the variance of the channel's residuals that rounding causes.
     """
 
     size: float
@@ -41,10 +42,10 @@ class Count:
 
 
 def counts(hypothesis: Hypothesis, rollouts: Rollouts) -> dict[str, Count]:
-    """Returns the counts of the channels that have any, by channel.
+    """Returns the encoder resolution by channel, for the channels that have one.
 
     Args:
-        hypothesis: A fitted model, whose residuals they are compared with.
+        hypothesis: A fitted model, whose residuals the rounding is compared with.
         rollouts: The recording.
     """
     found = {}
@@ -58,20 +59,20 @@ def counts(hypothesis: Hypothesis, rollouts: Rollouts) -> dict[str, Count]:
 
 
 def count_of(readings: NDArray[np.floating]) -> float | None:
-    """Returns the greatest step of which all readings are multiples, up to a common offset.
+    """Returns the largest step of which all measurements are multiples, up to a common offset.
 
     Args:
-        readings: Readings of one channel, ``(N,)``.
+        readings: Measurements of one channel, ``(N,)``.
 
     Returns:
-        ``None`` if they are multiples of nothing that single precision resolves.
+        ``None`` if there is no such step that single precision resolves.
     """
     levels = np.unique(readings.astype(np.float64))
     steps = np.diff(levels)
     steps = steps[steps > RESOLUTION * np.abs(levels).max()]
     if not len(steps):
         return None
-    # All steps together have more digits than the least one.
+    # The sum of all steps gives more digits than the smallest step.
     count = float(steps.sum() / np.round(steps / steps.min()).sum())
     multiples = (levels - levels[0]) / count
     return count if bool(np.all(np.abs(multiples - np.round(multiples)) < NEARLY)) else None

@@ -1,4 +1,4 @@
-"""Effects that are the same cause in other words, and sums of them."""
+"""Effects that describe the same cause in another way, and effects that are sums of others."""
 
 from collections.abc import Iterable
 
@@ -8,15 +8,15 @@ __all__ = ["equivalents", "irreducible"]
 
 
 def irreducible(effects: Iterable[Effect], present: tuple[str, ...] = ()) -> tuple[Effect, ...]:
-    """Returns the effects that are no sum of two others at the same port.
+    """Returns the effects that are not the sum of two others at the same port.
 
-    Asymmetric dry friction is dry friction and a bias: searched together with both, it would only
-    share their probability, and one by one they show which of them is there.
+    Asymmetric dry friction is the sum of dry friction and a bias. Searched together with both, it
+    would only take a share of their probability. Searched one by one, they show which is present.
 
     Args:
         effects: The candidates.
-        present: Names of effects that the model has already; they are left out, and count as
-            others.
+        present: Names of effects that the model has already; they are left out, but may be parts
+            of a sum.
     """
     effects = tuple(effects)
     names = {effect.name for effect in effects} | set(present)
@@ -31,12 +31,12 @@ def irreducible(effects: Iterable[Effect], present: tuple[str, ...] = ()) -> tup
 
 
 def equivalents(effect: Effect, present: Iterable[str] = ()) -> tuple[str, ...]:
-    """Returns ids of causes that the data may not tell from an effect.
+    """Returns ids of causes that the data may not distinguish from an effect.
 
     Args:
         effect: The effect.
-        present: Names of the model's effects: sums that contain the effect count when the others
-            are there too.
+        present: Names of the model's effects. A sum that contains the effect is returned only if
+            the model has the other parts.
     """
     at_port = {name.rsplit(".", 1)[1] for name in present if name.startswith(f"{effect.port}.")}
     result: list[str] = []

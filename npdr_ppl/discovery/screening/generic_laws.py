@@ -1,10 +1,10 @@
-"""Laws that no one would call physics, to notice what the catalogue has no word for.
+"""Generic laws, without a physical meaning, that detect effects outside the catalogue.
 
-Polynomials, signs and products of whatever is recorded, waves in time, and ripples: waves in a
-position, by themselves or as a factor of a command or of the direction of motion. Each is a force
-at a joint, and what it would change is a weighted sum of the responses to pulses. Errors of a
-sensor are functions of what it reads. And what is carried on a spring, or stands on one, rings
-after every change of speed.
+* Forces at a joint: polynomials, signs and products of all recorded channels, waves in time, and
+  ripples. A ripple is a wave in a position, alone or times a command or the direction of motion.
+  The change from such a force is a weighted sum of the responses to pulses.
+* Errors of a sensor, as functions of its own value.
+* Ringing after every change of speed, as of a part that is carried on a spring or stands on one.
 """
 
 import math
@@ -33,32 +33,34 @@ __all__ = [
 ]
 
 SIGN_WIDTH = 0.1
-"""Over which part of a channel's spread a sign changes."""
+"""Width over which a sign changes, as a fraction of the channel's spread."""
 
 FREQUENCIES = 120
-"""Frequencies tried of a wave in time, spaced by half the resolution of the longest rollout."""
+"""Number of frequencies tried for a wave in time, spaced by half the resolution of the longest
+rollout."""
 
 RIPPLES = 40
-"""Wave numbers tried of a ripple, spaced by half the resolution of a position's range."""
+"""Number of wave numbers tried for a ripple, spaced by half the resolution of a position's
+range."""
 
 RINGS = 30
-"""Frequencies tried of what rings …"""
+"""Number of ringing frequencies tried, evenly spaced in their logarithm."""
 
 SLOWEST_RING = 0.02
-"""… from so many periods per time step to half of one, evenly in their logarithm …"""
+"""Lowest ringing frequency, in periods per time step; the highest is half a period."""
 
 RING_DAMPING = 0.1
-"""… with this damping ratio."""
+"""Damping ratio of the ringing."""
 
 
 @dataclass(frozen=True)
 class GenericLaw:
-    """A law that is no one's: a function of what is recorded, as a force at a port.
+    """A law outside the catalogue: a function of the recorded channels, as a force at a port.
 
     Attributes:
-        name: What it is, e.g. ``"arm: arm_velocity²"``.
+        name: Description, e.g. ``"arm: arm_velocity²"``.
         make: Returns the change. It is computed on demand, because the changes of hundreds of
-            laws of a long recording do not fit into memory together.
+            laws on a long recording do not fit into memory together.
     """
 
     name: str
@@ -66,16 +68,16 @@ class GenericLaw:
 
     @property
     def change(self) -> Tensor:
-        """What it would change in the whitened readings, ``(S, N, k)``; made anew each time."""
+        """Its change of the whitened measurements, ``(S, N, k)``; computed at each access."""
         return self.make()
 
 
 def generic_laws(found: Responses, sensors: Sequence[Channel] = ()) -> list[GenericLaw]:
-    """Returns what a dictionary of laws would change.
+    """Returns a dictionary of laws, as forces at every joint.
 
     Args:
         found: The responses to pulses.
-        sensors: The simulator's sensors; waves are tried of angles.
+        sensors: The simulator's sensors; of angles, sines and cosines are tried too.
     """
     values = _dictionary(found, {sensor.name for sensor in sensors if sensor.unit == "rad"})
     return [
@@ -86,7 +88,7 @@ def generic_laws(found: Responses, sensors: Sequence[Channel] = ()) -> list[Gene
 
 
 def wave_laws(found: Responses) -> dict[str, list[GenericLaw]]:
-    """Returns what waves in time of many frequencies would change, by port.
+    """Returns waves in time of many frequencies, as forces, by port.
 
     Args:
         found: The responses to pulses.
@@ -104,11 +106,11 @@ def wave_laws(found: Responses) -> dict[str, list[GenericLaw]]:
 
 
 def ripple_laws(found: Responses, sensors: Sequence[Channel]) -> list[GenericLaw]:
-    """Returns what ripples over every position would change at every port.
+    """Returns ripples over every position, as forces at every port.
 
     Args:
         found: The responses to pulses.
-        sensors: The simulator's sensors, which say what is a position and what its velocity.
+        sensors: The simulator's sensors, which tell positions from velocities.
     """
     recorded = [sensor for sensor in sensors if sensor.name in found.channels]
     velocities = {sensor.rate_of: sensor.name for sensor in recorded if sensor.rate_of}
@@ -143,21 +145,21 @@ def _waved(change: Tensor, found: Responses, frequency: float) -> Tensor:
 
 
 def _rippled(change: Tensor, factor: Tensor, x: Tensor, number: float) -> Tensor:
-    """Returns what a factor times a ripple over x, both ``(S, pulses)``, would change."""
+    """Returns the change from a factor times a ripple over x, both ``(S, pulses)``."""
     phase = number * (x - x.mean())
     return change @ (factor[..., None] * torch.stack((phase.sin(), phase.cos()), dim=-1))
 
 
 def reading_laws(projection: Projection) -> list[GenericLaw]:
-    """Returns what errors of each sensor that depend on its reading would change.
+    """Returns errors of each sensor that depend on its own value.
 
-    A segment starts from where its sensor says it is, so errors count from there on.
+    A segment begins at the measured state, so the error at its beginning is subtracted.
 
     Args:
         projection: The fitted model.
     """
     hypothesis, segments = projection.hypothesis, projection.hypothesis.segments
-    # Of readings, not of what was read: that has its noise in common with the residuals.
+    # Of simulated values: measured ones have their noise in common with the residuals.
     simulated = segments.observed - hypothesis.difference
     laws = []
     for c, sensor in enumerate(segments.measured):
@@ -169,17 +171,23 @@ def reading_laws(projection: Projection) -> list[GenericLaw]:
 
 
 def _error_of(hypothesis: Hypothesis, channel: int, error: Tensor) -> Tensor:
-    """Returns an error of one channel, ``(S, K)``, in the whitened readings, ``(S, N, 1)``."""
+    """Returns the change of the whitened measurements, ``(S, N, 1)``, from a sensor's error.
+
+    Args:
+        hypothesis: The fitted model.
+        channel: Column of the sensor.
+        error: Its error, ``(S, K)``.
+    """
     errors = torch.zeros_like(hypothesis.segments.observed, dtype=torch.float64)
     errors[..., channel] = error
     return hypothesis.segments.whitened(errors, hypothesis.fit.scale)[..., None]
 
 
 def ringing_laws(projection: Projection) -> list[GenericLaw]:
-    """Returns what a part that rings after every change of speed would change.
+    """Returns the ringing of a part after every change of speed.
 
-    A mass on a spring that the measured part carries, or that carries it; which phase its swing
-    has in the readings is left open. A segment begins without a swing.
+    The part is a mass on a spring that the measured part carries, or that carries it. The phase
+    of the oscillation is left open. A segment begins without oscillation.
 
     Args:
         projection: The fitted model.
@@ -202,11 +210,11 @@ def ringing_laws(projection: Projection) -> list[GenericLaw]:
 def _rung(
     hypothesis: Hypothesis, kick: Tensor, position: int | None, rate: int | None, periods: float
 ) -> Tensor:
-    """Returns what rings after kicks, ``(S, K)``, in the whitened readings, ``(S, N, 2)``.
+    """Returns the change of the whitened measurements, ``(S, N, 2)``, from ringing after kicks.
 
     Args:
         hypothesis: The fitted model.
-        kick: Changes of speed.
+        kick: Changes of speed, ``(S, K)``.
         position: Column of the position that rings, if it is measured.
         rate: Column of its velocity, if that is measured.
         periods: Periods per time step.
@@ -229,7 +237,7 @@ def _rung(
 
 
 def _motions(measured: Sequence[Channel]) -> list[tuple[str, int | None, int | None]]:
-    """Returns what moves: its name, and the columns of its position and its velocity."""
+    """Returns the moving quantities: name, and the columns of position and velocity."""
     columns = {sensor.name: c for c, sensor in enumerate(measured)}
     positions = {s.rate_of: c for c, s in enumerate(measured) if s.rate_of}
     result: list[tuple[str, int | None, int | None]] = [
@@ -242,7 +250,7 @@ def _motions(measured: Sequence[Channel]) -> list[tuple[str, int | None, int | N
 
 
 def strongest_frequency(projection: Projection, found: Responses, port: str) -> float:
-    """Returns the frequency in Hz of the wave in time that explains most as a force at a port.
+    """Returns the frequency in Hz of the wave in time that, as a force at a port, explains most.
 
     Args:
         projection: The fitted model.
@@ -271,12 +279,12 @@ def _wave(found: Responses, frequency: float) -> Tensor:
 
 
 def _sign(x: Tensor) -> Tensor:
-    """Returns the sign of a channel, which changes over a part of its spread."""
+    """Returns the sign of a channel, smoothed over :data:`SIGN_WIDTH`."""
     return torch.tanh(x / x.square().mean().sqrt().clamp_min(1e-12) / SIGN_WIDTH)
 
 
 def _dictionary(found: Responses, angles: set[str]) -> dict[str, Tensor]:
-    """Returns the laws' values at the pulses, each of unit spread."""
+    """Returns the laws' values at the pulses, scaled to unit spread."""
     channels, time = found.channels, found.time
     values: dict[str, Tensor] = {"1": torch.ones_like(time), "t": time}
     signs = {name: _sign(x) for name, x in channels.items()}
@@ -297,7 +305,7 @@ def _dictionary(found: Responses, angles: set[str]) -> dict[str, Tensor]:
 
 
 def _of_one(name: str, channel: Tensor, is_angle: bool) -> dict[str, Tensor]:
-    """Returns functions of one channel by what they are."""
+    """Returns functions of one channel, by name."""
     x = channel / channel.square().mean().sqrt().clamp_min(1e-12)
     values = {
         name: x,

@@ -1,10 +1,10 @@
-"""The force that the model lacks, whatever its law.
+"""The force that the model lacks, estimated without a law.
 
-A pulse of force at a joint during a part of every segment changes the readings linearly while it
-is small. With the responses to all pulses, the effect of *any* force law along the recording is a
-weighted sum, without another simulation: the law's values at the pulses are the weights. So many
-laws can be tried (:mod:`~npdr_ppl.discovery.screening.generic_laws`), and the missing force itself
-can be estimated and shown against the states.
+A small pulse of force at a joint during a part of every segment changes the measurements linearly.
+The change from *any* force law is then a weighted sum of the responses to all pulses: the weights
+are the law's values at the pulses, and no other simulation is needed. So many laws can be tried
+(:mod:`~npdr_ppl.discovery.screening.generic_laws`), and the missing force itself can be estimated
+and shown against the states.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ PULSES = 10
 """Pulses per segment and joint."""
 
 SMALL = 1e-3
-"""Height of a pulse, in the port's rated force: a response is a derivative."""
+"""Height of a pulse, as a fraction of the port's rated force: a response is a derivative."""
 
 
 class Pulse(TimedForceEffect):
@@ -42,7 +42,7 @@ class Pulse(TimedForceEffect):
     )
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
-        """Returns priors that no one uses: pulses are never inferred."""
+        """Returns priors that are not used: pulses are never inferred."""
         one = dist.Normal(0.0, port.rated)
         return {"height": one, "begin": dist.HalfNormal(1.0), "end": dist.HalfNormal(1.0)}
 
@@ -60,15 +60,15 @@ class Pulse(TimedForceEffect):
 
 @dataclass(frozen=True)
 class Responses:
-    """What pulses change along the recording.
+    """The responses to pulses of force.
 
     Attributes:
-        by_port: Change of the whitened readings per unit of force, ``(S, N, pulses)``, by port.
+        by_port: Change of the whitened measurements per unit force, ``(S, N, pulses)``, by port.
         units: Unit of each port's force.
         rated: Each port's rated force.
-        channels: Readings when each pulse begins, as simulated, ``(S, pulses)``, by channel, and
-            the commands, by action.
-        time: Seconds since the rollout began when each pulse begins, ``(S, pulses)``.
+        channels: Simulated measurements, by channel, and commands, by action, at the beginning of
+            each pulse, ``(S, pulses)``.
+        time: Beginning of each pulse in seconds since the rollout began, ``(S, pulses)``.
         rollout: Index of each segment's rollout, ``(S,)``.
     """
 
@@ -98,7 +98,7 @@ class LatentForce:
 
 
 def responses(hypothesis: Hypothesis) -> Responses:
-    """Returns what pulses at every joint would change.
+    """Returns the responses to pulses at every joint.
 
     Args:
         hypothesis: The fitted model.
@@ -141,8 +141,8 @@ def responses(hypothesis: Hypothesis) -> Responses:
 def latent_force(projection: Projection, found: Responses) -> list[LatentForce]:
     """Estimates the missing force at every joint, with the initial states integrated out.
 
-    Each pulse's force is normal about zero; its standard deviation is the one under which the
-    recording is likeliest (empirical Bayes), the same for all segments of a joint.
+    Each pulse's force has a normal prior with mean zero. The prior's standard deviation is the one
+    under which the recording is likeliest (empirical Bayes). A joint has one for all segments.
 
     Args:
         projection: The fitted model.

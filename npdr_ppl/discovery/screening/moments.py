@@ -1,16 +1,17 @@
-"""Forces that act at some moments only, as bursts, impacts or a stop that is hit now and then.
+"""Forces that act at some moments only, such as bursts, impacts or a stop that is hit rarely.
 
-No law of what is recorded is resembled by a force that comes when it likes. But where it acts, the
-residuals of a segment lie along what a force would change, and where it does not, they lie
-anywhere. In every segment the residuals' energy along the largest responses to pulses is compared
-with that in all other directions (an F statistic), and with the same in the segment in the middle,
-since coloured noise resembles a force everywhere. A single reading that is far off may lie where
-all forces end; the one that speaks most for a force is left out of its segment.
+A force at arbitrary times resembles no law of the recorded channels. But in a segment where it
+acts, the residuals lie along the changes that a force would cause. In other segments they have no
+preferred direction. In every segment, the residuals' energy along the largest responses to pulses
+is compared with the energy in all other directions (an F statistic). Coloured noise resembles a
+force everywhere, so this ratio is also compared with its median over the segments. A single
+outlier can resemble the end of every force's response. So each segment leaves out the measurement
+that supports a force most.
 
-A few segments stand out by chance. Of the k smallest of S tail probabilities the greatest is p
-with the probability that at least k of S are below p (higher criticism; Donoho & Jin 2004), and
-the least of these over k counts, once for each k. A stop may be hit once, so one segment may speak
-alone.
+A few segments stand out by chance. Let p be the k-th smallest of S tail probabilities. Its p-value
+is the probability that at least k of S are below p (higher criticism; Donoho & Jin 2004). The
+least p-value over k is multiplied by the number of k that were tried. A stop may be hit once, so a
+single segment can be enough.
 """
 
 from dataclasses import dataclass
@@ -27,10 +28,11 @@ from npdr_ppl.discovery.screening.projection import Projection
 __all__ = ["Moments", "forces_at_moments"]
 
 SHAPES = 3
-"""Directions in which a force may act in one segment: those that change the readings most."""
+"""Number of directions in which a force may act in one segment: those that change the measurements
+most."""
 
 MOST = 20
-"""Segments that are looked at together."""
+"""Greatest number k of segments that are tested together."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Moments:
 
     Attributes:
         name: E.g. ``"arm: force at moments"``.
-        p_value: Probability of as many segments that stand out by as much, by chance.
+        p_value: Probability that as many segments stand out by as much, by chance.
         gain: Reduction of the misfit by a force in those segments.
     """
 
@@ -51,7 +53,7 @@ class Moments:
 def forces_at_moments(projection: Projection, found: Responses) -> list[Moments]:
     """Tests every joint for a force that acts in some segments.
 
-    Too few segments say nothing, and none with hardly more readings than forces have shapes.
+    The result is empty if there are too few segments, or too few measurements in a segment.
 
     Args:
         projection: The fitted model.
@@ -97,13 +99,13 @@ def _energies(residual: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _energies_without_one(residual: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns the same without the reading in each segment that speaks most for the directions.
+    """Returns the same without each segment's measurement that supports the directions most.
 
-    Without its row the directions D are no longer orthonormal; by Sherman and Morrison's formula
-    (DᵀD)⁻¹ is 1 + d dᵀ / (1 − dᵀd) with d that row.
+    Without its row d, the directions D are no longer orthonormal. By Sherman and Morrison's
+    formula, (DᵀD)⁻¹ is 1 + d dᵀ / (1 − dᵀd).
     """
     scores = torch.einsum("snk,sn->sk", directions, residual)[:, None]
-    scores = scores - directions * residual[..., None]  # (S, N, k), each without a reading
+    scores = scores - directions * residual[..., None]  # (S, N, k), each without a measurement
     left = (1.0 - directions.square().sum(-1)).clamp_min(1e-9)
     along = scores.square().sum(-1) + (scores * directions).sum(-1).square() / left
     energy = residual.square()

@@ -1,18 +1,19 @@
-"""What chance can do: the distribution of the largest statistic when nothing is missing.
+"""Permutation tests: the distribution of the largest statistic when nothing is missing.
 
-Everything that inflates a naive p-value is part of it: the parameters and initial states that were
-fitted to the same data, the readings' correlation within a segment, outliers, a wrong scale, and
-the search over a hundred candidates. Under the hypothesis that nothing is missing, the residuals
-of a segment have nothing to do with what an effect would have done there. So they are permuted
-anew: every segment gets the residuals of another one, with a random sign, and the largest of all
-candidates' statistics is noted (a permutation test with Westfall and Young's maximum, 1993).
-Residuals are scaled by each segment's own spread before they are permuted, since fast segments
-have larger ones, and neighbours go together as long as there are enough, since coloured noise and
-the smoother's windows reach across a boundary.
+It includes everything that inflates a naive p-value: parameters and initial states that were
+fitted to the same data, correlation of measurements within a segment, outliers, a wrong scale, and
+the search over a hundred candidates. If nothing is missing, the residuals of a segment are
+unrelated to the change that an effect would have caused there. So the residuals are permuted:
+every segment gets the residuals of another one, with a random sign. The largest of all candidates'
+statistics is recorded (a permutation test with Westfall and Young's maximum, 1993).
 
-Where something is missing, it is among what is permuted, and would hide behind its own size. So no
-segment keeps its own residuals, and the variance of each deal's score is that of what the
-candidate, fitted to the deal, leaves.
+Fast segments have larger residuals, so residuals are first scaled by each segment's own spread.
+Coloured noise and the smoother's windows reach across a boundary, so neighbours stay together as
+long as there are enough.
+
+If an effect is missing, the permuted residuals contain it, and its own size would hide it. So no
+segment keeps its own residuals. The variance of a permutation's score is that of the residuals
+after the candidate is fitted to the permutation.
 """
 
 import math
@@ -28,22 +29,22 @@ from npdr_ppl.discovery.screening.projection import Projection
 __all__ = ["FEWEST_BLOCKS", "LargestStatistic", "block_sums"]
 
 DRAWS = 2000
-"""Deals; a p-value is at least one in as many."""
+"""Number of permutations; a p-value is at least one divided by it."""
 
 FEWEST_BLOCKS = 24
 """Neighbouring segments are joined in pairs as long as this many pairs remain."""
 
 MOST_BLOCKS = 100
-"""Of long recordings more neighbours are joined: finer deals would tell no more, and take time by
-the cube of their number."""
+"""In long recordings more neighbours are joined, until at most this many blocks remain. More would
+not improve the test, and its time grows with the cube of their number."""
 
 MOST_NUMBERS = 1_000_000
-"""Numbers of candidates' changes looked at together, which with their tables fit a processor's
-caches; at least one candidate's."""
+"""Numbers in the changes of candidates that are processed together, at least one candidate's. With
+their tables they fit into a processor's caches."""
 
 
 def block_sums(by_segment: Tensor) -> Tensor:
-    """Joins the terms of neighbouring segments, ``(S, P)`` to ``(blocks, P)``."""
+    """Adds the terms of neighbouring segments in pairs, ``(S, P)`` to ``(blocks, P)``."""
     if len(by_segment) < 2 * FEWEST_BLOCKS:
         return by_segment
     even = len(by_segment) - len(by_segment) % 2
@@ -52,12 +53,12 @@ def block_sums(by_segment: Tensor) -> Tensor:
 
 
 class LargestStatistic:
-    """Compares candidates' statistics with the largest that chance gives.
+    """Compares candidates' statistics with the largest that occurs by chance.
 
     Args:
         projection: The fitted hypothesis.
-        seed: Seed of the deals.
-        draws: Number of deals; the first is what was observed.
+        seed: Seed of the permutations.
+        draws: Number of permutations; the first is the observed order.
     """
 
     def __init__(self, projection: Projection, *, seed: int, draws: int = DRAWS) -> None:
@@ -77,7 +78,7 @@ class LargestStatistic:
         order = _derangements(draws, self._blocks, generator)
         signs = torch.randint(0, 2, order.shape, generator=generator).double() * 2.0 - 1.0
         order[0], signs[0] = torch.arange(self._blocks), 1.0
-        # The entry of every block and what it is permuted, (draws, blocks · blocks).
+        # Index of each block and the block whose residuals it gets, (draws, blocks · blocks).
         entries = torch.arange(self._blocks) * self._blocks + order
         rows = torch.arange(draws).repeat_interleave(self._blocks)
         self._deals = torch.sparse_coo_tensor(
@@ -91,7 +92,7 @@ class LargestStatistic:
         """Returns each candidate's p-value among all of them.
 
         Args:
-            groups: Changes of each candidate, ``(S, N, k)``; a few are held at a time.
+            groups: Changes of each candidate, ``(S, N, k)``; only a few are in memory at a time.
         """
         observed: dict[int, float] = {}
         largest = torch.zeros(len(self._deals), dtype=torch.float64)
@@ -105,10 +106,10 @@ class LargestStatistic:
         return (largest >= own[:, None] - 1e-12).double().mean(1).tolist()
 
     def _tails(self, columns: Tensor) -> Tensor:
-        """Returns minus the log tail of each candidate's statistic in every deal, ``(P, draws)``.
+        """Returns minus the log tail of each candidate's statistic by permutation, ``(P, draws)``.
 
         Args:
-            columns: Changes of P candidates of k strengths, ``(S, N, P, k)``.
+            columns: Changes of P candidates with k strengths each, ``(S, N, P, k)``.
         """
         _, _, num, size = columns.shape
         changes = self._projection.projected(columns.flatten(-2))[: self._num_used]
@@ -116,11 +117,11 @@ class LargestStatistic:
             self._joined(by_segment).unflatten(-1, (num, size))
             for by_segment in (changes * self._spread, changes / self._spread)
         )
-        # What block b would score with the residuals of block c, (P, b, c, k), standardised.
+        # Score of block b with the residuals of block c, (P, b, c, k), standardised.
         scores = torch.einsum("bnpk,cn->pbck", weights, self._standard)
         scale = (scores.square().sum((1, 2)) / self._blocks).clamp_min(1e-300).sqrt()
         scores, weights = scores / scale[:, None, None], weights / scale
-        # ... and with what each strength changes in block c, (P, b, c, k, strength).
+        # Score of block b with the change of each strength in block c, (P, b, c, k, strength).
         signals = signals / signals.square().sum((0, 1)).clamp_min(1e-300).sqrt()
         expected = torch.einsum("bnpk,cnpl->pbckl", weights, signals)
         covariance = torch.einsum("pbci,pbcj->pij", scores, scores) / self._blocks
@@ -130,8 +131,8 @@ class LargestStatistic:
         inverse = torch.linalg.pinv(covariance, hermitian=True)
         direction = total @ inverse  # (P, draws, k)
         statistic = (direction * total).sum(-1)
-        # Strengths by least squares over all pairs of blocks, and what they take of the variance
-        # along the direction in which the score lies.
+        # Strengths by least squares over all pairs of blocks, and the variance that they explain
+        # along the direction of the score.
         pairs = torch.einsum("pbckl,pbckm->plm", expected, expected)
         strengths = aligned @ torch.linalg.pinv(pairs, hermitian=True)
         both = torch.einsum("pdk,pdl->pdkl", direction, strengths).flatten(-2)
@@ -141,7 +142,7 @@ class LargestStatistic:
         return _log_tail(statistic / left, size, self._blocks - size)
 
     def _permuted(self, table: Tensor) -> Tensor:
-        """Returns a table's sums in every deal, ``(P, b, c, Q)`` to ``(P, draws, Q)``."""
+        """Returns a table's sums in every permutation, ``(P, b, c, Q)`` to ``(P, draws, Q)``."""
         rows = table.permute(1, 2, 0, 3).flatten(0, 1).flatten(1)
         return torch.sparse.mm(self._deals, rows).unflatten(1, table.shape[::3]).transpose(0, 1)
 
@@ -151,7 +152,7 @@ class LargestStatistic:
 
 
 def _in_batches(groups: Iterable[Tensor]) -> Iterator[tuple[list[int], list[Tensor]]]:
-    """Yields places and changes of candidates of as many strengths, some at a time."""
+    """Yields places and changes of candidates with equal numbers of strengths, in batches."""
     waiting: dict[int, tuple[list[int], list[Tensor]]] = {}
     for place, group in enumerate(groups):
         size = group.shape[-1]
@@ -164,10 +165,10 @@ def _in_batches(groups: Iterable[Tensor]) -> Iterator[tuple[list[int], list[Tens
 
 
 def _derangements(draws: int, size: int, generator: torch.Generator) -> Tensor:
-    """Returns random orders in which nothing keeps its place, ``(draws, size)``."""
+    """Returns random permutations without a fixed point, ``(draws, size)``."""
     found: list[Tensor] = []
     while sum(map(len, found)) < draws:
-        # One in e has no fixed point.
+        # A share of 1/e has no fixed point.
         order = torch.rand(3 * draws, size, generator=generator).argsort(-1)
         found.append(order[(order != torch.arange(size)).all(-1)])
     return torch.cat(found)[:draws]
@@ -178,6 +179,6 @@ def _log_tail(statistic: Tensor, size: int, freedom: int) -> Tensor:
     halves = 0.5 * freedom, 0.5 * size
     share = freedom / (freedom + statistic.clamp_min(0.0).numpy())
     tail = special.betainc(*halves, share)
-    # Beyond what the function resolves, its leading term goes on.
+    # Where the function underflows, its leading term is used.
     far = halves[0] * np.log(share) - math.log(halves[0]) - special.betaln(*halves)
     return torch.from_numpy(-np.where(tail > 1e-290, np.log(tail.clip(1e-300)), far))

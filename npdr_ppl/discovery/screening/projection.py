@@ -1,18 +1,19 @@
-"""What is left of a change once everything that must not speak has been taken out.
+"""Removes from a change the part that initial states and parameters can imitate.
 
-The state at each segment's start is known within the smoother's error, and the parameters are
-refitted together with whatever is added: both can imitate an effect. With residuals r, starts'
-derivatives G and parameters' derivatives J, whitened, starts are integrated out by
+The initial state of each segment is known only within the smoother's error, and the parameters are
+refitted together with any effect that is added. Both can therefore imitate an effect. Let r be the
+residuals, G the derivatives by initial states and J the derivatives by parameters, all whitened.
+Initial states are integrated out, segment by segment, with
 
     C = 1 + G Gᵀ,     C⁻¹ = 1 − G (1 + Gᵀ G)⁻¹ Gᵀ
 
-segment by segment, and parameters by projecting on what J cannot explain: a column x has the score
+Parameters are projected out, which leaves the part that J cannot explain. A column x has the score
 
     g = xᵀ C⁻¹ r − B Jᵀ C⁻¹ r,     B = xᵀ C⁻¹ J (Jᵀ C⁻¹ J + 1)⁻¹
 
-and, with a second column y, the information xᵀ C⁻¹ y − B Jᵀ C⁻¹ y. Sums of a segment's terms are
-independent from segment to segment; what is inside one is not, so the variance of a score is
-taken from how the segments' terms scatter (Liang & Zeger 1986), never from their number.
+and, with a second column y, the information xᵀ C⁻¹ y − B Jᵀ C⁻¹ y. Terms are independent between
+segments but not within one. So the variance of a score is estimated from the scatter of the
+segments' sums (Liang & Zeger 1986), never from the number of terms.
 """
 
 import math
@@ -61,11 +62,11 @@ class Scores:
 
 
 class Projection:
-    """A fitted hypothesis, ready to be asked about columns.
+    """A fitted hypothesis, prepared to compute the scores of columns.
 
     Args:
         hypothesis: The hypothesis.
-        keep: Coordinates of the parameters that are refitted, a mask ``(d,)``; all by default.
+        keep: Mask of the coordinates of refitted parameters, ``(d,)``; all by default.
     """
 
     def __init__(self, hypothesis: Hypothesis, keep: Tensor | None = None) -> None:
@@ -75,7 +76,7 @@ class Projection:
         self._starts = now.by_starts
         eye = torch.eye(now.by_starts.shape[-1], dtype=torch.float64)
         self._inner = eye + now.by_starts.mT @ now.by_starts
-        #: Residuals as they were with the initial states at the smoother's estimate, (S, N).
+        #: Residuals with the initial states at the smoother's estimate, (S, N).
         self.residual = now.residual + (now.by_starts @ hypothesis.fit.offsets[..., None])[..., 0]
         self._by_z = by_z
         self._weights = self.solve(by_z)
@@ -85,9 +86,9 @@ class Projection:
         self._score = (by_z.mT @ self._weighted[..., None])[..., 0]  # (S, d)
 
     def projected(self, columns: Tensor) -> Tensor:
-        """Returns C^-½ x less what refitted parameters explain of it.
+        """Returns C^-½ x minus the part that refitted parameters explain.
 
-        Its products with the whitened residuals are scores, those with itself information.
+        Its products with the whitened residuals are scores; those with itself are information.
 
         Args:
             columns: The columns x, ``(S, N, P)``.
@@ -96,7 +97,7 @@ class Projection:
         return self.whitened(columns - self._by_z @ refit)
 
     def whitened(self, columns: Tensor) -> Tensor:
-        """Returns C^-½ x: with independent components of unit variance where x is a residual.
+        """Returns C^-½ x. If x is a residual, its components are independent, of unit variance.
 
         Args:
             columns: The columns x, ``(S, N, P)``.
@@ -107,11 +108,11 @@ class Projection:
 
     @cached_property
     def _starts_by_size(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Singular value decomposition of the starts' derivatives."""
+        """Singular value decomposition of the derivatives by initial states."""
         return torch.linalg.svd(self._starts, full_matrices=False)
 
     def _explained(self, columns: Tensor) -> Tensor:
-        """Returns the parameters' scores with columns for residuals, ``(d, P)``."""
+        """Returns the parameters' scores with columns in place of residuals, ``(d, P)``."""
         return (self._weights.mT @ columns).sum(0)
 
     @property
@@ -130,7 +131,7 @@ class Projection:
         return self._information
 
     def misfit_at(self, z: Tensor) -> Tensor:
-        """Returns rᵀ C⁻¹ r at other parameters, ``(n,)``; starts are taken to act as they do here.
+        """Returns rᵀ C⁻¹ r at other parameters, ``(n,)``, with the derivatives G of this fit.
 
         Args:
             z: Parameters, ``(n, d)``.
@@ -157,7 +158,7 @@ class Projection:
 
     @property
     def misfit_by_segment(self) -> Tensor:
-        """The same of each segment, ``(S,)``."""
+        """The part of each segment in :attr:`misfit`, ``(S,)``."""
         return (self.residual * self._weighted).sum(-1)
 
     def scores(self, columns: Tensor) -> Scores:
@@ -171,9 +172,9 @@ class Projection:
 
 
 def loss_without(hypothesis: Hypothesis, effect: Effect) -> float:
-    """Returns by how much the evidence falls without one of a hypothesis's effects.
+    """Returns the loss of evidence if one of a hypothesis's effects is removed.
 
-    To first order in what the other parameters and the initial states make up for.
+    The compensation by other parameters and initial states is computed to first order.
 
     Args:
         hypothesis: The hypothesis.

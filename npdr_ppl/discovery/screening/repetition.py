@@ -1,8 +1,8 @@
-"""Motions that repeat, and waves in step with them.
+"""Periodic motions, and waves that are synchronous with them.
 
-Whatever depends on the state of a motion that repeats is a sum of waves with its period. A wave in
-time that keeps in step with it is therefore no disturbance from outside, but what a law of the
-state looks like that the catalogue does not have.
+Along a periodic motion, any function of the state is a sum of waves with the same period. A
+synchronous wave in time is therefore no external disturbance. It indicates a law of the state that
+the catalogue does not have.
 """
 
 import numpy as np
@@ -15,22 +15,24 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["keeps_in_step", "period_of"]
 
 REPEATS = 0.1
-"""Change after a period, in the change between unrelated moments, below which a motion repeats."""
+"""A motion is periodic if its change after one period is below this fraction of its change between
+unrelated times."""
 
 FORGETS = 0.5
-"""Such a change from which a motion has left where it was, and a period can end."""
+"""Change, as the same fraction, above which a motion has left its initial state, so that a period
+can end."""
 
 MOST_POINTS = 1_000
-"""Points of a rollout that periods are sought among; the best is then refined."""
+"""Points of a rollout in the coarse search for a period; the best period is then refined."""
 
 SLIPS = 0.25
-"""Turns by which a wave in step is ahead or behind at the end of a rollout."""
+"""Phase error, in turns, that a synchronous wave stays below at the end of a rollout."""
 
 Array = NDArray[np.float64]
 
 
 def keeps_in_step(hypothesis: Hypothesis, effect: Effect, rollouts: Rollouts) -> bool:
-    """Returns whether an effect is a wave that repeats whenever the motion does.
+    """Returns whether an effect is a wave that is synchronous with a periodic motion.
 
     Args:
         hypothesis: A fitted model with the effect.
@@ -55,10 +57,10 @@ def _is_in_step(frequency: float, readings: Array, time_step: float) -> bool:
 
 
 def period_of(readings: Array) -> int | None:
-    """Returns the steps after which all channels repeat, ``None`` if they do not.
+    """Returns the number of steps after which all channels repeat, ``None`` if they do not.
 
     Args:
-        readings: Readings ``(T, C)``; a period that is longer than half of them is not seen.
+        readings: Measurements, ``(T, C)``; a period longer than half of them is not found.
     """
     spread = np.sqrt(2.0) * readings.std(0)
     moving = spread > 0

@@ -1,8 +1,8 @@
 """Screening: every candidate's linear gain, in its best shape and size.
 
-A candidate's gain is how far its strengths, fitted together with all parameters and the initial
-states, reduce the misfit. Whether that is more than chance can do is for
-:mod:`npdr_ppl.discovery.screening.permutation_tests` to say.
+A candidate's gain is the reduction of the misfit by its strengths, which are fitted together with
+all parameters and the initial states. Whether the gain is larger than chance explains is tested in
+:mod:`npdr_ppl.discovery.screening.permutation_tests`.
 """
 
 import itertools
@@ -18,7 +18,7 @@ from npdr_ppl.discovery.screening.sensitivities import Variant
 __all__ = ["Screened", "Screening", "screen"]
 
 DETECTABLE = 5.0
-"""Separation from which an effect shows among a hundred candidates."""
+"""Separation above which an effect is detected among a hundred candidates."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class Screened:
 
     Attributes:
         variant: The candidate.
-        sizes: Fitted strengths in sizes, ``(k,)``.
-        gain: Reduction of the misfit, in units of the readings' variance.
+        sizes: Fitted strengths in multiples of the variant's size, ``(k,)``.
+        gain: Reduction of the misfit, in units of the measurements' variance.
         separation: Distance ‖(1 − P) S β‖ between the model with and without it, in standard
             deviations.
         absorbed: Share of its change that refitted parameters explain.
-        minimum_detectable: Distance from none in parameter units at which it would show, by
-            strength.
+        minimum_detectable: Smallest detectable distance from zero strength, in parameter units,
+            by strength.
     """
 
     variant: Variant
@@ -49,13 +49,13 @@ class Screened:
         return self.variant.effect.name
 
     def without_change(self) -> "Screened":
-        """Returns the same without what it changes along the recording, which takes memory."""
+        """Returns the candidate without its change along the recording, to save memory."""
         nothing = self.variant.change.new_zeros(0)
         return replace(self, variant=replace(self.variant, change=nothing))
 
 
 class Screening:
-    """Ranks candidates, seen one after another, by their linear gain.
+    """Ranks candidates, which are added one after another, by their linear gain.
 
     Args:
         projection: The fitted hypothesis.
@@ -66,7 +66,7 @@ class Screening:
         self._best: dict[str, Screened] = {}
 
     def add(self, variant: Variant) -> None:
-        """Keeps a candidate if no other shape or size of the same effect gains more."""
+        """Keeps a candidate if no other shape or size of the same effect has a larger gain."""
         scores = self._projection.scores(variant.change)
         sizes, gain = _within_limits(scores, variant)
         if gain <= 0.0:
@@ -84,12 +84,12 @@ class Screening:
             )
 
     def ranking(self) -> list[Screened]:
-        """Returns the best shape and size of each effect, that of the greatest gain first."""
+        """Returns the best shape and size of each effect, the largest gain first."""
         return sorted(self._best.values(), key=lambda s: (-s.gain, s.name))
 
 
 def screen(projection: Projection, variants: Iterable[Variant]) -> list[Screened]:
-    """Returns the best shape and size of each effect, that of the greatest linear gain first.
+    """Returns the best shape and size of each effect, the largest linear gain first.
 
     Args:
         projection: The fitted hypothesis.
@@ -102,10 +102,10 @@ def screen(projection: Projection, variants: Iterable[Variant]) -> list[Screened
 
 
 def _within_limits(scores: Scores, variant: Variant) -> tuple[Tensor, float]:
-    """Returns the sizes of greatest gain that the priors admit, and the gain.
+    """Returns the sizes with the largest gain that the priors allow, and the gain.
 
-    Sizes at a limit stay there and the others are fitted: all choices are tried, there are few
-    strengths.
+    Every choice of sizes that are at a limit is tried, and the others are fitted. This is fast,
+    because there are few strengths.
     """
     num = len(variant.strengths)
     precision = variant.deviation.square().reciprocal().diag()

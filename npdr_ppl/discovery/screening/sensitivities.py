@@ -1,9 +1,9 @@
-"""What each candidate effect would change along the recording.
+"""Sensitivities: the change from each candidate effect along the recording.
 
 At zero strength an effect changes nothing, and close to it the change is linear in the strengths.
-The slope is a finite difference of the black box: one simulation with the effect switched on at a
-small size, less the one without. Parameters that give an effect its shape are tried at several
-values, and effects that are not smooth in their strength at several sizes.
+The slope is a finite difference of the black box: one simulation with the effect at a small size,
+minus one without it. Shape parameters are tried at several values, and effects that are not smooth
+in their strength at several sizes.
 """
 
 import itertools
@@ -25,48 +25,50 @@ from npdr_ppl.language.simulator import Simulator
 __all__ = ["Variant", "sensitivities"]
 
 NEXT = 1.1
-"""Ratio of one resonance to the next that is tried: lightly damped, it is a tenth wide."""
+"""Ratio between neighbouring sizes that are tried of a resonance. A lightly damped resonance is a
+tenth wide."""
 
 SIZES = (1.0, 0.25)
-"""Sizes of an effect that is not smooth, in those its probe gives."""
+"""Sizes of an effect that is not smooth, as multiples of its probe."""
 
 RESONANT_SIZES = tuple(0.05 * NEXT**k for k in range(40))
-"""Sizes of a resonance, in those its probe gives: up to twice as large."""
+"""Sizes of a resonance, as multiples of its probe: up to about twice its size."""
 
 BITES = 0.7
-"""Where in the commands' range a limit is tried first."""
+"""First value tried for a limit of commands, as a fraction of the largest command."""
 
 ROUNDING = 100.0
-"""Rounding errors of the largest reading below which a change is none: what an effect leaves that
-changes nothing, such as an encoder's bias where no force depends on its position."""
+"""A change below this many rounding errors of the largest measurement is treated as zero. Effects
+without influence leave such errors: an encoder's bias, where no force depends on its position."""
 
 SMALL = 0.05
-"""Size of one that is smooth: small enough for the linear term to rule."""
+"""Size of a smooth effect, as a multiple of its probe: small enough for a linear change."""
 
 SHAPE_QUANTILES = (0.5, 0.15, 0.85)
-"""Where in their priors shapes are tried; the first stands for all that is not varied."""
+"""Quantiles of the priors at which shape parameters are tried. The first stands for the parameters
+that are not varied; they have their nominal values."""
 
 MOST_SHAPES = 7
-"""Shapes tried of one effect."""
+"""Greatest number of shapes tried for one effect."""
 
 
 MOST_TOGETHER = 10_000
-"""Segments simulated together: beyond, their states outgrow a processor's cache."""
+"""Segments simulated together: the states of more exceed a processor's cache."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """An effect of one shape, switched on at one size.
+    """An effect with one shape, switched on at one size.
 
     Attributes:
         effect: The effect.
         values: Its parameters at size one, by short name.
-        strengths: Names of those that scale it.
+        strengths: Names of the parameters that scale it.
         nominal: Their values at zero strength.
-        lower: Least number of sizes that the priors admit, by strength.
-        upper: Greatest number of sizes, by strength.
-        deviation: Standard deviation of the priors in sizes, by strength.
-        change: What one size changes in the whitened readings, ``(S, N, k)``.
+        lower: Smallest multiple of the size that the priors allow, by strength.
+        upper: Largest multiple of the size, by strength.
+        deviation: Standard deviation of the priors in multiples of the size, by strength.
+        change: Change of the whitened measurements per size, ``(S, N, k)``.
         is_hinted: Whether its shape was found on the recording itself.
     """
 
@@ -81,7 +83,7 @@ class Variant:
     is_hinted: bool = False
 
     def parameters(self, sizes: Tensor) -> dict[str, Tensor]:
-        """Returns the parameters by site name for numbers of sizes, ``(k,)``."""
+        """Returns the parameters by site name for multiples of the size, ``(k,)``."""
         values = {name: torch.tensor(v, dtype=torch.float64) for name, v in self.values.items()}
         for k, name in enumerate(self.strengths):
             values[name] = self.nominal[k] + sizes[k] * (values[name] - self.nominal[k])
@@ -93,15 +95,15 @@ def sensitivities(
     effects: tuple[Effect, ...],
     hints: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Iterator[Variant]:
-    """Yields what each effect would change, in each shape and size.
+    """Yields the change from each effect, in each shape and size.
 
-    Effects are simulated some at a time, so that memory does not grow with their number; those
-    whose simulation fails are left out.
+    Effects are simulated in groups, so that memory does not grow with their number. Effects whose
+    simulation fails are left out.
 
     Args:
-        hypothesis: Where the effects are to be added.
+        hypothesis: The fitted model that the effects would be added to.
         effects: The candidates.
-        hints: Shapes to try besides, by effect's name: values of its parameters.
+        hints: Additional shapes to try, by effect's name: values of its parameters.
     """
     segments, fit = hypothesis.segments, hypothesis.fit
     box = segments.black_box(fit.z[None])
@@ -130,15 +132,16 @@ def sensitivities(
 
 @dataclass(frozen=True)
 class _Probe:
-    """An effect to be switched on, in several shapes and sizes.
+    """An effect to be simulated in several shapes and sizes.
 
     Attributes:
         effect: The effect.
         priors: Its priors, by parameter.
         cases: Values of its parameters at size one, whether they are hinted, and the size.
         strengths: Names of the parameters that scale it.
-        nominal: Their values at zero strength, or where a limit rests.
-        runs: Parameters of each simulation: one per case and strength, the others resting.
+        nominal: Their values at zero strength; for a limit, the largest command.
+        runs: Parameters of each simulation: one per case and strength, the others at zero
+            strength.
     """
 
     effect: Effect
@@ -181,10 +184,10 @@ def _probe(
 def _groups(
     probes: list[_Probe], simulator: Simulator, num_segments: int
 ) -> Iterator[list[_Probe]]:
-    """Yields effects of one kind that are simulated together, each alone in rows of its own.
+    """Yields groups of effects of one kind that are simulated together, each in its own rows.
 
     An effect at zero strength changes nothing, and a step of many simulations costs little more
-    than one of a few. Where each simulation is a call of an engine, effects stay apart.
+    than one of a few. If each simulation is a call of an engine, every effect is its own group.
     """
     together = 1 if isinstance(simulator, PooledSimulator) else MOST_TOGETHER
     kinds: dict[object, list[_Probe]] = {}
@@ -204,7 +207,7 @@ def _groups(
 
 
 def _side_by_side(group: list[_Probe]) -> dict[str, Tensor]:
-    """Returns the parameters of all effects of a group in the rows of each."""
+    """Returns the parameters of a group's effects; each is switched on only in its own rows."""
     result = {}
     for probe in group:
         resting = {p.name: p.nominal for p in probe.effect.parameters}
@@ -217,9 +220,9 @@ def _side_by_side(group: list[_Probe]) -> dict[str, Tensor]:
 
 
 def _variants(probe: _Probe, rows: Tensor, rounding: float) -> list[Variant]:
-    """Returns what an effect changes, of what its runs changed in the whitened readings.
+    """Returns an effect's variants from its runs' changes of the whitened measurements.
 
-    Changes up to a rounding error are none.
+    Changes up to a rounding error are left out.
     """
     strengths, nominal = probe.strengths, probe.nominal
     result = []
@@ -257,7 +260,7 @@ def _switched_on(
     resting: Mapping[str, float],
     strengths: tuple[str, ...],
 ) -> dict[str, float]:
-    """Returns an effect's parameters with one strength at a size and the others resting."""
+    """Returns an effect's parameters with one strength at a size and the others at zero."""
     rest = {name: resting[name] if name in strengths else value for name, value in values.items()}
     zero = float(nominal)
     return rest | {on: size * (values[on] - zero) + zero}
@@ -266,7 +269,7 @@ def _switched_on(
 def _shapes(
     effect: Effect, priors: Mapping[str, Distribution], strengths: tuple[str, ...]
 ) -> list[dict[str, float]]:
-    """Returns values of the parameters that give an effect its shape, nominal ones first."""
+    """Returns values of the shape parameters, the nominal ones first."""
     varied = [p for p in effect.parameters if p.name not in strengths]
     shapes: list[dict[str, float]] = [{p.name: p.nominal for p in varied}]
     for parameter in varied:
@@ -277,9 +280,9 @@ def _shapes(
 
 
 def _needs_size(effect: Effect, strengths: tuple[str, ...]) -> bool:
-    """Returns whether an effect shows only at a size, not in the slope at zero.
+    """Returns whether an effect is visible only at a size, not in the slope at zero.
 
-    A lag far below the sampling time changes nothing that is sampled.
+    Example: a lag far below the sampling time changes no sample.
     """
     units = {p.name: p.unit for p in effect.parameters}
     return not effect.is_smooth or any(units[name] == "s" for name in strengths)
@@ -296,7 +299,7 @@ def _within_reach(effect: Effect, probe: dict[str, float], inputs: Inputs) -> di
 
 
 def _resting(nominal: float, probe: float) -> float:
-    """Returns zero strength as a number to interpolate from: a limit rests at the peak."""
+    """Returns zero strength as a finite number; for a limit, the largest command."""
     return nominal if math.isfinite(nominal) else probe / BITES
 
 
@@ -306,7 +309,7 @@ def _limits(
     nominal: Tensor,
     full: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns least, greatest and typical numbers of sizes that the priors admit."""
+    """Returns the least, greatest and typical multiples of the size that the priors allow."""
     lower, upper, deviation = [], [], []
     for k, name in enumerate(strengths):
         prior = priors[name]

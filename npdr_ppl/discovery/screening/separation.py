@@ -1,7 +1,8 @@
-"""How far candidates are apart under the recording's excitation, parameters refitted.
+"""Distances between candidates under the recording's excitation, with parameters refitted.
 
-With unit changes S_i of the whitened readings, starts integrated out and the parameters' span
-projected out, what candidate i at its fitted size β_i does and candidate j cannot imitate is
+Let I be the information of the candidates' unit changes of the whitened measurements. Initial
+states are integrated out and the parameters' span is projected out. The change from candidate i at
+its fitted size β_i that candidate j cannot imitate is
 
     d_ij² = β_i² (I_ii − I_ij I_jj⁻¹ I_ji),        d_ii² = β_i² I_ii
 """
@@ -18,7 +19,7 @@ __all__ = ["separation_matrix"]
 
 
 def separation_matrix(projection: Projection, candidates: Sequence[Screened]) -> Tensor:
-    """Returns d, ``(n, n)``.
+    """Returns the distances d, ``(n, n)``.
 
     Args:
         projection: The fitted hypothesis.
