@@ -1,10 +1,10 @@
-"""ArviZ, imported in one place, which knows the differences between its releases.
+"""The only module that imports ArviZ; it hides the differences between ArviZ releases.
 
-Up to 0.23 ArviZ keeps its groups in an ``InferenceData``, from 1.0 on in xarray's ``DataTree``;
-functions took other arguments then, and tables had other columns. The functions here have one
-signature and one meaning for both, and every other module uses these alone. What they return is
-named as in ArviZ 1. Defaults that differ between the releases (the kind and probability of
-intervals, the rounding of tables) are always given explicitly.
+Up to 0.23 ArviZ keeps its groups in an ``InferenceData``, from 1.0 on in xarray's ``DataTree``.
+Function arguments and table columns differ too. The functions here have one signature and one
+meaning for both, and all other modules use only them. Results are named as in ArviZ 1. Defaults
+that differ between the releases (the kind and probability of intervals, the rounding of tables)
+are always given explicitly.
 """
 
 import warnings
@@ -50,14 +50,14 @@ HAS_DATATREE: bool = int(az.__version__.split(".")[0]) >= 1
 """Whether this ArviZ keeps groups in a ``DataTree``."""
 
 FEWEST_WEIGHTS = 25
-"""Weights without which a Pareto distribution is not fitted: a fifth of them are its tail, and
-five are needed for its shape."""
+"""Minimum number of weights for fitting a Pareto distribution: a fifth of them form its tail, and
+its shape needs five."""
 
-# The other release's names are unknown to a type checker that sees one of them installed.
+# A type checker sees only the installed release and does not know the other release's names.
 _az: Any = az
 
 Data = Any
-"""What ArviZ calls a collection of groups: its ``InferenceData``, from 1.0 on a ``DataTree``."""
+"""ArviZ's collection of groups: an ``InferenceData`` up to 0.23, a ``DataTree`` from 1.0 on."""
 
 _SUMMARY = ["mean", "sd", "hdi_lb", "hdi_ub"]
 _SUMMARY += ["mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
@@ -72,7 +72,7 @@ class Loo:
         se: Its standard error; NaN with a single observation.
         p: Effective number of parameters.
         pareto_k: Tail index of every observation's weights.
-        elpd_i: Every observation's part of ``elpd``.
+        elpd_i: Contribution of every observation to ``elpd``.
     """
 
     elpd: float
@@ -96,9 +96,9 @@ def from_dict(
         groups: Arrays by group and variable. Those of groups with ``data`` in their name have no
             sample dimensions; all others are ``(chain, draw, ...)``.
         coords: Labels by dimension.
-        dims: Names of the dimensions behind the samples', by variable.
+        dims: Names of the dimensions after the sample dimensions, by variable.
         attrs: Attributes of the whole object.
-        variable_attrs: Attributes by group and variable, e.g. its unit.
+        variable_attrs: Attributes by group and variable, e.g. the unit.
     """
     datasets = {}
     for name, values in groups.items():
@@ -130,7 +130,7 @@ def group(data: Data, name: str) -> xr.Dataset:
     """Returns a group.
 
     Raises:
-        DataError: There is none of that name.
+        DataError: There is no group of that name.
     """
     if name not in group_names(data):
         raise DataError(f"The ArviZ object has no group {name!r}; it has {group_names(data)}.")
@@ -202,7 +202,7 @@ def loo(data: Data, *, var_name: str | None = None) -> Loo:
     names = ("elpd", "p", "elpd_i") if HAS_DATATREE else ("elpd_loo", "p_loo", "loo_i")
     elpd, p, elpd_i = (getattr(found, name) for name in names)
     elpd_i = np.asarray(elpd_i)
-    # ArviZ 1 divides by n - 1 where earlier releases divide by n; with few segments that shows.
+    # ArviZ 1 divides by n - 1, ArviZ 0.x by n; the difference matters with few segments.
     se = float(np.sqrt(elpd_i.size * elpd_i.var(ddof=1))) if elpd_i.size > 1 else float("nan")
     return Loo(float(elpd), se, float(p), np.asarray(found.pareto_k), elpd_i)
 
@@ -241,10 +241,10 @@ def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.Da
 
 
 def _judged_draws(data: Data) -> Data:
-    """Returns the draws that have log likelihoods, which may be the first ones only.
+    """Returns the draws that have log likelihoods, which may be only the first ones.
 
     ArviZ divides the effective sample size of the whole posterior by the number of log
-    likelihoods. With more draws than those it would fit the tails of the weights to a few of them.
+    likelihoods. Draws without one would make ArviZ fit the tails of the weights to too few draws.
     """
     likelihood, posterior = group(data, "log_likelihood"), group(data, "posterior")
     kept = {
@@ -270,7 +270,7 @@ def from_netcdf(path: str | PathLike[str]) -> Data:
 
 @contextmanager
 def _any_group() -> Iterator[None]:
-    """Lets groups pass that are not in ArviZ 0.x's scheme, such as ArviZ 1's ``prior_sbc``."""
+    """Permits groups that are not in ArviZ 0.x's scheme, such as ArviZ 1's ``prior_sbc``."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*not defined in the InferenceData scheme")
         yield
@@ -278,9 +278,9 @@ def _any_group() -> Iterator[None]:
 
 @contextmanager
 def _quiet_loo() -> Iterator[None]:
-    """Silences ArviZ about large Pareto k, which the caller gets as figures or a flag."""
+    """Silences warnings about large Pareto k, which the caller gets as numbers or a flag."""
     with warnings.catch_warnings():
-        # ArviZ finds it suspicious that a single observation's part is the whole sum.
+        # With a single observation, its value equals the sum, about which ArviZ warns.
         warnings.filterwarnings("ignore", message="The point-wise LOO is the same with the sum")
         warnings.filterwarnings("ignore", message=".*shape parameter of Pareto distribution")
         # A plain function's output counts as one observation.
@@ -295,8 +295,8 @@ def pareto_smoothed(log_weights: ArrayLike) -> tuple[NDArray[np.float64], float]
         log_weights: Log weights of n draws, ``(n,)``; minus infinity for draws without weight.
 
     Returns:
-        Normalised log weights ``(n,)`` and the distribution's shape k, which is infinite where
-        fewer draws than the distribution's tail needs have a weight.
+        Normalised log weights ``(n,)`` and the distribution's shape k, which is infinite if fewer
+        than ``FEWEST_WEIGHTS`` draws have a weight.
 
     References:
         A. Vehtari, D. Simpson, A. Gelman, Y. Yao and J. Gabry, Pareto smoothed importance

@@ -1,4 +1,4 @@
-"""The errors of npdr_ppl: one small tree, each also the built-in it resembles."""
+"""The errors of npdr_ppl: one small tree; each also inherits the fitting built-in error."""
 
 __all__ = [
     "BackendError",
@@ -15,7 +15,7 @@ __all__ = [
 
 
 class NpdrError(Exception):
-    """Root of every error raised on purpose; its message is one sentence for a person."""
+    """Base class of all errors that npdr_ppl raises on purpose; the message is one sentence."""
 
 
 class DataError(NpdrError, ValueError):
@@ -23,7 +23,7 @@ class DataError(NpdrError, ValueError):
 
 
 class TooShortError(DataError):
-    """Measured rollouts are sound and fit, and are too short for what is asked of them."""
+    """Measured rollouts are valid and fit the model, but are too short for the task."""
 
 
 class ModelError(NpdrError, ValueError):
@@ -35,7 +35,7 @@ class ShapeError(NpdrError, ValueError):
 
 
 class IntractableError(NpdrError, NotImplementedError):
-    """A density was asked for that a black-box simulator does not have."""
+    """A density was requested that a black-box simulator does not have."""
 
 
 class SimulationError(NpdrError, RuntimeError):
@@ -47,8 +47,8 @@ class BackendError(NpdrError, ValueError):
 
 
 class DependencyError(NpdrError, ImportError):
-    """An optional package is needed and absent."""
+    """A required optional package is not installed."""
 
 
 class CompilationError(NpdrError, RuntimeError):
-    """A time loop was to be compiled, and the compiler failed."""
+    """The compiler failed on a time loop."""

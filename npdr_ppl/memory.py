@@ -1,4 +1,4 @@
-"""Measures the memory that a block of code takes, and releases freed memory."""
+"""Measures the memory that a block of code uses, and releases freed memory."""
 
 import ctypes
 import gc
@@ -11,17 +11,17 @@ from pathlib import Path
 __all__ = ["MemoryUse", "release_freed_memory", "sampled_memory"]
 
 INTERVAL = 0.02
-"""Seconds between two samples."""
+"""Time between two samples of the memory, in s."""
 
 STATM = Path("/proc/self/statm")
-"""Where Linux tells a process its size in pages; the second number is what is resident."""
+"""File in which Linux reports a process's size in pages; the second number is resident memory."""
 
 
 class MemoryUse:
-    """The greatest increase of resident memory that was seen.
+    """The largest measured increase of resident memory.
 
     Attributes:
-        peak: In MiB, over what was resident at the start; ``None`` where the system does not say.
+        peak: Increase over the start in MiB; ``None`` if the system does not report it.
     """
 
     def __init__(self) -> None:
@@ -30,12 +30,12 @@ class MemoryUse:
 
 @contextmanager
 def sampled_memory() -> Iterator[MemoryUse]:
-    """Samples the process's resident memory inside the block, by a thread.
+    """Samples the process's resident memory inside the block, in a thread.
 
-    The increase over the start is reported, since a process's own high-water mark cannot be
-    reset. What earlier work left to the allocator would be used again unseen, and is first given
-    back to the system where the C library can; libraries loaded at first use still count for
-    whoever uses them first.
+    The result is the increase over the start, because a process's own peak value cannot be reset.
+    Memory that earlier code freed is first returned to the system if the C library can do so;
+    otherwise its reuse would not be measured. Libraries loaded at first use count for the block
+    that uses them first.
     """
     gc.collect()
     release_freed_memory()
@@ -62,7 +62,7 @@ def sampled_memory() -> Iterator[MemoryUse]:
 
 
 def release_freed_memory() -> None:
-    """Returns freed memory to the operating system; does nothing where there is no glibc.
+    """Returns freed memory to the operating system; does nothing without glibc.
 
     Otherwise glibc keeps freed blocks that are too small for the next large array, and the process
     grows.
@@ -72,7 +72,7 @@ def release_freed_memory() -> None:
 
 
 def _resident() -> float | None:
-    """Returns the resident memory in MiB, ``None`` where it is not known."""
+    """Returns the resident memory in MiB, ``None`` if it is not known."""
     try:
         pages = int(STATM.read_text().split()[1])
     except (OSError, ValueError, IndexError):

@@ -1,4 +1,4 @@
-"""How far simulations are from measurements: RMSE, DTW, CRPS, PIT and coverage.
+"""Measures of the misfit of simulations: RMSE, DTW, CRPS, PIT and coverage.
 
 RMSE and DTW compare one simulated series per rollout with the measured one, as the tables of
 Muratore et al. (2021) do; the others compare an ensemble of trajectories, i.e. a predictive
@@ -36,8 +36,8 @@ __all__ = [
 ]
 
 MOST_ALIGNED = 3_000
-"""Most steps that dynamic time warping aligns, which takes 200 MB; the paper's recordings have
-2500."""
+"""Maximum number of steps that dynamic time warping aligns, which needs 200 MB; the paper's
+recordings have 2500 steps."""
 
 
 class Summary(TypedDict):
@@ -70,7 +70,7 @@ def rmse(simulated: Sequence[Tensor], measured: Sequence[Tensor]) -> Tensor:
 
     References:
         Muratore et al., Neural Posterior Domain Randomization, 2021, Tables 1 and 2. The paper
-        says that it divides by the state bounds; its figures come from dividing by the range.
+        says that it divides by the state bounds; its numbers come from dividing by the range.
     """
     _check(simulated, measured)
     result = []
@@ -86,28 +86,29 @@ def dtw(
     *,
     open_end: Literal["simulated", "measured"] = "simulated",
 ) -> Tensor:
-    """Distance of dynamic time warping per rollout, channels in units of their range.
+    """Distance of dynamic time warping per rollout, with channels in units of their range.
 
     With ``d_ij`` the Euclidean distance between step i of the measured and step j of the
     simulated series, both divided by ``max |measured|`` per channel::
 
         D_ij = min(D_(i−1)(j−1) + 2 d_ij, D_(i−1)j + d_ij, D_i(j−1) + d_ij),   D_00 = d_00
 
-    The alignment starts at the beginning of both series and spends the whole measured one, but
-    may leave out the end of the simulated one: the result is ``D_(T−1)j`` where
-    ``D_(T−1)j / (T + j + 1)`` is least. In dtw-python's words: the query is measured, the step
-    pattern ``symmetric2``, ``open_end=True``, the distance cumulative, not normalised.
+    The alignment starts at the beginning of both series and uses the whole measured one, but may
+    leave out the end of the simulated one. The result is ``D_(T−1)j`` for the j at which
+    ``D_(T−1)j / (T + j + 1)`` is smallest. In terms of dtw-python: the query is the measured
+    series, the step pattern is ``symmetric2``, ``open_end=True``, and the distance is cumulative,
+    not normalised.
 
-    Memory grows with the square of the length, so of series longer than ``MOST_ALIGNED`` steps
-    every k-th is aligned and the distance multiplied by k: an approximation, not to be compared
-    with distances of shorter series.
+    Memory grows with the square of the length. For series longer than ``MOST_ALIGNED`` steps, only
+    every k-th step is aligned and the distance is multiplied by k. This approximation must not be
+    compared with distances of shorter series.
 
     Args:
         simulated: One ``(..., T, C)`` per rollout.
         measured: One ``(T, C)`` per rollout, in the same units.
-        open_end: Which series may leave out its end. With ``"measured"`` the two change places:
-            the simulated one is spent and the measured one need not be, so that a simulation
-            that does too little is forgiven.
+        open_end: The series whose end may be left out. With ``"measured"``, the whole simulated
+            series is used and the end of the measured one may be left out, so that a simulation
+            that moves too little is not penalised.
 
     Returns:
         ``(..., R)`` float64, dimensionless; NaN where a simulation is not finite.
@@ -147,7 +148,7 @@ def _open_end_dtw(query: NDArray[np.float64], reference: NDArray[np.float64]) ->
 
 @cache
 def _dtw_python() -> ModuleType:
-    # It greets on standard output, which belongs to the caller's JSON.
+    # The import prints a greeting, which would mix with JSON on standard output.
     with redirect_stdout(StringIO()):
         return importlib.import_module("dtw")
 
@@ -167,7 +168,7 @@ def crps(samples: Tensor, observation: Tensor, *, is_fair: bool = False) -> Tens
         ``(...)`` in the observation's units; smaller is better, |x − y| for B = 1.
 
     Raises:
-        ShapeError: The shapes do not fit, or the fair form got one sample.
+        ShapeError: The shapes do not fit, or the fair form was given one sample.
 
     References:
         T. Gneiting and A. Raftery, Strictly proper scoring rules, prediction, and estimation,
@@ -192,7 +193,7 @@ def crps_by_step(
 
     Args:
         samples: Trajectories, ``(B, S, K, C)``.
-        observation: Readings after each step, ``(S, K, C)``.
+        observation: Measurements after each step, ``(S, K, C)``.
         mask: True for steps that exist, ``(S, K)``.
         is_fair: Whether to use the fair form; see :func:`crps`.
 
@@ -206,15 +207,15 @@ def crps_by_step(
 
 
 def pit(samples: Tensor, observation: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Probability integral transform: where the observation ranks among the ensemble.
+    """Probability integral transform: the rank of the observation in the ensemble.
 
-    ``(#{x_b < y} + u (1 + #{x_b = y})) / (B + 1)`` with ``u`` uniform on [0, 1]: exactly uniform
-    if the observation is one more draw of the ensemble's distribution, with ties as well.
+    ``(#{x_b < y} + u (1 + #{x_b = y})) / (B + 1)`` with ``u`` uniform on [0, 1]. It is exactly
+    uniform if the observation is a draw from the ensemble's distribution, even with ties.
 
     Args:
         samples: Ensemble x, ``(B, ...)``.
         observation: Observed values y, ``(...)``.
-        generator: Source of ``u``; ``None`` takes ``u = 1/2``.
+        generator: Source of ``u``; ``None`` uses ``u = 1/2``.
 
     Returns:
         ``(...)`` in [0, 1].
@@ -251,13 +252,13 @@ def coverage(pit_values: Tensor, levels: Sequence[float], mask: Tensor | None = 
     if mask is not None:
         distance = distance[mask.to(distance.device)]
     bounds = torch.as_tensor(levels, dtype=distance.dtype, device=distance.device) / 2
-    # A bound is itself a float: the whole interval must hold 0 and 1.
+    # The bound has a rounding error: the interval of level 1 must contain 0 and 1.
     inside = distance.flatten() <= bounds[:, None] + torch.finfo(distance.dtype).eps
     return inside.to(distance.dtype).mean(-1)
 
 
 def check_c2st() -> None:
-    """Checks that :func:`c2st` can be computed, before work that would be wasted without it.
+    """Checks that :func:`c2st` can be computed; to be called before expensive work.
 
     Raises:
         DependencyError: scikit-learn is not installed.
@@ -272,11 +273,11 @@ def check_c2st() -> None:
 
 
 def c2st(samples: Tensor, reference: Tensor, *, seed: int = 0) -> float:
-    """Classifier two-sample test: how well a network tells two sets of samples apart.
+    """Classifier two-sample test: how well a network distinguishes two sets of samples.
 
-    The cross-validated accuracy (5 folds) of a perceptron with two hidden layers of 10 d units on
-    data standardised by the reference: 0.5 if the sets are alike, 1 if they are apart (Lueckmann
-    et al. 2021, Benchmarking simulation-based inference).
+    The result is the cross-validated accuracy (5 folds) of a perceptron with two hidden layers of
+    10 d units, on data standardised by the reference. It is 0.5 for equal distributions and 1 for
+    disjoint ones (Lueckmann et al. 2021, Benchmarking simulation-based inference).
 
     Args:
         samples: ``(n, d)``.
@@ -306,14 +307,14 @@ def c2st(samples: Tensor, reference: Tensor, *, seed: int = 0) -> float:
     network = MLPClassifier(hidden, max_iter=1_000, solver="adam", random_state=seed)
     folds = KFold(n_splits=5, shuffle=True, random_state=seed)
     with warnings.catch_warnings():
-        # An unfinished classifier is a weaker one, which the score already says.
+        # A classifier that has not converged is weaker; the score already shows that.
         warnings.simplefilter("ignore", ConvergenceWarning)
         accuracy = cross_val_score(network, data, labels, cv=folds, scoring="accuracy")
     return float(np.mean(accuracy))
 
 
 def _scale(measured: Tensor) -> Tensor:
-    """Returns each channel's largest magnitude ``(C,)``, one where a channel is always zero."""
+    """Returns each channel's largest magnitude ``(C,)``; 1 for a channel that is always zero."""
     largest = measured.abs().amax(-2)
     return torch.where(largest > 0, largest, torch.ones_like(largest))
 

@@ -1,4 +1,4 @@
-"""Progress bars for what takes longer than a moment; silent where there is no terminal."""
+"""Progress bars for long operations; nothing is shown without a terminal."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -11,18 +11,18 @@ if TYPE_CHECKING:
 __all__ = ["Reporter", "Step", "reporter"]
 
 Step = Callable[[float, str], None]
-"""Takes the fraction done and a short status."""
+"""Callback that takes the fraction done and a short status."""
 
 
 class Reporter:
-    """Hands out one callback per stage of a workflow; this one reports nothing."""
+    """Provides one callback per stage of a workflow; this base class reports nothing."""
 
     def stage(self, label: str) -> Step:
         """Returns a callback for a stage: fraction done and a short status."""
         return lambda fraction, status: None
 
     def under(self, label: str) -> "Reporter":
-        """Returns a reporter whose stages have a label in front."""
+        """Returns a reporter that puts a label before the names of its stages."""
         return _Labelled(self, label)
 
 
@@ -49,7 +49,7 @@ class _RichReporter(Reporter):
         )
 
     def stage(self, label: str) -> Step:
-        # With its first step, because a stage may turn out to have nothing to do.
+        # The bar appears with the first step, because a stage may have nothing to do.
         task: TaskID | None = None
 
         def step(fraction: float, status: str) -> None:
@@ -66,8 +66,8 @@ def reporter(show: bool | Reporter | None = None) -> Iterator[Reporter]:
     """Shows progress bars inside the block.
 
     Args:
-        show: Whether to show them; ``None`` shows them if standard error is a terminal; a reporter
-            is that of a larger workflow, and used as it is.
+        show: Whether to show them; ``None`` shows them if standard error is a terminal. The
+            reporter of a larger workflow is used unchanged.
     """
     if isinstance(show, Reporter):
         yield show

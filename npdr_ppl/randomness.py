@@ -1,4 +1,4 @@
-"""Seeds: every random stream is derived from one seed and the purpose it serves."""
+"""Seeds: every random stream is derived from one seed and the purpose of the stream."""
 
 import zlib
 from collections.abc import Iterator
@@ -12,8 +12,8 @@ __all__ = ["derived_seed", "seeded"]
 def derived_seed(seed: int, *purpose: str | int) -> int:
     """Returns a 63-bit seed for one purpose, independent of all other purposes.
 
-    Deriving by purpose instead of drawing in sequence makes a resumed run, or one with another
-    number of workers, see the same random numbers.
+    Seeds depend on the purpose and not on the order of use. A resumed run, or a run with another
+    number of workers, therefore gets the same random numbers.
 
     Args:
         seed: The seed of the whole run.
@@ -30,7 +30,7 @@ def seeded(seed: int, *purpose: str | int) -> Iterator[None]:
 
     Pyro and zuko draw from torch's global stream and take no generator.
     """
-    import torch  # takes seconds, and processes that only derive seeds start often
+    import torch  # takes seconds; many processes only derive seeds
 
     devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
     with torch.random.fork_rng(devices=devices):

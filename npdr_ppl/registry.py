@@ -1,4 +1,4 @@
-"""What the registries of exchangeable methods share: classes by name, loaded when asked for."""
+"""Base of the registries of exchangeable methods: classes by name, loaded at first use."""
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
@@ -19,9 +19,9 @@ class Registry(Generic[T]):
     """Classes of one kind by name.
 
     Attributes:
-        kind: What they are called in messages, e.g. ``"backend"``.
-        base: Class of which all are subclasses.
-        error: What is raised where a name, a class or an option is wrong.
+        kind: Word for the classes in messages, e.g. ``"backend"``.
+        base: Common base class.
+        error: Error for a wrong name, class or option.
         locations: Returns ``module:class`` of each by name.
     """
 
@@ -54,7 +54,7 @@ class Registry(Generic[T]):
         """Returns an instance of the class called ``name``.
 
         Args:
-            name: Word that selects it.
+            name: Name of the class in the registry.
             options: Arguments of its constructor; an unknown one raises ``error``.
         """
         cls = self.find(name)
@@ -69,7 +69,7 @@ class Registry(Generic[T]):
 
 
 def hint(word: str, known: Iterable[str]) -> str:
-    """Returns the known word that was probably meant, or all of them."""
+    """Returns a hint with the most similar known word, or with all known words."""
     known = list(known)
     close = get_close_matches(word, known, n=1)
     return f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}."

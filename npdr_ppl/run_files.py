@@ -1,4 +1,4 @@
-"""Files of every run's folder: JSON and tensors, what a run was, and whether a folder holds it."""
+"""Files in a run's folder: JSON, tensors, and the description that identifies the run."""
 
 import functools
 import inspect
@@ -42,7 +42,7 @@ IN_WORDS = {
     "num_simulations": "the number of simulations",
     "num_steps": "the number of steps",
 }
-"""What the keys of descriptions mean to whoever gave a command."""
+"""Plain words for the keys of a run's description, for messages to the user."""
 
 _PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
 
@@ -51,7 +51,7 @@ def make_folder(path: Path) -> None:
     """Makes a folder for results if there is none.
 
     Raises:
-        DataError: A file is in the way.
+        DataError: A file exists at the path or above it.
     """
     for place in (path, *path.parents):
         if place.exists():
@@ -62,14 +62,14 @@ def make_folder(path: Path) -> None:
 
 
 def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
-    """Returns whether a run is described already.
+    """Returns whether a folder already describes this run.
 
-    The description of another run that never got as far as a result counts for nothing: whoever
-    repairs what stopped it gives the same command again.
+    The description of another run that has no results yet is ignored, so that a user can correct
+    an error and give the command again.
 
     Args:
         file: JSON with the description, which is not written here.
-        description: What the run at hand is to be.
+        description: Description of the run that is about to start.
 
     Raises:
         DataError: The folder holds results of another run.
@@ -90,7 +90,7 @@ def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes JSON in one step."""
+    """Writes JSON atomically."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
 
@@ -122,7 +122,7 @@ def versions() -> dict[str, str]:
 
 
 def source_text(model: Any) -> str:
-    """Returns the source of a model, and what was attached to it."""
+    """Returns the source of a model, and the names of what is attached to it."""
     if isinstance(model, ModelWithEffects):
         attached = "\n".join(f"# with {effect!r}" for effect, _ in model.effects)
         return f"{source_text(model.base)}\n{attached}"
@@ -131,7 +131,7 @@ def source_text(model: Any) -> str:
         and model.args
         and isinstance(model.args[0], Messenger)
     ):
-        # Pyro's way to keep a model under a handler: both are arguments of the partial.
+        # Pyro wraps a model in a handler by a partial that has both as arguments.
         return f"{source_text(model.args[-1])}\n# under {type(model.args[0]).__name__}"
     if isinstance(model, ModelWithFinerSteps | ModelWithWiderPriors):
         return f"{source_text(model.base)}\n# {model!r}"
@@ -142,7 +142,7 @@ def source_text(model: Any) -> str:
 
 
 def engine_settings(prior: Prior) -> dict[str, Any]:
-    """Returns the settings of the simulators' engines by site, where there are any."""
+    """Returns the settings of the simulators' engines by site, without empty ones."""
     settings = {
         name: box.simulator.recorded_settings()
         for name, box in prior.black_boxes.items()
@@ -152,7 +152,7 @@ def engine_settings(prior: Prior) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Turns tensors, tuples and mappings into what JSON has; NaN and infinity become null."""
+    """Turns tensors, tuples and mappings into JSON types; NaN and infinity become null."""
     if isinstance(value, Tensor):
         return plain(value.tolist())
     if isinstance(value, Mapping):
@@ -165,7 +165,7 @@ def plain(value: Any) -> Any:
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Writes tensors in one step."""
+    """Writes tensors atomically."""
     with replacing(path) as temporary:
         save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary)
 

@@ -1,4 +1,4 @@
-"""`npdr compare`: several backends on one model and recording."""
+"""`npdr compare`: compares several backends on one model and one recording."""
 
 from pathlib import Path
 from typing import Annotated
@@ -45,7 +45,7 @@ def compare(
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of simulating and training.")] = 2,
     simulations: Annotated[int, typer.Option(min=10, help="Simulations per round.")] = 2_000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
-    holdout: Annotated[str, typer.Option(help="Rollouts to judge by, e.g. 3,4.")] = "",
+    holdout: Annotated[str, typer.Option(help="Rollouts to evaluate on, e.g. 3,4.")] = "",
     effect: Annotated[
         list[str] | None,
         typer.Option(
@@ -67,7 +67,7 @@ def compare(
         Precision, typer.Option(help="Floating-point type of the simulation.")
     ] = Precision.FLOAT64,
     noise: Annotated[
-        Noise, typer.Option(help="Noise of readings: auto estimates it, model takes the model's.")
+        Noise, typer.Option(help="Measurement noise: auto estimates it, model keeps the model's.")
     ] = Noise.AUTO,
     device: Annotated[str, typer.Option(help="Where to train: cpu or cuda.")] = "cpu",
     executor: ExecutorOption = None,
@@ -80,9 +80,8 @@ def compare(
 ) -> None:
     """Compare inference backends with the same budget of simulations and the same seed.
 
-    A backend may be given options, features of its own (embedding=...) and a label. An
-    interrupted comparison continues when the same command is given again; backends may then be
-    added.
+    Each backend can have options, its own features (embedding=...) and a label. To continue an
+    interrupted comparison, give the same command again; you may add backends.
 
     Example: npdr compare furuta --data measured.csv --backends "snpe-c, maf = snpe-c(flow=maf)"
     --segment-length 200 --holdout 3,4 --out comparison

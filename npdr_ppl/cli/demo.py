@@ -1,4 +1,4 @@
-"""`npdr demo`: from a policy that fails on a rig to what the model lacked, and to success."""
+"""`npdr demo`: a policy fails on a rig; discovery repairs the model; a new policy succeeds."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,10 +17,10 @@ def demo(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Train a policy, find what the model lacks where it fails, and train it again.
+    """Train a policy that fails on a rig, find the effects the model lacks, and train again.
 
-    The rig is a Furuta pendulum in MuJoCo, another engine than the model's, with dry friction and
-    filtered rates that the model knows nothing of. Figures and a report tell the story.
+    The rig is a Furuta pendulum in MuJoCo, while the model uses another engine. The rig has dry
+    friction and filtered velocities that the model lacks. Writes figures and a report.
 
     Example: npdr demo --out demo-output
     """
@@ -34,11 +34,11 @@ def demo(
     from npdr_ppl.progress import reporter
     from npdr_ppl.reproduction.demo import run_demo
 
-    # Batches are small here: a second thread makes training a fourth slower, and the search of
-    # discovery has its processes.
+    # Batches are small here: a second thread makes training 25 % slower, and the search for
+    # missing effects runs in its own processes.
     torch.set_num_threads(1)
     console = Console(quiet=quiet or as_json)
-    console.print("A Furuta pendulum in MuJoCo is the rig; the model has the paper's equations …")
+    console.print("The rig is a Furuta pendulum in MuJoCo; the model has the paper's equations …")
     with (
         resumable(f"the same command again continues the run in {out}."),
         workers(),
@@ -54,4 +54,4 @@ def demo(
         typer.echo((out / "demo.json").read_text(), nl=False)
     elif not quiet:
         show_demo(told.result)
-        console.print(f"Figures are in {out}/, the whole story in {page}")
+        console.print(f"Figures are in {out}/, the report is {page}")

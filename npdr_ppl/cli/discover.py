@@ -1,4 +1,4 @@
-"""`npdr discover`: find what a model misses, name it, add it, prove it."""
+"""`npdr discover`: finds effects that a model lacks, adds them and tests them."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -20,7 +20,7 @@ __all__ = ["discover"]
 
 
 class LastStage(StrEnum):
-    """Where to stop; each stage includes those before."""
+    """Last stage to run; each stage includes the earlier ones."""
 
     CHECK = "check"
     LOCATE = "locate"
@@ -38,10 +38,10 @@ def discover(
     ],
     data: Annotated[Path, typer.Option(help="Rollouts: CSV, Parquet, NPZ or NetCDF.")],
     out: Annotated[Path, typer.Option(help="Folder for results.")],
-    holdout: Annotated[str, typer.Option(help="Rollouts to prove it on, e.g. 3,4.")] = "",
+    holdout: Annotated[str, typer.Option(help="Rollouts to test on, e.g. 3,4.")] = "",
     holdout_data: Annotated[
         Path | None,
-        typer.Option(help="File of rollouts to prove it on: another excitation is better proof."),
+        typer.Option(help="File of held-out rollouts; best with another excitation."),
     ] = None,
     segment_length: Annotated[
         int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for 0.2 s.")
@@ -49,23 +49,23 @@ def discover(
     effect: Annotated[
         list[str] | None,
         typer.Option(
-            help="Effect that the model has already, port.effect; may be repeated.",
+            help="Effect that the model already has, port.effect; may be repeated.",
             autocompletion=complete_effect,
         ),
     ] = None,
     effects: Annotated[
         str,
         typer.Option(
-            help="Effects to search, port.effect,port.effect; all if not given.",
+            help="Effects to try, port.effect,port.effect; all if not given.",
             autocompletion=complete_effect,
         ),
     ] = "",
-    max_effects: Annotated[int, typer.Option(min=0, help="Greatest number to add.")] = 5,
+    max_effects: Annotated[int, typer.Option(min=0, help="Maximum number of effects to add.")] = 5,
     false_alarm_rate: Annotated[
-        float, typer.Option(help="Probability of an alarm although nothing is missing.")
+        float, typer.Option(help="Probability of an alarm if nothing is missing.")
     ] = 0.01,
     stage: Annotated[
-        LastStage, typer.Option(help="Stop after this stage and write what there is.")
+        LastStage, typer.Option(help="Stop after this stage and write the results so far.")
     ] = LastStage.PROVE,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     executor: ExecutorOption = None,
@@ -76,10 +76,10 @@ def discover(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Find what a model misses in a recording, name it, add it and prove that it helps.
+    """Find effects that a model lacks, add them, and test the revised model on held-out data.
 
-    Writes discovery.json, revised_model.py (a model for every other command) and figures. An
-    interrupted search begins anew when the same command is given again; a finished one is shown.
+    Writes discovery.json, revised_model.py (a model for every other command) and figures. The
+    same command restarts an interrupted search, or shows the result of a finished one.
 
     Example: npdr discover furuta --data measured.csv --holdout 3,4 --out discovery
     """
@@ -112,7 +112,7 @@ def discover(
     found = folder.finished(stage.value)
     if found is None:
         with (
-            resumable(f"the same command again begins the search in {out} anew."),
+            resumable(f"the same command again restarts the search in {out}."),
             chosen_workers(executor, workers, address, time_limit),
         ):
             with sentences(options, False if quiet else None) as report:

@@ -1,4 +1,4 @@
-"""`npdr fit`: a posterior from measured rollouts."""
+"""`npdr fit`: infers a posterior from measured rollouts."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -26,7 +26,7 @@ __all__ = ["InitialState", "fit"]
 
 
 class InitialState(StrEnum):
-    """How the state at a segment's start is found."""
+    """How the state at a segment's start is obtained."""
 
     ESTIMATED = "estimated"
     RECORDED = "recorded"
@@ -41,7 +41,7 @@ class Precision(StrEnum):
 
 
 class Noise(StrEnum):
-    """Where the readings' noise comes from."""
+    """Source of the measurement noise."""
 
     AUTO = "auto"
     MODEL = "model"
@@ -64,7 +64,7 @@ def fit(
     ] = "snpe-c",
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of simulating and training.")] = 1,
     extra_rounds: Annotated[
-        int, typer.Option(min=0, help="Rounds to add where the estimator has not converged.")
+        int, typer.Option(min=0, help="Rounds to add if the estimator has not converged.")
     ] = 2,
     simulations: Annotated[int, typer.Option(min=10, help="Simulations per round.")] = 1_000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
@@ -90,7 +90,7 @@ def fit(
         Precision, typer.Option(help="Floating-point type of the simulation.")
     ] = Precision.FLOAT64,
     noise: Annotated[
-        Noise, typer.Option(help="Noise of readings: auto estimates it, model takes the model's.")
+        Noise, typer.Option(help="Measurement noise: auto estimates it, model keeps the model's.")
     ] = Noise.AUTO,
     device: Annotated[str, typer.Option(help="Where to train: cpu or cuda.")] = "cpu",
     executor: ExecutorOption = None,
@@ -103,7 +103,7 @@ def fit(
 ) -> None:
     """Infer the posterior over a model's parameters from measured rollouts.
 
-    An interrupted run continues when the same command is given again.
+    To continue an interrupted run, give the same command again.
 
     Example: npdr fit furuta --data measured.csv --segment-length 200 --holdout 3,4 --out fit
     """

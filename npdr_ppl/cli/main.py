@@ -1,4 +1,4 @@
-"""Entry point of `npdr`: the commands, and one sentence with exit code 2 for bad input."""
+"""Entry point of `npdr`: registers the commands; bad input gives one sentence and exit code 2."""
 
 import os
 import sys
@@ -11,7 +11,7 @@ from npdr_ppl.errors import NpdrError
 
 __all__ = ["app", "main"]
 
-# The public name of the class from which wrong options, values and commands all descend.
+# Base class of the errors for wrong options, values and commands.
 _UsageError: Any = typer.BadParameter.__bases__[0]
 
 app = typer.Typer(
@@ -39,11 +39,11 @@ app.command("searches", rich_help_panel="What there is")(listings.searches)
 
 def main() -> None:
     """Runs the command line."""
-    # Threads of torch that spin while they wait bring a busy machine to a crawl; OpenMP reads
-    # this when torch is first imported, which is after this line.
+    # Waiting threads of torch would spin and slow down a busy machine. OpenMP reads this variable
+    # when torch is first imported, which happens after this line.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
-        # Without arguments the help is shown, which is no sentence.
+        # Without arguments, typer prints the help text itself.
         sys.exit(app(standalone_mode=len(sys.argv) < 2) or 0)
     except _UsageError as error:
         where = error.ctx.command_path if error.ctx else "npdr"

@@ -1,4 +1,4 @@
-"""What commands have in common: how much they say, as what, and how they take an interruption."""
+"""Options that the commands share (--quiet, --json, --verbose), and the handling of Ctrl-C."""
 
 import logging
 from collections.abc import Iterator
@@ -10,11 +10,11 @@ import typer
 __all__ = ["INTERRUPTED", "AsJson", "Quiet", "Verbose", "resumable"]
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+"""Exit code after Ctrl-C, the same as in shells."""
 
 
 def _log(is_wanted: bool) -> None:
-    """Has the package's log written to standard error."""
+    """Writes the package's log to standard error."""
     if is_wanted:
         logger = logging.getLogger("npdr_ppl")
         handler = logging.StreamHandler()
@@ -25,19 +25,19 @@ def _log(is_wanted: bool) -> None:
 
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
-# The callback does everything, so commands need not look at the value.
+# The callback sets up the log, so commands ignore the value.
 Verbose = Annotated[
     bool,
-    typer.Option("--verbose", "-v", callback=_log, help="Log to standard error what is done."),
+    typer.Option("--verbose", "-v", callback=_log, help="Log progress to standard error."),
 ]
 
 
 @contextmanager
 def resumable(how: str) -> Iterator[None]:
-    """Answers Ctrl-C inside the block with how to go on, and with the shells' exit code.
+    """On Ctrl-C inside the block, prints how to continue the run and exits with the shells' code.
 
     Args:
-        how: What continues the run, to follow "interrupted; ".
+        how: How to continue the run; printed after "interrupted; ".
     """
     try:
         yield

@@ -1,8 +1,8 @@
-"""What the shell completes: names of the zoo and of the registries, without loading any of them.
+"""Names for shell completion: models, backends, effects and more, without importing them.
 
-Registries import torch, which takes longer than anyone waits for a tab. The names are therefore
-written down once more, and a test compares them with the registries. What other packages add is
-read from their entry points, which costs next to nothing.
+The registries import torch, which is too slow for tab completion. The names are therefore repeated
+here, and a test compares them with the registries. Names that other packages add are read from
+their entry points, which is fast.
 """
 
 from collections.abc import Iterable
@@ -92,11 +92,11 @@ EFFECTS = (
 )
 
 EMBEDDINGS = ("bayessim", "score", "all/", "gru/")
-"""How the words for trajectory features begin."""
+"""Names of trajectory features, or their beginnings."""
 
 
 def complete_model(incomplete: str) -> list[str]:
-    """Completes MODEL; where nothing fits, shells go on with the names of files."""
+    """Completes MODEL; if no name fits, the shell completes file names."""
     return _beginning_with(incomplete, MODELS)
 
 
@@ -116,7 +116,7 @@ def complete_backend(incomplete: str) -> list[str]:
 
 
 def complete_backends(incomplete: str) -> list[str]:
-    """Completes the last one of several backends with commas in between."""
+    """Completes the last backend of a comma-separated list."""
     done, comma, last = incomplete.rpartition(",")
     before = done + comma + " " * (len(last) - len(last.lstrip()))
     return [before + name for name in complete_backend(last.lstrip())]
@@ -128,9 +128,9 @@ def complete_search(incomplete: str) -> list[str]:
 
 
 def complete_effect(incomplete: str) -> list[str]:
-    """Completes the effect in ``port.effect``, of several with commas the last one.
+    """Completes the effect in ``port.effect``, the last one of a comma-separated list.
 
-    Ports belong to the simulator, which would have to be loaded.
+    Ports are not completed, because the simulator would have to be loaded.
     """
     port, dot, last = incomplete.rpartition(".")
     if not dot:

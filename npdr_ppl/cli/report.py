@@ -1,4 +1,4 @@
-"""`npdr report`: a finished run as one HTML file."""
+"""`npdr report`: writes a finished run as one HTML file."""
 
 import json
 from pathlib import Path
@@ -22,8 +22,8 @@ def report(
 ) -> None:
     """Write a finished run as one HTML file that opens anywhere, without a network.
 
-    Verdict and key figures come first, then charts, diagnostics in plain language, the model's
-    source, and what it takes to make the result again.
+    The report begins with the verdict and the key numbers. Charts, diagnostics in plain language,
+    the model's source and the steps to reproduce the result follow.
 
     Example: npdr report fit --out fit.html
     """

@@ -1,4 +1,4 @@
-"""`npdr reproduce`: the paper's experiments."""
+"""`npdr reproduce`: repeats the paper's experiments."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -14,7 +14,7 @@ __all__ = ["reproduce"]
 
 
 class Experiment(StrEnum):
-    """An experiment of Muratore et al. (2021), or on its recordings."""
+    """An experiment of Muratore et al. (2021), or one that uses its recordings."""
 
     TABLE2 = "table2"
     PENDULUM = "pendulum"
@@ -27,8 +27,8 @@ def reproduce(
     data: Annotated[
         Path | None,
         typer.Option(
-            help="The paper's recordings; needed for table2, mini-golf and missing-effect, which "
-            "also takes a folder with two of them."
+            help="The paper's recordings; needed for table2, mini-golf and missing-effect. "
+            "missing-effect also takes a folder with two recordings."
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("reproduction"),
@@ -37,19 +37,19 @@ def reproduce(
         typer.Option(
             "--backends",
             "--backend",
-            help="Some of the paper's methods, or others; all if not given.",
+            help="Backends to run; all methods of the paper if not given.",
             autocompletion=complete_backends,
         ),
     ] = "",
     initial_state: Annotated[
-        InitialState, typer.Option(help="State at a segment's start; the paper took recorded.")
+        InitialState, typer.Option(help="State at a segment's start; the paper used recorded.")
     ] = InitialState.RECORDED,
     returns: Annotated[
         int,
         typer.Option(
             min=0,
-            help="table2: training runs per method for the rows of returns, on a hidden rig in "
-            "MuJoCo; minutes each. 0 leaves these rows out.",
+            help="table2: training runs per method for the rows with returns, on a hidden rig "
+            "in MuJoCo; each takes minutes. 0 leaves these rows out.",
         ),
     ] = 0,
     rounds: Annotated[
@@ -63,7 +63,7 @@ def reproduce(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Reproduce an experiment of the NPDR paper, and compare with its figures.
+    """Reproduce an experiment of the NPDR paper, and compare with its published numbers.
 
     Example: npdr reproduce table2 --data swing_up_500hz_5s.csv --out table2
     """
@@ -144,7 +144,7 @@ def _reproduce_missing_effect(
     if data is None:
         raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")
     swing_ups, chirps = load_recordings(data)
-    with resumable(f"the same command again begins the search in {out} anew."), workers():
+    with resumable(f"the same command again restarts the search in {out}."), workers():
         story, result = reproduce_missing_effect(
             swing_ups,
             chirps,

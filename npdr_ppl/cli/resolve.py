@@ -1,4 +1,4 @@
-"""Turns words on the command line into models, effects, data, targets, tasks and methods."""
+"""Turns command-line words into models, effects, data, targets, tasks and methods."""
 
 import importlib.util
 import sys
@@ -34,13 +34,13 @@ __all__ = [
 T = TypeVar("T")
 
 DATA_FILES = (".csv", ".parquet", ".npz", ".nc")
-"""Endings of files with rollouts."""
+"""File name extensions of rollouts."""
 
 SCENES = (".xml", ".mjcf", ".urdf")
-"""Endings of files that describe a robot."""
+"""File name extensions of robot descriptions."""
 
 DEFAULT_TASKS = {"furuta": "furuta-swing-up", "furuta_paper": "furuta-swing-up"}
-"""What a policy is to do, by model of the zoo."""
+"""Default control task by name of the zoo's model."""
 
 
 def resolve_model(word: str) -> Callable[..., Any]:
@@ -78,14 +78,14 @@ def _load_function(path: Path, function: str) -> Callable[..., Any]:
         close = get_close_matches(path.name, [p.name for p in path.parent.glob("*.py")], n=1)
         hint = f" Did you mean {path.with_name(close[0])}:{function}?" if close else ""
         raise ModelError(f"{path} does not exist.{hint}")
-    # Under a name of its own: a file called json.py must not take the library's place.
+    # The module gets a unique name: a file called json.py must not replace the library.
     name = f"_npdr_model_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ModelError(f"{path} is not a Python file.")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    # Workers cannot import a module of this name, so what it defines travels as code.
+    # Workers cannot import a module of this name, so its definitions are sent as code.
     cloudpickle.register_pickle_by_value(module)
     try:
         spec.loader.exec_module(module)
@@ -103,7 +103,7 @@ def _load_function(path: Path, function: str) -> Callable[..., Any]:
 def resolve_effects(model: Callable[..., Any], words: Sequence[str]) -> Callable[..., Any]:
     """Attaches effects given as ``port.effect``, e.g. ``pole.coulomb_friction``.
 
-    A word may hold several of them, with commas in between.
+    A word may hold several effects, separated by commas.
 
     Raises:
         ModelError: There is no such effect.
@@ -116,7 +116,7 @@ def resolve_effects(model: Callable[..., Any], words: Sequence[str]) -> Callable
 
 
 def named_effects(words: Sequence[str]) -> "list[Effect]":
-    """Returns effects given as ``port.effect``; a word may hold several, with commas in between.
+    """Returns effects given as ``port.effect``; a word may hold several, separated by commas.
 
     Raises:
         ModelError: There is no such effect.
@@ -140,7 +140,7 @@ def named_effects(words: Sequence[str]) -> "list[Effect]":
 
 
 def _split_effects(text: str, known: Collection[str]) -> list[str]:
-    """Splits at commas that follow an effect; the name of a port may have commas of its own."""
+    """Splits at commas that follow an effect; the name of a port may itself contain commas."""
     parts = [""]
     for piece in text.split(","):
         if parts[-1].rpartition(".")[2] in known:
@@ -174,7 +174,7 @@ def resolve_rollouts(path: Path, holdout: str = "") -> tuple[Any, Any]:
         raise DataError(f"--holdout takes positions such as 3,4; got {holdout!r}.") from None
     if test[0] < 0 or test[-1] >= len(rollouts):
         raise DataError(
-            f"--holdout {holdout} asks for rollouts that are not there: {path} has "
+            f"--holdout {holdout} names rollouts that do not exist: {path} has "
             f"{len(rollouts)}, counted from 0, so the last is {len(rollouts) - 1}."
         )
     if len(test) == len(rollouts):
@@ -204,12 +204,12 @@ def resolve_holdout(path: Path, holdout: str, file: Path | None) -> tuple[Any, A
     if file is None:
         return resolve_rollouts(path, holdout)
     if holdout:
-        raise DataError("--holdout and --holdout-data are two ways to say one thing; give one.")
+        raise DataError("--holdout and --holdout-data exclude each other; give one.")
     return Rollouts.load(path), Rollouts.load(file)
 
 
 def resolve_device(word: str) -> str:
-    """Returns the device that ``--device`` names, once it is known to be there.
+    """Returns the device that ``--device`` names, after checking that it is available.
 
     Raises:
         BackendError: There is no such device.
@@ -220,14 +220,14 @@ def resolve_device(word: str) -> str:
         torch.empty(0, device=word)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).partition("\n")[0].rstrip(".")
-        raise BackendError(f"--device {word} is not to be had: {reason}; use cpu.") from error
+        raise BackendError(f"--device {word} is not available: {reason}; use cpu.") from error
     return word
 
 
 def resolve_target(word: str) -> "TargetDomain":
     """Returns the target domain that ``TARGET`` names.
 
-    It is a target of the zoo, a file of recordings, ``gym:`` with the id of a Gymnasium
+    The word is a target of the zoo, a file of recordings, ``gym:`` with the id of a Gymnasium
     environment, or ``path/to/file.py:function`` with a function that returns a target.
 
     Raises:
@@ -263,11 +263,11 @@ def resolve_task(word: str, model: str) -> "ControlTask":
     """Returns the task that ``--task`` names: one of the zoo, or ``path/to/file.py:function``.
 
     Args:
-        word: The task; the model's own if empty.
+        word: The task; empty for the model's default task.
         model: The word that named the model.
 
     Raises:
-        ModelError: There is no such task, or the model has none of its own.
+        ModelError: There is no such task, or the model has no default task.
     """
     from npdr_ppl.loop.control_task import ControlTask, control_task, control_tasks
 
@@ -285,7 +285,7 @@ def resolve_task(word: str, model: str) -> "ControlTask":
 def resolve_backend(word: str) -> "str | Backend":
     """Returns the backend that e.g. ``snpe-c`` or ``snpe-c(flow=maf)`` names.
 
-    One without options stays a word, as which it is recorded with a run.
+    Without options it returns the word itself, which is recorded with the run.
 
     Raises:
         BackendError: There is no such backend or option.
@@ -298,7 +298,7 @@ def resolve_backend(word: str) -> "str | Backend":
 def resolve_search(word: str) -> "str | PolicySearch[Any]":
     """Returns the policy search that e.g. ``power`` or ``power(population=100)`` names.
 
-    One without options stays a word, as which it is recorded with a run.
+    Without options it returns the word itself, which is recorded with the run.
 
     Raises:
         ModelError: There is no such search or option.
@@ -309,7 +309,7 @@ def resolve_search(word: str) -> "str | PolicySearch[Any]":
 
 
 def _method(word: str, make: Callable[..., T]) -> str | T:
-    """Makes what a word with options in parentheses names; without options, only checks it."""
+    """Makes the method that a word names; without options in parentheses, only checks the name."""
     from npdr_ppl.posterior.comparison.compared_backends import name_and_options
 
     name, options = name_and_options(word)

@@ -1,4 +1,4 @@
-"""The option that says how recordings are cut into segments."""
+"""The option --segment-length: how recordings are cut into segments."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,7 +20,7 @@ SegmentLengthOption = Annotated[
 
 
 def resolve_segment_length(word: str) -> "SegmentLength":
-    """Returns the length that a word describes.
+    """Returns the segment length that a word describes.
 
     Raises:
         DataError: It is neither ``auto`` nor a number of steps.

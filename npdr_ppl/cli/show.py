@@ -22,26 +22,27 @@ __all__ = [
 ]
 
 FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
-"""Columns of figures with the width they need."""
+"""Numeric columns and their widths in characters."""
 
 WORTH_TELLING = 0.1
-"""Share of what is left in a channel from which its encoder's counts are told."""
+"""The encoder resolution is printed if it causes more than this share of a channel's remaining
+variance."""
 
 MOST_ROWS = 10
-"""Rows of a ranking."""
+"""Maximum number of rows of a ranking."""
 
 WIDEST_NAME = 29
-"""Columns that an effect's name may take from its parameters'."""
+"""Maximum width of the column with effect names, in characters."""
 
 WIDTH = 100
-"""Columns of a table that is written to a file or a pipe."""
+"""Width in characters of a table that is written to a file or a pipe."""
 
 
 def show_fit(result: Mapping[str, Any], out: Path) -> None:
     """Prints the content of ``fit.json``."""
     console = _console()
     table = Table(title=f"Posterior ({result['backend']})", box=SIMPLE)
-    # Long names of effects' parameters are folded; figures stay whole.
+    # Long names of effects' parameters are folded; numbers are never cut.
     table.add_column("parameter", overflow="fold")
     for column, width in FIGURES.items():
         table.add_column(column, justify="right", no_wrap=True, min_width=width)
@@ -109,7 +110,7 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
 
 
 def show_discovery(found: Mapping[str, Any], out: Path) -> None:
-    """Prints the content of ``discovery.json``, as far as the discovery went."""
+    """Prints the content of ``discovery.json``, up to the last finished stage."""
     console = _console()
     for problem in found["data_problems"]:
         _print_reason(console, "data problem", problem)
@@ -120,13 +121,13 @@ def show_discovery(found: Mapping[str, Any], out: Path) -> None:
     elif "where" in found:
         _show_worst(console, found["where"])
     elif not found["data_problems"]:
-        console.print("The recording shows none of the problems that are looked for.")
+        console.print("The data checks found no problem in the recording.")
     console.print(f"Results and figures are in {out}/")
 
 
 def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
     if found["effects"]:
-        table = Table(title="What was missing", box=SIMPLE, padding=(0, 1, 0, 0))
+        table = Table(title="Missing effects", box=SIMPLE, padding=(0, 1, 0, 0))
         width = min(WIDEST_NAME, max(len(f"at {row['port']}") for row in found["effects"]))
         table.add_column("effect", overflow="fold", min_width=width)
         table.add_column("parameter", overflow="fold")
@@ -159,12 +160,12 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
     _print_reason(console, found["verdict"], found["reason"])
     if found["remainder"]["fired"] and found["verdict"] != "unknown":
         share = found["remainder"]["unexplained"]
-        console.print(f"Something smaller is left over: {share:.2%} of the disagreement.")
+        console.print(f"A smaller misfit remains: {share:.2%} of the disagreement.")
     for channel, count in found["counts"].items():
         if count["share"] > WORTH_TELLING:
             console.print(
-                f"{escape(channel)} is read in counts of {count['size']:.3g}, which make "
-                f"{count['share']:.0%} of the variance that is left there."
+                f"{escape(channel)} has an encoder resolution of {count['size']:.3g}, which "
+                f"causes {count['share']:.0%} of the remaining variance."
             )
     if (experiment := found["next_experiment"]) is not None:
         _print_reason(console, "next experiment", _advice(experiment))
@@ -174,18 +175,18 @@ def _advice(experiment: Mapping[str, Any]) -> str:
     """Returns a next experiment in a sentence."""
     words = experiment["separated_by"]
     if experiment["excitation"] is None:
-        return words or "none of the excitations that were tried would tell them apart."
+        return words or "none of the tried excitations separates the alternatives."
     kind = experiment["excitation"]
     limits = ", ".join(f"{name} up to {v:.3g}" for name, v in experiment["amplitude"].items())
     sentence = (
-        f"{kind.replace('_', ' ')} with {limits}, which sets the alternatives "
-        f"{experiment['separations'][kind]:.0f} standard deviations apart"
+        f"{kind.replace('_', ' ')} with {limits}, which separates the alternatives by "
+        f"{experiment['separations'][kind]:.0f} standard deviations"
     )
     return f"{sentence}; {words}" if words else f"{sentence}."
 
 
 def _show_candidates(console: Console, found: Mapping[str, Any]) -> None:
-    table = Table(title="Candidates at the model as it is", box=SIMPLE)
+    table = Table(title="Candidate effects for the present model", box=SIMPLE)
     table.add_column("effect", overflow="fold")
     for column in ("separation", "absorbed", "p"):
         table.add_column(column, justify="right", no_wrap=True)
@@ -206,7 +207,7 @@ def _show_worst(console: Console, where: Sequence[Mapping[str, Any]]) -> None:
     table = Table(title="Windows that the model misses most", box=SIMPLE)
     for column in ("rollout", "seconds", "z"):
         table.add_column(column, justify="right", no_wrap=True)
-    for column in ("channel", "what went on there"):
+    for column in ("channel", "conditions"):
         table.add_column(column, overflow="fold")
     for row in where:
         begin, end = row["time_span"]
@@ -227,8 +228,8 @@ def show_training(result: Mapping[str, Any], out: Path) -> None:
     table.add_column("iteration", justify="right", no_wrap=True)
     table.add_column("real return", justify="right", no_wrap=True)
     table.add_column("decision", no_wrap=True)
-    table.add_column("what the loop did", no_wrap=True)
-    # Of the policy that the iteration trained, which the next one runs.
+    table.add_column("action", no_wrap=True)
+    # Return of the policy that this iteration trained; the next iteration runs it.
     table.add_column("simulated return", justify="right", no_wrap=True)
     for number, row in enumerate(result["iterations"], start=1):
         table.add_row(
@@ -247,7 +248,7 @@ def show_training(result: Mapping[str, Any], out: Path) -> None:
 
 
 def show_missing_effect(found: Mapping[str, Any], result: Mapping[str, Any], out: Path) -> None:
-    """Prints the content of ``missing-effect.json`` after what was found."""
+    """Prints the content of ``discovery.json``, then of ``missing-effect.json``."""
     show_discovery(found, out)
     tables = {
         "Held-out swing-ups": ("", {}),
@@ -267,7 +268,7 @@ def show_missing_effect(found: Mapping[str, Any], result: Mapping[str, Any], out
 
 
 def show_demo(result: Mapping[str, Any]) -> None:
-    """Prints the content of ``demo.json`` as a story."""
+    """Prints the content of ``demo.json`` in the order of events."""
     console = _console()
     before, after = result["returns"].values()
     console.print(f"The policy from the prior earns {before:.0f} on the rig.")
@@ -289,7 +290,7 @@ def show_demo(result: Mapping[str, Any]) -> None:
 
 
 def show_rows(title: str, result: Mapping[str, Any]) -> None:
-    """Prints the content of a reproduction's JSON: ours beside the paper's."""
+    """Prints the content of a reproduction's JSON: our results next to the paper's."""
     table = Table(title=title, box=SIMPLE)
     metrics = list(dict.fromkeys(m for row in result["rows"].values() for m in row))
     published = {m for row in result["paper"].values() for m in row}
@@ -314,7 +315,7 @@ def show_rows(title: str, result: Mapping[str, Any]) -> None:
 
 def _console() -> Console:
     console = Console()
-    # Without a terminal rich assumes 80 columns, which would cut numbers in two.
+    # Without a terminal, rich assumes 80 columns, which would split numbers.
     return console if console.is_terminal else Console(width=WIDTH)
 
 
@@ -327,7 +328,7 @@ def _number(value: float | None, format_spec: str) -> str:
 
 
 def _spread(values: Sequence[float]) -> str:
-    """Returns the mean of some values, and their standard deviation if they are several."""
+    """Returns the mean of some values, with their standard deviation if there are several."""
     middle = f"{mean(values):.0f}"
     return f"{middle} ± {stdev(values):.0f}" if len(values) > 1 else middle
 

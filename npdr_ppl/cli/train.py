@@ -1,4 +1,4 @@
-"""`npdr train`: a policy for a device that differs from its simulator."""
+"""`npdr train`: trains a policy for a device that differs from its simulator."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -29,7 +29,7 @@ __all__ = ["train"]
 
 
 class InternalModel(StrEnum):
-    """Parameters of the policy's own model on the target."""
+    """Parameters of the model inside the policy when it runs on the target."""
 
     MOST_LIKELY = "most-likely"
     NOMINAL = "nominal"
@@ -45,7 +45,7 @@ def train(
     target: Annotated[
         str,
         typer.Option(
-            help="What the policy is for: a target of the zoo (see npdr targets), a file of "
+            help="Device to control: a target of the zoo (see npdr targets), a file of "
             "rollouts, gym:ENVIRONMENT, or path/to/file.py:function.",
             autocompletion=complete_target,
         ),
@@ -54,8 +54,8 @@ def train(
     task: Annotated[
         str,
         typer.Option(
-            help="What the policy is to do: see npdr tasks, or path/to/file.py:function; the "
-            "model's own if not given.",
+            help="Control task: see npdr tasks, or path/to/file.py:function; the model's "
+            "default task if not given.",
             autocompletion=complete_task,
         ),
     ] = "",
@@ -83,7 +83,7 @@ def train(
         typer.Option(
             "--effect",
             "--effects",
-            help="Effect to attach, port.effect; may be repeated, or several with commas.",
+            help="Effect to attach, port.effect; repeat the option or separate by commas.",
             autocompletion=complete_effect,
         ),
     ] = None,
@@ -101,25 +101,25 @@ def train(
         InitialState, typer.Option(help="State at a segment's start.")
     ] = InitialState.UNCERTAIN,
     search_iterations: Annotated[
-        int, typer.Option(min=1, help="Iterations of the policy search, each time.")
+        int, typer.Option(min=1, help="Iterations of each policy search.")
     ] = 20,
     domains: Annotated[
-        int, typer.Option(min=1, help="Domains that the policy is trained in.")
+        int, typer.Option(min=1, help="Number of domains to train the policy in.")
     ] = 50,
     spread: Annotated[
         float, typer.Option(min=0, max=1, help="Spread of the domains around the posterior.")
     ] = 0.1,
     internal_model: Annotated[
-        InternalModel, typer.Option(help="Parameters of the policy's own model.")
+        InternalModel, typer.Option(help="Parameters of the model inside the policy.")
     ] = InternalModel.MOST_LIKELY,
     decisions: Annotated[
         bool,
-        typer.Option("--decisions/--no-decisions", help="Follow diagnoses, or only log them."),
+        typer.Option("--decisions/--no-decisions", help="Act on diagnoses, or only log them."),
     ] = True,
     extra_rollouts: Annotated[
         int,
         typer.Option(
-            min=0, help="Real rollouts that diagnoses and simulated checks may ask for in all."
+            min=0, help="Maximum total of real rollouts that diagnoses and checks may add."
         ),
     ] = 0,
     least_success: Annotated[
@@ -127,23 +127,23 @@ def train(
         typer.Option(
             min=0,
             max=1,
-            help="Share of the posterior's draws in which a policy must succeed before it runs "
-            "on the target; else another rollout, or training for the worst domains.",
+            help="Share of posterior draws in which a policy must succeed in simulation before "
+            "it runs on the target; else record another rollout, or train for the worst domains.",
         ),
     ] = 0.9,
     tail_share: Annotated[
         float,
-        typer.Option(min=0, max=1, help="Share of the domains that counts as the worst."),
+        typer.Option(min=0, max=1, help="Share of the domains that are treated as the worst."),
     ] = 0.2,
     discover: Annotated[
         bool,
         typer.Option(
             "--discover",
-            help="Look in the real rollouts for effects that the model lacks, and add them.",
+            help="Search the real rollouts for effects that the model lacks, and add them.",
         ),
     ] = False,
     stop_return: Annotated[
-        float | None, typer.Option(help="Real return at which an accepted posterior is the end.")
+        float | None, typer.Option(help="Stop at this real return, if the posterior is accepted.")
     ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue the run that the folder holds.")
@@ -159,12 +159,11 @@ def train(
     verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
-    """Train a policy for a target domain: run it, infer the parameters, train, and again.
+    """Train a policy for a target domain in a loop: run it, infer parameters, train it.
 
-    The simulator is fitted to what the policy does on the target, and the policy is trained in
-    simulators drawn from the posterior. With --discover the model gets what the rollouts say it
-    lacks. Before a policy runs on the target it is tried in draws of the posterior. An interrupted
-    run continues with --resume.
+    Rollouts on the target give a posterior, and the policy is trained in simulators drawn from it.
+    With --discover, effects that the model lacks are added. Before a policy runs on the target, it
+    is tested in simulators drawn from the posterior. --resume continues an interrupted run.
 
     Example: npdr train furuta --target furuta-hard --effects
     arm.coulomb_friction,pole.coulomb_friction --iterations 3 --out run
@@ -239,7 +238,7 @@ def train(
 
 
 def _check_folder(out: Path, is_resumed: bool) -> None:
-    """Raises an error if a run would be continued by accident, or begun by accident."""
+    """Raises an error if --resume does not match the folder: a run exists, or none does."""
     from npdr_ppl.errors import DataError
 
     holds_run = (out / "loop.json").exists()
@@ -248,4 +247,4 @@ def _check_folder(out: Path, is_resumed: bool) -> None:
             f"{out} holds a run already: pass --resume to continue it, or choose another folder."
         )
     if is_resumed and not holds_run:
-        raise DataError(f"{out} holds no run to continue: leave --resume away to begin one.")
+        raise DataError(f"{out} holds no run to continue: omit --resume to start one.")

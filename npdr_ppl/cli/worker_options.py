@@ -20,7 +20,7 @@ PANEL = "Workers, for engines that run one simulation at a time"
 
 
 class ExecutorName(StrEnum):
-    """What runs simulations."""
+    """Executor that runs the simulations."""
 
     LOKY = "loky"
     DASK = "dask"
@@ -31,14 +31,12 @@ class ExecutorName(StrEnum):
 
 ExecutorOption = Annotated[
     ExecutorName | None,
-    typer.Option(
-        "--executor", help="What runs simulations; loky by default.", rich_help_panel=PANEL
-    ),
+    typer.Option("--executor", help="Executor to use; loky by default.", rich_help_panel=PANEL),
 ]
 WorkersOption = Annotated[
     int | None,
     typer.Option(
-        "--workers", min=1, help="Workers; one per core by default.", rich_help_panel=PANEL
+        "--workers", min=1, help="Worker count; one per core by default.", rich_help_panel=PANEL
     ),
 ]
 Address = Annotated[
@@ -48,7 +46,7 @@ Address = Annotated[
 TimeLimit = Annotated[
     float | None,
     typer.Option(
-        "--time-limit", help="Seconds per simulation; 60 by default.", rich_help_panel=PANEL
+        "--time-limit", help="Limit per simulation in s; 60 by default.", rich_help_panel=PANEL
     ),
 ]
 
@@ -60,10 +58,10 @@ def chosen_workers(
     address: str | None,
     time_limit: float | None,
 ) -> Iterator[None]:
-    """Has simulations inside the block run where the options say.
+    """Runs simulations inside the block on the executor and workers that the options name.
 
-    A model whose engine is batched has no use for workers; if any were asked for, standard error
-    says so in the end.
+    A model with a batched engine does not use workers. If any of these options was given then, a
+    note is printed to standard error at the end.
     """
     from npdr_ppl.engines.workers import workers
 

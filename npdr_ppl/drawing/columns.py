@@ -10,7 +10,7 @@ __all__ = ["scalar_columns"]
 
 
 def scalar_columns(parameters: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
-    """Returns one column ``(n,)`` per scalar parameter, those of vectors as ``name[i]``.
+    """Returns one column ``(n,)`` per scalar parameter; elements of vectors are ``name[i]``.
 
     Args:
         parameters: Draws ``(n, ...)`` by name, as tensors on the CPU or arrays.

@@ -1,4 +1,4 @@
-"""One marginal density, the prior's behind it."""
+"""One marginal density of a posterior, with the prior's density behind it."""
 
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ __all__ = ["density", "draw_marginal"]
 def draw_marginal(
     axis: "Axes", posterior: NDArray[np.float64], prior: NDArray[np.float64] | None = None
 ) -> None:
-    """Draws one marginal density, the prior's in grey behind it."""
+    """Draws one marginal density, with the prior's density in grey behind it."""
     together = posterior if prior is None else np.concatenate([posterior, prior])
     low, high = together.min(), together.max()
     grid = np.linspace(low, high, 200)
@@ -33,7 +33,7 @@ def draw_marginal(
 
 
 def density(samples: NDArray[np.float64], grid: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns a kernel density, reflected at the samples' ends so that edges stay visible."""
+    """Returns a kernel density, reflected at the samples' ends so that edges stay sharp."""
     from scipy.stats import gaussian_kde
 
     low, high = samples.min(), samples.max()

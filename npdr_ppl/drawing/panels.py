@@ -20,14 +20,14 @@ def panels(
     """Returns axes to draw on, ``(count,)``.
 
     Args:
-        axes: The caller's, as many as there are panels; ``None`` for a figure of its own, which
-            pyplot manages, so that notebooks show it.
+        axes: The caller's axes, one per panel; ``None`` makes a new figure, which pyplot manages,
+            so that notebooks show it.
         count: Number of panels.
         columns: Panels in a row of a new figure.
         size: Width and height of a panel of a new figure, inches.
 
     Raises:
-        ShapeError: The caller's axes are not as many.
+        ShapeError: The number of the caller's axes is not ``count``.
     """
     if axes is not None:
         given = np.atleast_1d(np.asarray(axes, dtype=object)).ravel()

@@ -1,4 +1,4 @@
-"""One look for all figures."""
+"""Common style of all figures."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 __all__ = ["COLORS", "SERIES", "save_figure", "theme"]
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart.
+# Okabe and Ito's palette, which colour-blind readers can distinguish.
 COLORS = {
     "posterior": "#0072B2",
     "prior": "#999999",
@@ -21,7 +21,7 @@ COLORS = {
 }
 
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
-"""The same palette for several posteriors in one panel, in this order, over and over."""
+"""The same palette for several posteriors in one panel, used in this order and repeated."""
 
 _STYLE: Any = {
     "figure.dpi": 120,
@@ -38,7 +38,7 @@ _STYLE: Any = {
 
 @contextmanager
 def theme() -> Iterator[None]:
-    """Applies the look inside the block."""
+    """Applies the style inside the block."""
     import matplotlib as mpl
 
     with mpl.rc_context(_STYLE):
@@ -46,7 +46,7 @@ def theme() -> Iterator[None]:
 
 
 def save_figure(figure: "Figure", path: Path) -> Path:
-    """Writes a figure, without needing a display, and returns its path."""
+    """Writes a figure and returns its path; no display is needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, bbox_inches="tight", dpi=150)
     return path

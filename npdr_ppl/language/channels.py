@@ -1,4 +1,4 @@
-"""What a simulator declares about itself: channels, parameters and ports, each with a unit."""
+"""Declarations of a simulator: channels, parameters and ports, each with a unit."""
 
 import math
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ PortKind = Literal["force", "action", "sensor", "environment", "clock", "paramet
 
 @dataclass(frozen=True)
 class Channel:
-    """One column of a trajectory: a state, a sensor reading or an action.
+    """One column of a trajectory: a state, a measurement or an action.
 
     Attributes:
         name: Name as in data files, e.g. ``"arm_angle"``.
         unit: SI unit, e.g. ``"rad/s"``.
         lower: Least possible value, in ``unit``.
         upper: Greatest possible value, in ``unit``.
-        rate_of: Name of the channel whose time derivative this one is; lets the state at a
-            segment's start be estimated from position readings alone.
+        rate_of: Name of the channel whose time derivative this one is. With it, the state at a
+            segment's start can be estimated from position measurements alone.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Parameter:
         name: Name as it appears as a sample site, e.g. ``"pole_mass"``.
         unit: SI unit, ``"1"`` if it has none.
         nominal: Data-sheet value, in ``unit``.
-        description: A few words for tables.
+        description: Short description for tables.
     """
 
     name: str
@@ -51,20 +51,20 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Port:
-    """A place where effects attach.
+    """A place in a simulator where effects attach.
 
     Attributes:
-        name: Name in sites and JSON. A group of sensor channels that one device reads joins their
-            names with commas: ``"arm_velocity,pole_velocity"``.
-        kind: What passes through: a generalised force at a joint, an action on its way to the
-            dynamics, a sensor's reading, the environment's own quantities, the clock that stamps
-            all readings, or a domain parameter.
-        unit: SI unit of what passes through.
+        name: Name in sites and JSON. For a group of sensor channels that one device measures,
+            their names joined by commas: ``"arm_velocity,pole_velocity"``.
+        kind: Quantity at the port: a generalised force at a joint, an action before it reaches
+            the dynamics, a measurement, a quantity of the environment, the clock that stamps all
+            measurements, or a domain parameter.
+        unit: SI unit of the quantity.
         rated: Typical magnitude, in ``unit``; effects scale their priors by it.
         rated_speed: Typical speed of a joint that a force acts on, in its coordinate per second.
         rated_position: Typical excursion of such a joint, in its coordinate.
-        coordinate: Unit of the position of a joint that a force acts on: ``"rad"`` where it turns,
-            ``"m"`` where it slides.
+        coordinate: Unit of the position of a joint that a force acts on: ``"rad"`` for a revolute,
+            ``"m"`` for a prismatic joint.
         is_driven: Whether an actuator drives the joint that a force acts on.
     """
 

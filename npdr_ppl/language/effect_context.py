@@ -1,4 +1,4 @@
-"""What an engine tells effects of the moment they act in, and what they say of themselves."""
+"""Data that an engine passes to effects, and types for the declarations of effects."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,26 +19,26 @@ Excitation = Literal[
     "payload",
     "long_run",
 ]
-"""The experiments that reveal effects: speeds near zero; many reversals of the motion; steps of
-the command; a chirp through the resonances; standing still under load; all of the range of motion
-and commands; one constant speed; the same motion with an extra mass; minutes on end."""
+"""Experiments that reveal effects, in this order: speeds near zero; many reversals of the motion;
+steps of the command; a chirp through the resonances; standstill under load; the whole range of
+motion and commands; one constant speed; the same motion with an extra mass; a run of minutes."""
 
 
 SensorSpan = Literal["position", "rate", "joint", "positions", "rates", "all"]
-"""The sensor channels that one device may have an effect on, with the same parameters: one
-position, or what is no rate; one rate; a position with its rate, or a channel that stands alone;
+"""Sensor channels that one device can affect with the same parameters, in this order: one position
+or other channel that is not a rate; one rate; a position with its rate, or a channel without one;
 all positions; all rates; all channels."""
 
 
 @dataclass(frozen=True)
 class EquivalenceClass:
-    """Causes that recordings may not be able to tell apart.
+    """Causes that recordings may not be able to distinguish.
 
     Attributes:
-        name: What the class is called in reports.
-        members: Ids of effects; ``"a + b"`` is a sum of effects, and a word that is no id is a
+        name: Name of the class in reports.
+        members: Ids of effects. ``"a + b"`` is a sum of effects; a word that is not an id is a
             cause outside the catalogue.
-        separated_by: What would tell the members apart.
+        separated_by: Experiment that distinguishes the members.
     """
 
     name: str
@@ -47,18 +47,18 @@ class EquivalenceClass:
 
 
 class Start(NamedTuple):
-    """What an effect's own state at the start of a segment or an episode can be made of.
+    """Data from which an effect computes its own state at the start of a segment or an episode.
 
     Attributes:
         time: Seconds since the rollout began, ``(N,)``.
         time_step: Seconds between two calls of the effect.
         parameters: The effect's parameters by short name.
-        history: Past values that the effect asked to keep, rounded up.
-        changes: By how much a sensor channel's true value differed one step before the start, two
-            steps and so on, as the simulator without its effects predicts; empty for what is no
-            sensor, or does not ask.
-        is_rate: Whether the value is a sensor's of a velocity. Under commands that are held for a
-            step, velocities are kinked where steps meet, and positions smooth.
+        history: Number of past values that the effect requested, rounded up.
+        changes: Differences of a sensor channel's true value one step before the start, two
+            steps before and so on, as the simulator without its effects predicts. Empty for
+            effects that are not on sensors or do not request it.
+        is_rate: Whether the value is a measured velocity. With commands that are constant within
+            a step, velocities have kinks between steps, while positions are smooth.
     """
 
     time: Tensor
@@ -69,9 +69,7 @@ class Start(NamedTuple):
     is_rate: bool = False
 
     def past(self, value: Tensor) -> tuple[Tensor, ...]:
-        """Returns a sensor channel's true values before the start, latest first.
-
-        As many as :attr:`history`.
+        """Returns :attr:`history` true values of a sensor channel before the start, latest first.
 
         Args:
             value: The true value at the start.
@@ -80,17 +78,17 @@ class Start(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """A joint at the start of a step; tensors of the batch's shape.
+    """State of a joint at the start of a step; all tensors have the batch shape.
 
     Attributes:
         position: Generalised position.
         velocity: Its rate.
-        acceleration: Acceleration under the actions and all smooth forces, dry friction and the
-            effects that ask for this left out.
-        inverse_inertia: Acceleration per unit force at the joint, all joints free to move.
-        drive: Generalised force that the drive exerts at the joint. Where the equations alone are
+        acceleration: Acceleration under the actions and all smooth forces, without dry friction
+            and without the effects that request this joint state.
+        inverse_inertia: Acceleration per unit force at the joint, with all joints free to move.
+        drive: Generalised force that the drive exerts at the joint. If only the equations are
             known, the part that depends on the actions: a motor's torque without its back-EMF.
-        takes_moments: Whether the engine moves the joint by a force's moment within a step besides
+        takes_moments: Whether the engine uses the moment of a force within a step in addition to
             its mean; see :meth:`ForceEffect.moment`.
     """
 

@@ -1,7 +1,7 @@
-"""Effects: physical causes a simulator may miss, declared once and attached to ports.
+"""Effects: physical causes that a simulator may lack, declared once and attached to ports.
 
-An effect is data plus one law. The law is written against plain tensors that carry the batch
-dimensions, so any engine that can hand over velocities, commands or readings can apply it.
+An effect consists of data and one law. The law uses plain tensors with batch dimensions, so any
+engine that provides velocities, commands or measurements can apply it.
 """
 
 import copy
@@ -39,11 +39,11 @@ __all__ = [
 
 
 LONGEST_TIME = 3.0
-"""Time steps that the default priors of delays and lags reach at least."""
+"""Default priors of delays and lags reach at least this many time steps."""
 
 
 def _upper_end(prior: Distribution) -> float:
-    """Returns where a range that begins at zero ends; infinity for other priors."""
+    """Returns the upper end of a range that begins at zero; infinity for other priors."""
     if isinstance(prior, Uniform) and float(prior.low) == 0.0:
         return float(prior.high)
     return math.inf
@@ -52,36 +52,38 @@ def _upper_end(prior: Distribution) -> float:
 class Effect(ABC):
     """One physical cause with a law, parameters with units and priors, and a port.
 
-    The parameters' nominal value is zero strength: with it the simulator reproduces its
+    The parameters' nominal values mean zero strength: with them the simulator reproduces its
     trajectory without the effect bit for bit.
 
     Args:
         port: Name of the port to attach to.
-        priors: Priors that replace the effect's own, by parameter name.
+        priors: Priors that replace the effect's default priors, by parameter name.
 
     Attributes:
         id: Name in code and JSON, e.g. ``"coulomb_friction"``.
         port_kinds: Kinds of port the effect can attach to.
         parameters: Its parameters; ``{port}`` in a unit stands for the port's unit,
             ``{coordinate}`` for that of the joint's position.
-        strength: Names of the parameters that scale the effect from zero; the others give it its
+        strength: Names of the parameters that scale the effect from zero; the others set its
             shape, and their nominal values are those of a typical device. Empty for all.
-        is_smooth: Whether trajectories are differentiable in the strengths at zero. Where they
-            are not, sensitivities take finite steps of the size that :meth:`probe` gives.
-        is_resonant: Whether it swings at a rate that its strength sets, a time constant. Of two
-            sizes none is more of the other, so that a search tries many.
-        has_local_minima: Whether the misfit has local minima along its parameters, as where parts
-            hit each other: a hit one sample earlier makes another motion. Fits then also restart.
-        is_noise: Whether it only scatters readings about the truth. No search asks for such an
-            effect: a fit that simulates the scatter follows it by chance.
+        is_smooth: Whether trajectories are differentiable in the strengths at zero. If not,
+            sensitivities use finite steps of the size that :meth:`probe` gives.
+        is_resonant: Whether the effect oscillates at a rate that its strength, a time constant,
+            sets. The effect then does not simply grow with its strength, so a search tries many
+            values.
+        has_local_minima: Whether the misfit has local minima along its parameters, e.g. for parts
+            that collide: a collision one sample earlier changes the motion. Fits then also
+            restart.
+        is_noise: Whether it only scatters measurements about the true value. Searches leave out
+            such effects, because a fit that simulates the scatter follows the data by chance.
         wave: Name of the parameter that is the frequency in Hz of a wave in time, empty if none
-            is. Priors are too wide to meet a wave's frequency, so a search reads it from the
-            spectrum of what the model leaves over, and counts all frequencies it looked at.
-        incidental: Names of shapes that a law may be without and still be the same cause.
+            is. Priors are too wide to hit a wave's frequency, so a search takes it from the
+            spectrum of the residuals and corrects for the number of frequencies it examined.
+        incidental: Names of shape parameters without which the law is still the same cause.
         law: The law in one formula.
-        equivalence: Causes that it may not be told from.
+        equivalence: Causes that may be indistinguishable from it.
         excitation: The experiment that reveals it best.
-        reference: Where the law is from.
+        reference: Source of the law.
     """
 
     id: ClassVar[str]
@@ -115,7 +117,7 @@ class Effect(ABC):
 
     @property
     def given_priors(self) -> Mapping[str, Distribution]:
-        """Priors that its user gave, by parameter name."""
+        """Priors that the user gave, by parameter name."""
         return self._priors
 
     def priors(self, port: Port) -> dict[str, Distribution]:
@@ -123,11 +125,11 @@ class Effect(ABC):
         return {**self.default_priors(port), **self._priors}
 
     def at_rate(self, port: Port, time_step: float) -> Self:
-        """Returns the effect with priors of times that reach ``LONGEST_TIME`` time steps.
+        """Returns the effect with priors of times that reach at least ``LONGEST_TIME`` time steps.
 
-        A recording cannot tell times that are much shorter than its time step, and devices that
-        are sampled slowly have delays and lags of several steps. Priors that the user gave, and
-        those that reach further, stay.
+        A recording cannot resolve times much shorter than its time step, and devices with slow
+        sampling have delays and lags of several steps. Priors that the user gave, and longer
+        ones, are kept.
 
         Args:
             port: The port it attaches to.
@@ -148,10 +150,10 @@ class Effect(ABC):
         return changed
 
     def probe(self, port: Port) -> dict[str, float]:
-        """Returns a typical value of every parameter: the effect switched on.
+        """Returns a typical value of every parameter, with the effect switched on.
 
-        Strengths are as far from zero strength as the priors expect (root mean square), shapes
-        are nominal.
+        The distance of strengths from zero strength is the root mean square under the priors;
+        shape parameters are nominal.
         """
         priors = self.default_priors(port)
         result = {}
@@ -185,7 +187,7 @@ class Effect(ABC):
         return tuple(f"{self.name}.{parameter.name}" for parameter in self.parameters)
 
     def own_parameters(self, parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Picks this effect's parameters by their short names; missing ones have no strength."""
+        """Returns this effect's parameters by short name; missing ones are nominal."""
         some = next(iter(parameters.values()), torch.zeros(()))
         return {
             parameter.name: parameters[site]
@@ -199,7 +201,7 @@ class Effect(ABC):
 
 
 class ForceEffect(Effect):
-    """An effect at a joint: a generalised force, a dry friction, or both.
+    """An effect at a joint: a generalised force, dry friction, or both.
 
     Attributes:
         needs_joint: Whether :meth:`begin_step` is called, which costs the engine two evaluations
@@ -216,11 +218,11 @@ class ForceEffect(Effect):
     def begin_step(
         self, joint: Joint, parameters: Mapping[str, Tensor], memory: Any, time_step: float
     ) -> Any:
-        """Returns the memory with what the step's forces need to know of the joint.
+        """Returns the memory with the data of the joint that the step's forces need.
 
-        Called before :meth:`force` and :meth:`dry_friction` if ``needs_joint``. A stiff law can
-        solve for its mean force over the step here, keep it in the memory and return it from
-        :meth:`force`.
+        It is called before :meth:`force` and :meth:`dry_friction` if ``needs_joint`` is true. A
+        stiff law can solve for its mean force over the step here, keep it in the memory and return
+        it from :meth:`force`.
         """
         return memory
 
@@ -233,16 +235,16 @@ class ForceEffect(Effect):
     ) -> Tensor | None:
         """Returns a generalised force that is smooth in the state, or ``None``.
 
-        Evaluated within the integrator's stages.
+        It is evaluated in every stage of the integrator.
         """
         return None
 
     def moment(self, parameters: Mapping[str, Tensor], memory: Any) -> Tensor | None:
         """Returns the first moment of the force within a step, or ``None`` if it is constant.
 
-        ∫ (t − h/2) f dt about the middle of a step of length h, in the force's unit times s², of
-        an effect that asks for its joint; see :class:`Uneven`. Engines that hold forces for a step
-        make do without.
+        ∫ (t − h/2) f dt about the middle of a step of length h, in the force's unit times s², for
+        an effect with ``needs_joint``; see :class:`Uneven`. Engines that hold forces constant for
+        a step ignore it.
         """
         return None
 
@@ -255,8 +257,8 @@ class ForceEffect(Effect):
     ) -> Tensor | None:
         """Returns the greatest magnitude of dry friction, or ``None``.
 
-        The engine applies up to this much against the motion, and at rest just what keeps the
-        joint at rest (stiction): the set-valued law of Coulomb, solved within a step instead of
+        The engine applies this force against the motion, and at rest up to this force to keep the
+        joint at rest (stiction). This is Coulomb's set-valued law, solved within a step instead of
         smoothed.
         """
         return None
@@ -274,11 +276,11 @@ class ForceEffect(Effect):
 
 
 class LinearForceEffect(ForceEffect):
-    """A force that is linear in base parameters, f = Σ_i φ_i(q, q̇) b_i, once the joint moves.
+    """A force that is linear in base parameters, f = Σ_i φ_i(q, q̇) b_i, while the joint moves.
 
     By default the base parameters b are the effect's own parameters. Dry friction is linear in
-    its magnitudes while the joint moves; at rest it is whatever holds the joint, and its columns
-    are zero.
+    its magnitudes while the joint moves. At rest it equals the force that holds the joint, and its
+    columns are zero.
     """
 
     @abstractmethod
@@ -286,7 +288,7 @@ class LinearForceEffect(ForceEffect):
         """Returns φ_i, the force per unit of each base parameter, shaped like the position."""
 
     def to_base(self, parameters: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
-        """Returns the base parameters b that stand for the effect's parameters (short names)."""
+        """Returns the base parameters b for the effect's parameters (short names)."""
         return tuple(parameters[parameter.name] for parameter in self.parameters)
 
     def from_base(self, base: tuple[Tensor, ...]) -> dict[str, Tensor]:
@@ -295,7 +297,7 @@ class LinearForceEffect(ForceEffect):
 
 
 class Commands(ABC):
-    """The commands given so far, as an action effect sees them."""
+    """The present and past commands, for an action effect."""
 
     @abstractmethod
     def now(self) -> Tensor:
@@ -303,14 +305,14 @@ class Commands(ABC):
 
     @abstractmethod
     def delayed(self, steps: Tensor) -> Tensor:
-        """Returns the command of ``steps`` (whole numbers, ≥ 0) steps ago, batch-wise."""
+        """Returns the command of ``steps`` (integers ≥ 0) steps ago, per batch element."""
 
 
 class Uneven(NamedTuple):
     """A command that changes within a step.
 
-    Velocities move as far as under its mean, and positions lag as its moment says. Engines that
-    hold a command for a step make do with the mean.
+    The mean determines the change of velocities over the step; the moment adds to the change of
+    positions. Engines that hold a command constant for a step use only the mean.
 
     Attributes:
         mean: Its mean, in its unit.
@@ -323,34 +325,34 @@ class Uneven(NamedTuple):
 
 
 class ActionEffect(Effect):
-    """An effect on a command on its way to the dynamics."""
+    """An effect on a command before it reaches the dynamics."""
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("action",)
 
     def initial_memory(self, command: Tensor, start: Start) -> Any:
-        """Returns the effect's own state when ``command`` has been given for long.
+        """Returns the effect's own state after a long time with a constant ``command``.
 
-        ``None`` if it has none.
+        ``None`` if it has no state.
         """
         return None
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
-        """Returns the number of past commands that :meth:`act` may ask for."""
+        """Returns the number of past commands that :meth:`act` may request."""
         return 0
 
     @abstractmethod
     def act(
         self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
     ) -> "tuple[Tensor | Uneven, Any]":
-        """Returns what reaches the dynamics during this step, and the next memory."""
+        """Returns the command that reaches the dynamics in this step, and the next memory."""
 
 
 class SensorEffect(Effect):
-    """An effect between the true value of a channel and its reading.
+    """An effect between the true value of a channel and its measurement.
 
     Attributes:
-        needs_past: Whether its memory starts from :attr:`Start.changes`.
-        spans: The channels that one device may have it on, with the same parameters.
+        needs_past: Whether its initial memory needs :attr:`Start.changes`.
+        spans: The channels that one device can affect with the same parameters.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
@@ -358,7 +360,7 @@ class SensorEffect(Effect):
     spans: ClassVar[tuple[SensorSpan, ...]] = ("position", "rate", "positions", "rates")
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
-        """Returns the number of past true values that the memory is to hold."""
+        """Returns the number of past true values that the memory holds."""
         return 0
 
     def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> Any:
@@ -366,32 +368,32 @@ class SensorEffect(Effect):
 
         Args:
             value: True value of the channel at the start.
-            reading: What the sensor reported there.
-            start: What else is known.
+            reading: Measurement at the start.
+            start: Other known data at the start.
         """
         return None
 
     def initial_value(self, reading: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Returns the true value at a segment's start behind what was read there.
+        """Returns the true value at a segment's start for the measurement there.
 
-        By default the reading itself; an offset or a wrong scale has to be taken out, or
-        re-synchronised segments would start from the wrong state.
+        By default it is the measurement itself. Effects with an offset or a wrong scale must
+        remove it, otherwise re-synchronised segments would start from the wrong state.
         """
         return reading
 
     def initial_rate(self, rate: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Returns the true rate of change behind one that was derived from successive readings.
+        """Returns the true rate of change for a rate derived from successive measurements.
 
-        By default the rate itself; a wrong scale, of the readings or of their time stamps, has to
-        be taken out.
+        By default it is the rate itself. Effects with a wrong scale of measurements or time stamps
+        must remove it.
         """
         return rate
 
     def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor | None:
-        """Returns by how many seconds readings are ahead of the truth; ``None`` for not at all.
+        """Returns by how many seconds measurements lead the true values; ``None`` for zero.
 
-        Negative for a delay. A segment whose state was read too late starts from where it has come
-        to since.
+        A delay is negative. The initial state of a segment is moved forward in time by the delay
+        of its measurement.
 
         Args:
             parameters: The effect's parameters by short name.
@@ -403,7 +405,7 @@ class SensorEffect(Effect):
     def read(
         self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
     ) -> tuple[Tensor, Any]:
-        """Returns the reading after a step, and the next memory."""
+        """Returns the measurement after a step, and the next memory."""
 
 
 class EnvironmentEffect(Effect):
@@ -419,7 +421,7 @@ class EnvironmentEffect(Effect):
 class ParameterEffect(Effect):
     """An effect that changes a domain parameter from segment to segment.
 
-    Every domain parameter is a port. Within a segment the parameter is constant.
+    Every domain parameter is a port. The parameter is constant within a segment.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("parameter",)
@@ -431,5 +433,5 @@ class ParameterEffect(Effect):
         Args:
             value: The domain parameter.
             parameters: The effect's parameters by short name.
-            time: Seconds from the rollout's beginning to the segment's middle.
+            time: Seconds from the start of the rollout to the middle of the segment.
         """

@@ -1,4 +1,4 @@
-"""Effect handlers: change a model's black-box sites without touching the model's code."""
+"""Effect handlers: change a model's black-box sites without changing the model's code."""
 
 from collections.abc import Callable
 from typing import Any
@@ -35,8 +35,8 @@ class EffectMessenger(Messenger):
     """Attaches one effect to the simulators of a program while it runs.
 
     Inside the handler the effect's parameters become sample sites
-    ``"<port>.<effect>.<parameter>"``, drawn right before the black-box site they act on. Several
-    black-box sites whose simulators have the port share one device and therefore the parameters.
+    ``"<port>.<effect>.<parameter>"``, drawn just before the black-box site they act on. Several
+    black-box sites whose simulators have the port represent one device and share the parameters.
 
     Args:
         effect: The effect.
@@ -76,7 +76,7 @@ class EffectMessenger(Messenger):
                 site = f"{self.effect.name}.{name}"
                 self._drawn[site] = pyro.sample(site, prior)  # pyright: ignore[reportArgumentType]
         changed = box.with_effects(self.effect, parameters=self._drawn)
-        # The plates may have expanded the site already, because they are entered inside.
+        # Plates may already have expanded the site, because they are inside this handler.
         shape = torch.broadcast_shapes(changed.batch_shape, box.batch_shape)
         msg["fn"] = changed.expand(shape)
         self._attached = True
@@ -87,7 +87,7 @@ class ModelWithEffects:
 
     Attributes:
         base: The model without effects.
-        effects: The effects with the site each is restricted to, in the order of attachment.
+        effects: The effects, each with the site it is restricted to, in the order of attachment.
     """
 
     def __init__(self, base: Model, effects: tuple[tuple[Effect, str | None], ...]) -> None:
@@ -99,7 +99,7 @@ class ModelWithEffects:
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Runs the base model with all effects attached."""
         run = self.base
-        # The handler entered last sees a site first, so the last effect goes outside.
+        # The innermost handler processes a site first, so the last effect is outermost.
         for effect, site in self.effects:
             run = EffectMessenger(effect, site)(run)
         return run(*args, **kwargs)
@@ -147,7 +147,7 @@ def _parts(model: Model) -> tuple[Model, tuple[tuple[Effect, str | None], ...]]:
 
 
 class FinerStepsMessenger(Messenger):
-    """Lets the simulators of a program integrate more accurately while it runs, where they can."""
+    """Makes a program's simulators integrate more accurately while it runs, if they can."""
 
     def _pyro_sample(self, msg: Any) -> None:
         box = msg["fn"]
@@ -178,10 +178,10 @@ class ModelWithFinerSteps:
 
 
 def with_finer_steps(model: Model) -> Model:
-    """Returns the model with simulators that integrate more accurately, where they can.
+    """Returns the model with simulators that integrate more accurately, if they can.
 
-    One step per sample is enough to learn a policy in; set against measurements, the error of such
-    steps looks like a delay. What is still too coarse may be refined once more.
+    One step per sample is enough to train a policy. In a comparison with measurements, the error
+    of such steps looks like a delay. Apply the function again if the steps are still too coarse.
     """
     base, effects = _parts(model)
     base = ModelWithFinerSteps(base)
@@ -198,7 +198,7 @@ def num_finer_steps(model: Model) -> int:
 
 
 class NoiseMessenger(Messenger):
-    """Replaces the noise of the readings at a program's black-box sites while it runs.
+    """Replaces the measurement noise at a program's black-box sites while it runs.
 
     Args:
         noise: The noise, ``None`` for none.
@@ -214,7 +214,7 @@ class NoiseMessenger(Messenger):
 
 
 def with_noise(model: Model, noise: Noise | None) -> Model:
-    """Returns the model with another noise of the readings; see :func:`npdr_ppl.simulate`."""
+    """Returns the model with another measurement noise; see :func:`npdr_ppl.simulate`."""
     return NoiseMessenger(noise)(model)
 
 
@@ -253,7 +253,7 @@ class LikelihoodMessenger(Messenger):
 class SkipSimulation(Messenger):
     """Runs a program without simulating: black-box sites get zeros of the right shape.
 
-    For looking at a program's priors only.
+    It is for runs that need only a program's priors.
     """
 
     def _pyro_sample(self, msg: Any) -> None:

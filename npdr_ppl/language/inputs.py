@@ -1,4 +1,4 @@
-"""What a simulator is told: actions, time step and how each segment starts."""
+"""Inputs of a simulator: actions, time step and initial state of each segment."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -24,16 +24,16 @@ class Inputs:
     """Inputs of a batch of segments; sizes are S segments, K steps, A actions and C channels.
 
     A segment is a stretch of a rollout that is simulated from a re-synchronised state. All
-    segments share K; where a segment is shorter, its tail is padded and ``mask`` is false there.
-    Tensors may carry leading batch dimensions that broadcast against the parameters', e.g. for a
-    plate of devices that were each given other actions.
+    segments have K steps; a shorter segment is padded at its end, where ``mask`` is false.
+    Tensors may have leading batch dimensions that broadcast against the parameters', e.g. for a
+    plate of devices with different actions.
 
     Attributes:
         actions: Commands, each held for one step, shape ``(..., S, K, A)``.
         action_names: Names of the A actions.
-        initial_readings: What the sensors reported at each segment's start, ``(..., S, C)``.
-        initial_values: Best value of each channel at the start: the reading itself (``recorded``)
-            or a smoother's estimate (``estimated``), ``(..., S, C)``.
+        initial_readings: Measurements at each segment's start, ``(..., S, C)``.
+        initial_values: Best value of each channel at the start, ``(..., S, C)``: the measurement
+            itself (``recorded``) or a smoother's estimate (``estimated``).
         channel_names: Names of the C channels.
         past_actions: Commands of the H steps before each segment, oldest first, zero before the
             rollout began, ``(..., S, H, A)``; delays need them.
@@ -42,11 +42,11 @@ class Inputs:
         rollout: Index of the rollout that each segment comes from, ``(S,)``.
         start: Step of the rollout at which each segment starts, ``(S,)``.
         initial_rates: Estimated time derivative of each channel at the start, in units per
-            second, ``(..., S, C)``; ``None`` where recorded states are taken as true.
+            second, ``(..., S, C)``; ``None`` if recorded states are assumed to be exact.
         initial_value_errors: Standard deviations of the initial values' errors, ``(..., S, C)``;
-            ``None`` where the values are taken as true. With errors, every simulation starts from
-            a draw of its own.
-        initial_rate_errors: Those of the initial rates.
+            ``None`` if the values are assumed to be exact. With errors, every simulation starts
+            from a different draw.
+        initial_rate_errors: Standard deviations of the initial rates' errors.
     """
 
     actions: Tensor
@@ -64,7 +64,7 @@ class Inputs:
     initial_rate_errors: Tensor | None = None
 
     def __post_init__(self) -> None:
-        """Checks that the shapes fit each other."""
+        """Checks that the shapes match."""
         segments, steps, num_actions = self.actions.shape[-3:]
         expected = {
             "mask": ((segments, steps), self.mask.shape),
@@ -99,7 +99,7 @@ class Inputs:
         time_step: float,
         history: int = 0,
     ) -> "Inputs":
-        """Returns one segment that starts in a known state, e.g. for an experiment to simulate.
+        """Returns one segment with a known initial state, e.g. to simulate an experiment.
 
         Args:
             actions: Commands, ``(K, A)``.
@@ -107,7 +107,7 @@ class Inputs:
             action_names: Names of the actions.
             state_names: Names of the state's components.
             time_step: Seconds between actions.
-            history: Steps of zero commands to assume before the start.
+            history: Number of steps with zero commands before the start.
         """
         actions = torch.atleast_2d(actions)
         state = torch.as_tensor(initial_state, dtype=actions.dtype).expand(1, -1)
@@ -136,19 +136,19 @@ class Inputs:
 
     @property
     def batch_shape(self) -> torch.Size:
-        """Leading dimensions, empty unless devices were given different inputs."""
+        """Leading dimensions; empty unless devices have different inputs."""
         return self.actions.shape[:-3]
 
     @property
     def is_start_uncertain(self) -> bool:
-        """Whether simulations start from draws of their own."""
+        """Whether every simulation draws its own initial states."""
         return self.initial_value_errors is not None
 
     def with_drawn_start(self, batch_shape: torch.Size) -> "Inputs":
-        """Returns the inputs with starts drawn for every element of a batch.
+        """Returns the inputs with initial states drawn for every element of a batch.
 
         Args:
-            batch_shape: Shape of the batch; the inputs' own broadcasts to it.
+            batch_shape: Shape of the batch, to which the inputs' own batch shape broadcasts.
         """
         if self.initial_value_errors is None:
             return self
@@ -172,7 +172,7 @@ class Inputs:
     def to(
         self, *, dtype: torch.dtype | None = None, device: str | torch.device | None = None
     ) -> "Inputs":
-        """Returns the inputs with tensors on ``device`` and floating ones as ``dtype``."""
+        """Returns the inputs with tensors on ``device``; floating-point ones get ``dtype``."""
         changed = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -201,7 +201,7 @@ class Inputs:
         )
 
     def element(self, index: int) -> "Inputs":
-        """Returns the inputs of one element of the (flattened) batch; all share unbatched ones."""
+        """Returns the inputs of one element of the (flattened) batch; unbatched ones unchanged."""
         if not self.batch_shape:
             return self
         depth = len(self.batch_shape)
@@ -218,6 +218,6 @@ class Inputs:
         )
 
     def _starts(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
-        """Returns what is known of the segments' starts, changed, without what is ``None``."""
+        """Applies a function to the fields of initial states that are not ``None``."""
         values = {name: getattr(self, name) for name in _STARTS}
         return {name: change(value) for name, value in values.items() if value is not None}

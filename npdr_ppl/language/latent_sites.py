@@ -32,8 +32,8 @@ class LatentSite:
         batch_shape: Shape of its plates.
         shape: Shape of one value, plates included.
         coordinate_shape: Shape of its reference coordinates, plates included.
-        coordinates: Its place in the vector z.
-        dtype: Precision in which the program samples it.
+        coordinates: Its slice of the vector z.
+        dtype: Floating-point type in which the program samples it.
         plates: Its plates as (name, size, dimension), outermost first.
     """
 
@@ -47,10 +47,10 @@ class LatentSite:
 
 
 class Batch(Messenger):
-    """A plate left of the model's own: all points in one run.
+    """A plate to the left of the model's plates, which evaluates all points in one run.
 
-    ``pyro.plate`` itself would compete with plates of a caller's program, such as Predictive's,
-    for the same dimension.
+    ``pyro.plate`` itself would use the same dimension as plates of a caller's program, such as
+    Predictive's.
     """
 
     def __init__(self, max_plate_nesting: int, size: int) -> None:
@@ -64,7 +64,7 @@ class Batch(Messenger):
 
 
 class WriteCoordinates(Messenger):
-    """Gives each latent site the value that its coordinates stand for."""
+    """Sets each latent site to the value for its coordinates."""
 
     def __init__(self, sites: Sequence[LatentSite], z: Tensor) -> None:
         super().__init__()
@@ -85,7 +85,7 @@ class WriteCoordinates(Messenger):
 
 
 class ReadCoordinates(Messenger):
-    """Reads the coordinates of each latent site off its value."""
+    """Computes the coordinates of each latent site from its value."""
 
     def __init__(self, sites: Sequence[LatentSite]) -> None:
         super().__init__()
@@ -99,9 +99,9 @@ class ReadCoordinates(Messenger):
 
 
 class CheckSupport(Messenger):
-    """Gives each latent site a value if that lies on its support, and its median elsewhere.
+    """Sets each latent site to its value if that is on its support, else to its median.
 
-    Without the median, a site whose distribution depends on an impossible value could not be.
+    Without the median, an impossible value would give later sites an invalid distribution.
     """
 
     def __init__(self, values: Mapping[str, Tensor], num_points: int) -> None:
@@ -124,7 +124,7 @@ class CheckSupport(Messenger):
 
 
 def per_point(log_prob: Tensor, num_points: int) -> Tensor:
-    """Sums a log density over all dimensions but the batch's."""
+    """Sums a log density over all dimensions except the batch dimension."""
     if log_prob.dim() == 0:
         return log_prob.expand(num_points)
     return log_prob.flatten(1).sum(-1) if log_prob.dim() > 1 else log_prob

@@ -1,4 +1,4 @@
-"""Equations of motion that are linear in base parameters: what linear regression needs.
+"""Equations of motion that are linear in base parameters, for linear regression.
 
 The inverse dynamics of a rigid mechanism are linear in *base parameters* β, combinations of its
 physical parameters (masses, lengths, dampings):
@@ -44,9 +44,9 @@ class Motion:
 
     Attributes:
         positions: Generalised positions, one tensor per joint.
-        velocities: Their rates.
-        accelerations: Their second rates.
-        actions: Commands in force at each instant, one tensor per action channel.
+        velocities: Their first derivatives.
+        accelerations: Their second derivatives.
+        actions: Commands at each instant, one tensor per action channel.
     """
 
     positions: tuple[Tensor, ...]
@@ -56,18 +56,18 @@ class Motion:
 
 
 class InverseDynamics(ABC):
-    """Y(q, q̇, q̈, u) β = t, and how β and the physical parameters follow from each other.
+    """Y(q, q̇, q̈, u) β = t, and the maps between β and the physical parameters.
 
-    Neither Y nor t may depend on a parameter: one that scales or shifts them, such as a motor's
-    gain, belongs into β.
+    Neither Y nor t may depend on a parameter. A parameter that scales or shifts them, such as a
+    motor's gain, must be a part of β.
 
     Attributes:
         base: The base parameters β, in the order of Y's columns.
-        determined: Physical parameters that follow from β once all others are given. Those others
-            (a motor's constants, gravity) may appear in β, but no measurement of the motion can
-            tell them.
-        positive: Physical parameters that must be greater than zero to mean anything.
-        non_negative: Those that must not be less than zero.
+        determined: Physical parameters that follow from β if all others are given. The others
+            (a motor's constants, gravity) may appear in β, but measurements of the motion cannot
+            determine them.
+        positive: Physical parameters that must be greater than zero.
+        non_negative: Physical parameters that must not be less than zero.
     """
 
     base: tuple[BaseParameter, ...]
@@ -85,7 +85,7 @@ class InverseDynamics(ABC):
 
     @abstractmethod
     def to_base(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Maps physical parameters, all of a shape B, to base parameters, ``B + (k,)``."""
+        """Maps physical parameters, all of shape B, to base parameters, ``B + (k,)``."""
 
     @abstractmethod
     def to_physical(self, base: Tensor, given: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -93,21 +93,21 @@ class InverseDynamics(ABC):
 
         Args:
             base: Base parameters, ``B + (k,)``, of any value.
-            given: Physical parameters of the shape B; those determined are not looked at.
+            given: Physical parameters of shape B; the determined ones are ignored.
 
         Returns:
             The determined parameters, which may be implausible: negative, infinite or NaN.
         """
 
     def force_scale(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Returns by how much a row changes per unit of generalised force at its joint, shape B.
+        """Returns the change of a row per unit of generalised force at its joint, shape B.
 
-        One where t is a force or torque; 1/(gain) where t is a command.
+        It is one if t is a force or torque, and 1/(gain) if t is a command.
         """
         return torch.ones_like(next(iter(parameters.values())))
 
     def is_physical(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Returns which parameter sets, of shape B, can exist: a mask of shape B."""
+        """Returns a mask of shape B: which parameter sets are physically possible."""
         possible = torch.stack([parameters[name].isfinite() for name in self.determined]).all(0)
         for name in self.positive:
             possible = possible & (parameters[name] > 0.0)

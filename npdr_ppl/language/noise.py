@@ -1,4 +1,4 @@
-"""Noise of the readings, which gives a deterministic simulator a density."""
+"""Measurement noise, which gives a deterministic simulator a density."""
 
 from collections.abc import Callable, Mapping
 
@@ -12,12 +12,12 @@ from npdr_ppl.errors import ModelError
 __all__ = ["Noise", "noise_batch_shape", "reading_distribution"]
 
 Noise = float | Tensor | Mapping[str, float | Tensor] | Callable[[Tensor], TorchDistribution]
-"""Noise of readings: one standard deviation for all channels (a number, or a tensor of the batch
-shape), one per channel by name, or a function from noise-free readings to their distribution."""
+"""Measurement noise: one standard deviation for all channels (a number, or a tensor of the batch
+shape), one per channel by name, or a function from noise-free measurements to a distribution."""
 
 
 def noise_batch_shape(noise: Noise | None) -> torch.Size:
-    """Returns the batch shape that the noise's own parameters bring along."""
+    """Returns the batch shape of the noise's own parameters."""
     if isinstance(noise, Tensor):
         return noise.shape
     if isinstance(noise, Mapping):
@@ -29,22 +29,22 @@ def noise_batch_shape(noise: Noise | None) -> torch.Size:
 def reading_distribution(
     noise: Noise, readings: Tensor, event_dim: int, channel_names: tuple[str, ...] | None
 ) -> TorchDistribution:
-    """Returns the distribution of noisy readings, independent over the event.
+    """Returns the distribution of noisy measurements, independent over the event dimensions.
 
     Args:
-        noise: What :data:`Noise` says.
-        readings: Noise-free readings, batch shape plus ``event_dim`` dimensions, the last one
-            being the channels.
+        noise: See :data:`Noise`.
+        readings: Noise-free measurements, batch shape plus ``event_dim`` dimensions; the last one
+            is the channels.
         event_dim: Number of event dimensions.
         channel_names: Names of the channels, ``None`` for a plain function's output.
 
     Raises:
-        ModelError: The noise names other channels than the readings have.
+        ModelError: The noise names other channels than the measurements have.
     """
     if isinstance(noise, Mapping):
         if channel_names is None or set(noise) != set(channel_names):
             raise ModelError(
-                f"noise names the channels {', '.join(sorted(noise))}, but the readings are "
+                f"noise names the channels {', '.join(sorted(noise))}, but the measurements are "
                 f"{', '.join(channel_names or ('unnamed',))}."
             )
         columns = [torch.as_tensor(noise[name]).to(readings) for name in channel_names]

@@ -1,9 +1,9 @@
 """The prior of a whole program, in reference coordinates.
 
-Site by site, in the order in which the program samples them, each latent site is written as a
-function of standard normal coordinates and of the sites before it (see
-:mod:`npdr_ppl.language.reference`). The joint prior of any program, dependent and hierarchical
-ones included, thereby becomes N(0, I), and every point maps to a plausible parameter.
+In the order in which the program samples them, each latent site is written as a function of
+standard normal coordinates and of the sites before it (see :mod:`npdr_ppl.language.reference`).
+The joint prior of any program, even a dependent or hierarchical one, thereby becomes N(0, I), and
+every point maps to a plausible parameter.
 """
 
 import math
@@ -46,15 +46,15 @@ class Prior:
 
     Attributes:
         sites: The latent sites, in the order of sampling.
-        black_boxes: The black-box sites by name, as one run of the program made them.
-        distributions: The latent sites' distributions by name, as one run made them.
+        black_boxes: The black-box sites by name, from one run of the program.
+        distributions: The latent sites' distributions by name, from one run of the program.
         num_parameters: Dimension d of the reference coordinates.
         is_standard_normal: Whether the prior over z is exactly N(0, I).
         max_plate_nesting: Depth of the model's plates.
 
     Raises:
-        ModelError: A latent site is discrete, there is none, a site does not fit its plates, or an
-            ordinary site is observed whose density depends on latent sites.
+        ModelError: There is no latent site, one is discrete, a site does not fit its plates, or
+            the density of an observed ordinary site depends on latent sites.
     """
 
     def __init__(self, model: Callable[..., Any], args: tuple[Any, ...] = ()) -> None:
@@ -114,7 +114,7 @@ class Prior:
         return tuple(sites)
 
     def _check_plates(self, prototype: Any) -> None:
-        """Refuses sites with more dimensions than the plates around them."""
+        """Rejects sites with more dimensions than the plates around them."""
         for site in self.sites:
             loose = len(site.batch_shape) - self.max_plate_nesting
             if loose > 0:
@@ -132,7 +132,7 @@ class Prior:
                 )
 
     def _check_observed_sites(self, prototype: Any) -> None:
-        """Refuses ordinary likelihoods, which no likelihood-free backend would see."""
+        """Rejects ordinary likelihoods, which likelihood-free backends would ignore."""
         ordinary = [
             name
             for name, site in sample_sites(prototype)
@@ -234,8 +234,8 @@ class Prior:
     def black_boxes_at(self, z: Tensor) -> dict[str, BlackBox]:
         """Returns the black-box sites as the program makes them at n points, ``(n, d)``.
 
-        Their parameters have the shape ``(n,) + plates``, or fewer dimensions where the program
-        gives the same to all. Nothing is simulated.
+        Their parameters have the shape ``(n,) + plates``, or fewer dimensions if the program
+        uses one value for all points. Nothing is simulated.
         """
         trace = self._run(WriteCoordinates(self.sites, z))
         return {name: trace.nodes[name]["fn"] for name in self.black_boxes}
@@ -258,7 +258,7 @@ class Prior:
         result = {}
         for name in self.black_boxes:
             value = trace.nodes[name]["value"]
-            # Dimensions of plates that do not enclose this site stand behind the batch.
+            # Plates that do not enclose this site have their dimensions after the batch.
             skipped = self.max_plate_nesting - _depth(trace, name)
             if any(size != 1 for size in value.shape[1 : 1 + skipped]):
                 size = max(value.shape[1 : 1 + skipped])
@@ -276,13 +276,13 @@ class Prior:
         }
 
     def pointwise_log_prob(self, name: str, value: Tensor, z: Tensor) -> Tensor:
-        """Returns the density of every reading at a black-box site, ``(n,) + value.shape``.
+        """Returns the density of every measurement at a black-box site, ``(n,) + value.shape``.
 
-        It is differentiable in z where the simulator is.
+        It is differentiable in z if the simulator is differentiable.
 
         Args:
             name: The site.
-            value: What was observed there.
+            value: Observation at the site.
             z: Points, ``(n, d)``.
 
         Raises:
@@ -293,7 +293,7 @@ class Prior:
         return log_prob.reshape((len(z), *value.shape))
 
     def _run(self, writer: WriteCoordinates) -> Any:
-        """Runs the program at all of a writer's points at once, without simulating."""
+        """Runs the program at all points of a writer at once, without simulating."""
         with alone(), SkipSimulation(), writer, Batch(self.max_plate_nesting, writer.num_points):
             return traced(self.model, self.args)
 
@@ -306,6 +306,6 @@ class Prior:
 
 
 def _depth(trace: Any, name: str) -> int:
-    """Returns how many dimensions the program's own plates around a site take."""
+    """Returns the number of dimensions of the program's own plates around a site."""
     frames = trace.nodes[name]["cond_indep_stack"]
     return max((-frame.dim for frame in frames if frame.name != BATCH_PLATE), default=0)

@@ -1,4 +1,4 @@
-"""Runs of a program that nothing outside notices."""
+"""Runs of a program that are invisible to outer handlers."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -14,22 +14,22 @@ from npdr_ppl.errors import ModelError, NpdrError
 __all__ = ["BATCH_PLATE", "alone", "sample_sites", "traced"]
 
 BATCH_PLATE = "_npdr_batch"
-"""Name of the plate left of a program's own, in which all points are run at once."""
+"""Name of the plate to the left of a program's plates; it evaluates all points in one run."""
 
 ALL_POINTS = (
     "A program runs at many points at once, whose dimension comes first: index from the right, a "
     "vector's component as mass[..., 0], a member of a plate as mass[..., :1]."
 )
-"""What to do about a program that takes the dimension of the points for one of its own."""
+"""Advice for a program that uses the dimension of the points as one of its own."""
 
 
 @contextmanager
 def alone() -> Iterator[None]:
-    """Keeps a run of the program to itself: outside handlers do not see it.
+    """Hides a run of the program from outer handlers and switches off validation.
 
-    Values are not validated: those off a support are asked about on purpose, and a simulation that
-    gave NaN costs only itself. Pyro's own switch would not do, because other libraries change
-    torch's default behind its back.
+    Values are not validated, because some are deliberately off their support, and a NaN from one
+    simulation must not affect the others. Pyro's own switch is not enough, because other libraries
+    change torch's default without Pyro's knowledge.
     """
     is_validating = Distribution._validate_args
     Distribution.set_default_validate_args(False)
@@ -41,7 +41,7 @@ def alone() -> Iterator[None]:
 
 
 def traced(model: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-    """Traces a run of the program; our own errors come out without Pyro's table of shapes.
+    """Traces a run of the program; our own errors are raised without Pyro's table of shapes.
 
     Raises:
         ModelError: A site does not fit its plates, or plates do not fit each other.
@@ -66,7 +66,7 @@ def _innermost(error: NpdrError) -> NpdrError:
 
 
 def _about_plates(message: str) -> str | None:
-    """Returns what Pyro says of plates as a sentence; ``None`` for what is not about plates."""
+    """Returns Pyro's message about plates as a sentence; ``None`` for other messages."""
     found = re.match(
         r"Shape mismatch inside plate\('(.*?)'\) at site (\S+) dim (-\d+), (\d+) vs (\d+)", message
     )
@@ -89,7 +89,7 @@ def _about_plates(message: str) -> str | None:
 
 
 def sample_sites(trace: Any) -> list[tuple[str, Any]]:
-    """Returns name and message of every sample site of a trace, without those of subsampling."""
+    """Returns name and message of every sample site of a trace, except subsampling sites."""
     return [
         (name, site)
         for name, site in trace.nodes.items()

@@ -1,9 +1,9 @@
 r"""Reference coordinates of one distribution: a real vector z in which the prior is N(0, I).
 
 For a scalar ξ with distribution function F,  z = Φ⁻¹(F(ξ)),  ξ = F⁻¹(Φ(z)).  Transformed and
-multivariate normal distributions use their own construction from normals instead. A distribution
-without either is mapped to its unconstrained space and standardised there; its prior in z is then
-whatever it is, and :attr:`ReferenceMap.is_standard_normal` says so.
+multivariate normal distributions use their own construction from normals instead. Any other
+distribution is mapped to its unconstrained space. Its prior in z is then not N(0, I), and
+:attr:`ReferenceMap.is_standard_normal` is false.
 """
 
 import math
@@ -19,9 +19,9 @@ from torch.distributions.transforms import ComposeTransform
 
 __all__ = ["ReferenceMap", "reference_map"]
 
-# Φ(±8.2) is the last value that float64 tells from 0 and 1.
+# Φ(±8.2) are the last values that float64 distinguishes from 0 and 1.
 _MAX_Z = 8.2
-# Torch has no quantile function for these, scipy has.
+# Torch has no quantile function for these distributions, but scipy has.
 _SCIPY_QUANTILES = (distributions.Gamma, distributions.Beta)
 
 
@@ -29,8 +29,8 @@ class ReferenceMap(ABC):
     """Bijection between reference coordinates and the support of one distribution.
 
     Attributes:
-        event_shape: Shape of z for one draw, which differs from the draw's own shape where the
-            support is curved, e.g. a simplex.
+        event_shape: Shape of z for one draw. It differs from the draw's own shape if the support
+            is curved, e.g. a simplex.
         is_standard_normal: Whether z is N(0, I) under the distribution.
     """
 
@@ -135,7 +135,7 @@ class _Independent(ReferenceMap):
 
 
 class _Unconstrained(ReferenceMap):
-    """z = biject_to(support)⁻¹(ξ): no standard normal, but real."""
+    """z = biject_to(support)⁻¹(ξ): real, but not standard normal."""
 
     is_standard_normal = False
 
@@ -143,7 +143,7 @@ class _Unconstrained(ReferenceMap):
         self.distribution = distribution
         support = distribution.support
         if isinstance(distribution, distributions.VonMises):
-            # Torch calls the real line its support; its density is one per turn.
+            # Torch gives the real line as its support, but the density integrates to 1 per turn.
             support = constraints.interval(-math.pi, math.pi)
         self.transform = biject_to(support)
         shape = self.transform.inverse_shape(distribution.batch_shape + distribution.event_shape)
@@ -173,7 +173,7 @@ def reference_map(distribution: distributions.Distribution) -> ReferenceMap:
         return _Independent(base, inner)
     if isinstance(distribution, distributions.TransformedDistribution):
         transform = ComposeTransform(distribution.transforms)
-        # A half-normal folds its base over, which cannot be undone; it has quantiles instead.
+        # A half-normal takes the absolute value, which has no inverse; it uses quantiles.
         if transform.bijective:
             return _Transformed(distribution, transform)
     if isinstance(distribution, distributions.Normal):
@@ -186,7 +186,7 @@ def reference_map(distribution: distributions.Distribution) -> ReferenceMap:
 
 
 def _own_dtype(distribution: Any) -> torch.dtype:
-    """Returns the precision in which a distribution samples by itself."""
+    """Returns the floating-point type in which a distribution samples."""
     while not distribution.arg_constraints and hasattr(distribution, "base_dist"):
         distribution = distribution.base_dist
     values = [getattr(distribution, name) for name in distribution.arg_constraints]

@@ -17,29 +17,29 @@ from npdr_ppl.language.linear_dynamics import InverseDynamics
 __all__ = ["Simulator"]
 
 MAX_STEP_RATIO = 200.0
-"""A recording's time step over the simulator's own beyond which its time cannot be in seconds:
-milliseconds are off by 1000, and by 250 where the recording is four times as dense."""
+"""Largest ratio of a recording's time step to the simulator's. Above it, time cannot be in s:
+milliseconds give a ratio of 1000, or 250 if the recording is four times as dense."""
 
 
 class Simulator(ABC):
-    """Maps domain parameters and inputs to the readings of a trajectory, in batches.
+    """Maps domain parameters and inputs to the measurements of a trajectory, in batches.
 
-    Only :meth:`simulate` is required; everything else is declaration. Simulators are immutable:
+    A subclass declares the attributes and implements :meth:`simulate`. Simulators are immutable:
     :meth:`with_effects` returns a changed copy.
 
     Attributes:
         states: The state's components.
         actions: The action channels.
-        sensors: The channels of a trajectory, what the sensors report.
+        sensors: The channels of a trajectory, which the sensors measure.
         parameters: Domain parameters with nominal values; a parameter that a model does not
             sample keeps its nominal value.
-        ports: Where effects attach; see :attr:`all_ports` for those that need no declaration.
+        ports: Places where effects attach; :attr:`all_ports` also has those without declaration.
         time_step: Seconds per step.
         is_deterministic: Whether equal parameters and inputs give equal trajectories.
         is_differentiable: Whether gradients flow from trajectories to parameters.
         effects: The effects attached, in the order of attachment.
-        inverse_dynamics: The equations of motion in the form that linear regression needs, where
-            they have been declared.
+        inverse_dynamics: The equations of motion in the form for linear regression; ``None`` if
+            not declared.
     """
 
     states: tuple[Channel, ...]
@@ -64,8 +64,8 @@ class Simulator(ABC):
             inputs: Segments to simulate.
 
         Returns:
-            Readings *after* each step, shape ``B + (segments, steps, sensors)``, in the sensors'
-            units; zero where ``inputs.mask`` is false.
+            Measurements *after* each step, shape ``B + (segments, steps, sensors)``, in the
+            sensors' units; zero where ``inputs.mask`` is false.
         """
 
     @property
@@ -101,11 +101,11 @@ class Simulator(ABC):
 
     @property
     def rate_lag(self) -> float:
-        """Part of a time step between the state's rates and the derivatives of its positions."""
+        """Time between the state's rates and the derivatives of its positions, in time steps."""
         return 0.0
 
     def with_finer_steps(self) -> Self | None:
-        """Returns a copy whose integration errs less; ``None`` where there is none to offer."""
+        """Returns a copy with a smaller integration error; ``None`` if the engine has none."""
         return None
 
     @property
@@ -115,7 +115,7 @@ class Simulator(ABC):
 
     @property
     def all_ports(self) -> tuple[Port, ...]:
-        """The declared ports, the clock, and every domain parameter that is no port's namesake."""
+        """The declared ports, the clock, and every domain parameter whose name is not a port's."""
         implied = (
             Port("clock", "clock", "s", rated=1.0),
             *(
@@ -142,7 +142,7 @@ class Simulator(ABC):
             )
 
     def check_inputs(self, inputs: Inputs) -> None:
-        """Raises a DataError where the inputs' channels or time step do not fit."""
+        """Raises a DataError if the inputs' channels or time step do not fit."""
         missing = [a.name for a in self.actions if a.name not in inputs.action_names]
         if missing:
             raise DataError(
@@ -158,12 +158,12 @@ class Simulator(ABC):
     def initial_states(self, inputs: Inputs) -> tuple[Tensor, ...]:
         """Returns each state component at the start of each segment, ``(..., S)`` each.
 
-        A rate whose position is measured is taken from the estimated derivative of the position
-        readings where the inputs carry one, otherwise from its own reading. At a rollout's first
-        sample the derivative sees one side only, and what was read of the rate is better.
+        A rate whose position is measured comes from the estimated derivative of the position if
+        the inputs have one, otherwise from its own measurement. At a rollout's first sample the
+        derivative uses later samples only, so a measured rate is more accurate and preferred.
 
         Raises:
-            DataError: A component was neither recorded nor can be estimated.
+            DataError: A component was not recorded and cannot be estimated.
         """
         columns = {name: i for i, name in enumerate(inputs.channel_names)}
         result = []
@@ -179,7 +179,7 @@ class Simulator(ABC):
             else:
                 raise DataError(
                     f"{state.name} was not recorded, so the state at a segment's start is "
-                    "unknown; use initial_state='estimated' with readings of "
+                    "unknown; use initial_state='estimated' with measurements of "
                     f"{state.rate_of or state.name}."
                 )
         return tuple(result)
@@ -187,7 +187,7 @@ class Simulator(ABC):
     def recorded_settings(self) -> dict[str, Any]:
         """Returns settings of the engine that are a part of the model, for reports.
 
-        Empty by default; values have to be what JSON can hold.
+        Empty by default; values must be JSON types.
         """
         return {}
 
@@ -201,7 +201,7 @@ class Simulator(ABC):
     def complete(
         self, parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
     ) -> dict[str, Tensor]:
-        """Returns all parameters, missing ones nominal and effects' included.
+        """Returns all parameters including those of effects; missing ones are nominal.
 
         Args:
             parameters: Some of the parameters, tensors or numbers.
@@ -218,11 +218,11 @@ class Simulator(ABC):
         }
 
     def changed(self, parameters: Mapping[str, Tensor], time: Tensor) -> dict[str, Tensor]:
-        """Returns all parameters, the domain's as parameter effects change them.
+        """Returns all parameters after parameter effects have changed the domain parameters.
 
         Args:
-            parameters: What :meth:`complete` returned.
-            time: Seconds from the rollout's beginning to each segment's middle.
+            parameters: Result of :meth:`complete`.
+            time: Seconds from the start of the rollout to the middle of each segment.
         """
         result = dict(parameters)
         for effect in self.effects:

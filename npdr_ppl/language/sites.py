@@ -38,11 +38,11 @@ def simulate(
         simulator: A :class:`~npdr_ppl.language.simulator.Simulator`, or a plain function. A
             function is called with the parameters as keywords, each with one leading batch
             dimension, and returns a tensor ``(batch, ...)``.
-        parameters: Domain parameters by name, each of the batch shape (a plain function's may
-            have event dimensions behind it).
+        parameters: Domain parameters by name, each of the batch shape (those of a plain function
+            may have event dimensions after it).
         inputs: Segments to simulate; a plain function takes none.
-        noise: Noise of the readings. It is added to samples, and gives the site a density where
-            the simulator is deterministic.
+        noise: Measurement noise. It is added to samples, and gives the site a density if the
+            simulator is deterministic.
 
     Returns:
         The trajectory, batch shape plus ``(segments, steps, sensors)``, or the function's output.
@@ -89,13 +89,13 @@ class SiteLikelihood(Protocol):
 
 
 class BlackBox(TorchDistribution):
-    """Distribution of a simulator's output: it can be sampled, its density may be unknown.
+    """Distribution of a simulator's output; it can be sampled, but its density may be unknown.
 
     Attributes:
         site: Name of the sample site.
         parameters: Domain parameters by name.
-        noise: Noise of the readings, ``None`` if the simulator's output is the observation.
-        likelihood: A learnt density that takes the place of the site's own, ``None`` for none.
+        noise: Measurement noise, ``None`` if the simulator's output is the observation.
+        likelihood: A learnt density that replaces the site's own, ``None`` for none.
     """
 
     parameters: Mapping[str, Tensor]
@@ -133,7 +133,7 @@ class BlackBox(TorchDistribution):
         return None
 
     def _mask(self) -> Tensor | None:
-        """Returns a mask over the event, ``None`` if all of it counts."""
+        """Returns a mask over the event, ``None`` if all of the event is valid."""
         return None
 
     @property
@@ -150,7 +150,7 @@ class BlackBox(TorchDistribution):
         return expanded
 
     def with_noise(self, noise: Noise | None) -> "BlackBox":
-        """Returns the same site with another noise of the readings, ``None`` for none."""
+        """Returns the same site with another measurement noise, ``None`` for none."""
         changed = self.expand(torch.broadcast_shapes(self.batch_shape, noise_batch_shape(noise)))
         changed.noise = noise
         return changed
@@ -162,7 +162,7 @@ class BlackBox(TorchDistribution):
         return changed
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        """Simulates the whole batch, and adds the noise where there is one."""
+        """Simulates the whole batch, and adds the noise if one is declared."""
         with torch.no_grad():
             shape = torch.Size(sample_shape) + self.batch_shape
             output = self._run(shape)
@@ -177,10 +177,10 @@ class BlackBox(TorchDistribution):
             return output
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Returns the learnt density, or that of noisy readings where the simulator has one.
+        """Returns the learnt density, or else the density of noisy measurements.
 
         Raises:
-            IntractableError: None was learnt, and no noise was declared or the simulator is
+            IntractableError: No density was learnt, and no noise was declared or the simulator is
                 itself random.
         """
         if self.likelihood is not None:
@@ -189,7 +189,7 @@ class BlackBox(TorchDistribution):
         return pointwise.flatten(-event_dim).sum(-1) if event_dim else pointwise
 
     def pointwise_log_prob(self, value: Tensor) -> tuple[Tensor, int]:
-        """Returns the density of every reading and the number of event dimensions.
+        """Returns the density of every measurement and the number of event dimensions.
 
         Raises:
             IntractableError: As :meth:`log_prob`.
@@ -198,7 +198,7 @@ class BlackBox(TorchDistribution):
             raise IntractableError(
                 f"The density of site {self.site!r} is intractable, because its simulator is a "
                 "black box that can only be sampled; use a likelihood-free backend "
-                "(npdr.infer), declare the readings' noise with simulate(..., noise=...), or "
+                "(npdr.infer), declare measurement noise with simulate(..., noise=...), or "
                 "give it a learnt density (npdr.with_likelihood)."
             )
         if not self._is_deterministic:
@@ -297,7 +297,7 @@ class SimulatorBlackBox(BlackBox):
         device = self.inputs.actions.device
         parameters = {name: value.to(device) for name, value in self.parameters.items()}
         if not self.simulator.is_deterministic:
-            # Every element of the batch deserves its own randomness.
+            # Every element of the batch needs independent random numbers.
             parameters = {name: value.expand(batch_shape) for name, value in parameters.items()}
         inputs = self.inputs.with_drawn_start(batch_shape)
         output = self.simulator.simulate(parameters, inputs)
@@ -323,8 +323,8 @@ class FunctionBlackBox(BlackBox):
     ) -> None:
         self.function = function
         self.parameters = {name: torch.as_tensor(value) for name, value in parameters.items()}
-        # A parameter's leading dimensions are the plates around the statement; what is left over
-        # is the parameter's own shape.
+        # A parameter's leading dimensions are the plates around the statement; the other
+        # dimensions are the parameter's own shape.
         self._event_dims = {
             name: max(0, value.dim() - plate_depth) for name, value in self.parameters.items()
         }
@@ -346,7 +346,7 @@ class FunctionBlackBox(BlackBox):
 
     @property
     def is_differentiable(self) -> bool:
-        """Whether the declared noise gives a density with gradients; a function is tried out."""
+        """Whether the declared noise gives a density with gradients, found by one test call."""
         arguments = {
             name: value.detach().double().requires_grad_()
             for name, value in self.parameters.items()
@@ -356,12 +356,12 @@ class FunctionBlackBox(BlackBox):
         try:
             with torch.random.fork_rng(devices=[]), torch.enable_grad():
                 return bool(probe._run(self.batch_shape).requires_grad)
-        except RuntimeError:  # what leaves torch, for NumPy say, refuses tensors with gradients
+        except RuntimeError:  # e.g. NumPy does not accept tensors with gradients
             return False
 
     @property
     def _is_deterministic(self) -> bool:
-        # With declared noise the function is taken to be the noise-free part.
+        # With declared noise, the function is assumed to be noise-free.
         return self.noise is not None
 
     def _run(self, batch_shape: torch.Size) -> Tensor:

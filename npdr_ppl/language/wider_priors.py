@@ -1,4 +1,4 @@
-"""An effect handler that widens the priors of some sites, to ask whether they are too narrow."""
+"""An effect handler that widens the priors of some sites, to test whether they are too narrow."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,11 +14,11 @@ __all__ = ["ModelWithWiderPriors", "described_prior", "widened", "with_wider_pri
 Model = Callable[..., Any]
 
 TIMES = 3.0
-"""By how much scales are multiplied, and how many times its own width a range is given."""
+"""Factor by which scales of distributions and widths of ranges are multiplied."""
 
 LEAST_SHARE = 0.1
-"""A range that lies on one side of zero is widened towards zero down to this share of its end:
-masses and lengths of zero cannot be simulated."""
+"""A range on one side of zero is widened towards zero only down to this fraction of its end,
+because masses and lengths of zero cannot be simulated."""
 
 
 class WiderPriorsMessenger(Messenger):
@@ -60,21 +60,21 @@ class ModelWithWiderPriors:
 def with_wider_priors(model: Model, names: Sequence[str]) -> Model:
     """Returns the model with wider priors of some sites.
 
-    A range grows by its own width at both ends but stays on its side of zero; a normal,
+    A range grows by its own width at both ends but stays on its side of zero. A normal,
     half-normal or log-normal distribution gets three times the scale.
 
     Args:
         model: A Pyro model.
-        names: Its latent sites; those with other kinds of priors keep them.
+        names: Latent sites to widen; sites with other kinds of priors keep them.
     """
     return ModelWithWiderPriors(model, names)
 
 
 def widened(prior: Any) -> Any | None:
-    """Returns a wider prior of the same family, ``None`` for families that have no width.
+    """Returns a wider prior of the same family, ``None`` for other families.
 
     Args:
-        prior: A distribution of Pyro's.
+        prior: A Pyro distribution.
     """
     if isinstance(prior, ExpandedDistribution):
         base = widened(prior.base_dist)
@@ -94,7 +94,7 @@ def widened(prior: Any) -> Any | None:
 
 
 def described_prior(prior: Any) -> str:
-    """Returns a prior as a person would write it, e.g. ``Uniform(0.3, 1.7)``."""
+    """Returns a prior as readable text, e.g. ``Uniform(0.3, 1.7)``."""
     if isinstance(prior, ExpandedDistribution):
         return described_prior(prior.base_dist)
     name = type(prior).__name__

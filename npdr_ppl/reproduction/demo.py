@@ -1,9 +1,9 @@
-"""The demonstration: from a policy that fails on a rig to what the model lacked, and to success.
+"""The demonstration: a policy fails on a rig; discovery repairs the model; a new policy succeeds.
 
-A Furuta pendulum in MuJoCo, with MuJoCo's own dry friction of the arm and a filter of the rates
-that the paper's equations know nothing of, plays the device. A policy is trained on the prior and
-runs on it; the posterior is inferred and diagnosed; discovery finds that no parameters explain the
-rollout, and names what is missing; the revised model trains the policy again.
+The device is a Furuta pendulum in MuJoCo. It has MuJoCo's own dry friction of the arm and filtered
+velocities, which the paper's equations lack. A policy is trained on the prior and runs on the rig.
+The posterior is inferred and diagnosed. Discovery finds that no parameters explain the rollout,
+and names the missing effects. The policy is then trained again with the revised model.
 """
 
 import time
@@ -40,7 +40,7 @@ RIG = FurutaRig(
     arm_friction=1.2e-3,
     velocity_time_constant=0.008,
 )
-"""What the rig is in truth: off the nominal values by up to 10 %, and what the model lacks."""
+"""True parameters of the rig: up to 10 % from the nominal values, plus effects the model lacks."""
 
 DEMO_OPTIONS = LoopOptions(
     iterations=1,
@@ -52,23 +52,23 @@ DEMO_OPTIONS = LoopOptions(
     search_iterations=45,
     num_domains=30,
     num_initial_states=2,
-    # The story is of one policy before and one after; a check might ask for more of both.
+    # The demo has one policy before and one after; a check could request more of both.
     least_success=0.0,
     deploys="last",
     discovers="after diagnosis",
     discovery=DiscoveryOptions(max_effects=2, precision="float32"),
 )
-"""Enough for the story; a study takes more simulations, domains and iterations."""
+"""Settings for a short demo; a study needs more simulations, domains and iterations."""
 
 
 @dataclass(frozen=True)
 class Demonstration:
-    """What the demonstration came to.
+    """Result of the demonstration.
 
     Attributes:
         training: The run of the loop.
         target: The rig.
-        task: What the policy is to do.
+        task: The control task of the policy.
         result: The content of ``demo.json``.
     """
 
@@ -86,10 +86,10 @@ def run_demo(
     num_steps: int | None = None,
     progress: bool | Reporter | None = None,
 ) -> Demonstration:
-    """Tells the whole story in a folder, from a policy that fails to one that works.
+    """Runs the demonstration in a folder, from a policy that fails to one that works.
 
     Args:
-        out: Folder for the run, ``demo.json`` included; a run killed there continues.
+        out: Folder for the run and ``demo.json``; an interrupted run in it continues.
         seed: Seed of everything random.
         options: Options of the loop; ``DEMO_OPTIONS`` if ``None``.
         num_steps: Steps of an episode; the task's if ``None``.

@@ -1,8 +1,8 @@
-"""The clocks of ball and arm: motion capture and joint readings need not agree on the time.
+"""The clocks of ball and arm: time stamps of motion capture and joint sensors may differ.
 
-In the paper's recordings the ball moves 30 to 40 ms before the club is there in three strikes, and
-90 ms after it in the fourth. A single strike can make up for that with other parameters; strikes
-that are fitted together cannot, since each is off by its own time.
+In three strikes of the paper's recordings, the ball moves 30 to 40 ms before the club arrives, in
+the fourth 90 ms after. A fit to one strike can compensate for that with other parameters. A joint
+fit cannot, because the time offset differs between strikes.
 """
 
 from dataclasses import replace
@@ -20,20 +20,22 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["clocks_aligned"]
 
 MOVED = 0.005
-"""Metres from its place at which the ball has been struck: far above motion capture's noise."""
+"""Distance in m from its place at which the ball counts as struck: far above motion capture's
+noise."""
 
 
 def clocks_aligned(strikes: Rollouts) -> tuple[Rollouts, list[int]]:
-    """Shifts the ball's readings in time, so that it leaves its place when the club reaches it.
+    """Shifts the ball's measurements in time, so that it moves when the club reaches it.
 
-    When that is follows from the joints' readings and the ball's place, up to the ball's radius
-    over the club's speed, 10 ms. At the ends, where nothing was recorded, the ball lies still.
+    The time of the strike follows from the joint measurements and the ball's place, with an error
+    up to the ball's radius over the club's speed, 10 ms. Samples that are missing at the ends
+    after the shift repeat the first or last position.
 
     Args:
         strikes: Whole strikes.
 
     Returns:
-        The strikes, and by how many steps each ball was delayed.
+        The strikes, and the delay of each ball in steps.
 
     Raises:
         DataError: A ball is never struck, in the recording or in simulation.
@@ -60,5 +62,5 @@ def _departure(positions: Tensor) -> int:
     """Returns the step at which a ball at ``(T, 2)`` has left its place."""
     has_left = (positions - positions[0]).norm(dim=-1) > MOVED
     if not bool(has_left.any()):
-        raise DataError("The ball is never struck, so its clock cannot be told.")
+        raise DataError("The ball is never struck, so its clock cannot be determined.")
     return int(has_left.double().argmax())

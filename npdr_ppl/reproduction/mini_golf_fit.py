@@ -1,4 +1,4 @@
-"""One fit of a mini-golf model to strikes, as every row of Table 1 needs it."""
+"""Fits a mini-golf model to strikes, for the rows of Table 1."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,33 +35,34 @@ Model = Callable[..., Tensor]
 BALL = ("ball_x", "ball_y")
 
 EMBEDDING = "linear[ball_x,ball_y]~8"
-"""A trained linear layer over the ball's way. Means of eight readings carry what every second one
-does, which is what the paper takes, at a quarter of the size."""
+"""A trained linear layer over the ball's path. It gets means of eight samples, which carry the
+same information as every second sample (the paper's choice) at a quarter of the size."""
 
 NOISE = {sensor.name: 0.05 if sensor.name in BALL else 1e-9 for sensor in MiniGolf.sensors}
-"""Standard deviations of the readings in m and rad: what the best of the ten parameters leave
-unexplained. The recorded ball is off before any simulated one is touched, so that without noise
-the recording is unlike every simulation, and a network is asked about what it never saw."""
+"""Standard deviations of the measurement noise in m and rad: the residuals at the best values of
+the ten parameters. The recorded ball moves before any simulated one is struck. Without noise the
+recording would differ from all simulations, and the network would have to extrapolate."""
 
 OPTIONS = DataOptions(EMBEDDING, None, "recorded")
-"""Whole strikes, from the recorded place of the ball."""
+"""Whole strikes, from the recorded initial position of the ball."""
 
 
 NUM_DRAWS = 1_000
-"""Posterior draws among which the most likely is sought, less than one round's simulations."""
+"""Number of posterior draws among which the most likely is searched; less than the simulations of
+one round."""
 
 NUM_LIKELIEST = 20
-"""Draws whose mean says where the obstacles are: the likeliest one of a wide posterior is off by
-degrees by chance."""
+"""Number of draws whose mean gives the obstacles' angles: the single most likely draw of a wide
+posterior has a random error of degrees."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How much a fit may cost, and where it is kept.
+    """Simulation budget of a fit, and its folder.
 
     Attributes:
         rounds: Rounds of a sequential method.
-        num_simulations: Simulations of each round; other methods get all at once.
+        num_simulations: Simulations of each round; other methods get all in one round.
         seed: Seed of everything random.
         out: Folder for runs; an interrupted one continues from there.
         progress: Whether to show progress; ``None`` shows it on a terminal.
@@ -80,8 +81,8 @@ class Budget:
 
         Args:
             model: The Pyro model.
-            candidate: The backend with its embedding. A trained embedding is given noisy
-                readings; a statistic of differences would measure the noise instead.
+            candidate: The backend with its embedding. Only a trained embedding gets noisy
+                simulations; a statistic of differences would measure the noise instead.
             rollouts: The strikes.
             label: The method's label.
             name: Name of this fit.
@@ -116,10 +117,10 @@ def likeliest_draws(
 ) -> dict[str, Tensor]:
     """Returns the :data:`NUM_LIKELIEST` draws that make the strikes most likely, best first.
 
-    The simulator is deterministic, so that under the noise of :data:`NOISE` every draw that is
-    simulated once more has a likelihood, and no network has to be asked for it. The density of a
-    network over ten parameters is a poor judge of single draws: relative to the prior it is
-    greatest far out, at the edges of the parameters' ranges, where it has seen least.
+    The simulator is deterministic, so one simulation of a draw gives its likelihood under the
+    noise of :data:`NOISE`; no network is needed. A network's density over ten parameters is not
+    accurate for single draws: relative to the prior it is largest at the edges of the parameters'
+    ranges, where the network had the fewest training data.
 
     Args:
         posterior: The posterior.
@@ -131,7 +132,7 @@ def likeliest_draws(
     replayed = replay(model, rollouts, draws, OPTIONS)
     measured = rollouts.observation(replayed.inputs, channels=replayed.channel_names)
     scale = measured.new_tensor([NOISE[name] for name in replayed.channel_names])
-    # Replayed joints are the measured ones, whatever the draw.
+    # Replayed joints equal the measured ones for every draw.
     ball = [replayed.channel_names.index(name) for name in BALL]
     error = ((replayed.trajectory - measured) / scale)[..., ball].square()
     best = error.flatten(1).sum(-1).nan_to_num(torch.inf).argsort()[:NUM_LIKELIEST]

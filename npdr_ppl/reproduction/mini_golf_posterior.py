@@ -1,4 +1,4 @@
-"""What a posterior over the mini-golf course says: Figure 4's facts, and the obstacles' angles."""
+"""Results from a mini-golf posterior: the facts of Figure 4, and the obstacles' angles."""
 
 import math
 from typing import Any
@@ -24,10 +24,10 @@ def figure4_facts(posterior: PosteriorBase, *, seed: int = 0) -> dict[str, Any]:
         seed: Seed of the draws.
 
     Returns:
-        ``mass_spread``: standard deviation of the ball's mass relative to the prior's, 1 where
-        the strike says nothing of it; ``radius_restitution`` and ``<side>_x_y``: correlations;
-        ``<side>_turned_round``: share of the draws in which an obstacle is turned by more than a
-        right angle – a box that is turned by half a turn is the same box, so there are two modes.
+        ``mass_spread``: standard deviation of the ball's mass relative to the prior's, 1 if the
+        strike contains no information about it; ``radius_restitution`` and ``<side>_x_y``:
+        correlations; ``<side>_turned_round``: share of the draws in which an obstacle is rotated
+        by more than 90°. A box rotated by 180° is the same box, so there are two modes.
     """
     draws = {
         name: v.double().numpy() for name, v in posterior.sample(NUM_DRAWS, seed=seed).items()
@@ -44,14 +44,14 @@ def figure4_facts(posterior: PosteriorBase, *, seed: int = 0) -> dict[str, Any]:
 
 
 def obstacle_angles(parameters: dict[str, Tensor]) -> dict[str, dict[str, float]]:
-    """Returns both obstacles' angles beside those of motion capture, in degrees.
+    """Returns both obstacles' angles and those of motion capture, in degrees.
 
     Args:
         parameters: Values by site, e.g. the most likely ones, or several of each, ``(n,)``.
 
     Returns:
-        ``angle``, ``measured`` and ``error`` by side, the mean of several; a box is the same after
-        half a turn, so that it is the mean direction of axes (Mardia & Jupp 2000, §9.2).
+        ``angle``, ``measured`` and ``error`` by side. Several values are averaged; a box is the
+        same after half a turn, so this is the mean direction of axes (Mardia & Jupp 2000, §9.2).
     """
     result = {}
     for side, box, measured in zip(SIDES, OBSTACLES, MEASURED_OBSTACLES, strict=True):

@@ -1,14 +1,14 @@
 """Table 1 of Muratore et al. (2021): real strikes of a golf ball, replayed in simulation.
 
-Every method is fitted to each strike and judged on the same, as in the paper, by the most likely
-of its draws (see :func:`~npdr_ppl.reproduction.mini_golf_fit.most_likely_draw`); beside it, it is
-fitted to all strikes but one and judged on that one. The mean of the other strikes, taken as a
-prediction of the one left out, says how well the rig repeats itself: no simulator that is told
-the same inputs predicts a strike much better, however well it fits.
+Every method is fitted to each strike and evaluated on the same strike, as in the paper, by the
+most likely of its draws (see :func:`~npdr_ppl.reproduction.mini_golf_fit.most_likely_draw`). In
+addition, it is fitted to all strikes except one and evaluated on that one. The mean of the other
+strikes, used as a prediction of the one left out, measures the rig's repeatability: no simulator
+with the same inputs predicts a strike much better.
 
-``dtw`` is that of Table 2, which spends the whole recording. ``dtw_open`` spends the simulation
-instead and may leave out the recording's end; it is the smaller, and the one by which the rig's
-repeatability is at the paper's figure.
+``dtw`` is that of Table 2, which uses the whole recording. ``dtw_open`` uses the whole simulation
+instead and may leave out the recording's end. It is smaller, and with it the rig's repeatability
+agrees with the paper's value.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,29 +45,29 @@ PAPER: Mapping[str, Mapping[str, Mapping[str, float]]] = {
     "snpe-c": {"rmse": {"mean": 7.19e-3, "std": 0.65e-3}, "dtw": {"mean": 33.0, "std": 1.6}},
     "bayessim": {"rmse": {"mean": 2.19e-2, "std": 0.51e-2}, "dtw": {"mean": 92.1, "std": 6.4}},
 }
-"""The paper's figures; its NPDR is SNPE-C."""
+"""The paper's numbers; its NPDR is SNPE-C."""
 
 ROUNDS = 5
 NUM_SIMULATIONS = 1_500
 
 _TRAINING = "members=1, epochs=60, batch_size=128, learning_rate=3e-3"
-"""More and smaller steps than by default: the layer has many weights, and time is spent on
-simulations."""
+"""More and smaller training steps than by default: the layer has many weights, and simulations
+take most of the time anyway."""
 
 COLUMNS: Mapping[str, str] = {
     "snpe-c": f"snpe-c(embedding='{EMBEDDING}', {_TRAINING})",
     "bayessim": "bayessim(embedding='bayessim[ball_x,ball_y]')",
 }
-"""The paper's methods by label, in the words of
+"""The paper's methods by label, in the syntax of
 :mod:`npdr_ppl.posterior.comparison.compared_backends`. All get the same number of simulations;
-those that are not sequential in one round."""
+methods that are not sequential get them in one round."""
 
 REPEATABILITY = "mean of the other strikes"
 
 OUTLIER = 1.5
-"""A strike that the mean of the others misses by more than so many times the median is left out
-of the joint fit: one club cannot strike with two strengths. On the recordings that is strike 0,
-a quarter weaker than the rest for no reason that the joints show."""
+"""A strike is left out of the joint fit if its difference from the mean of the others exceeds this
+many times the median difference, because one club cannot strike with two strengths. In the
+recordings this is strike 0: it is a quarter weaker, and the joints do not show why."""
 
 
 def reproduce_mini_golf(
@@ -84,11 +84,11 @@ def reproduce_mini_golf(
 
     Args:
         rollouts: The paper's recordings, 100 Hz.
-        out: Folder for results; what it holds of an interrupted run is not simulated again.
-        backends: Labels of :data:`COLUMNS`, or other backends; ``None`` for all columns whose
-            backend there is, the others being noted as skipped.
+        out: Folder for results; finished parts of an interrupted run are not simulated again.
+        backends: Labels of :data:`COLUMNS`, or other backends; ``None`` for all columns with an
+            available backend; the others are recorded as skipped.
         rounds: Rounds of inference; :data:`ROUNDS` if not given.
-        num_simulations: Simulations of each; :data:`NUM_SIMULATIONS` if not given.
+        num_simulations: Simulations per round; :data:`NUM_SIMULATIONS` if not given.
         seed: Seed of everything random.
         progress: Whether to show progress; ``None`` shows it on a terminal.
 
@@ -102,7 +102,7 @@ def reproduce_mini_golf(
     rollouts.check(MiniGolf.sensors, MiniGolf.actions, allow_extra=True)
     if len(rollouts) < 2 or len(set(rollouts.lengths)) > 1:
         raise DataError(
-            "Table 1 needs two strikes at least, all of one length, to leave one out; got "
+            "Table 1 needs at least two strikes of equal length, to leave one out; got "
             f"{rollouts.lengths} steps."
         )
     chosen, skipped = requested(backends, COLUMNS)
@@ -145,7 +145,7 @@ def reproduce_mini_golf(
 def repeatability(rollouts: Rollouts) -> dict[str, Tensor]:
     """Scores the mean of the other strikes as a prediction of each, ``(R,)`` per metric.
 
-    The joints are those of the strike itself, as they are in a simulation that replays them.
+    Joint measurements are those of the strike itself, because a simulation replays them.
     """
     series = rollouts.series()
     columns = [rollouts.channel_names.index(name) for name in BALL]
@@ -165,11 +165,11 @@ def repeatability(rollouts: Rollouts) -> dict[str, Tensor]:
 def _column(
     label: str, candidate: Candidate, rollouts: Rollouts, budget: Budget
 ) -> tuple[list[Posterior], dict[str, metrics.Summary], dict[str, Any]]:
-    """Returns a method's posteriors of single strikes, its row of the table, and the rest.
+    """Returns a method's posteriors of single strikes, its row of the table, and the details.
 
-    With separate restitutions it is fitted to all strikes at once that are alike: one restitution
-    for club and obstacles can fit the ball's launch or its rebounds, and turns the obstacles to
-    make up.
+    The model with separate restitutions is fitted jointly to all similar strikes. One restitution
+    for club and obstacles can fit either the ball's launch or its rebounds, and such a fit
+    rotates the obstacles to compensate.
     """
     indices = range(len(rollouts))
     strikes = [rollouts[[i]] for i in indices]
@@ -201,7 +201,7 @@ def _column(
 def _separate_restitutions(
     label: str, candidate: Candidate, rollouts: Rollouts, budget: Budget
 ) -> dict[str, Any]:
-    """Fits the model with two restitutions to the strikes that are alike, their clocks aligned."""
+    """Fits the model with two restitutions to the similar strikes, with aligned clocks."""
     error = repeatability(rollouts)["rmse"]
     alike = [i for i, e in enumerate(error.tolist()) if e <= OUTLIER * float(error.median())]
     strikes, delays = clocks_aligned(rollouts[alike])
@@ -221,7 +221,7 @@ def _separate_restitutions(
 def _row(
     within: Mapping[str, Tensor], left_out: Mapping[str, Tensor] | None = None
 ) -> dict[str, metrics.Summary]:
-    """Returns the summary of in-sample figures and, under names of their own, of held-out ones."""
+    """Returns summaries of in-sample scores and, as ``*_left_out``, of held-out scores."""
     named = dict(within) | {f"{name}_left_out": v for name, v in (left_out or {}).items()}
     return {name: metrics.summarise(value) for name, value in named.items()}
 

@@ -1,16 +1,16 @@
-"""What the paper's model of the real Furuta pendulum was missing.
+"""The effects that the paper's model of the real Furuta pendulum lacks.
 
 Muratore et al. (2021) fitted nine parameters of the rigid-body equations to five swing-ups, and
-Table 2 says how much was left. Here discovery starts from the same equations and the first three
-swing-ups. The other two, and chirps at another rate, say whether what it adds is there.
+Table 2 gives the remaining error. Here discovery starts from the same equations and the first
+three swing-ups. The other two, and chirps at another sampling rate, test the effects that it adds.
 
-Discovery fits short segments, whose initial states it estimates too. What Table 2 asks for is to
-predict longer ones, so both models are fitted once more to the segments that it judges by, of the
-rollouts to fit.
+Discovery fits short segments and also estimates their initial states. Table 2 evaluates the
+prediction of longer segments. Both models are therefore fitted again, on the rollouts to fit, to
+segments of Table 2's length.
 
-The paper re-synchronises to recorded states, whose velocities the rig's driver has filtered. A
-model that says so is still started from them there, so the figures to look at are those from
-states that a smoother estimates; those from recorded states are for comparison with the paper.
+The paper re-synchronises to recorded states, whose velocities the rig's driver has filtered. Even
+a model of this filter then starts from filtered velocities. The main results therefore use initial
+states that a smoother estimates; results from recorded states are for comparison with the paper.
 """
 
 from dataclasses import dataclass
@@ -34,22 +34,22 @@ from npdr_ppl.run_files import read_json, write_json
 __all__ = ["Story", "load_recordings", "reproduce_missing_effect"]
 
 SWING_UP, CHIRP = "swing_up_500hz_5s.csv", "chirp_positive_250hz_10s.csv"
-"""The recordings' names in a folder."""
+"""File names of the recordings in a folder."""
 
 CHIRP_SEGMENT_LENGTH = 100
-"""Steps of 4 ms: as long as Table 2's 200 steps of 2 ms."""
+"""Number of steps of 4 ms; the duration equals Table 2's 200 steps of 2 ms."""
 
 Row = dict[str, metrics.Summary]
 
 
 @dataclass(frozen=True)
 class Story:
-    """What was found, and the models before and after.
+    """The discovery, and the models before and after.
 
     Attributes:
         discovery: The discovery.
         refitted: The paper's equations, fitted to Table 2's segments.
-        revised: The equations with the effects that were missing, likewise.
+        revised: The equations with the missing effects, fitted to the same segments.
     """
 
     discovery: Discovery
@@ -58,13 +58,14 @@ class Story:
 
 
 def load_recordings(path: Path) -> tuple[Rollouts, Rollouts | None]:
-    """Loads the swing-ups and, where it is there, the other excitation.
+    """Loads the swing-ups and, if it exists, the other excitation.
 
     Args:
-        path: The folder of both, or the file of the swing-ups beside which the other may lie.
+        path: The folder of both files, or the file of the swing-ups; the other file is then
+            searched in its folder.
 
     Raises:
-        DataError: There are no swing-ups, or they are of another device.
+        DataError: There are no swing-ups, or they are from another device.
     """
     if not path.exists():
         raise DataError(f"{path} does not exist.")
@@ -86,18 +87,18 @@ def reproduce_missing_effect(
     options: DiscoveryOptions | None = None,
     progress: bool | None = None,
 ) -> tuple[Story | None, dict[str, Any]]:
-    """Finds what the paper's equations miss, and writes ``missing-effect.json``.
+    """Finds the effects that the paper's equations lack; writes ``missing-effect.json``.
 
     Args:
         swing_ups: The paper's recordings, 500 Hz.
         chirps: The same rig under another excitation, or ``None``.
-        out: Folder for results; an interrupted search in it begins anew, a finished one is read.
-        holdout: Swing-ups to be judged on; the others are fitted.
-        options: How to search.
+        out: Folder for results; an interrupted search in it restarts, a finished one is read.
+        holdout: Swing-ups for the evaluation; the others are fitted.
+        options: Options of the search.
         progress: Whether to show progress; ``None`` shows it on a terminal.
 
     Returns:
-        Discovery and models, ``None`` if they were finished before, and the content of
+        Discovery and models, ``None`` if results of a finished run were read, and the content of
         ``missing-effect.json``.
 
     Raises:
@@ -142,19 +143,19 @@ def reproduce_missing_effect(
 
 
 def _refitted(model: Model, found: Hypothesis, rollouts: Rollouts) -> Hypothesis:
-    """Fits a model of the discovery to Table 2's segments, from where the discovery left it.
+    """Fits a model of the discovery to Table 2's segments; starts at the discovery's parameters.
 
     Args:
         model: The hypothesis's model without its effects.
         found: The hypothesis.
-        rollouts: What to fit.
+        rollouts: The rollouts to fit.
     """
     options = DataOptions(None, SEGMENT_LENGTH, "estimated", "float64")
     return fit_hypothesis(model, rollouts, options, effects=found.effects, start=found.parameters)
 
 
 def _row(model: Any, parameters: Any, held_out: Rollouts, chirps: Rollouts | None) -> Row:
-    """Returns Table 2's metrics from estimated and from recorded states, and the chirps'."""
+    """Returns Table 2's metrics from estimated and recorded states, and those of the chirps."""
     row = _scores(model, parameters, held_out, SEGMENT_LENGTH, "estimated")
     recorded = _scores(model, parameters, held_out, SEGMENT_LENGTH, "recorded")
     row |= {f"{name}_recorded": value for name, value in recorded.items()}
@@ -173,5 +174,5 @@ def _scores(
 
 
 def _published(method: str) -> dict[str, Any]:
-    """Returns the paper's figures, which start from recorded states."""
+    """Returns the paper's numbers, which are for recorded initial states."""
     return {name: PAPER[method][name] for name in ("rmse", "dtw")}

@@ -1,10 +1,10 @@
 """Bayesian linear regression of any MJCF's inertial and friction parameters.
 
-No motion tells all ten inertial parameters of every body: the regressor's columns are linearly
-dependent. A rank-revealing QR with column pivoting finds the base parameters β = K π that a
-recording tells (Gautier 1991), the conjugate posterior is over these, and each draw is carried to
-the physical parameters π of least change from the nominal ones. Draws that no body can have are
-counted.
+No motion determines all ten inertial parameters of every body, because the regressor's columns
+are linearly dependent. A rank-revealing QR with column pivoting finds the base parameters β = K π
+that a recording determines (Gautier 1991). The conjugate posterior is over β. Each draw is mapped
+to the physical parameters π with the smallest change from the nominal ones. Physically impossible
+draws are counted.
 
 Reference: M. Gautier, Numerical calculation of the base inertial parameters of robots, 1991.
 """
@@ -44,8 +44,8 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 RELATIVE_RANK = 1e-8
-"""Least diagonal entry of R that counts, relative to the largest: what no motion tells is zero to
-1e-13, and what this motion tells less than this is lost in any noise."""
+"""Smallest diagonal entry of R that is used, relative to the largest. Directions that no motion
+determines are below 1e-13; directions below this limit are lost in any noise."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class MjcfPosterior:
     Attributes:
         dynamics: The model's inverse dynamics.
         names: Names of its parameters π, P of them.
-        base_names: The parameter that each base parameter β stands for, r of them; the others in
-            its row of ``grouping`` go along with it.
+        base_names: Main parameter of each base parameter β, r of them; the others in its row of
+            ``grouping`` are combined with it.
         grouping: K with β = K π, ``(r, P)``.
         base: Posterior over β.
-        nominal: π of the model as it stands, ``(P,)``.
-        scales: Size of each π in which changes are measured, ``(P,)``; zero for fixed ones.
+        nominal: π of the given model, ``(P,)``.
+        scales: Unit in which the change of each π is measured, ``(P,)``; zero for fixed ones.
     """
 
     dynamics: MujocoInverseDynamics
@@ -72,7 +72,7 @@ class MjcfPosterior:
     scales: Array
 
     def to_physical(self, base: Array) -> Array:
-        """Returns the π of least change from the nominal ones that have these β.
+        """Returns the π with these β and the smallest change from the nominal ones.
 
         The change is measured by ‖(π − π₀)/s‖ with the scales s.
 
@@ -80,7 +80,7 @@ class MjcfPosterior:
             base: Base parameters, ``(n, r)``.
 
         Returns:
-            Parameters, ``(n, P)``, of which some may be impossible.
+            Parameters, ``(n, P)``; some may be physically impossible.
         """
         inverse = self.scales[:, None] * np.linalg.pinv(self.grouping * self.scales)
         return self.nominal + (base - self.grouping @ self.nominal) @ inverse.T
@@ -91,7 +91,7 @@ class MjcfPosterior:
         return dict(zip(self.names, values.tolist(), strict=True))
 
     def draw(self, num_draws: int, *, seed: int = 0) -> tuple[Array, NDArray[np.bool_]]:
-        """Draws from the posterior, the impossible ones included, which are counted and logged.
+        """Draws from the posterior, including impossible draws, which are counted and logged.
 
         Args:
             num_draws: Number of draws n.
@@ -126,24 +126,24 @@ def regress_mjcf(
     fixed: Sequence[str] = (),
     prior_spread: float = 10.0,
 ) -> MjcfPosterior:
-    """Regresses an MJCF's parameters on a motion that is known at N instants.
+    """Regresses an MJCF's parameters on a known motion at N instants.
 
     Args:
         source: Path of an MJCF file, or a ``mujoco.MjModel``; its parameters are nominal.
         positions: MuJoCo's qpos, ``(N, nq)``.
         velocities: Its qvel, ``(N, nv)``.
         accelerations: Its qacc, ``(N, nv)``.
-        applied: Applied generalised forces, those of actuators included, ``(N, nv)``.
-        fixed: Patterns of the names of parameters that are known to be nominal, e.g.
-            ``"*.armature"``. A joint without damping is best told so: half of what noise makes
-            of it would be negative, hence implausible.
+        applied: Applied generalised forces including those of actuators, ``(N, nv)``.
+        fixed: Name patterns of parameters that are known to be nominal, e.g. ``"*.armature"``.
+            Fix the damping of a joint without damping: noise would make half of its estimates
+            negative, hence implausible.
         prior_spread: Standard deviation of the prior about the nominal values, in scales of the
-            parameters, where the noise is as great as what the fit leaves.
+            parameters, if the noise equals the residuals of the fit.
 
     Raises:
         ModelError: The model has no joints, or equality constraints, or no such parameter.
         ShapeError: The shapes do not fit the model.
-        DataError: Nothing moves, or nothing is left to find.
+        DataError: Nothing moves, or all parameters are fixed.
     """
     dynamics = MujocoInverseDynamics(load_mjcf(source))
     rows = dynamics.regressors(positions, velocities, accelerations)
@@ -165,9 +165,9 @@ def regress_mjcf_recording(
 
     Args:
         source: Path of an MJCF file, or a ``mujoco.MjModel`` of hinges and slides only.
-        positions: Position readings, ``(T + 1, nq)``.
+        positions: Position measurements, ``(T + 1, nq)``.
         controls: Controls, each held for one step, ``(T, nu)``.
-        time_step: Seconds between readings.
+        time_step: Seconds between measurements.
         smoothing: Cut-offs of the filters.
         fixed: See :func:`regress_mjcf`.
         prior_spread: See :func:`regress_mjcf`.
@@ -204,7 +204,7 @@ def _regress(
     nominal, names = dynamics.nominal(), dynamics.names
     is_fixed = _matches(names, fixed)
     targets = targets - rows[..., is_fixed] @ nominal[is_fixed]
-    # What does not change has no size of change.
+    # Fixed parameters have scale zero.
     scales = np.where(is_fixed, 0.0, _scales(dynamics, nominal))
     chosen, grouping = _base(rows, scales)
     mean = torch.as_tensor(grouping @ nominal)
@@ -220,7 +220,7 @@ def _regress(
 
 
 def _matches(names: Sequence[str], patterns: Sequence[str]) -> NDArray[np.bool_]:
-    """Returns which names some pattern matches, ``(P,)``."""
+    """Returns a mask ``(P,)`` of the names that match a pattern."""
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in names):
             raise ModelError(f"No parameter is called {pattern!r}; there are {', '.join(names)}.")
@@ -230,18 +230,18 @@ def _matches(names: Sequence[str], patterns: Sequence[str]) -> NDArray[np.bool_]
 def _base(rows: Array, scales: Array) -> tuple[NDArray[np.int64], Array]:
     """Returns the independent columns, ``(r,)``, and K, ``(r, P)``.
 
-    With W S P = Q [R₁ R₂; 0 0], the columns behind the first r are W_d = W_b R₁⁻¹ R₂ in scaled
-    units, so that their parameters go along with those of the first: β = π_b + R₁⁻¹ R₂ π_d.
+    With W S P = Q [R₁ R₂; 0 0], the columns after the first r are W_d = W_b R₁⁻¹ R₂ in scaled
+    units, so their parameters are combined with those of the first r: β = π_b + R₁⁻¹ R₂ π_d.
     """
     matrix = (rows * scales).reshape(-1, rows.shape[-1])
     decomposition: Any = linalg.qr(matrix, mode="r", pivoting=True)
     r, order = decomposition
     size = np.abs(np.diag(r))
     if not size.size or size[0] == 0.0:
-        raise DataError("The recording tells no parameter, because nothing moves or all is fixed.")
+        raise DataError("The recording determines no parameter: nothing moves or all is fixed.")
     rank = int((size > RELATIVE_RANK * size[0]).sum())
     scaled = linalg.solve_triangular(r[:rank, :rank], r[:rank])
-    # What is zero by structure should not be 1e-17.
+    # Structural zeros should not be rounding errors of 1e-17.
     scaled[np.abs(scaled) < 1e-10] = 0.0
     inverse = np.divide(1.0, scales, out=np.zeros_like(scales), where=scales > 0.0)
     grouping = np.zeros((rank, len(scales)))
@@ -250,19 +250,19 @@ def _base(rows: Array, scales: Array) -> tuple[NDArray[np.int64], Array]:
 
 
 def _scales(dynamics: MujocoInverseDynamics, nominal: Array) -> Array:
-    """Returns the size of each parameter, ``(P,)``: that of its body or joint, never zero."""
+    """Returns the scale of each parameter, ``(P,)``, from its body or joint; never zero."""
     model = dynamics.model
     result = []
     for body in dynamics.bodies:
         mass = max(float(model.body_mass[body]), 1e-6 * float(model.body_mass.sum()))
-        # Radius of gyration about the frame's origin, at least a thousandth of the mechanism.
+        # Radius of gyration about the frame's origin, at least 1/1000 of the mechanism's size.
         centre = float(model.body_ipos[body] @ model.body_ipos[body])
         square = centre + float(model.body_inertia[body].sum()) / (2.0 * mass)
         square = max(square, (1e-3 * float(model.stat.extent)) ** 2)
         result += [mass, *[mass * np.sqrt(square)] * 3, *[mass * square] * 6]
     inertia = np.maximum(model.dof_M0, 1e-12)
     for dof in range(model.nv):
-        # A joint that stops in a second, or that brakes by a unit of acceleration.
+        # Scales of a joint that stops in one second, or that brakes by one unit of acceleration.
         own = nominal[len(result) : len(result) + 3]
         result += np.maximum(own, inertia[dof]).tolist()
     return np.array(result)

@@ -1,11 +1,11 @@
 """Figure 2 of Muratore et al. (2021): the posterior over a pendulum's mass and length.
 
-The torque reaches the pendulum through 3/(m l²) alone, so parameters along m l² = 1 move alike as
-long as gravity has not had its say; gravity's term is 1.5 g/l. In the first second from rest a
-noisy recording cannot tell them apart and the posterior is a ridge along that curve. Over the
-paper's eight seconds gravity resolves mass and length: the exact posterior, by a grid and by NUTS,
-shrinks to a spot at the truth. Both are computed here, and the posteriors of likelihood-free
-backends are compared with NUTS on the same model.
+The torque acts on the pendulum only through 3/(m l²), so parameters along m l² = 1 give almost the
+same motion until gravity's term 1.5 g/l has an effect. In the first second from rest, a noisy
+recording cannot distinguish them, and the posterior is a ridge along that curve. Over the paper's
+eight seconds, gravity determines mass and length: the exact posterior, by a grid and by NUTS,
+shrinks to a small region at the truth. Both durations are computed here, and the posteriors of
+likelihood-free backends are compared with NUTS on the same model.
 """
 
 import math
@@ -40,18 +40,18 @@ from npdr_ppl.run_files import write_json
 __all__ = ["Ridge", "exact_samples", "nuts_samples", "reproduce_pendulum", "valley"]
 
 NOISE = {"angle": 0.25, "velocity": 1.0}
-"""Standard deviations in rad and rad/s, about a sixth of the motion's amplitude."""
+"""Standard deviations of the noise in rad and rad/s, about a sixth of the motion's amplitude."""
 
 ROUNDS = 8
 NUM_SIMULATIONS = 100
 NUM_SAMPLES = 2_000
 EMBEDDING = "all~10"
 METHODS: Mapping[str, str] = {"snpe-c": "snpe-c(outside=3e-3)", "snpe-a": "snpe-a"}
-"""The paper's methods by label, in the words of
-:mod:`npdr_ppl.posterior.comparison.compared_backends`. With a hundred simulations per round it
-pays to cut SNPE-C's proposals less tightly than by default."""
+"""The paper's methods by label, in the syntax of
+:mod:`npdr_ppl.posterior.comparison.compared_backends`. With a hundred simulations per round,
+SNPE-C works better if its proposals are truncated less than by default."""
 DURATIONS = {"1 s": 50, "8 s": 400}
-"""Steps of 20 ms; the paper's recording lasts eight seconds."""
+"""Number of steps of 20 ms by duration; the paper's recording lasts eight seconds."""
 
 RANGE = (0.3, 1.7)
 GRID = 350
@@ -59,12 +59,12 @@ GRID = 350
 
 @dataclass(frozen=True)
 class Ridge:
-    """One recording's posteriors.
+    """Posteriors of one recording.
 
     Attributes:
-        posteriors: Those of the backends by label, with all their rounds.
+        posteriors: Posteriors of the backends by label, with all their rounds.
         reference: NUTS draws, ``(n, 2)``: mass in kg, length in m.
-        valley: Points ``(k, 2)`` of the curve of least difference from the recording.
+        valley: Points ``(k, 2)`` of the curve with the smallest misfit to the recording.
     """
 
     posteriors: Mapping[str, Posterior]
@@ -72,7 +72,7 @@ class Ridge:
     valley: NDArray[np.float64]
 
     def samples(self, label: str, round_index: int = -1) -> NDArray[np.float64]:
-        """Returns a backend's draws after a round, its last one if not given, ``(n, 2)``."""
+        """Returns a backend's draws ``(n, 2)`` after a round, by default after the last one."""
         posterior = self.posteriors[label]
         if round_index >= 0:
             posterior = posterior.after_round(round_index)
@@ -90,9 +90,9 @@ def reproduce_pendulum(
     """Infers mass and length from one second and from eight, and compares with NUTS.
 
     Args:
-        out: Folder for ``pendulum.json`` and the fits; those that it holds are not repeated.
-        backends: Labels of :data:`METHODS`, or other backends; ``None`` for all methods whose
-            backend there is, the others being noted as skipped.
+        out: Folder for ``pendulum.json`` and the fits; existing fits are not repeated.
+        backends: Labels of :data:`METHODS`, or other backends; ``None`` for all methods with an
+            available backend; the others are recorded as skipped.
         seed: Seed of everything random.
         progress: Whether to show progress; ``None`` shows it on a terminal.
 
@@ -102,7 +102,7 @@ def reproduce_pendulum(
     Raises:
         BackendError: Every backend failed.
         DataError: The folder holds fits with other settings.
-        DependencyError: What the posteriors are compared by is not installed.
+        DependencyError: scikit-learn, which compares the posteriors, is not installed.
     """
     check_c2st()
     chosen, skipped = requested(backends, METHODS)
@@ -161,14 +161,14 @@ def infer_mass_and_length(
     *,
     checkpoint: Path | None = None,
 ) -> Posterior:
-    """Infers with the budget of all: in one round if the backend is not sequential.
+    """Infers with the common budget; in one round if the backend is not sequential.
 
     Args:
         candidate: The backend.
         rollouts: The recording.
         seed: Seed of everything random.
         progress: Whether to show progress; ``None`` shows it on a terminal.
-        checkpoint: Folder for the rounds; those that it holds are not run again.
+        checkpoint: Folder for the rounds; existing rounds are not run again.
     """
     rounds = ROUNDS if candidate.is_sequential else 1
     return infer(
@@ -216,7 +216,7 @@ def figures(
     reference: NDArray[np.float64],
     curve: NDArray[np.float64],
 ) -> dict[str, float]:
-    """Returns how a method's draws lie on the ridge and against NUTS.
+    """Returns how close a method's draws are to the ridge and to NUTS.
 
     Args:
         samples: Draws ``(n, 2)``.
@@ -242,10 +242,10 @@ def figures(
 
 
 def valley(inputs: Inputs, observed: Tensor) -> NDArray[np.float64]:
-    """Returns the length of least difference for every mass whose difference is within the noise.
+    """Returns the best-fitting length for every mass whose misfit is within the noise.
 
-    The difference is the root-mean-square over readings in units of their noise; the curve is
-    m l² = 1 modulated by gravity.
+    The misfit is the mean square over measurements in units of their noise. The curve is
+    m l² = 1 modified by gravity.
     """
     axis, distance = _distances(inputs, observed)
     table = distance.reshape(GRID, GRID) / observed.numel()
@@ -288,7 +288,7 @@ def nuts_samples(
     Args:
         inputs: The segment.
         observed: The recording, ``(1, K, 2)``.
-        start: Mass and length to start from; far from the posterior a step takes long.
+        start: Initial mass and length; far from the posterior, NUTS steps are slow.
         seed: Seed of the draws.
     """
     conditioned = pyro.condition(partial(pendulum, noise=NOISE), data={"trajectory": observed})

@@ -1,8 +1,8 @@
-"""Returns on hidden rigs: which way of choosing domains makes a policy that works on the target.
+"""Returns on hidden rigs: compares ways to choose the domains in which a policy is trained.
 
-The rows of Table 2 of Muratore et al. (2021) that the paper's recordings cannot tell: each method
-trains a swing-up policy, the policy runs on a rig in another engine whose parameters the method
-cannot see, and again in the nominal simulator. Methods that learn from the rig go through
+These rows of Table 2 of Muratore et al. (2021) cannot be computed from the paper's recordings.
+Each method trains a swing-up policy. The policy runs on a rig in another engine, whose parameters
+are hidden from the method, and in the nominal simulator. Methods that learn from the rig use
 :func:`npdr_ppl.train`; all get the same real rollouts, simulations and iterations of the search.
 """
 
@@ -48,7 +48,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 def furuta_with_effects() -> Callable[..., Any]:
-    """Returns the zoo's model with what the rigs have beyond the paper's equations."""
+    """Returns the zoo's model with the rigs' effects that the paper's equations lack."""
     model = add_effect(furuta, CoulombFriction("arm"))
     model = add_effect(model, CoulombFriction("pole"))
     return add_effect(model, SensorLowPass("arm_velocity,pole_velocity"))
@@ -59,12 +59,12 @@ class RigMethod:
     """A way of choosing the domains that a policy is trained in.
 
     Attributes:
-        domains: ``"none"`` leaves the policy as it comes; ``"nominal"`` and ``"prior"`` train it
-            once, without the rig; ``"posterior"`` goes through the loop.
+        domains: ``"none"`` leaves the policy untrained; ``"nominal"`` and ``"prior"`` train it
+            once, without the rig; ``"posterior"`` uses the loop.
         backend: The loop's backend.
-        embedding: What it conditions on; ``None`` for the loop's.
+        embedding: Trajectory features of the backend; ``None`` for the loop's default.
         has_effects: Whether the model has the rigs' effects.
-        discovers: Whether the loop looks for effects that the model lacks.
+        discovers: Whether the loop searches for effects that the model lacks.
     """
 
     domains: Literal["none", "nominal", "prior", "posterior"]
@@ -84,18 +84,18 @@ METHODS: Mapping[str, RigMethod] = {
     "npdr with effects": RigMethod("posterior", "snpe-c", has_effects=True),
     "npdr with discovery": RigMethod("posterior", "snpe-c", discovers=True),
 }
-"""The columns of the paper's Table 2, what a policy does untrained and trained on the prior, and
-the loop on a model that has the effects, and the loop that has to find them."""
+"""The columns of the paper's Table 2, the policy untrained and trained on the prior, the loop on a
+model with the effects, and the loop that must find the effects."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a method came to on one rig with one seed.
+    """Result of a method on one rig with one seed.
 
     Attributes:
         returns: Returns of the last policy on the rig, one per fresh episode.
         sim_return: Its mean return in the nominal simulator.
-        iterations: The loop's records; empty for methods without.
+        iterations: The loop's records; empty for methods without a loop.
     """
 
     returns: tuple[float, ...]
@@ -120,9 +120,9 @@ def run_method(
         method: The method.
         target: The rig.
         task: The task.
-        options: Options of the loop; those of the policy search hold for every method.
+        options: Options of the loop; those of the policy search apply to every method.
         seed: Seed of everything random.
-        num_episodes: Fresh episodes on the rig that the last policy is judged by.
+        num_episodes: New episodes on the rig that evaluate the last policy.
         out: Folder for the loop's run.
         progress: Whether to show progress; ``None`` shows it on a terminal.
     """
@@ -140,7 +140,7 @@ def run_method(
             trained = train(model, target, task, chosen, out=out, seed=seed, progress=progress)
             policy, domain, records = trained.policy, trained.domain, trained.iterations
         except TooShortError as error:
-            # A rollout that ended early can be too short for a method: it has no second policy.
+            # A rollout that ended early can be too short for a method; the prior's policy is used.
             _LOGGER.warning("%s", error)
             policy = _trained_once(METHODS["prior"], model, target, task, options, seed)
     elif method.domains != "none":
@@ -168,11 +168,11 @@ def study(
     progress: bool | Reporter | None = None,
     note: Callable[[str, str, int, Outcome], None] | None = None,
 ) -> dict[str, dict[str, list[Outcome]]]:
-    """Runs methods on rigs with several seeds; what a folder holds is not run again.
+    """Runs methods on rigs with several seeds; existing results in the folder are reused.
 
     Args:
         methods: Labels of :data:`METHODS`.
-        rigs: Names that :func:`~npdr_ppl.models.furuta_targets.furuta_target` knows.
+        rigs: Names for :func:`~npdr_ppl.models.furuta_targets.furuta_target`.
         seeds: Seeds of the training.
         options: Options of the loop.
         out: Folder for all runs.
@@ -214,11 +214,11 @@ def study(
 def summarise(outcomes: Mapping[str, Sequence[Outcome]], success: float) -> dict[str, Any]:
     """Returns mean and standard deviation over rigs and seeds, and the share of successes.
 
-    A rig and seed counts once, by its mean over episodes, which are nearly identical.
+    Each pair of rig and seed enters as its mean over episodes, which are nearly identical.
 
     Args:
         outcomes: Outcomes of one method by rig.
-        success: Return above which a run counts as a success.
+        success: Return above which a run is a success.
     """
     runs = [outcome for several in outcomes.values() for outcome in several]
     rig = torch.tensor([sum(run.returns) / len(run.returns) for run in runs], dtype=torch.float64)
@@ -239,7 +239,7 @@ def _trained_once(
     options: LoopOptions,
     seed: int,
 ) -> Policy:
-    """Trains a policy without the rig, with as many iterations as the loop spends on its first."""
+    """Trains a policy without the rig, with as many iterations as the loop's first policy."""
     domains = _nominal()
     if method.domains == "prior":
         prior = prior_of(model, target.sensors, target.actions, target.time_step)

@@ -1,7 +1,8 @@
 """Table 2 of Muratore et al. (2021): the real Furuta pendulum, replayed in simulation.
 
-Every method gets the same recordings: the first rollouts to fit, the last ones to be judged on,
-with the state re-synchronised to the recording every 200 steps of 2 ms as in the paper's code.
+Every method gets the same recordings: the first rollouts for the fit, the last ones for the
+evaluation. The state is re-synchronised to the recording every 200 steps of 2 ms, as in the
+paper's code.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,7 +54,7 @@ PAPER: Mapping[str, Mapping[str, Mapping[str, float]]] = {
         "return_rig": {"mean": 328.0, "std": 144.0},
     },
 }
-"""The paper's figures; its NPDR is SNPE-C, and its rig a real one."""
+"""The paper's numbers; its NPDR is SNPE-C, and its rig is real."""
 
 RETURN_METHODS: Mapping[str, str] = {
     "nominal": "nominal",
@@ -64,27 +65,27 @@ RETURN_METHODS: Mapping[str, str] = {
     "prior": "prior",
     "snpe-c with effects": "npdr with effects",
 }
-"""Rows of the returns, and what they are called in :mod:`npdr_ppl.reproduction.rig_study`."""
+"""Rows of the returns, and their names in :mod:`npdr_ppl.reproduction.rig_study`."""
 
 RIG = "furuta-hard"
-"""The rig in MuJoCo that stands in for the paper's, which is not at hand."""
+"""The rig in MuJoCo that replaces the paper's rig, which is not available."""
 
 SEGMENT_LENGTH = 200
 EMBEDDING = "all/50"
-"""Readings four times per segment: with re-synchronised segments they carry what the parameters
-do, where the paper's statistic sums over them."""
+"""Measurements at four times per segment. In re-synchronised segments they show the influence of
+the parameters, while the paper's statistic sums over the segments."""
 ROUNDS = 5
 NUM_SIMULATIONS = 3_000
 
 COLUMNS: Mapping[str, str] = {
     "snpe-c": f"snpe-c(embedding={EMBEDDING})",
-    # The statistic that the method is named for.
+    # The statistic that has the method's name.
     "bayessim": "bayessim(embedding=bayessim)",
     "bayesian-linear-regression": "bayesian-linear-regression",
 }
-"""The paper's methods by label, in the words of
+"""The paper's methods by label, in the syntax of
 :mod:`npdr_ppl.posterior.comparison.compared_backends`. All get the same number of simulations;
-those that are not sequential, or use none, in one round."""
+methods that are not sequential, or use no simulations, run in one round."""
 
 
 def reproduce_table2(
@@ -104,12 +105,12 @@ def reproduce_table2(
     Args:
         rollouts: The paper's recordings, 500 Hz.
         out: Folder for results.
-        holdout: Rollouts to be judged on; the others are fitted.
-        backends: Labels of :data:`COLUMNS`, or other backends; ``None`` for all columns whose
-            backend there is, the others being noted as skipped.
+        holdout: Rollouts for the evaluation; the others are fitted.
+        backends: Labels of :data:`COLUMNS`, or other backends; ``None`` for all columns with an
+            available backend; the others are recorded as skipped.
         rounds: Rounds of inference; :data:`ROUNDS` if not given.
-        num_simulations: Simulations of each; :data:`NUM_SIMULATIONS` if not given.
-        initial_state: ``"recorded"``, the paper's way, or ``"estimated"``.
+        num_simulations: Simulations per round; :data:`NUM_SIMULATIONS` if not given.
+        initial_state: ``"recorded"``, as in the paper, or ``"estimated"``.
         seed: Seed of everything random.
         progress: Whether to show progress; ``None`` shows it on a terminal.
 
@@ -134,8 +135,8 @@ def reproduce_table2(
     )
     exact = DataOptions(EMBEDDING, SEGMENT_LENGTH, initial_state, "float64")
     nominal = nominal_parameters(furuta, train.inputs(SEGMENT_LENGTH))
-    # Nothing is fitted in the nominal column, so it is judged on all rollouts, as in the paper;
-    # the other columns on the held-out ones alone.
+    # Nothing is fitted in the nominal column, so it is evaluated on all rollouts, as in the paper.
+    # The other columns are evaluated on the held-out rollouts only.
     rows = {"nominal": _row(score(furuta, rollouts, nominal, exact))}
     failed: dict[str, str] = {}
     for label, row in comparison.rows.items():
@@ -167,11 +168,11 @@ def add_returns(
 ) -> dict[str, Any]:
     """Trains policies by every method and adds their returns to the rows of ``table2.json``.
 
-    The paper's rig is not at hand, so the policies run on a hidden one in MuJoCo.
+    The paper's rig is not available, so the policies run on a hidden rig in MuJoCo.
 
     Args:
         result: The content of ``table2.json``.
-        out: Folder for results and runs; what it holds is not run again.
+        out: Folder for results and runs; existing results are reused.
         num_seeds: Training runs of each method.
         options: Options of the loop.
         progress: Whether to show progress; ``None`` shows it on a terminal.
@@ -183,7 +184,7 @@ def add_returns(
         list(RETURN_METHODS.values()),
         [RIG],
         range(num_seeds),
-        # Every method trains as often as the others: no check asks for more of it.
+        # Checks are disabled, so that every method trains equally often.
         options or LoopOptions(least_success=0.0),
         out / "returns",
         progress=progress,

@@ -1,4 +1,4 @@
-"""What a target domain is: something that runs a controller and hands back what it recorded."""
+"""Base class of target domains: a target runs a controller and returns the recording."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -16,27 +16,27 @@ __all__ = ["Array", "Controller", "TargetDomain", "TargetError", "end_episode", 
 Array = NDArray[np.float64]
 
 Controller = Callable[[Array, float], Array]
-"""Maps readings ``(sensors,)``, in the order of the target's sensors, and the time since the
-episode's start in s to commands ``(actions,)``, before any limit."""
+"""Function from measurements ``(sensors,)``, in the order of the target's sensors, and the time
+since the episode's start in s to commands ``(actions,)``, before any limit is applied."""
 
 
 class TargetError(NpdrError, RuntimeError):
-    """A target domain cannot go on, and a person should look at it."""
+    """A target domain cannot continue, and a person should check it."""
 
 
 class TargetDomain(ABC):
     """The real device of the policy loop: a rig, another engine, or recorded data.
 
-    A target knows nothing of models, posteriors and rewards of ours, and whoever holds one sees
-    its channels and its recordings only: parameters that it may have are private.
+    A target does not use our models, posteriors or rewards. Its users see only its channels and
+    its recordings; any parameters are private.
 
     Attributes:
         name: Name in tables and files.
-        sensors: Channels of the readings, with units and the bounds of safe operation.
-        actions: Channels of the commands, with the limits that the target applies.
+        sensors: Measured channels, with units and the bounds of safe operation.
+        actions: Command channels, with the limits that the target applies.
         time_step: Seconds between commands.
-        is_recorded: Whether episodes were recorded beforehand, so that controllers are ignored.
-        num_episodes: How many episodes there are; ``None`` for as many as wanted.
+        is_recorded: Whether episodes were recorded in advance, so that controllers are ignored.
+        num_episodes: Number of available episodes; ``None`` if it is unlimited.
     """
 
     name: str
@@ -52,23 +52,23 @@ class TargetDomain(ABC):
     ) -> Rollouts:
         """Runs one episode from the target's own distribution of initial states.
 
-        The controller may carry memory, so it serves one episode. What takes time after the last
-        reading (homing, disconnecting) follows :func:`end_episode`. An exception that ends the
-        episode carries what was recorded until then where that is worth keeping; see
+        A controller may have memory and is therefore used for one episode only. Slow actions after
+        the last measurement (homing, disconnecting) follow the call of :func:`end_episode`. If an
+        exception ends the episode, it carries the recording up to then; see
         :func:`partial_rollout`.
 
         Args:
-            controller: What commands the target.
-            num_steps: Greatest number of steps; episodes that leave the bounds are shorter.
-            episode: Number of the episode in the caller's run, from 0; tells recordings apart.
-            seed: Seed of everything random: a simulated target repeats an episode exactly.
+            controller: Function that commands the target.
+            num_steps: Maximum number of steps; an episode that leaves the bounds is shorter.
+            episode: Number of the episode in the caller's run, from 0; selects among recordings.
+            seed: Random seed: with the same seed, a simulated target repeats an episode exactly.
 
         Returns:
-            One rollout of T steps: readings ``(T + 1, sensors)``, actions as applied
+            One rollout of T steps: measurements ``(T + 1, sensors)``, actions as applied
             ``(T, actions)``, and rewards ``(T,)`` if the target has its own.
 
         Raises:
-            TargetError: The target cannot go on, or was commanded something that is no number.
+            TargetError: The target cannot continue, or a command is not a finite number.
             ShapeError: The controller returned the wrong number of commands.
         """
 
@@ -76,12 +76,12 @@ class TargetDomain(ABC):
         """Returns commands as they are applied, ``(actions,)``.
 
         Args:
-            commands: What a controller returned, ``(actions,)``; a single number will do for one
-                action.
+            commands: Output of a controller, ``(actions,)``; may be a single number if there is
+                one action.
 
         Raises:
             ShapeError: There are more or fewer commands than actions.
-            TargetError: A command is not finite, which no limit makes safe.
+            TargetError: A command is not finite; no limit can make it safe.
         """
         values = np.array(commands, dtype=np.float64, ndmin=1)
         if values.shape != (len(self.actions),):
@@ -103,11 +103,11 @@ class TargetDomain(ABC):
         actions: ArrayLike,
         rewards: ArrayLike | None = None,
     ) -> Rollouts:
-        """Returns what was recorded as one rollout with this target's columns.
+        """Returns a recording as one rollout with this target's columns.
 
         Args:
-            readings: Before each step and after the last, ``(T + 1, sensors)``.
-            actions: As applied, ``(T, actions)``.
+            readings: Measurements before each step and after the last, ``(T + 1, sensors)``.
+            actions: Commands as applied, ``(T, actions)``.
             rewards: ``(T,)``, if the target has its own.
         """
         return Rollouts.from_arrays(
@@ -130,13 +130,13 @@ class TargetDomain(ABC):
 
 
 def end_episode(controller: Controller, readings: ArrayLike) -> None:
-    """Hands the last readings of an episode to a controller that keeps a record of it.
+    """Gives the last measurements of an episode to a controller that records the episode.
 
-    A process killed from then on has the whole episode on disk, and does not repeat it.
+    The whole episode is then on disk, so that a run that is killed later does not repeat it.
 
     Args:
-        controller: What commanded the target; one without a method ``end`` is left alone.
-        readings: The readings after the last step, ``(sensors,)``.
+        controller: Controller of the episode; nothing happens if it has no method ``end``.
+        readings: The measurements after the last step, ``(sensors,)``.
     """
     end = getattr(controller, "end", None)
     if end is not None:
@@ -144,9 +144,9 @@ def end_episode(controller: Controller, readings: ArrayLike) -> None:
 
 
 def partial_rollout(error: BaseException) -> Rollouts | None:
-    """Returns what a target recorded before an exception ended its episode.
+    """Returns the recording of a target up to the exception that ended its episode.
 
-    It is the exception's attribute ``rollout``, whatever its type, e.g. of a
-    ``KeyboardInterrupt``; ``None`` where not even one step was made.
+    It is the attribute ``rollout`` of the exception, which can have any type, e.g.
+    ``KeyboardInterrupt``. The result is ``None`` if no step was completed.
     """
     return getattr(error, "rollout", None)

@@ -23,23 +23,23 @@ __all__ = ["GymnasiumTarget"]
 class GymnasiumTarget(TargetDomain):
     """Runs controllers in a Gymnasium environment and records its observations and rewards.
 
-    An episode ends where the environment terminates or truncates it; mind the step limits that
-    ``gymnasium.make`` brings along.
+    An episode ends when the environment terminates or truncates it. Note the step limits that
+    ``gymnasium.make`` adds.
 
     Args:
         environment: An environment, or the id of a registered one, e.g. ``"Pendulum-v1"``.
-        sensors: Names, units and bounds of the readings; ``None`` names the observation's
+        sensors: Names, units and bounds of the measurements; ``None`` names the observation's
             entries ``observation_0`` and so on, with the bounds of its box.
         actions: Names and units of the commands; ``None`` names them ``action_0`` and so on.
-            Limits are those of the environment's box in either case.
-        read: Maps an observation to the readings ``(sensors,)``, e.g. a cosine and a sine to an
-            angle; needs ``sensors``. ``None`` takes the observation as it is.
-        time_step: Seconds per step; ``None`` takes the environment's attribute ``dt``.
-        name: Name in tables and files; ``None`` takes the environment's id.
+            The limits always come from the environment's box.
+        read: Function from an observation to measurements ``(sensors,)``, e.g. from a cosine and a
+            sine to an angle; needs ``sensors``. ``None`` uses the observation unchanged.
+        time_step: Seconds per step; ``None`` uses the environment's attribute ``dt``.
+        name: Name in tables and files; ``None`` uses the environment's id.
 
     Raises:
         DependencyError: Gymnasium is not installed.
-        ModelError: The environment does not exist, or its spaces or time step do not do.
+        ModelError: The environment does not exist, or its spaces or time step are unsuitable.
 
     Example:
         >>> pendulum = GymnasiumTarget(
@@ -102,7 +102,7 @@ class GymnasiumTarget(TargetDomain):
         The rollout's rewards are the environment's.
         """
         environment, space = self._environment, self._environment.action_space
-        # Environments outside Python know 32-bit seeds only.
+        # Environments that are not written in Python accept only 32-bit seeds.
         observation, _ = environment.reset(seed=derived_seed(seed, "environment") % 2**31)
         readings = [self._reading(observation)]
         actions: list[Array] = []
@@ -124,7 +124,7 @@ class GymnasiumTarget(TargetDomain):
         self._environment.close()
 
     def _reading(self, observation: Any) -> Array:
-        """Returns the readings of an observation, as a copy: environments may reuse theirs."""
+        """Returns a copy of an observation's measurements: environments may reuse arrays."""
         reading = np.array(self._read(observation), dtype=np.float64)
         if reading.shape != (len(self.sensors),):
             raise ModelError(

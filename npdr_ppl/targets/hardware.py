@@ -1,4 +1,4 @@
-"""A template for physical devices: a loop at a fixed rate that always ends at rest."""
+"""Base class for physical devices: a control loop at a fixed rate that always ends at rest."""
 
 import threading
 import time
@@ -21,13 +21,13 @@ __all__ = ["HardwareReport", "HardwareTarget"]
 
 @dataclass
 class HardwareReport:
-    """How the latest episode went.
+    """Timing and end of the latest episode.
 
     Attributes:
-        ending: Why the episode ended, one sentence.
-        num_steps: Steps made.
-        missed_deadlines: Steps that began late.
-        largest_delay: The latest that a step began, in s after its due time.
+        ending: Reason why the episode ended, one sentence.
+        num_steps: Number of completed steps.
+        missed_deadlines: Number of steps that began late.
+        largest_delay: Largest delay of a step after its due time, in s.
     """
 
     ending: str = ""
@@ -38,44 +38,44 @@ class HardwareReport:
 
 @dataclass
 class _Record:
-    """What was read and applied so far."""
+    """Measurements and applied commands so far."""
 
     readings: list[Array] = field(default_factory=list)
     actions: list[Array] = field(default_factory=list)
 
 
 class HardwareTarget(TargetDomain):
-    """A physical device; subclasses say how to talk to it.
+    """A physical device; subclasses implement the communication with it.
 
-    A subclass sets ``name``, ``sensors``, ``actions`` and ``time_step`` and writes the hooks
+    A subclass sets ``name``, ``sensors``, ``actions`` and ``time_step`` and implements the hooks
     :meth:`connect`, :meth:`reset`, :meth:`read`, :meth:`write`, :meth:`stop` and
     :meth:`disconnect`. An episode calls them as follows:
 
-        connect, reset, read, then in each step: controller, write, wait for the tick, read;
-        at the end, whatever ended it: write the command of rest, stop, disconnect.
+        connect, reset, read, then in each step: controller, write, wait for the next tick, read;
+        at the end, for any reason: write the rest command, stop, disconnect.
 
-    The end comes also upon exceptions and Ctrl-C, and each of its three calls is made even if
-    another one fails. Python runs none of it when the process is killed, so let SIGTERM set the
-    emergency stop (``signal.signal(signal.SIGTERM, lambda *_: event.set())``), and give the
-    device a watchdog of its own.
+    The three last calls are also made after exceptions and Ctrl-C, each even if another one fails.
+    Python makes none of them when the process is killed. Therefore let SIGTERM set the emergency
+    stop (``signal.signal(signal.SIGTERM, lambda *_: event.set())``), and use a watchdog in the
+    device itself.
 
-    A reading outside the bounds of ``sensors`` ends the episode, as in simulation. What needs a
-    person raises instead: the emergency stop, missed deadlines, silence, a reading that is no
-    number. In either case no reading is lost: the exception carries the rollout so far, see
-    :func:`~npdr_ppl.targets.base.partial_rollout`.
+    A measurement outside the bounds of ``sensors`` ends the episode, as in simulation. Problems
+    that need a person raise an error: the emergency stop, missed deadlines, a silent controller or
+    driver, a measurement that is not a number. No measurement is lost: the exception carries the
+    rollout so far, see :func:`~npdr_ppl.targets.base.partial_rollout`.
 
     Args:
-        emergency_stop: Event, or function that returns whether to stop at once; asked before
-            each command and after each reading.
-        max_missed_deadlines: Late steps that an episode may have. A step is late if it begins
-            more than a tenth of the time step after it is due, which is what recordings may
-            deviate from constant sampling; later ones are then shifted, not caught up with.
+        emergency_stop: Event, or function that returns whether to stop at once; checked before
+            each command and after each measurement.
+        max_missed_deadlines: Number of late steps that an episode may have. A step is late if it
+            begins more than a tenth of the time step after its due time, the tolerance for
+            constant sampling of recordings. All later steps are then shifted by the delay.
         watchdog_timeout: Seconds after which a silent controller or driver is stopped.
-        clock: Time in s that never goes back.
-        sleep: Waits for a time in s.
+        clock: Function that returns a monotonic time in s.
+        sleep: Function that waits for a time in s.
 
     Attributes:
-        report: How the latest episode went.
+        report: Timing and end of the latest episode.
     """
 
     def __init__(
@@ -104,11 +104,11 @@ class HardwareTarget(TargetDomain):
 
     @abstractmethod
     def reset(self) -> None:
-        """Brings the device to its initial state and returns when it is there."""
+        """Moves the device to its initial state and returns when it has arrived."""
 
     @abstractmethod
     def read(self) -> ArrayLike:
-        """Returns the present readings, ``(sensors,)``, in the sensors' units."""
+        """Returns the present measurements, ``(sensors,)``, in the sensors' units."""
 
     @abstractmethod
     def write(self, actions: Array) -> None:
@@ -116,10 +116,10 @@ class HardwareTarget(TargetDomain):
 
     @abstractmethod
     def stop(self) -> None:
-        """Takes the power from the actuators.
+        """Switches off the power of the actuators.
 
-        It is called at every end, and may be called more than once, and by the watchdog from
-        another thread while another hook hangs.
+        It is called at the end of every episode, perhaps more than once. The watchdog may call it
+        from another thread while another hook hangs.
         """
 
     @abstractmethod
@@ -127,9 +127,9 @@ class HardwareTarget(TargetDomain):
         """Closes the connection."""
 
     def rest(self) -> Array:
-        """Returns the command that lets the device rest, ``(actions,)``: zeros.
+        """Returns the command for the device at rest, ``(actions,)``: zeros.
 
-        Devices that take positions must override this: zero would be a place to go to.
+        Devices that take positions must override this, because they would move to position zero.
         """
         return np.zeros(len(self.actions))
 
@@ -141,13 +141,13 @@ class HardwareTarget(TargetDomain):
         """Runs one episode; see the class and :class:`TargetDomain`.
 
         Args:
-            controller: What commands the device; it has to answer within the time step.
-            num_steps: Greatest number of steps.
-            episode: Ignored: all episodes are alike.
-            seed: Ignored: a device is where :meth:`reset` brings it.
+            controller: Controller of the device; it must return within the time step.
+            num_steps: Maximum number of steps.
+            episode: Ignored: all episodes are equal.
+            seed: Ignored: :meth:`reset` sets the initial state of a device.
 
         Raises:
-            TargetError: A person should look at the device.
+            TargetError: A person should check the device.
         """
         self._check_declaration(num_steps)
         record = _Record()
@@ -155,7 +155,7 @@ class HardwareTarget(TargetDomain):
         try:
             with ExitStack() as cleanup:
                 self.connect()
-                # In reverse: the command of rest goes first, while there still is a connection.
+                # Called in reverse order: the rest command is sent while the connection is open.
                 cleanup.callback(self.disconnect)
                 watchdog = cleanup.enter_context(Watchdog(self._watchdog_timeout, self.stop))
                 cleanup.callback(self.stop)
@@ -165,7 +165,7 @@ class HardwareTarget(TargetDomain):
             return self._rollout_of(record)
         except BaseException as error:
             self.report.ending = f"{type(error).__name__}: {error}"
-            # One step is the least that a rollout can hold.
+            # A rollout needs at least one step.
             if record.actions and len(record.readings) > 1:
                 error.rollout = self._rollout_of(record)  # type: ignore[attr-defined]
             raise
@@ -173,7 +173,7 @@ class HardwareTarget(TargetDomain):
             self.report.num_steps = max(len(record.readings) - 1, 0)
 
     def _check_declaration(self, num_steps: int) -> None:
-        """Raises an error for what would otherwise show when the device has already moved."""
+        """Checks the declaration, so that errors appear before the device moves."""
         if num_steps < 1:
             raise ModelError(f"An episode has at least one step, got {num_steps=}.")
         if self._watchdog_timeout < 2.0 * self.time_step:
@@ -181,7 +181,7 @@ class HardwareTarget(TargetDomain):
                 f"The watchdog of {self.name} is fed every {self.time_step:g} s: it needs a "
                 f"timeout of two steps or more, got {self._watchdog_timeout:g} s."
             )
-        # Columns that no rollout can have, e.g. two of one name, raise here.
+        # Invalid columns, e.g. two with the same name, raise an error here.
         self.rollout(np.zeros((2, len(self.sensors))), np.zeros((1, len(self.actions))))
 
     def _loop(
@@ -215,7 +215,7 @@ class HardwareTarget(TargetDomain):
         return ending
 
     def _wait_until(self, due: float) -> float:
-        """Waits for a tick and returns when it was due, or when it came if that was too late."""
+        """Waits for a tick; returns its due time, or its actual time if it was late."""
         remaining = due - self._clock()
         if remaining > 0.0:
             self._sleep(remaining)
@@ -244,7 +244,7 @@ class HardwareTarget(TargetDomain):
             )
 
     def _checked_reading(self) -> Array:
-        """Returns the present readings, which a rollout can hold."""
+        """Returns the present measurements after checking their number and values."""
         reading = np.array(self.read(), dtype=np.float64)
         if reading.shape != (len(self.sensors),):
             raise TargetError(
@@ -256,7 +256,7 @@ class HardwareTarget(TargetDomain):
         return reading
 
     def _violation(self, reading: Array) -> str:
-        """Returns which reading is outside its bounds, or an empty string."""
+        """Describes a measurement outside its bounds; an empty string if there is none."""
         for value, channel in zip(reading, self.sensors, strict=True):
             if not channel.lower <= value <= channel.upper:
                 return (
@@ -266,6 +266,6 @@ class HardwareTarget(TargetDomain):
         return ""
 
     def _rollout_of(self, record: _Record) -> Rollouts:
-        """Returns the recorded steps; a command without a reading after it is left out."""
+        """Returns the recorded steps; a command without a later measurement is left out."""
         num_steps = min(len(record.actions), len(record.readings) - 1)
         return self.rollout(record.readings[: num_steps + 1], record.actions[:num_steps])

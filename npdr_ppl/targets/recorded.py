@@ -1,4 +1,4 @@
-"""Recorded data as a target domain, for devices that are not at hand."""
+"""Recorded data as a target domain, for devices that are not available."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ __all__ = ["RecordedTarget"]
 
 
 class RecordedTarget(TargetDomain):
-    """Hands out recorded rollouts, whatever the controller would have done.
+    """Returns recorded rollouts and ignores the controller.
 
     Args:
         rollouts: The recordings, one per episode.
@@ -35,12 +35,12 @@ class RecordedTarget(TargetDomain):
 
         Args:
             controller: Ignored.
-            num_steps: Greatest number of steps.
-            episode: Position of the recording.
+            num_steps: Maximum number of steps.
+            episode: Index of the recording, from 0.
             seed: Ignored.
 
         Raises:
-            DataError: There are not so many recordings.
+            DataError: There is no recording with this index.
         """
         if not 0 <= episode < len(self._rollouts):
             raise DataError(

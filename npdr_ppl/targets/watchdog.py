@@ -1,4 +1,4 @@
-"""A watchdog: stops a device whose control loop has gone silent."""
+"""A watchdog: stops a device whose control loop hangs."""
 
 import math
 import threading
@@ -11,14 +11,15 @@ __all__ = ["Watchdog"]
 
 
 class Watchdog:
-    """Calls a function from another thread if it is not fed for a while, at most once.
+    """Calls a function from another thread, at most once, if :meth:`feed` is not called in time.
 
-    The first feeding arms it. It notices a controller or a driver that waits forever, but not a
-    process that has died or been suspended: it does not replace the watchdog in the device.
+    The first call of :meth:`feed` arms it. It detects a controller or a driver that waits forever,
+    but not a dead or suspended process: it does not replace the watchdog in the device.
 
     Args:
-        timeout: Silence that it tolerates, in s; it may take a quarter longer to notice.
-        bark: What to call.
+        timeout: Longest permitted time between two calls of :meth:`feed`, in s; detection may
+            take 25 % longer.
+        bark: Function to call.
     """
 
     def __init__(self, timeout: float, bark: Callable[[], None]) -> None:
@@ -31,11 +32,11 @@ class Watchdog:
 
     @property
     def has_barked(self) -> bool:
-        """Whether the loop has been silent for too long."""
+        """Whether the function was called, because the loop was silent for too long."""
         return self._has_barked.is_set()
 
     def feed(self) -> None:
-        """Tells that the loop is alive."""
+        """Reports that the loop is running."""
         self._fed_at = time.monotonic()
 
     def __enter__(self) -> Self:
@@ -49,11 +50,11 @@ class Watchdog:
         traceback: TracebackType | None,
     ) -> None:
         self._is_done.set()
-        # Not forever: a device whose stop hangs must not keep the loop from its own clean-up.
+        # With a timeout: a device whose stop hangs must not block the loop's own clean-up.
         self._thread.join(self._timeout)
 
     def _watch(self) -> None:
-        # Waking now and then costs the loop less than being woken by it in each step.
+        # Polling costs the loop less time than a wake-up call in each step.
         while not self._is_done.wait(self._timeout / 4.0):
             if time.monotonic() - self._fed_at > self._timeout:
                 self._has_barked.set()

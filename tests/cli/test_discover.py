@@ -206,9 +206,10 @@ def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, t
     show.show_discovery(found, tmp_path)
     shown = " ".join(text.getvalue().split())
     assert "ambiguous: It cannot tell." in shown
-    assert "slow ramp with torque up to 4, which sets the alternatives 12 standard" in shown
+    assert "slow ramp with torque up to 4, which separates the alternatives by 12" in shown
     assert "a change of load" in shown and "5.00%" in shown
-    assert "angle is read in counts of 0.00307, which make 42%" in shown and "way" not in shown
+    assert "angle has an encoder resolution of 0.00307, which causes 42%" in shown
+    assert "way" not in shown
 
 
 def test_the_command_has_the_defaults_of_the_options():

@@ -108,7 +108,7 @@ def test_a_mistake_in_a_recording(monkeypatch, capsys, tmp_path, name):
         (["pendulum", "--holdout", "0"], "leaves no rollouts to fit"),
         (["pendulum", "--data", "measurd.csv"], "Did you mean measured.csv?"),
         (["pendulum", "--data", "."], ".: is a directory, but a file is needed."),
-        (["pendulum", "--device", "cuda:99"], "--device cuda:99 is not to be had"),
+        (["pendulum", "--device", "cuda:99"], "--device cuda:99 is not available"),
     ],
 )
 def test_a_mistake_in_a_command(monkeypatch, capsys, tmp_path, words, sentence):

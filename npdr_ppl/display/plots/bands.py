@@ -55,7 +55,7 @@ def plot_bands(
                 axis.plot(time, line[:, c], color=COLORS.get(label, "C1"), lw=0.9, label=label)
             axis.plot(time, measured[:, c], color=COLORS["measured"], lw=1.1, label="measured")
             if np.isfinite(ends).all():
-                # A line that goes far away is cut; it does not squeeze recording and bands.
+                # Recording and bands set the axis limits; lines outside them are cut.
                 margin = 0.05 * (max(ends) - min(ends)) + np.finfo(float).tiny
                 axis.set_ylim(min(ends) - margin, max(ends) + margin)
             for reset in [] if resets is None else resets:
@@ -71,15 +71,15 @@ def plot_bands(
 def nominal_line(
     model: Callable[..., Any], rollouts: Rollouts, options: DataOptions
 ) -> dict[str, NDArray[np.float64]]:
-    """Returns the first rollout as the nominal simulator has it, for :func:`plot_bands`.
+    """Returns the nominal simulation of the first rollout, for :func:`plot_bands`.
 
     Args:
-        model: The model without reading noise.
+        model: The model without measurement noise.
         rollouts: The recording.
         options: Segments, initial states and precision.
 
     Returns:
-        The simulation ``(T, C)`` by its legend entry; nothing where a parameter has no nominal
+        The simulation ``(T, C)`` by its legend entry; empty if a parameter has no nominal
         value or nominal parameters cannot be simulated.
     """
     shown = rollouts[[0]]

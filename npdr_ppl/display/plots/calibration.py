@@ -1,4 +1,4 @@
-"""Figures of a calibration: rank distributions and coverage, each with the band of chance."""
+"""Figures of a calibration: rank distributions and coverage, each with its confidence band."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,10 +22,10 @@ BAND = 0.95
 def plot_ranks(calibration: Calibration) -> Figure:
     """Draws how every parameter's rank distribution differs from the uniform one.
 
-    Curves are those of Säilynoja et al. (2022): the empirical distribution function minus the
-    uniform one, in its 95 % simultaneous band. An arch above zero on the left and below on the
-    right (the truth too often in the tails) is over-confidence, the reverse under-confidence; a
-    bow to one side is bias.
+    The curves follow Säilynoja et al. (2022): the empirical distribution function minus the
+    uniform one, with its 95 % simultaneous band. A curve above zero on the left and below zero on
+    the right (the truth is too often in the tails) means over-confidence, the reverse
+    under-confidence. A curve on one side of zero means bias.
 
     Args:
         calibration: The ranks.
@@ -56,8 +56,8 @@ def plot_coverage(
 ) -> Figure:
     """Draws expected against nominal coverage, with the band of a calibrated posterior.
 
-    Below the diagonal regions hold the truth less often than they say: the posterior is
-    over-confident (or biased).
+    Below the diagonal, regions contain the truth less often than their nominal probability: the
+    posterior is over-confident (or biased).
 
     Args:
         calibration: The ranks.

@@ -27,11 +27,11 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["write_comparison_figures"]
 
 PANELS = 4
-"""Pair panels in a row at most."""
+"""Maximum number of pair panels in a row."""
 
 SMOOTHING = 1.0
-"""Bins over which a pair panel is smoothed: with two thousand draws a broad posterior is speckled
-without."""
+"""Standard deviation of the smoothing of a pair panel, in bins; without it, a broad posterior
+with two thousand draws looks speckled."""
 
 
 def write_comparison_figures(
@@ -44,11 +44,11 @@ def write_comparison_figures(
     seed: int = 0,
     progress: Step | None = None,
 ) -> list[Path]:
-    """Draws all posteriors that a comparison found, and their predictions for one rollout.
+    """Draws all posteriors of a comparison, and their predictions for one rollout.
 
     Args:
         comparison: The comparison.
-        model: The model without reading noise, to draw the simulator's own spread.
+        model: The model without measurement noise, to draw only the simulator's spread.
         rollouts: The first of these is drawn.
         out: Folder for ``marginals.png``, ``pairs.png``, ``bands.png`` and ``seconds.png``.
         marks: Values to mark, by legend entry and parameter.
@@ -81,7 +81,7 @@ def write_comparison_figures(
     step(0.5, "predictions")
     options = some.bound.options
     shown = rollouts[[0]]
-    # The posteriors' simulations are drawn together, so that they share what there is.
+    # The posteriors are simulated for one figure, so they share the memory budget.
     budget = BUDGET // (4 * len(draws))
     num = affordable_draws(NUM_PREDICTIVE, shown.readings[0].size, budget=budget)
     replays = {
@@ -114,14 +114,14 @@ def most_informative(samples: Mapping[str, Samples], prior: Samples) -> tuple[st
         for name in prior
     }
     first, second = sorted(contraction, key=lambda name: -contraction[name])[:2]
-    # In the model's order, so that a repeated comparison has the same axes.
+    # The model's order is kept, so that a repeated comparison has the same axes.
     return (first, second) if list(prior).index(first) < list(prior).index(second) else (
         second, first
     )  # fmt: skip
 
 
 def _wrapped(panels: Mapping[str, Samples]) -> dict[str, dict[str, Samples]]:
-    """Returns panels in rows of about equal length, under titles that show nothing."""
+    """Returns panels in rows of about equal length, with blank row titles."""
     count = -(-len(panels) // PANELS)
     length = -(-len(panels) // count)
     labels = list(panels)
@@ -136,10 +136,10 @@ def _range(
     samples: Mapping[str, Samples],
     prior: Samples,
 ) -> tuple[float, float]:
-    """Returns limits that hold every posterior, but no more of the prior than is of use.
+    """Returns limits that show all posteriors, but not necessarily the whole prior.
 
-    Posteriors are often a small spot of the prior; the axes end where the widest of them does,
-    with a quarter of its width to spare, or where the prior does.
+    Posteriors often fill only a small part of the prior. The axes contain 99 % of every
+    posterior and a margin of a quarter of that range, but end at the prior's ends.
     """
     ends = np.array([np.quantile(values[name], [0.005, 0.995]) for values in samples.values()])
     low, high = float(ends[:, 0].min()), float(ends[:, 1].max())

@@ -14,22 +14,22 @@ from npdr_ppl.drawing.theme import COLORS, SERIES, theme
 __all__ = ["plot_bands_by_backend", "plot_overlaid_marginals", "plot_seconds"]
 
 STAGES = {"simulate": "#56B4E9", "train": "#0072B2", "sample": "#E69F00"}
-"""Where a backend's time goes, with a colour each."""
+"""Stages of a backend, each with the colour of its computing time."""
 
 PEAK_RATIO = 6.0
-"""A sharp posterior's peak is cut at this many times the lowest one's, which stays visible so."""
+"""Peaks are cut at this many times the lowest peak, so that broad posteriors stay visible."""
 
 SHARPEST = 1e-6
-"""A posterior narrower than this part of the axis is drawn as a line."""
+"""A posterior narrower than this fraction of the axis is drawn as a line."""
 
 LEVELS = (0.05, 0.95, 0.25), (0.25, 0.75, 0.45)
 """Quantiles between which bands lie, and their opacity."""
 
 NUM_POINTS = 300
-"""Points of a density's curve."""
+"""Number of points of a density curve."""
 
 STYLES = ("-", "--", "-.", ":")
-"""Line styles, so that the ninth posterior is not drawn like the first."""
+"""Line styles; they distinguish the ninth posterior from the first, which has its colour."""
 
 
 def plot_overlaid_marginals(
@@ -41,7 +41,7 @@ def plot_overlaid_marginals(
 ) -> Figure:
     """Draws every parameter's marginal of all posteriors over the prior.
 
-    In the manner of Figure 4 of Muratore et al. (2021).
+    The figure follows Figure 4 of Muratore et al. (2021).
 
     Args:
         posteriors: Draws ``(n,)`` by legend entry and parameter.
@@ -73,7 +73,7 @@ def plot_overlaid_marginals(
                 if np.ptp(values) <= SHARPEST * (high - low):
                     axis.axvline(values[0], **look)
                     continue
-                # On its own range: a sharp posterior falls between the points of a common grid.
+                # Each density has its own grid: a common one could miss a sharp posterior.
                 grid = np.linspace(values.min(), values.max(), NUM_POINTS)
                 shape = density(values, grid)
                 peaks.append(float(shape.max()))
@@ -105,8 +105,8 @@ def plot_bands_by_backend(
 ) -> Figure:
     """Draws every posterior's predictive bands over the recording, a column for each.
 
-    In the manner of Figure 5 of Muratore et al. (2021), in which the recording is drawn beside
-    what nominal parameters and draws of a posterior make of it.
+    The figure follows Figure 5 of Muratore et al. (2021), which shows the recording together with
+    simulations with nominal parameters and with draws of a posterior.
 
     Args:
         time: Seconds, ``(T,)``.
@@ -127,7 +127,7 @@ def plot_bands_by_backend(
         for column, (label, predictive) in enumerate(predictives.items()):
             axes[0, column].set_title(label)
             color = SERIES[column % len(SERIES)]
-            # Draws whose simulation failed have no band; a quantile of NaN would hide the others.
+            # Failed simulations are left out: NaN would make the quantiles of all draws NaN.
             whole = predictive[np.isfinite(predictive).all((1, 2))]
             for c, axis in enumerate(axes[:, column]):
                 for reset in [] if resets is None else resets:
@@ -138,12 +138,12 @@ def plot_bands_by_backend(
                     band = np.quantile(whole[..., c], [low, high], axis=0)
                     axis.fill_between(time, band[0], band[1], color=color, alpha=alpha, lw=0)
                 if len(whole):
-                    # The band of a sharp posterior is too thin to be seen.
+                    # The band of a sharp posterior is too thin to see, so the median is drawn too.
                     middle = np.median(whole[..., c], axis=0)
                     for start, stop in _stretches(time, resets):
                         axis.plot(time[start:stop], middle[start:stop], color=color, lw=0.8)
                 for entry, line in (lines or {}).items():
-                    # Colours are the columns': the second one's is what nominal has elsewhere.
+                    # Grey, because the second column has the colour that marks nominal elsewhere.
                     look = {"color": "0.4", "lw": 0.7, "ls": "--"}
                     for start, stop in _stretches(time, resets):
                         axis.plot(time[start:stop], line[start:stop, c], label=entry, **look)
@@ -155,11 +155,11 @@ def plot_bands_by_backend(
             axes[-1, column].set_xlabel("time [s]")
             axes[-1, column].set_xlim(time[0], time[-1])
         for c, row in enumerate(axes):
-            # The recording sets the scale: a band that leaves it is cut, not the recording.
+            # The recording sets the axis limits; bands outside them are cut.
             low, high = measured[:, c].min(), measured[:, c].max()
             margin = 0.25 * (high - low) + np.finfo(float).tiny
             row[0].set_ylim(low - margin, high + margin)
-        # Columns have colours of their own, so that the legend's bands have none.
+        # Every column has its own colour, so the bands in the legend are black.
         for low, high, alpha in LEVELS:
             label = f"posterior {high - low:.0%}"
             axes[0, 0].add_patch(
@@ -172,14 +172,14 @@ def plot_bands_by_backend(
 def _stretches(
     time: NDArray[np.float64], resets: NDArray[np.float64] | None
 ) -> list[tuple[int, int]]:
-    """Returns where a line is to be drawn in one piece: from one reset to the next."""
+    """Returns the index ranges between resets, in which a line is drawn without a gap."""
     starts = [] if resets is None else np.searchsorted(time, resets - 1e-9).tolist()
     bounds = sorted({0, len(time), *starts})
     return list(zip(bounds[:-1], bounds[1:], strict=True))
 
 
 def plot_seconds(seconds: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Draws where each backend's time went, a bar for each.
+    """Draws the computing time of each backend by stage, one bar per backend.
 
     Args:
         seconds: Seconds by label and stage.

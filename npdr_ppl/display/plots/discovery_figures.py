@@ -26,7 +26,7 @@ Columns = dict[str, NDArray[np.float64]]
 
 
 def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
-    """Draws where the model was wrong, what was missing, and what adding it did.
+    """Draws the residuals of the model, the missing effects, and the improvement by adding them.
 
     Args:
         discovery: The discovery.
@@ -53,7 +53,7 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
     posteriors = {BEFORE: draws}
     if after is not None:
         wide, narrow = _draws(after, discovery.draws, seed)
-        # First, so that it has the colour that it has in the other figures.
+        # The revised model comes first, so that it has the same colour as in the other figures.
         posteriors = {AFTER: {name: narrow[name] for name in draws}, **posteriors}
         new = [name for name in narrow if name not in draws]
         figures["effects"] = plot_overlaid_marginals(
@@ -68,13 +68,13 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
 
 
 def write_stage_figures(investigation: Investigation, stage: Stage, out: Path) -> list[Path]:
-    """Draws what is known after a stage before the naming of effects.
+    """Draws the results after a stage that precedes the naming of effects.
 
     Args:
         investigation: The investigation.
         stage: The last stage.
         out: Folder for ``residual_map.png``, ``latent_force.png``, ``ranking.png`` and
-            ``separation.png``, as far as the stages have come.
+            ``separation.png``, if their stage was reached.
     """
     reached = STAGES.index(stage)
     figures = {}

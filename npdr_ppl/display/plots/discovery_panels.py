@@ -1,4 +1,4 @@
-"""What discovery found in bars and tables: ranking, held-out gap, separation."""
+"""Results of a discovery as bars and tables: ranking, held-out gap, separation."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
 __all__ = ["plot_gap", "plot_ranking", "plot_separation"]
 
 MOST_CANDIDATES = 12
-"""Candidates of the first panel."""
+"""Maximum number of candidates in the first panel."""
 
 MOST_COLUMNS = 3
 
 
 def plot_ranking(ranking: Sequence[Screened], discovery: "Discovery | None" = None) -> Figure:
-    """Draws the candidates by separation, and the probabilities of what could be missing.
+    """Draws the candidates by separation, and the probabilities of the missing effects.
 
     Args:
-        ranking: All candidates at the model as it was.
-        discovery: What was found; without it there are no probabilities.
+        ranking: All candidates for the original model.
+        discovery: The discovery; without it no probabilities are drawn.
     """
     panels = (
         []
@@ -94,11 +94,11 @@ def plot_gap(gap: Mapping[str, Gap]) -> Figure:
 
 
 def plot_separation(distance: NDArray[np.float64], names: Sequence[str]) -> Figure:
-    """Draws how far the leading candidates are apart once the parameters are refitted.
+    """Draws the separation of the leading candidates after refitting the parameters.
 
     Args:
         distance: Standard deviations between the row's candidate at its best size and the
-            column's at any size, ``(n, n)``; the diagonal is the distance from none.
+            column's at any size, ``(n, n)``; the diagonal is the distance from no effect.
         names: Names of the n candidates.
     """
     count = len(names)

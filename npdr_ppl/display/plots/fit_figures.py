@@ -23,7 +23,7 @@ __all__ = ["scalar_columns", "write_fit_figures"]
 NUM_DRAWS = 2_000
 NUM_PREDICTIVE = 100
 MAX_PAIRS = 12
-"""Parameters of a pair plot; more would be too small to read."""
+"""Maximum number of parameters of a pair plot; more panels would be too small to read."""
 
 
 def write_fit_figures(
@@ -40,7 +40,7 @@ def write_fit_figures(
 
     Args:
         posterior: The posterior.
-        model: The model without reading noise, to draw the simulator's own spread.
+        model: The model without measurement noise, to draw only the simulator's spread.
         rollouts: The first of these is drawn.
         out: Folder for ``marginals.png``, ``pairs.png`` and ``bands.png``.
         marks: Values to mark, by legend entry and parameter.

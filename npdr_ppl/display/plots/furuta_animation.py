@@ -22,7 +22,7 @@ CHANNELS = ("arm_angle", "pole_angle")
 FRAMES_PER_SECOND = 20
 
 MAX_FRAMES = 160
-"""Longer rollouts are shown faster than they were: a frame takes about 10 kB."""
+"""Maximum number of frames, about 10 kB each; longer rollouts are shown faster than real time."""
 
 SIZE = 3.6
 """Width and height in inches."""
@@ -30,7 +30,7 @@ SIZE = 3.6
 DOTS_PER_INCH = 100
 
 TRAIL = 0.6
-"""Seconds for which the way of the pole's tip remains visible."""
+"""Time in s for which the path of the pole's tip remains visible."""
 
 
 def check_animated(channel_names: Sequence[str]) -> None:
@@ -49,7 +49,7 @@ def furuta_points(
     arm_length: float,
     pole_length: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns where the arm ends and where the pole ends, ``(T, 3)`` each, in m, z up.
+    """Returns the end positions of arm and pole, ``(T, 3)`` each, in m, z up.
 
     Args:
         arm_angle: In rad, ``(T,)``.
@@ -73,7 +73,7 @@ def write_furuta_animation(
     Args:
         rollout: Rollouts with the angles of a Furuta pendulum.
         path: The file.
-        domain: Gives the lengths of arm and pole; missing ones are nominal.
+        domain: Parameters with the lengths of arm and pole; missing ones are nominal.
 
     Raises:
         DataError: The angles were not recorded.
@@ -116,8 +116,8 @@ def write_furuta_animation(
 
 
 def _draw_rig(figure: Figure, arm_length: float, pole_length: float) -> dict[str, Any]:
-    """Draws what does not move, and returns what does, by name."""
-    # Larger than the frame, because matplotlib leaves room for tick labels.
+    """Draws the fixed parts, and returns the moving parts by name."""
+    # The axes exceed the frame, because matplotlib leaves space for tick labels.
     axis: Any = figure.add_axes((-0.08, -0.06, 1.16, 1.16), projection="3d")
     reach = arm_length + 0.3 * pole_length
     floor = -1.15 * pole_length

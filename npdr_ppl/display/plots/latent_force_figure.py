@@ -1,4 +1,4 @@
-"""The force that a model lacks, against what was going on when it lacked it."""
+"""The force that a model lacks, plotted against channels, commands and time."""
 
 from collections.abc import Mapping
 
@@ -16,13 +16,13 @@ from npdr_ppl.drawing.theme import COLORS, theme
 __all__ = ["plot_latent_force"]
 
 BINS = 15
-"""Bins along a channel, of equal width between its lowest and highest hundredth."""
+"""Number of bins along a channel, of equal width between its 1 % and 99 % quantiles."""
 
 FEWEST = 8
-"""Estimates in a bin that is drawn."""
+"""Minimum number of estimates in a bin; bins with fewer are not drawn."""
 
 MOST_DOTS = 250
-"""Estimates drawn as dots, picked at random; all count for the line."""
+"""Maximum number of estimates drawn as dots, chosen at random; the line uses all estimates."""
 
 WIDTH = 2.0
 """Half the band's width, in standard errors of a bin's mean."""
@@ -39,17 +39,17 @@ def plot_latent_force(
 ) -> Figure | None:
     """Draws the missing force at every joint against every channel, command and time.
 
-    Each dot is the mean force over a pulse; the line is their mean in bins, weighted by the
-    estimates' precision, the band two standard errors of it. The axis is the lines': some dots
-    lie outside.
+    Each dot is the mean force over a pulse. The line is the mean of the dots in bins, weighted by
+    the estimates' precision, and the band is two standard errors of it. The lines and bands set
+    the axis limits, so some dots lie outside.
 
     Args:
-        first: What was seen at the model as it was.
-        last: What was seen at the revised model.
+        first: Round of the search with the original model.
+        last: Round of the search with the revised model.
         units: Units of channels and commands by name.
 
     Returns:
-        The figure, or ``None`` where the model has no joint that a force could act on.
+        The figure, or ``None`` if the model has no joint on which a force can act.
     """
     rounds = {BEFORE: first}
     if last is not None and last.hypothesis is not first.hypothesis:
@@ -86,7 +86,7 @@ def plot_latent_force(
 
 
 def _draw(axis: Axes, x: Array, found: LatentForce, title: str) -> float:
-    """Draws one joint's force against one channel; returns how far the band reaches."""
+    """Draws one joint's force against one channel; returns the band's largest magnitude."""
     force = found.force.numpy().ravel()
     precision = found.error.numpy().ravel().clip(1e-12) ** -2.0
     few = np.random.default_rng(0).permutation(len(x))[:MOST_DOTS]
@@ -126,6 +126,6 @@ def _forces(now: Round) -> dict[str, LatentForce]:
 
 
 def _axes_of(now: Round) -> dict[str, Array]:
-    """Returns what the forces are drawn against, flattened as they are."""
+    """Returns channels, commands and time in the order of the flattened forces."""
     values = {name: v.numpy().ravel() for name, v in now.responses.channels.items()}
     return values | {"time": now.responses.time.numpy().ravel()}

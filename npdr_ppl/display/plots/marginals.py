@@ -51,7 +51,7 @@ def plot_marginals(
 
 
 def add_legend(figure: Figure, **placement: Any) -> None:
-    """Adds one legend with every entry that any of the figure's axes has."""
+    """Adds one legend with the entries of all axes of the figure."""
     entries: dict[str, Any] = {}
     for axis in figure.axes:
         handles, labels = axis.get_legend_handles_labels()

@@ -1,4 +1,4 @@
-"""Figure 4 of Muratore et al. (2021): the posterior over a golf ball and the obstacles' places."""
+"""Figure 4 of Muratore et al. (2021): the posterior over golf ball and obstacle poses."""
 
 import math
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ def write_mini_golf_figures(
 
 
 def measured_shifts() -> dict[str, float]:
-    """Returns where motion capture saw the obstacles, relative to the plan, in m and rad."""
+    """Returns the obstacle poses from motion capture relative to the plan, in m and rad."""
     shifts = {}
     for side, planned, seen in zip(("left", "right"), OBSTACLES, MEASURED_OBSTACLES, strict=True):
         x, y, degrees = seen

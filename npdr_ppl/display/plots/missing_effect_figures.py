@@ -23,12 +23,12 @@ __all__ = ["plot_replays", "write_missing_effect_figures"]
 def write_missing_effect_figures(
     story: Story, held_out: Rollouts, chirps: Rollouts | None, out: Path
 ) -> list[Path]:
-    """Draws the discovery, and both models' predictions for recordings that neither has seen.
+    """Draws the discovery, and the predictions of both models for held-out recordings.
 
     Args:
         story: The discovery and the models before and after.
         held_out: Held-out swing-ups, of which the first is drawn.
-        chirps: Rollouts of the other excitation, likewise.
+        chirps: Rollouts of the other excitation, of which the first is drawn.
         out: Folder for the figures of a discovery, ``held_out.png`` and ``chirp.png``.
     """
     paths = write_discovery_figures(story.discovery, out)
@@ -43,7 +43,7 @@ def write_missing_effect_figures(
 
 
 def plot_replays(models: Mapping[str, Hypothesis], rollouts: Rollouts, length: int) -> Figure:
-    """Draws what fitted models simulate over one recorded rollout.
+    """Draws simulations of fitted models over one recorded rollout.
 
     Args:
         models: The models by legend entry.

@@ -13,7 +13,7 @@ from npdr_ppl.drawing.theme import COLORS, theme
 
 __all__ = ["plot_pair"]
 
-# Levels of a two-dimensional highest-density region: half and 90 % of the draws.
+# Levels of a two-dimensional highest-density region: 90 % and 50 % of the draws.
 MASSES = (0.9, 0.5)
 BINS = 40
 
@@ -65,7 +65,7 @@ def plot_pair(
 
 
 def _draw_joint(axis: Axes, posterior: Samples, prior: Samples, x: str, y: str) -> None:
-    # The posterior may press against the very edge of the prior.
+    # The posterior may reach the edge of the prior's draws or exceed it.
     joint = {name: np.concatenate([prior[name], posterior[name]]) for name in (x, y)}
     bounds = [(values.min(), values.max()) for values in joint.values()]
     density, edges_x, edges_y = np.histogram2d(posterior[x], posterior[y], bins=BINS, range=bounds)

@@ -16,7 +16,7 @@ SHOWN_ROUNDS = (0, 2, ROUNDS - 1)
 
 
 def write_pendulum_figures(ridges: Mapping[str, Ridge], out: Path) -> list[Path]:
-    """Draws every method's posterior after rounds 1, 3 and 8 beside NUTS, by duration.
+    """Draws every method's posterior after rounds 1, 3 and 8 and NUTS, one file per duration.
 
     Args:
         ridges: The posteriors by duration, e.g. ``"8 s"``.

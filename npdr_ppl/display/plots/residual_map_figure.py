@@ -1,4 +1,4 @@
-"""Where a model misses a recording: standardised residuals over time and channel."""
+"""Map of a model's residuals: standardised residuals over time and channel."""
 
 from collections.abc import Sequence
 
@@ -18,13 +18,13 @@ from npdr_ppl.drawing.theme import COLORS, theme
 __all__ = ["plot_residual_map"]
 
 MOST_ROLLOUTS = 5
-"""Rollouts drawn, those with the worst windows first."""
+"""Maximum number of rollouts; those with the worst windows are preferred."""
 
 MOST_COLUMNS = 500
-"""Cells along the time axis; the root mean square of the readings in a cell is drawn."""
+"""Maximum number of cells along the time axis; a cell shows the root mean square of its values."""
 
 QUIETEST = 1.0
-"""Residuals below one standard deviation of the readings' noise are all drawn alike."""
+"""Residuals below one standard deviation of the measurement noise have the same colour."""
 
 Array = NDArray[np.float64]
 
@@ -32,12 +32,12 @@ Array = NDArray[np.float64]
 def plot_residual_map(
     before: Hypothesis, after: Hypothesis | None = None, where: Sequence[Spot] = ()
 ) -> Figure:
-    """Draws |residual| in standard deviations of the readings' noise, a panel for each rollout.
+    """Draws |residual| in standard deviations of the measurement noise, one panel per rollout.
 
     Args:
-        before: The model as it was, fitted.
+        before: The original model, fitted.
         after: The revised model, drawn in a second column.
-        where: The worst windows of the model as it was, marked and numbered.
+        where: The worst windows of the original model, marked and numbered.
     """
     names = before.segments.channel_names
     columns = {"the model as it was": before}
@@ -72,9 +72,7 @@ def plot_residual_map(
                     _mark(axis, rollout, where, names)
             axes[-1, column].set_xlabel("time [s]")
         if image is not None:
-            figure.colorbar(
-                image, ax=axes, extend="both", label="|residual| / noise of the readings"
-            )
+            figure.colorbar(image, ax=axes, extend="both", label="|residual| / measurement noise")
     return figure
 
 
@@ -97,14 +95,14 @@ def _mark(axis: Axes, rollout: int, where: Sequence[Spot], names: Sequence[str])
 
 
 def _shown(hypothesis: Hypothesis, where: Sequence[Spot]) -> list[int]:
-    """Returns the rollouts to draw, in their own order."""
+    """Returns the rollouts to draw, in the order of the recording."""
     every = hypothesis.segments.inputs.rollout.unique().tolist()
     loud = list(dict.fromkeys(spot.rollout for spot in where))
     return sorted([*loud, *(r for r in every if r not in loud)][:MOST_ROLLOUTS])
 
 
 def _noise(hypothesis: Hypothesis) -> torch.Tensor:
-    """Returns the readings' noise, ``(C,)``, from third differences inside the segments."""
+    """Returns the measurement noise, ``(C,)``, from third differences inside the segments."""
     observed = hypothesis.segments.observed.double()
     mask = hypothesis.segments.inputs.mask
     third = observed.diff(n=3, dim=1).abs()[mask[:, 3:]]
@@ -113,7 +111,7 @@ def _noise(hypothesis: Hypothesis) -> torch.Tensor:
 
 
 def _by_rollout(hypothesis: Hypothesis, noise: torch.Tensor) -> dict[int, Array]:
-    """Returns |residual| in units of noise, ``(T, C)`` by rollout; NaN where there is none."""
+    """Returns |residual| in units of noise, ``(T, C)`` by rollout; NaN outside the segments."""
     segments, fit = hypothesis.segments, hypothesis.fit
     residual = segments.residuals(fit.z[None], fit.offsets[None], noise)[0]
     z = residual.unflatten(-1, (-1, len(noise))).abs()
@@ -132,7 +130,7 @@ def _by_rollout(hypothesis: Hypothesis, noise: torch.Tensor) -> dict[int, Array]
 
 
 def _thinned(values: Array) -> Array:
-    """Returns the root mean square over as many steps as make a cell, ``(cells, C)``."""
+    """Returns the root mean square over the steps of each cell, ``(cells, C)``."""
     width = -(-len(values) // MOST_COLUMNS)
     padding = -len(values) % width
     padded = np.concatenate((values, np.full((padding, values.shape[1]), np.nan)))

@@ -33,16 +33,16 @@ Records = Sequence[Mapping[str, Any]]
 """Records of the iterations, as in ``train.json``."""
 
 NUM_PRIOR_DRAWS = 2_000
-"""Draws that give a prior's range and standard deviation."""
+"""Number of draws from which a prior's range and standard deviation are computed."""
 
 RANGE = (0.005, 0.995)
-"""Quantiles that are drawn as a prior's range; a uniform one's is all but its edges."""
+"""Quantiles that are drawn as a prior's range; for a uniform prior, almost the whole range."""
 
 
 def write_training_figures(
     training: Training, target: TargetDomain, task: ControlTask, out: Path
 ) -> list[Path]:
-    """Draws what became of a run of the loop.
+    """Draws the results of a run of the loop.
 
     Args:
         training: The run's result.
@@ -74,9 +74,9 @@ def write_training_figures(
 
 
 def last_rollout(records: Records) -> int:
-    """Returns the position of the last rollout that an iteration began with.
+    """Returns the position of the last rollout that an iteration recorded at its start.
 
-    Rollouts that a diagnosis asked for come after it; they need not be the policy's.
+    Rollouts that a diagnosis requested come later and may use another controller.
     """
     last = records[-1]
     before = records[-2]["num_rollouts"] if len(records) > 1 else 0
@@ -88,7 +88,7 @@ def plot_learning_curve(
 ) -> Figure:
     """Draws the returns of each iteration's policy, on the target and in simulation.
 
-    The last iteration's policy has not been run on the target.
+    The policy that the last iteration trained has not run on the target.
 
     Args:
         records: Records of the iterations, as in ``train.json``.
@@ -96,7 +96,7 @@ def plot_learning_curve(
         success: Return above which an episode counts as a success.
     """
     numbers = np.arange(1, len(records) + 1)
-    # What an iteration trains, the next one runs.
+    # The policy that an iteration trains runs in the next iteration.
     simulated = [first_sim_return, *(record.get("sim_return") for record in records)]
     with theme():
         size = (max(5.5, 0.85 * len(records) + 2.0), 3.2)
@@ -124,14 +124,14 @@ def plot_learning_curve(
         axis.set_xticks(ticks, labels)
         axis.set_xlim(0.5, ticks[-1] + 0.5)
         axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
-        axis.set_xlabel("iteration, and what was decided after its rollouts")
+        axis.set_xlabel("iteration, and the decision after its rollouts")
         axis.set_ylabel("return")
         add_legend(figure, loc="outside upper center", ncols=2)
     return figure
 
 
 def plot_rollouts(rollouts: Mapping[str, Rollouts]) -> Figure:
-    """Draws readings and applied commands over time; a cross marks an episode that ended early.
+    """Draws measurements and applied commands over time; a cross marks an early end.
 
     Args:
         rollouts: One rollout by legend entry; all have the same channels.
@@ -146,7 +146,7 @@ def plot_rollouts(rollouts: Mapping[str, Rollouts]) -> Figure:
         axes = figure.subplots(len(names), 1, sharex=True, squeeze=False).ravel()
         for (label, rollout), color in zip(rollouts.items(), colors, strict=True):
             time = rollout.time[0]
-            # The last command holds until the last reading.
+            # The last command is held until the last measurement.
             commands = np.concatenate([rollout.actions[0], rollout.actions[0][-1:]])
             series = np.concatenate([rollout.readings[0], commands], axis=1)
             count = len(rollout.channel_names)
@@ -178,9 +178,9 @@ def plot_parameters_by_iteration(
     """Draws how domain parameters change from iteration to iteration, against their prior.
 
     Args:
-        mean: Posterior means by parameter, one per iteration, ``(I,)``; NaN where an iteration has
+        mean: Posterior means by parameter, one per iteration, ``(I,)``; NaN if an iteration has
             none.
-        sd: Posterior standard deviations, alike.
+        sd: Posterior standard deviations, in the same format.
         prior: Draws ``(m,)`` by parameter; their range is shaded.
         nominal: Values to mark.
         units: Units by parameter.
@@ -201,7 +201,7 @@ def plot_parameters_by_iteration(
                 numbers, mean[name], sd[name], color=COLORS["posterior"], fmt="o-", ms=4,
                 lw=1, capsize=3, label="posterior mean ± sd",
             )  # fmt: skip
-            # Error bars know no edges; the prior does.
+            # Error bars may leave the prior's range; the axis does not include them.
             margin = 0.04 * (high - low)
             bottom, top = (
                 np.nanmin([low, *mean[name]]),
@@ -243,7 +243,7 @@ def _by_iteration(
 
 
 def _decisions(record: Mapping[str, Any]) -> str:
-    """Returns what was decided in an iteration, a line for each."""
+    """Returns the decisions of an iteration, one per line."""
     return "\n".join(str(decision["decision"]) for decision in record["decisions"])
 
 
@@ -253,7 +253,7 @@ def _return(rollouts: Rollouts, row: int) -> float:
 
 
 def _name_parameter(axis: Axes, name: str, unit: str) -> None:
-    """Writes a parameter's name above its panel, that of an effect's in two lines."""
+    """Writes a parameter's name above its panel; names of effects take two lines."""
     port, separator, rest = name.partition(".")
     label = f"{port}\n{rest}" if separator else name
     axis.set_title(f"{label} [{unit}]" if unit and unit != "1" else label, fontsize=8, pad=10)

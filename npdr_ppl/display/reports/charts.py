@@ -1,7 +1,7 @@
-"""Charts as plain Plotly specifications: traces and layouts that JSON can hold.
+"""Charts as plain Plotly specifications: traces and layouts of JSON types.
 
-They are dictionaries rather than Plotly's own objects, so that a report is written without
-importing the larger part of that library; the tests have Plotly check them.
+They are dictionaries rather than Plotly's own objects, so that writing a report does not import
+most of that library. The tests check them with Plotly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,10 +28,10 @@ __all__ = [
 Array = NDArray[np.float64]
 
 MAX_POINTS = 400
-"""Points of a line; a phone shows no more, and a page has to stay small."""
+"""Maximum number of points of a line; a phone shows no more, and the page must stay small."""
 
 MAX_MARKERS = 40
-"""Points of a line that are marked; more would hide it."""
+"""Maximum number of marked points of a line; more would hide the line."""
 
 _GRID = 120
 _BINS = 20
@@ -40,7 +40,7 @@ _DIGITS = 5
 
 
 def rounded(values: Any) -> list[Any]:
-    """Returns numbers with five digits, and None for what JSON has not."""
+    """Returns numbers with five digits; None for NaN and infinity, which JSON lacks."""
     flat = np.asarray(values, dtype=float)
     if flat.ndim > 1:
         return [rounded(row) for row in flat]
@@ -95,7 +95,7 @@ def marginals_chart(
     layout["margin"] |= {"t": 60, "b": 80}
     layout["legend"] |= {"y": -0.25, "yanchor": "top"}
     layout["updatemenus"] = [menu] if len(names) > 1 else []
-    caption = "Marginal posterior over the prior. What the data say nothing about keeps its prior."
+    caption = "Marginal posterior over the prior; equal if the data contain no information."
     return ChartPart("marginals", caption, data, layout, 360)
 
 
@@ -161,7 +161,7 @@ def lines_chart(
     caption: str,
     diagonal: bool = False,
 ) -> ChartPart:
-    """Draws lines with markers, ``label: (x, y)``, where wanted over the diagonal."""
+    """Draws lines with markers, ``label: (x, y)``, optionally with the diagonal."""
     data: list[dict[str, Any]] = [
         {
             "type": "scatter",
@@ -170,7 +170,7 @@ def lines_chart(
             "x": rounded(x),
             "y": rounded(np.array([np.nan if v is None else v for v in y], dtype=float)),
             "line": {"color": SERIES[index % len(SERIES)]},
-            # Black would vanish on a dark page.
+            # Black is invisible on a dark page.
             **({"meta": "ink"} if SERIES[index % len(SERIES)] == "#000000" else {}),
         }
         for index, (label, (x, y)) in enumerate(lines.items())
@@ -234,12 +234,12 @@ def bands_chart(
             "line": {"width": 1.5},
         }
     )
-    caption = f"{titles[1]}: what was measured, over what the fitted model predicts."
+    caption = f"{titles[1]}: measurement over the prediction of the fitted model."
     return ChartPart(name, caption, data, _layout(*titles), 300)
 
 
 def pit_chart(pit: Array) -> ChartPart:
-    """Draws the histogram of probability integral transforms, ``(readings,)``."""
+    """Draws the histogram of probability integral transforms, ``(measurements,)``."""
     counts, edges = np.histogram(pit, bins=_BINS, range=(0.0, 1.0))
     share = counts * _BINS / max(1, counts.sum())
     data: list[dict[str, Any]] = [
@@ -261,17 +261,17 @@ def pit_chart(pit: Array) -> ChartPart:
         },
     ]
     caption = (
-        "Where readings fall within the predictive distribution. Flat at 1 is right; a hill means "
-        "predictions wider than need be, a valley too narrow ones, a slope a bias."
+        "Ranks of the measurements in the predictive distribution. Flat at 1 is ideal; a hill "
+        "means too wide predictions, a valley too narrow ones, a slope a bias."
     )
-    layout = _layout("share of predictions below the reading", "density") | {"bargap": 0.05}
+    layout = _layout("share of predictions below the measurement", "density") | {"bargap": 0.05}
     return ChartPart("pit", caption, data, layout, 280)
 
 
 def matrix_chart(samples: Mapping[str, Array]) -> ChartPart:
     """Draws the correlations between parameters."""
     names = list(samples)
-    # A parameter without any spread has no correlation.
+    # A parameter without spread has no correlation.
     with np.errstate(invalid="ignore", divide="ignore"):
         matrix = np.corrcoef(np.stack([samples[name] for name in names]))
     data = [
@@ -291,7 +291,7 @@ def matrix_chart(samples: Mapping[str, Array]) -> ChartPart:
     layout["xaxis"] |= {"automargin": True}
     layout["yaxis"] |= {"automargin": True, "autorange": "reversed"}
     caption = (
-        "Correlation of parameters in the posterior. Close to ±1: the data tell only a "
+        "Correlation of parameters in the posterior. Close to ±1, the data determine only a "
         "combination of the two."
     )
     return ChartPart("correlations", caption, data, layout, 420)

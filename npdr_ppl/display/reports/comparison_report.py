@@ -23,11 +23,11 @@ from npdr_ppl.run_files import read_json
 __all__ = ["comparison_report"]
 
 MAX_FORESTS = 12
-"""Parameters whose intervals are drawn side by side."""
+"""Maximum number of parameters whose intervals are drawn."""
 
 
 def comparison_report(folder: Path) -> Report:
-    """Reads what ``npdr compare`` wrote.
+    """Reads the results of ``npdr compare``.
 
     Args:
         folder: Folder with ``comparison.json``.
@@ -35,7 +35,7 @@ def comparison_report(folder: Path) -> Report:
     result = read_json(folder / "comparison.json")
     rows, ranking = result["backends"], result["ranking"]
     settings = result.get("settings") or {}
-    # All backends ran on the same data and model; the best one's run stands for them.
+    # All backends ran on the same data and model, so the description of the best one is used.
     own = folder / folder_name(ranking[0]) if ranking else folder
     description = run_description(own)
     ranked = {label: rows[label] for label in ranking}
@@ -65,11 +65,11 @@ def _verdict(ranked: Mapping[str, Any]) -> Verdict:
     second = ranked[others[0]]
     behind, error = second.get("elpd_difference"), second.get("elpd_difference_se")
     if behind is None:
-        return Verdict(best, f"Best by CRPS; {others[0]} comes next. No elpd was finite.", "plain")
-    shown = f"{others[0]} is {number(abs(behind), '.1f')} ± {number(error, '.1f')} in elpd behind"
+        return Verdict(best, f"Best by CRPS; {others[0]} is second. No elpd was finite.", "plain")
+    shown = f"{others[0]} has {number(abs(behind), '.1f')} ± {number(error, '.1f')} less elpd"
     if error is None:
         return Verdict(
-            best, f"{others[0]} is {behind:.1f} in elpd behind, on one segment.", "warn"
+            best, f"{others[0]} has an elpd difference of {behind:.1f} on one segment.", "warn"
         )
     if abs(behind) > 2 * error:
         word, tone = ranked[best].get("decision"), "good"
@@ -78,7 +78,7 @@ def _verdict(ranked: Mapping[str, Any]) -> Verdict:
             sentence, tone = f"{sentence} Its own diagnosis says: {word}.", "warn"
         return Verdict(best, sentence, tone)
     return Verdict(
-        f"{best}, by a hair", f"{shown}, which may be chance: take the cheaper one.", "warn"
+        f"{best}, by a small margin", f"{shown}, which may be chance: use the cheaper one.", "warn"
     )
 
 
@@ -116,7 +116,7 @@ def _ranking(ranked: Mapping[str, Any], weights: Mapping[str, float]) -> list[Pa
     ]
     caption = (
         "Best first. elpd: log predictive density of the segments, larger is better. Weight: its "
-        "share of the mixture that predicts best. CRPS: error of a whole predictive distribution."
+        "share in the mixture that predicts best. CRPS: error of a predictive distribution."
     )
     parts: list[Part] = [TablePart(columns, rows, caption)]
     behind = {
@@ -126,7 +126,7 @@ def _ranking(ranked: Mapping[str, Any], weights: Mapping[str, float]) -> list[Pa
         for e in (row.get("elpd_difference_se"),)
     }
     if behind:
-        caption = "How far behind the best, ± two standard errors; across 0 it may be chance."
+        caption = "Difference from the best, ± two standard errors; across 0 it may be chance."
         parts.append(
             intervals_chart("behind", behind, title="difference in elpd", caption=caption)
         )
@@ -149,10 +149,10 @@ def _coverage_chart(ranked: Mapping[str, Any]) -> Part:
         if row.get("coverage")
     }
     caption = (
-        "Share of readings inside the central predictive interval. Below the dotted line "
-        "predictions are too sure of themselves, above it too cautious."
+        "Share of measurements inside the central predictive interval. Below the dotted line, "
+        "predictive intervals are too narrow; above it, they are too wide."
     )
-    titles = ("probability of the interval", "share of readings inside")
+    titles = ("probability of the interval", "share of measurements inside")
     return lines_chart("coverage", lines, titles=titles, caption=caption, diagonal=True)
 
 
@@ -177,7 +177,7 @@ def _seconds_chart(ranked: Mapping[str, Any]) -> Part:
         kind: {label: (row["seconds"] or {}).get(kind) or 0.0 for label, row in ranked.items()}
         for kind in kinds
     }
-    return bars_chart("seconds", bars, title="seconds", caption="Where the time went.")
+    return bars_chart("seconds", bars, title="seconds", caption="Computing time by stage.")
 
 
 def _diagnoses(rows: Mapping[str, Any]) -> list[Finding]:

@@ -1,4 +1,4 @@
-"""What a report says, apart from how it looks: each kind of run fills it in."""
+"""Content of a report, independent of its layout; each kind of run fills it in."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,17 +24,17 @@ __all__ = [
 ]
 
 Tone = Literal["good", "warn", "bad", "plain"]
-"""How a figure is to be taken; a word stands beside every colour, for those who see none."""
+"""Rating of a number; the page shows a word next to every colour, for colour-blind readers."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The one thing to know.
+    """The main result.
 
     Attributes:
-        word: Such as ``"accept"``.
-        sentence: Why.
-        tone: How to take it.
+        word: Verdict in a few words, such as ``"accept"``.
+        sentence: Reason.
+        tone: Rating.
     """
 
     word: str
@@ -67,7 +67,7 @@ class TablePart:
         columns: Headings.
         rows: Cells as text.
         caption: What the table shows.
-        layout: Whether cells are figures, which stay whole, or prose, which is wrapped.
+        layout: Whether cells are numbers, which are not wrapped, or prose, which is wrapped.
     """
 
     columns: Sequence[str]
@@ -83,10 +83,10 @@ class ChartPart:
 
     Attributes:
         name: Identifier on the page.
-        caption: What is shown and how to read it.
+        caption: Content of the chart and how to read it.
         data: Plotly's traces.
-        layout: Plotly's layout; colours of text and grid are the page's.
-        height: CSS pixels.
+        layout: Plotly's layout; the page sets the colours of text and grid.
+        height: Height in CSS pixels.
     """
 
     name: str
@@ -117,7 +117,7 @@ class DiffPart:
 
 @dataclass(frozen=True)
 class PicturePart:
-    """A figure that was drawn by the run, embedded as data."""
+    """A figure that the run has drawn, embedded as data."""
 
     data_uri: str
     caption: str
@@ -129,10 +129,10 @@ class Finding:
     """A diagnostic with its meaning in plain language.
 
     Attributes:
-        name: The diagnostic.
+        name: Name of the diagnostic.
         value: Its value as text.
-        tone: How to take it.
-        meaning: What it measures, and what this value says.
+        tone: Rating of the value.
+        meaning: What the diagnostic measures, and what this value means.
     """
 
     name: str
@@ -167,9 +167,9 @@ class Report:
     Attributes:
         kind: Command that made the run, such as ``"fit"``.
         title: Heading.
-        verdict: What comes first.
-        figures: Key figures, which come second.
-        sections: The rest.
+        verdict: Main result, at the top.
+        figures: Key figures, below the verdict.
+        sections: All other content.
     """
 
     kind: str
@@ -180,7 +180,7 @@ class Report:
 
 
 def number(value: Any, format_spec: str = ".3g") -> str:
-    """Returns a number as text, and a dash for what is not known."""
+    """Returns a number as text, or a dash if it is not known."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return "–"
     return format(value, format_spec)

@@ -1,4 +1,4 @@
-"""The report on the demonstration: returns before and after, and what discovery found between."""
+"""The report on the demonstration: returns before and after, and the result of discovery."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,11 +22,11 @@ from npdr_ppl.run_files import read_json
 __all__ = ["demo_report"]
 
 SHARED = ("Effects", "Where", "Revised model")
-"""Sections of discovery's own report that are part of the story."""
+"""Sections that are taken from the report on the discovery."""
 
 
 def demo_report(folder: Path) -> Report:
-    """Reads what ``npdr demo`` wrote.
+    """Reads the results of ``npdr demo``.
 
     Args:
         folder: Folder with ``demo.json`` and the run of the loop.
@@ -52,18 +52,18 @@ def demo_report(folder: Path) -> Report:
 
 def _verdict(result: Mapping[str, Any]) -> Verdict:
     before, after = result["returns"].values()
-    gain = f"The return on the rig went from {before:.0f} to {after:.0f}."
+    gain = f"The return on the rig changed from {before:.0f} to {after:.0f}."
     names = ", ".join(f"{row['effect']} at {row['port']}" for row in result["effects"])
     if not names:
         return Verdict("nothing was found", f"Discovery named no missing effect. {gain}", "warn")
     succeeds = after >= result["success"]
-    meaning = f"The model got {names}. {gain} From {result['success']:.0f} on it stands upright."
+    meaning = f"Added: {names}. {gain} Above {result['success']:.0f} the pole balances upright."
     word = "the revised model's policy works" if succeeds else "the policy still fails"
     return Verdict(word, meaning, "good" if succeeds else "warn")
 
 
 def _returns(returns: Mapping[str, float]) -> list[Part]:
-    caption = "Return of one episode on the rig, which is made by MuJoCo; 2500 is the greatest."
+    caption = "Return of one episode on the rig, simulated by MuJoCo; the maximum is 2500."
     return [bars_chart("returns", {"return": dict(returns)}, title="return", caption=caption)]
 
 
@@ -71,8 +71,8 @@ def _truth(truth: Mapping[str, Any]) -> list[Part]:
     rows = [[name, number(value, ".4g")] for name, value in truth.items() if name != "parameters"]
     rows += [[name, number(value, ".4g")] for name, value in truth["parameters"].items()]
     text = (
-        "The loop never saw these. Friction is MuJoCo's own, which gives way a little before it "
-        "slips, and the rates are filtered differences of encoder counts: near relatives of the "
-        "catalogue's effects, not the same formulas."
+        "The loop never used these values. Friction is MuJoCo's own, which yields slightly before "
+        "it slips, and velocities are filtered differences of encoder steps. Both are similar to "
+        "the catalogue's effects, but not the same formulas."
     )
     return [TextPart(text), TablePart(("quantity", "value in SI units"), rows)]

@@ -1,7 +1,6 @@
-"""The report on a search for the missing effect, from the names that ``discovery.json`` has.
+"""The report on a search for the missing effect, from the content of ``discovery.json``.
 
-Everything but ``verdict`` is optional here: a search that found no gap has nothing to say of the
-effects that would close it.
+Everything except ``verdict`` is optional: a search that found no gap has no effects to report.
 """
 
 import base64
@@ -31,11 +30,12 @@ from npdr_ppl.run_files import read_json
 __all__ = ["discovery_report"]
 
 MAX_PICTURE_BYTES = 700_000
-"""Sum of the pictures on a page; the rest is named, so that the page stays small."""
+"""Maximum total size of the pictures on a page in base64 characters, so that the page stays
+small; larger ones are only named."""
 
 
 def discovery_report(folder: Path) -> Report:
-    """Reads what ``npdr discover`` wrote.
+    """Reads the results of ``npdr discover``.
 
     Args:
         folder: Folder with ``discovery.json``, and possibly ``revised_model.py`` and figures.
@@ -73,18 +73,18 @@ def _verdict(result: Mapping[str, Any], effects: list[Any]) -> Verdict:
     verdicts = {
         "none": Verdict(
             "no effect is missing",
-            f"The model explains the recording as it is (alarm: p = {p_value}).",
+            f"The present model explains the recording (alarm: p = {p_value}).",
             "good",
         ),
         "named": Verdict(f"missing: {best}", gained, "good"),
         "ambiguous": Verdict(
             f"missing: {best}, or another",
-            f"These data do not tell it from {others or 'its equivalents'}. {gained}",
+            f"These data do not distinguish it from {others or 'its equivalents'}. {gained}",
             "warn",
         ),
         "unknown": Verdict(
             "something unknown is missing",
-            "The model misses the recording, and no effect of the catalogue explains how.",
+            "The model does not fit the recording, and no effect of the catalogue explains it.",
             "bad",
         ),
     }
@@ -92,14 +92,14 @@ def _verdict(result: Mapping[str, Any], effects: list[Any]) -> Verdict:
 
 
 def _gained(gap: Mapping[str, Any]) -> str:
-    """Returns in a sentence what the revised model gains on held-out rollouts."""
+    """Returns a sentence about the gain of the revised model on held-out rollouts."""
     closed = [
         f"{values['closed']:.0%} in {metric}"
         for metric, values in gap.items()
         if values.get("closed") is not None
     ]
     if not closed:
-        return "What it gains on held-out rollouts was not measured."
+        return "The gain on held-out rollouts was not measured."
     return f"Of the gap on held-out rollouts it closes {', '.join(closed)}."
 
 
@@ -135,12 +135,12 @@ def _gap(gap: Mapping[str, Any]) -> list[Part]:
         for metric, values in gap.items()
     ]
     caption = (
-        "Closed: share of the way from before to the noise floor, which is what the revised model "
-        "would leave of a recording of its own."
+        "Closed: share of the distance from before to the noise floor, the error of the revised "
+        "model on a recording that it simulated itself."
     )
     columns = ("metric", "before", "after", "noise floor", "closed")
     parts: list[Part] = [TablePart(columns, rows, caption)]
-    # Metrics have scales of their own, so each is drawn in units of what it was before.
+    # Metrics have different scales, so each is drawn relative to its value before.
     data: list[dict[str, Any]] = []
     for name, color in zip(names, SERIES, strict=False):
         shares = {
@@ -180,7 +180,7 @@ def _effects(effects: list[Any], ranking: list[Any]) -> list[Part]:
         ]
         for effect in effects
     ]
-    columns = ("effect", "probability", "these data do not tell it from")
+    columns = ("effect", "probability", "not distinguishable from")
     parts: list[Part] = [TablePart(columns, rows)]
     parameters = [
         [
@@ -202,7 +202,7 @@ def _effects(effects: list[Any], ranking: list[Any]) -> list[Part]:
         if isinstance(e, Mapping) and e.get("probability") is not None
     }
     if scored:
-        caption = "Probability of each candidate that was tried."
+        caption = "Probability of each tested candidate."
         parts.append(
             bars_chart(
                 "probability", {"probability": scored}, title="probability", caption=caption
@@ -213,7 +213,7 @@ def _effects(effects: list[Any], ranking: list[Any]) -> list[Part]:
 
 def _where(where: list[Any]) -> list[Part]:
     if not where:
-        return [TextPart("No place stands out.")]
+        return [TextPart("No window deviates significantly.")]
     rows = [
         [
             str(place.get("channel", "–")),
@@ -225,7 +225,7 @@ def _where(where: list[Any]) -> list[Part]:
         for place in where
     ]
     columns = ("channel", "rollout", "time [s]", "region", "z")
-    caption = "Where the model misses the recording by most, in standard deviations."
+    caption = "Windows with the largest deviation of the model; z in standard deviations."
     return [TablePart(columns, rows, caption)]
 
 
@@ -235,12 +235,12 @@ def _next(experiment: Any) -> list[Section]:
     if not isinstance(experiment, Mapping):
         return [Section("Next experiment", [TextPart(_words(experiment))])]
     rows = [[str(name), _words(value)] for name, value in experiment.items()]
-    caption = "The recording that would tell the remaining candidates apart."
-    return [Section("Next experiment", [TablePart(("what", "value"), rows, caption, "prose")])]
+    caption = "A recording that would distinguish the remaining candidates."
+    return [Section("Next experiment", [TablePart(("item", "value"), rows, caption, "prose")])]
 
 
 def _revision(folder: Path, description: Mapping[str, Any]) -> list[Section]:
-    """Returns the revised model, as a diff where the model before is known."""
+    """Returns the revised model, as a diff if the previous model is known."""
     file = folder / "revised_model.py"
     if not file.exists():
         return []
@@ -248,11 +248,11 @@ def _revision(folder: Path, description: Mapping[str, Any]) -> list[Section]:
     model = description.get("model")
     before = model.get("source") if isinstance(model, Mapping) else model
     if not isinstance(before, str) or not before.strip():
-        return [Section("Revised model", [CodePart(revised, "revised_model.py, for MODEL.")])]
+        return [Section("Revised model", [CodePart(revised, "revised_model.py, for MODEL")])]
     lines = difflib.unified_diff(
         before.splitlines(), revised.splitlines(), "model", "revised_model.py", lineterm=""
     )
-    caption = "What changed; revised_model.py is a file that MODEL accepts."
+    caption = "Changes to the model; revised_model.py can be used as MODEL."
     return [Section("Revised model", [DiffPart(list(lines), caption)])]
 
 

@@ -24,7 +24,7 @@ __all__ = ["fit_report", "parameters_table"]
 
 
 def fit_report(folder: Path) -> Report:
-    """Reads what ``npdr fit`` wrote.
+    """Reads the results of ``npdr fit``.
 
     Args:
         folder: Folder with ``fit.json`` and ``posterior.nc``.
@@ -70,7 +70,7 @@ def parameters_table(
                 ]
             )
     columns = ("parameter", "mean", "sd", "94 % interval", "most likely", "contraction")
-    return TablePart(columns, rows, "The interval holds 94 % of the posterior.")
+    return TablePart(columns, rows, "The interval contains 94 % of the posterior.")
 
 
 def _elements(
@@ -124,7 +124,7 @@ def _parameters(
     ]
     if data := _posterior(folder):
         return parts + posterior_charts(data, result.get("units") or {})
-    # Without draws, the intervals alone, each in units of its own middle.
+    # Without draws, only the intervals are drawn, relative to the means.
     scalars = {
         name: row
         for name, row in result["parameters"].items()
@@ -134,9 +134,9 @@ def _parameters(
         name: (row["hdi_94"][0] / row["mean"], 1.0, row["hdi_94"][1] / row["mean"])
         for name, row in scalars.items()
     }
-    caption = "94 % intervals relative to the mean; the draws (posterior.nc) are not there."
+    caption = "94 % intervals relative to the mean; the draws (posterior.nc) are missing."
     if not rows:
-        return [*parts, TextPart("The draws (posterior.nc) are not there.")]
+        return [*parts, TextPart("The draws (posterior.nc) are missing.")]
     return [*parts, intervals_chart("intervals", rows, title="relative to mean", caption=caption)]
 
 

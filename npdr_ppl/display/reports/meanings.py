@@ -1,4 +1,4 @@
-"""Diagnostics in plain language: what a figure measures, and what this value of it says."""
+"""Diagnostics in plain language: what a number measures, and what its value means."""
 
 import math
 from collections.abc import Mapping
@@ -10,10 +10,10 @@ from npdr_ppl.posterior.diagnostics import Decision, Thresholds
 __all__ = ["decision_verdict", "findings"]
 
 MIN_ESS = 400
-"""Effective draws below which intervals are rough (Vehtari et al. 2021)."""
+"""Minimum number of effective draws for accurate intervals (Vehtari et al. 2021)."""
 
 SMALL_PIT_DEVIATION = 0.15
-"""Distance from uniform that a few hundred correlated readings easily show by chance."""
+"""Distance from uniform that a few hundred correlated measurements often have by chance."""
 
 _TONES: Mapping[str, Tone] = {
     Decision.ACCEPT: "good",
@@ -27,13 +27,13 @@ _TONES: Mapping[str, Tone] = {
 
 
 def decision_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
-    """Returns the verdict of a diagnosis, as ``fit.json`` has it."""
+    """Returns the verdict of a diagnosis, in the format of ``fit.json``."""
     word = str(diagnosis.get("decision", "no decision"))
     return Verdict(word, str(diagnosis.get("reason", "")), _TONES.get(word, "plain"))
 
 
 def findings(diagnosis: Mapping[str, Any]) -> list[Finding]:
-    """Returns the figures of a diagnosis with their meaning."""
+    """Returns the numbers of a diagnosis with their meaning."""
     limits = Thresholds()
     return [
         *_against_simulator(diagnosis, limits),
@@ -45,7 +45,7 @@ def findings(diagnosis: Mapping[str, Any]) -> list[Finding]:
 
 
 def _against_simulator(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
-    """Returns what the simulator itself says of model and estimator, where it was asked."""
+    """Returns the checks of model and estimator by the simulator, if they were made."""
     result = []
     p_value, k = _value(diagnosis, "model_p_value"), _value(diagnosis, "estimator_k")
     if not math.isnan(p_value):
@@ -55,9 +55,9 @@ def _against_simulator(diagnosis: Mapping[str, Any], limits: Thresholds) -> list
                 "what no parameters explain",
                 f"p = {p_value:.2g}",
                 "bad" if is_missing else "good",
-                "Residuals at the best parameters show something regular: an effect is missing."
+                "Residuals at the best parameters are systematic: an effect is missing."
                 if is_missing
-                else "At the best parameters nothing regular is left of the recording.",
+                else "Residuals at the best parameters are not systematic.",
             )
         )
     if not math.isnan(k):
@@ -67,10 +67,10 @@ def _against_simulator(diagnosis: Mapping[str, Any], limits: Thresholds) -> list
                 "posterior against the simulator, Pareto k",
                 number(k, ".2f"),
                 "good" if is_right else "warn",
-                f"The draws are weighted evenly by the simulator (limit {limits.pareto_k})."
+                f"The simulator gives the draws even weights (limit {limits.pareto_k})."
                 if is_right
-                else "Few draws carry most of the weight that the simulator gives them: the "
-                "estimator has not converged.",
+                else "The simulator gives a few draws most of the weight: the estimator has not "
+                "converged.",
             )
         )
     return result
@@ -83,7 +83,7 @@ def _convergence(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Findi
             "r̂ across members",
             "–",
             "plain",
-            "Only one estimator was trained, so nothing tells whether another would agree.",
+            "Only one estimator was trained, so its agreement with another one is not known.",
         )
     elif r_hat <= limits.r_hat:
         agreement = Finding(
@@ -97,15 +97,15 @@ def _convergence(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Findi
             "r̂ across members",
             number(r_hat, ".2f"),
             "warn",
-            f"Independently trained estimators disagree (limit {limits.r_hat}): the estimator "
-            "decides, not the data. More simulations or rounds help.",
+            f"Independently trained estimators disagree (limit {limits.r_hat}): the result "
+            "depends on the estimator, not only on the data. More simulations or rounds help.",
         )
     draws = Finding(
         "Effective sample size",
         number(ess, ".0f"),
         "good" if ess >= MIN_ESS else "warn",
-        "Independent draws that the intervals stand on. "
-        + ("Enough." if ess >= MIN_ESS else f"Below {MIN_ESS}, ends of intervals are rough."),
+        "Number of independent draws behind the intervals. "
+        + ("Enough." if ess >= MIN_ESS else f"Below {MIN_ESS}, interval ends are inaccurate."),
     )
     return [agreement, draws]
 
@@ -122,33 +122,33 @@ def _prediction(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Findin
             "Coverage of the 90 % band",
             number(coverage, ".0%"),
             "bad" if lost else "good",
-            "Share of readings inside the central 90 % of the predictions. "
+            "Share of measurements inside the central 90 % of the predictions. "
             + (
-                "Far too few: the model cannot do what the device does."
+                "Far too few: the model cannot reproduce the device."
                 if lost
-                else "More than 90 %: predictions are cautious."
+                else "More than 90 %: predictive intervals are wide."
                 if wide
-                else "As it should be."
+                else "As expected."
             ),
         ),
         Finding(
             "Worst segment, p-value",
             number(p_value, ".3f"),
             "bad" if unlikely else "good",
-            "How often the fitted model itself strays as far as the recording does where it fits "
-            "worst. "
+            "Probability that the fitted model itself deviates as much as the recording does in "
+            "its worst segment. "
             + (
-                "Almost never: an effect is missing, at least there."
+                "Very small: an effect is missing, at least there."
                 if unlikely
-                else "Often enough: nothing stands out."
+                else "Large enough: no segment is suspicious."
             ),
         ),
         Finding(
             "Deviation of the PIT",
             number(pit, ".2f"),
             "good" if pit <= SMALL_PIT_DEVIATION else "warn",
-            "Greatest distance between the distribution of readings within the predictions and a "
-            "uniform one. "
+            "Largest distance between the distribution of the measurements' ranks within the "
+            "predictions and a uniform one. "
             + (
                 "Small."
                 if pit <= SMALL_PIT_DEVIATION
@@ -172,13 +172,13 @@ def _against_prior(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Fin
                 "Contraction",
                 f"{min(contraction.values()):.0%} … {max(contraction.values()):.0%}",
                 tone,
-                "How much narrower than its prior a parameter became (0 % nothing was learnt, "
-                "100 % all). "
+                "How much narrower the posterior of a parameter is than its prior (0 %: equal, "
+                "100 %: known exactly). "
                 + (
-                    f"Hardly anything was learnt about {', '.join(unlearnt)}; a rollout that "
-                    "excites the system more may tell."
+                    f"The data contain little information about {', '.join(unlearnt)}; record a "
+                    "rollout that excites the system more."
                     if unlearnt
-                    else "Something was learnt about every parameter."
+                    else "The data contain information about every parameter."
                 ),
             )
         )
@@ -191,10 +191,10 @@ def _against_prior(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Fin
                 "warn" if pressed else "good",
                 "Share of the posterior in the outermost 2 % of the prior. "
                 + (
-                    f"{', '.join(pressed)} would go further if the prior let it: widen the prior, "
-                    "or ask what it makes up for."
+                    f"The prior limits {', '.join(pressed)}: widen the prior, or check whether it "
+                    "compensates for a missing effect."
                     if pressed
-                    else "No parameter presses against its prior."
+                    else "No parameter is at the edge of its prior."
                 ),
             )
         )
@@ -207,21 +207,21 @@ def _leaving_out(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Findi
     if elpd[0] is None:
         return []
     if math.isnan(k):
-        trust = "It could not be told whether the estimate can be trusted (no Pareto k)."
+        trust = "Whether the estimate can be trusted is not known (no Pareto k)."
     elif k <= limits.pareto_k:
         trust = f"Pareto k is {k:.2f}: the estimate can be trusted."
     else:
         trust = (
-            f"Pareto k is {k:.2f} (limit {limits.pareto_k}): a segment is so influential that the "
-            "estimate cannot be trusted; judge by held-out rollouts."
+            f"Pareto k is {k:.2f} (limit {limits.pareto_k}): one segment is so influential that "
+            "the estimate cannot be trusted; use held-out rollouts instead."
         )
     return [
         Finding(
             "elpd by PSIS-LOO",
             f"{number(elpd[0], '.1f')} ± {number(elpd[1], '.1f')}",
             "plain" if k <= limits.pareto_k else "warn",
-            "Log predictive density of each segment when it is left out; larger is better, and "
-            f"only differences between models on the same data mean something. {trust}",
+            "Log predictive density of each segment when it is left out. Larger is better; only "
+            f"compare values of models on the same data. {trust}",
         )
     ]
 

@@ -1,4 +1,4 @@
-"""From a report to one HTML file: template, style, script and Plotly, all inside the page."""
+"""Renders a report as one HTML file that contains its style, its script and Plotly."""
 
 from typing import Any
 
@@ -7,14 +7,14 @@ from npdr_ppl.display.reports.content import ChartPart, Report
 __all__ = ["MAX_BYTES", "render"]
 
 MAX_BYTES = 6_000_000
-"""Size that a page should stay below, so that it can be sent by mail."""
+"""Maximum size of a page in bytes, so that it can be sent by e-mail."""
 
 
 def render(report: Report) -> str:
-    """Returns the page.
+    """Returns the page as HTML.
 
-    Every text is escaped by the template engine. Only the style, the script and Plotly, which ship
-    with the packages, go in as they are; data reach the script as JSON.
+    The template engine escapes every text. Only the style, the script and Plotly, which come with
+    the packages, are inserted unchanged. The script gets its data as JSON.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup

@@ -1,4 +1,4 @@
-"""What a saved posterior shows: marginals, correlations, bands over the recording, and PIT."""
+"""Charts of a saved posterior: marginals, correlations, predictive bands, and PIT."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 MAX_DRAWS = 2_000
 MAX_CORRELATED = 20
-"""Parameters of a correlation matrix; the labels of more cannot be read."""
+"""Maximum number of parameters of a correlation matrix; more labels would be unreadable."""
 
 _TIME = ("time [s]", "step")
 
@@ -52,7 +52,7 @@ def predictive_charts(data: "Data", run: Path) -> list[ChartPart]:
 
     Args:
         data: An ArviZ object.
-        run: Folder of the run of inference, whose recording knows the time step and the units.
+        run: Folder of the inference run; its recording contains the time step and the units.
     """
     from npdr_ppl.arviz_module import group, group_names
 
@@ -78,7 +78,7 @@ def predictive_charts(data: "Data", run: Path) -> list[ChartPart]:
 
 
 def parameter_samples(dataset: "xr.Dataset") -> dict[str, Array]:
-    """Returns the draws ``(n,)`` of every scalar parameter, vectors element by element."""
+    """Returns the draws ``(n,)`` of every scalar parameter; vectors are split into elements."""
     draws = {}
     for name in dataset.data_vars:
         values = np.asarray(dataset[name], dtype=float)
@@ -96,7 +96,7 @@ def _bands(
     known: NDArray[np.bool_],
     run: Path,
 ) -> list[ChartPart]:
-    """Lays the segments of the first rollout end to end, ``(segments, steps, channels)``."""
+    """Joins the segments of the first rollout in time and draws one chart per channel."""
     constant = groups["constant_data"]
     rollout, start = np.asarray(constant[f"{site}_rollout"]), np.asarray(constant[f"{site}_start"])
     first = [int(s) for s in np.flatnonzero(rollout == rollout[0])]
@@ -121,13 +121,13 @@ def _bands(
 
 
 def _clock(recording: Path) -> tuple[float | None, dict[str, str]]:
-    """Returns the time step in seconds and the channels' units, where the recording is there."""
+    """Returns the time step in seconds and the channels' units, if the recording exists."""
     if not recording.exists():
         return None, {}
     try:
         rollouts = Rollouts.from_netcdf(recording)
     except NpdrError:
-        # A page about the result is worth having even if the recording was damaged since.
+        # The report is useful even if the recording is damaged.
         return None, {}
     units = dict(zip(rollouts.channel_names, rollouts.channel_units, strict=False))
     return rollouts.time_step, units

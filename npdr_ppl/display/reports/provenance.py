@@ -1,4 +1,4 @@
-"""What a result came from: versions, seeds, settings, the model's source and checksums of data."""
+"""Origin of a result: versions, seeds, settings, the model's source and checksums of data."""
 
 import hashlib
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ _BLOCK = 1 << 20
 
 
 def run_description(folder: Path) -> dict[str, Any]:
-    """Returns what ``run.json`` or ``loop.json`` says about a run; empty if there is neither."""
+    """Returns the content of a run's ``run.json`` or ``loop.json``; empty if there is neither."""
     for file in (folder / "run.json", folder / "run" / "run.json", folder / "loop.json"):
         if file.exists():
             return read_json(file)
@@ -33,12 +33,12 @@ def data_files(folder: Path) -> list[Path]:
 
 
 def source_section(description: Mapping[str, Any]) -> list[Section]:
-    """Returns the model's source as a section, or none where it was not recorded."""
+    """Returns the model's source as a section; no section if it was not recorded."""
     model = description.get("model")
     text = model.get("source") if isinstance(model, Mapping) else model
     if not isinstance(text, str) or not text.strip():
         return []
-    return [Section("Model", [CodePart(text.rstrip(), "Source of the model as it ran.")])]
+    return [Section("Model", [CodePart(text.rstrip(), "Source of the model in this run.")])]
 
 
 def provenance_section(description: Mapping[str, Any], folder: Path) -> Section:
@@ -64,9 +64,9 @@ def provenance_section(description: Mapping[str, Any], folder: Path) -> Section:
         rows.append(["SHA-256 of the features of the data", str(fingerprint)])
     rows += [[f"SHA-256 of {f.relative_to(folder)}", checksum(f)] for f in data_files(folder)]
     if not rows:
-        return Section("Provenance", [TextPart("The run recorded nothing about its origin.")])
-    caption = "What is needed to make this result again."
-    return Section("Provenance", [TablePart(("what", "value"), rows, caption, "prose")])
+        return Section("Provenance", [TextPart("The run did not record its origin.")])
+    caption = "Settings and files that are needed to reproduce this result."
+    return Section("Provenance", [TablePart(("item", "value"), rows, caption, "prose")])
 
 
 def checksum(path: Path) -> str:

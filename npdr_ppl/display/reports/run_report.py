@@ -1,4 +1,4 @@
-"""Which kind of run a folder holds, and its report as a file."""
+"""Detects the kind of run in a folder, and writes its report to a file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,8 +15,8 @@ from npdr_ppl.rollouts.io.atomic_files import replacing
 
 __all__ = ["read_run", "write_report"]
 
-# A training run may hold a discovery in a folder of its own, and every kind holds runs of
-# inference, so the file at the top decides.
+# A training run may contain a discovery in a subfolder, and every kind contains inference runs,
+# so the file at the top level decides.
 _READERS: dict[str, Callable[[Path], Report]] = {
     "demo.json": demo_report,
     "discovery.json": discovery_report,
@@ -33,7 +33,7 @@ def read_run(run: Path) -> Report:
         run: Folder that ``npdr fit``, ``compare``, ``train``, ``discover`` or ``demo`` wrote.
 
     Raises:
-        DataError: The folder is not one of these, or its files are not as they were written.
+        DataError: The folder is not one of these, or its files were changed.
     """
     if not run.is_dir():
         raise DataError(f"{run} is not a folder; give the one that was passed as --out.")

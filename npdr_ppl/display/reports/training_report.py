@@ -32,13 +32,13 @@ __all__ = ["training_report"]
 Records = Sequence[Mapping[str, Any]]
 
 MAX_POLICY_PARAMETERS = 50
-"""Parameters of a policy that are listed; a network's are not for reading."""
+"""Maximum number of policy parameters that are listed; those of a network are not."""
 
 MAX_POINTS = 400
 
 
 def training_report(folder: Path) -> Report:
-    """Reads what ``npdr train`` wrote.
+    """Reads the results of ``npdr train``.
 
     Args:
         folder: Folder with ``train.json``.
@@ -69,17 +69,17 @@ def _verdict(result: Mapping[str, Any], records: Records) -> Verdict:
     deployed = result.get("deployed")
     first, best = records[0].get("real_return"), max(_real(records), default=float("nan"))
     gain = (
-        f"On the target the return went from {number(first, '.4g')} at first to "
-        f"{number(best, '.4g')} at best."
+        f"On the target, the first return was {number(first, '.4g')} and the best was "
+        f"{number(best, '.4g')}."
     )
     if deployed is None:
         word = "last policy"
-        sentence = f"{gain} The last policy is handed over; it has not been run on the target."
+        sentence = f"{gain} The result is the last policy, which has not run on the target."
         return Verdict(word, sentence, "warn")
     measured = records[deployed].get("real_return") if deployed < len(records) else None
     word = f"policy of iteration {deployed + 1}"
     return Verdict(
-        word, f"{gain} The policy handed over was measured: {number(measured, '.4g')}.", "good"
+        word, f"{gain} The resulting policy was measured: {number(measured, '.4g')}.", "good"
     )
 
 
@@ -114,10 +114,10 @@ def _returns(records: Records) -> list[Part]:
     numbers = [float(n) for n in range(1, len(records) + 1)]
     lines = {
         "on the target": (numbers, [record.get("real_return") for record in records]),
-        # What an iteration trains, the next one runs.
+        # The policy that an iteration trains runs in the next iteration.
         "in simulation": ([n + 1 for n in numbers], [r.get("sim_return") for r in records]),
     }
-    caption = "Return by iteration of the policy that ran; in simulation, mean over its domains."
+    caption = "Return of the policy that ran in each iteration; in simulation, mean over domains."
     return [lines_chart("returns", lines, titles=("iteration", "return"), caption=caption)]
 
 
@@ -161,9 +161,9 @@ def _parameters(record: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list
 def _policy(result: Mapping[str, Any]) -> list[Part]:
     policy = result.get("policy") or {}
     if not policy or len(policy) > MAX_POLICY_PARAMETERS:
-        return [TextPart(f"A policy of {len(policy)} parameters; train.json lists them.")]
+        return [TextPart(f"The policy has {len(policy)} parameters; train.json lists them.")]
     rows = [[name, number(value, ".4g")] for name, value in policy.items()]
-    return [TablePart(("parameter", "value"), rows, "The policy that is handed over.")]
+    return [TablePart(("parameter", "value"), rows, "The resulting policy.")]
 
 
 def _rollout(folder: Path) -> list[Section]:
