@@ -1,4 +1,4 @@
-"""Conversion of what users pass to the float64 arrays of recordings."""
+"""Conversion of user input to the float64 arrays of recordings."""
 
 from typing import Any
 
@@ -24,11 +24,11 @@ def as_arrays(values: Any, name: str) -> tuple[Array, ...]:
     """Returns one float64 array per rollout.
 
     Args:
-        values: A stack, or a sequence of arrays or tensors.
-        name: What they are, for messages.
+        values: A stacked array, or a sequence of arrays or tensors.
+        name: Their name, for messages.
 
     Raises:
-        DataError: They are not numbers.
+        DataError: The values are not numbers.
     """
     try:
         return tuple(

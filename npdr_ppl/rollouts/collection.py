@@ -1,4 +1,4 @@
-"""Rollouts as a collection: stacked, picked, joined, compared, summed up in a line."""
+"""Rollouts as a collection: stack, pick, join, compare, and summarise in a line."""
 
 import math
 from collections.abc import Sequence
@@ -18,11 +18,11 @@ __all__ = ["are_equal", "joined", "picked", "stacked", "summary", "with_channels
 Episodes = TypeVar("Episodes", bound=Recording)
 
 COLUMNS = ("channel_names", "action_names", "channel_units", "action_units")
-"""Fields that say which columns there are."""
+"""Fields that describe the columns."""
 
 
 def stacked(rollouts: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Returns readings, actions and mask of all rollouts; see :meth:`Rollouts.stacked`."""
+    """Returns measurements, actions and mask of all rollouts; see :meth:`Rollouts.stacked`."""
     longest, num = max(rollouts.lengths), len(rollouts)
     readings = np.zeros((num, longest + 1, len(rollouts.channel_names)))
     actions = np.zeros((num, longest, len(rollouts.action_names)))
@@ -111,7 +111,7 @@ def joined(parts: Sequence[Episodes]) -> Episodes:
 
 
 def summary(rollouts: Recording) -> str:
-    """Returns size, time step and columns in one line."""
+    """Returns number of rollouts, lengths, time step and columns in one line."""
     low, high = min(rollouts.lengths), max(rollouts.lengths)
     steps = f"{low}" if low == high else f"{low}–{high}"
     return (

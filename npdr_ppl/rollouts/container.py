@@ -33,7 +33,7 @@ Path = str | PathLike[str]
 class Rollouts(Recording):
     """R recorded or simulated episodes with the same columns and the same time step.
 
-    The fields and what is checked of them are those of :class:`Recording`.
+    The fields and their checks are those of :class:`Recording`.
     """
 
     # -- Construction ------------------------------------------------------------------------
@@ -50,8 +50,9 @@ class Rollouts(Recording):
     def from_csv(cls, path: Path, *, actions: Sequence[str] | None = None) -> "Rollouts":
         """Reads a CSV file with the columns ``rollout,time,<channels…>,<actions…>``.
 
-        Units are SI. Actions, and a column ``reward``, are the columns that are empty in the last
-        row of every rollout: there is one more row of readings than of actions.
+        Units are SI. A rollout has one more row of measurements than of actions. Actions and the
+        column ``reward`` are therefore recognised by an empty cell in the last row of every
+        rollout.
 
         Args:
             path: The file, UTF-8 with commas.
@@ -97,17 +98,17 @@ class Rollouts(Recording):
     def from_simurlacra(cls, path: Path, names: Mapping[str, str] | None = None) -> "Rollouts":
         """Reads a rollout, or a list of rollouts, that SimuRLacra saved.
 
-        The pickle is read by a machine that builds arrays and inert records and calls nothing, so
-        a file from an untrusted source does no harm. States become channels (observations, where
-        no states were saved), the applied actions become actions (the commanded ones, where no
-        applied ones were saved).
+        The reader builds arrays and plain records only and calls no code from the pickle, so a
+        file from an untrusted source does no harm. States become channels; if no states were
+        saved, observations do. Applied actions become actions; if none were saved, the commanded
+        ones do.
 
         Args:
             path: A ``.pkl`` file.
-            names: New names for the file's own ones, e.g. ``{"theta": "arm_angle"}``.
+            names: New names for names in the file, e.g. ``{"theta": "arm_angle"}``.
 
         Raises:
-            DataError: The file is damaged, holds something else, or asks for code to be run.
+            DataError: The file is damaged, holds no rollouts, or would run code.
 
         References:
             F. Muratore, SimuRLacra, https://github.com/famura/SimuRLacra (class ``StepSequence``).
@@ -118,7 +119,7 @@ class Rollouts(Recording):
 
     @classmethod
     def load(cls, path: Path) -> "Rollouts":
-        """Reads ``.csv``, ``.parquet``, ``.npz`` or ``.nc``, as the suffix says.
+        """Reads ``.csv``, ``.parquet``, ``.npz`` or ``.nc``, chosen by the suffix.
 
         Raises:
             DataError: The suffix is unknown or the file cannot be read.
@@ -130,7 +131,7 @@ class Rollouts(Recording):
     # -- Export ------------------------------------------------------------------------------
 
     def to_csv(self, path: Path) -> None:
-        """Writes the CSV layout of :meth:`from_csv`; numbers keep every bit, units are lost."""
+        """Writes the CSV layout of :meth:`from_csv`; numbers stay exact, units are not written."""
         from npdr_ppl.rollouts.io.csv_files import write_csv
 
         write_csv(self, path)
@@ -164,7 +165,7 @@ class Rollouts(Recording):
         return to_xarray(self)
 
     def stacked(self) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Returns readings ``(R, T + 1, C)``, actions ``(R, T, A)`` and mask ``(R, T)``.
+        """Returns measurements ``(R, T + 1, C)``, actions ``(R, T, A)`` and mask ``(R, T)``.
 
         T is the length of the longest rollout; shorter ones are zero-padded where the mask is
         false.
@@ -196,7 +197,7 @@ class Rollouts(Recording):
         return rollouts_html(self)
 
     def plot(self, axes: Any = None) -> NDArray[Any]:
-        """Draws every channel and action over time, all rollouts over each other.
+        """Plots every channel and action over time, with all rollouts in the same axes.
 
         Args:
             axes: Axes to draw on, one per channel and action; ``None`` makes a figure.
@@ -218,16 +219,17 @@ class Rollouts(Recording):
         """Splits by rollout, never by sample: samples of one rollout are not independent.
 
         Args:
-            train: Indices of the rollouts to learn from, or their fraction, which is rounded so
-                that both sides get at least one.
-            test: Indices of the rollouts to test on; the others if left out.
-            seed: Shuffles before a fractional split; without it the first ones train.
+            train: Indices of the training rollouts, or their fraction, which is rounded so that
+                both sets get at least one.
+            test: Indices of the test rollouts; all others if left out.
+            seed: Seed to shuffle with before a fractional split; without it, the first rollouts
+                are the training set.
 
         Returns:
             Training and test rollouts.
 
         Raises:
-            DataError: A side is empty, or a rollout is on both sides.
+            DataError: A set is empty, or a rollout is in both sets.
         """
         left, right = indices.split(len(self), train, test, seed)
         return self[left], self[right]
@@ -253,15 +255,15 @@ class Rollouts(Recording):
         *,
         allow_extra: bool = False,
     ) -> None:
-        """Checks that the data fit a simulator: columns, units and no rollout twice.
+        """Checks that the data fit a simulator: columns, units and no duplicate rollouts.
 
         Args:
             channels: The simulator's state or sensor channels.
             actions: The simulator's actions.
-            allow_extra: Accept channels that the simulator does not know.
+            allow_extra: Accept channels that the simulator does not have.
 
         Raises:
-            DataError: Something is wrong; the message says what in one sentence.
+            DataError: A check failed; the message says which in one sentence.
         """
         simulator_checks.check_duplicates(self)
         if channels or actions:
@@ -276,16 +278,15 @@ class Rollouts(Recording):
         history: int = segments.DEFAULT_HISTORY,
         dtype: torch.dtype = torch.float64,
     ) -> Inputs:
-        """Returns what a simulator is told to replay these rollouts.
+        """Returns the inputs with which a simulator replays these rollouts.
 
         Args:
             segment_length: Steps after which the simulation is re-synchronised with the data;
                 ``None`` for whole rollouts. The last segment of a rollout may be shorter.
-            initial_state: ``"estimated"`` smooths the readings around each segment's start and
-                differentiates them; ``"recorded"`` takes the readings as the truth;
-                ``"uncertain"`` adds the smoother's error to the estimate, and every simulation
-                starts from a draw of its own.
-            history: Steps of commands before each segment to hand over, for delays.
+            initial_state: ``"estimated"`` smooths and differentiates the measurements around each
+                segment's start; ``"recorded"`` takes the measurements as exact; ``"uncertain"``
+                draws the initial state of every simulation from the estimate and its error.
+            history: Steps of commands before each segment to include, for delays.
             dtype: Floating-point type of the tensors.
 
         Raises:
@@ -302,11 +303,11 @@ class Rollouts(Recording):
     def observation(
         self, inputs: Inputs | int | None = None, channels: Sequence[str] | None = None
     ) -> Tensor:
-        """Returns the readings after each step, the data's counterpart of a trajectory.
+        """Returns the measurements after each step, to compare with a simulated trajectory.
 
         Args:
             inputs: Result of :meth:`inputs`, or a segment length as given to it.
-            channels: Names and order of the channels wanted; all if ``None``.
+            channels: Names of the wanted channels, in the wanted order; all if ``None``.
 
         Returns:
             ``(segments, steps, channels)``, zero where ``inputs.mask`` is false.
@@ -317,9 +318,9 @@ class Rollouts(Recording):
         return segments.observation(self, inputs, channels)
 
     def series(self, channels: Sequence[str] | None = None) -> list[Tensor]:
-        """Returns the readings *before* each step, ``(T, C)`` float64 per rollout.
+        """Returns the measurements *before* each step, ``(T, C)`` float64 per rollout.
 
-        This is the ground truth of the paper's metrics; see :func:`segments.stitch`.
+        These are the ground truth of the paper's metrics; see :func:`segments.stitch`.
         """
         names = self.channel_names if channels is None else tuple(channels)
         columns = segments.columns_of(names, self.channel_names)

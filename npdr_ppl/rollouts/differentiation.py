@@ -1,10 +1,12 @@
-"""Velocities and accelerations from position readings, by zero-phase low-pass filters.
+"""Velocities and accelerations from position measurements, by zero-phase low-pass filters.
 
-The practice of robot identification: positions pass a low-pass filter forwards and backwards, so
-that no phase is lost, and are differentiated by central differences; then both sides of the
-equations of motion pass the same second low-pass (the *parallel filter*), which keeps them equal
-and takes away what the differentiation amplified; at last only as many rows are kept as that
-filter leaves independent.
+This is the usual procedure of robot identification:
+
+1. Positions pass a low-pass filter forwards and backwards, which causes no phase shift, and are
+   differentiated by central differences.
+2. Both sides of the equations of motion pass the same second low-pass filter (the *parallel
+   filter*). It keeps the two sides equal and removes the noise that differentiation amplified.
+3. Only as many rows are kept as are independent after that filter.
 
 Reference: M. Gautier, A. Janot, P.-O. Vandanjon, A new closed-loop output error method for
 parameter identification of robot dynamics, 2013, and the references there.
@@ -25,30 +27,33 @@ __all__ = ["Derivatives", "Smoothing", "cutoffs", "differentiate", "held_actions
 Array = NDArray[np.float64]
 
 ORDER = 4
-"""Order of the Butterworth filters; forwards and backwards makes 8."""
+"""Order of the Butterworth filters; the forward and backward passes together have order 8."""
 
 PARALLEL_RATIO = 0.4
-"""Cut-off of the parallel filter in that of the positions: at 0.4 of its cut-off the latter still
-passes 0.9993 of a motion. Two and five times the bandwidth of the motion are the usual choice."""
+"""Ratio of the parallel filter's cut-off to that of the positions' filter. At 0.4 of its cut-off
+the positions' filter still passes 0.9993 of the amplitude. Usual cut-offs are two and five times
+the bandwidth of the motion."""
 
 GREATEST_CUTOFF = 0.2
-"""Greatest automatic cut-off, in sampling rates, where the difference formula is still exact to
-1 %, and to 1e-5 at the parallel filter's."""
+"""Greatest automatic cut-off, as a fraction of the sampling rate. The error of the difference
+formula is 1 % there and 1e-5 at the parallel filter's cut-off."""
 
 FLOOR_RATIO = 4.0
-"""How far a motion's spectrum must stand above the floor of reading errors to count."""
+"""Ratio of power to the noise floor above which a frequency belongs to the motion."""
 
 NUM_SEGMENTS = 8
-"""Stretches of a rollout, which overlap by half, whose spectra are averaged."""
+"""A rollout is divided by this number to get the length of the half-overlapping stretches whose
+spectra are averaged."""
 
 STENCIL = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
 """Central difference of sixth order."""
 
 EDGE_PERIODS = 2.0
-"""Periods of the parallel filter's cut-off dropped at each end, where filters have not settled."""
+"""Length dropped at each end, where filters have not settled, in periods of the parallel filter's
+cut-off frequency."""
 
 LEAST_ROWS = 64
-"""Samples below which there is nothing to filter."""
+"""Least number of samples of a rollout that can be filtered."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +62,8 @@ class Smoothing:
 
     Attributes:
         position_cutoff: Cut-off of the positions' filter, in Hz; ``None`` for the frequency at
-            which the positions' spectrum meets the floor of reading errors.
-        parallel_cutoff: Cut-off of the parallel filter, in Hz; ``None`` for 0.4 of the other.
+            which the positions' spectrum reaches the noise floor.
+        parallel_cutoff: Cut-off of the parallel filter, in Hz; ``None`` for 0.4 times the other.
     """
 
     position_cutoff: float | None = None
@@ -86,20 +91,20 @@ def cutoffs(
 ) -> tuple[float, float]:
     """Returns the cut-offs in Hz of the positions' and of the parallel filter.
 
-    The automatic one is, for each rollout, the frequency up to which the spectrum of some joint
-    stands above its floor, the median of its upper half; then the median over rollouts.
+    The automatic cut-off is the median over rollouts of the frequency up to which the spectrum of
+    some joint is above its noise floor. The floor is the median of the spectrum's upper half.
 
     Args:
-        positions: Position readings, ``(T, J)`` per rollout.
-        time_step: Seconds between readings.
-        smoothing: What the user wants.
+        positions: Measured positions, ``(T, J)`` per rollout.
+        time_step: Seconds between measurements.
+        smoothing: The cut-offs that the user chose.
 
     Raises:
         DataError: A rollout is too short, or a cut-off is not below half the sampling rate.
     """
     if min(len(values) for values in positions) < LEAST_ROWS:
         raise TooShortError(
-            f"Accelerations are estimated from rollouts of at least {LEAST_ROWS} readings, got "
+            f"Accelerations are estimated from rollouts of at least {LEAST_ROWS} samples, got "
             f"one of {min(len(values) for values in positions)}."
         )
     chosen = smoothing.position_cutoff
@@ -119,11 +124,11 @@ def cutoffs(
 
 
 def differentiate(positions: Array, time_step: float, cutoff: float) -> Derivatives:
-    """Smooths and differentiates position readings.
+    """Smooths and differentiates measured positions.
 
     Args:
-        positions: Readings, ``(T, J)``.
-        time_step: Seconds between readings.
+        positions: Measured positions, ``(T, J)``.
+        time_step: Seconds between measurements.
         cutoff: Cut-off of the low-pass, in Hz.
     """
     smooth = _low_pass(positions, time_step, cutoff)
@@ -132,7 +137,7 @@ def differentiate(positions: Array, time_step: float, cutoff: float) -> Derivati
 
 
 def thin(rows: Array, time_step: float, cutoff: float) -> Array:
-    """Passes columns through the parallel filter and keeps what it leaves independent.
+    """Passes columns through the parallel filter and keeps as many rows as are independent.
 
     Args:
         rows: Columns of both sides of the equations, ``(T, ...)``.
@@ -140,7 +145,7 @@ def thin(rows: Array, time_step: float, cutoff: float) -> Array:
         cutoff: Cut-off of the filter, in Hz.
 
     Returns:
-        Rows at twice the cut-off without both ends, ``(n, ...)``, maybe none.
+        Rows sampled at twice the cut-off, without both ends, ``(n, ...)``; n may be 0.
     """
     edge = int(np.ceil(EDGE_PERIODS / (cutoff * time_step)))
     stride = max(1, int(0.5 / (cutoff * time_step)))
@@ -148,10 +153,10 @@ def thin(rows: Array, time_step: float, cutoff: float) -> Array:
 
 
 def held_actions(actions: Array) -> Array:
-    """Returns the commands in force at each reading, ``(T + 1, A)``.
+    """Returns the effective command at each measurement, ``(T + 1, A)``.
 
-    A command is held from one reading to the next, so that at a reading two meet. The weights
-    (−1, 13, 13, −1)/24 reproduce, to fourth order in frequency, the held signal.
+    A command is held from one measurement to the next, so it changes exactly at a measurement.
+    The weights (−1, 13, 13, −1)/24 reproduce the held signal to fourth order in frequency.
 
     Args:
         actions: Commands, ``(T, A)``.
@@ -170,14 +175,14 @@ def _low_pass(values: Array, time_step: float, cutoff: float) -> Array:
 
 
 def _difference(values: Array, time_step: float) -> Array:
-    """Differentiates along the first axis; the first and last three rows are one-sided."""
+    """Differentiates along the first axis; the first and last three rows are less accurate."""
     rates = np.gradient(values, axis=0)
     rates[3:-3] = np.tensordot(sliding_window_view(values, 7, axis=0), STENCIL, axes=1)
     return rates / time_step
 
 
 def _bandwidth(channel: Array, time_step: float) -> float:
-    """Returns the frequency in Hz at which a channel's spectrum first meets its floor."""
+    """Returns the frequency in Hz at which a channel's spectrum first reaches its noise floor."""
     size = max(LEAST_ROWS, len(channel) // NUM_SEGMENTS)
     frequencies, power = signal.welch(
         signal.detrend(channel), fs=1.0 / time_step, nperseg=size, detrend="linear"

@@ -1,4 +1,4 @@
-"""Which rollouts: subsets and splits, by rollout and never by sample."""
+"""Chooses rollouts: subsets and splits, by rollout and never by sample."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,8 +17,8 @@ def chosen(index: Index, count: int) -> list[int]:
     """Returns the positions that an index chooses out of ``count``.
 
     Raises:
-        DataError: Nothing is chosen, or the index is no index.
-        IndexError: A position does not exist; iteration relies on this very error.
+        DataError: Nothing is chosen, or the index is invalid.
+        IndexError: A position does not exist; iteration relies on this error.
     """
     if isinstance(index, int | np.integer):
         positions = [int(index)]
@@ -44,7 +44,7 @@ def chosen(index: Index, count: int) -> list[int]:
 def split(
     count: int, train: Sequence[int] | float, test: Sequence[int] | None, seed: int | None
 ) -> tuple[list[int], list[int]]:
-    """Returns the positions of both sides of a split; see :meth:`Rollouts.split`."""
+    """Returns the positions of the training and test rollouts; see :meth:`Rollouts.split`."""
     if isinstance(train, int | float):
         if not 0 < train < 1 or count < 2 or test is not None:
             raise DataError(

@@ -1,4 +1,4 @@
-"""Recorded or simulated episodes as arrays that fit each other: what readers return."""
+"""Recorded or simulated episodes as arrays of matching shapes; file readers return these."""
 
 import math
 from collections.abc import Sequence
@@ -22,24 +22,24 @@ __all__ = ["Recording"]
 class Recording:
     """R recorded or simulated episodes with the same columns and the same time step.
 
-    Episodes may differ in length: T below is the number of steps of one of them. The readings
-    need not be the whole state, e.g. a position without its velocity.
+    Episodes may differ in length: T below is the number of steps of one of them. The measurements
+    need not contain the whole state, e.g. a position without its velocity.
 
     Attributes:
-        readings: What the sensors reported before each step and after the last, one
-            ``(T + 1, C)`` per rollout, in ``channel_units``.
+        readings: Measurements before each step and after the last one, one ``(T + 1, C)`` per
+            rollout, in ``channel_units``.
         actions: Commands, each held for one step, one ``(T, A)`` per rollout, in ``action_units``.
         channel_names: Names of the C channels.
         action_names: Names of the A actions.
-        time_step: Seconds between readings.
+        time_step: Seconds between measurements.
         rewards: Rewards of the steps, one ``(T,)`` per rollout, or ``None``.
         time: Time stamps in s, one ``(T + 1,)`` per rollout; ``k·time_step`` if not given.
         channel_units: Units of the channels, ``""`` where unknown.
         action_units: Units of the actions, ``""`` where unknown.
 
     Raises:
-        DataError: Columns are named wrongly, shapes do not fit each other, values are not finite,
-            or the sampling is not constant.
+        DataError: A column name is invalid, shapes do not match, values are not finite, or the
+            sampling is not constant.
     """
 
     readings: tuple[Array, ...]
@@ -83,21 +83,21 @@ class Recording:
         channel_units: Sequence[str] = (),
         action_units: Sequence[str] = (),
     ) -> Self:
-        """Makes a recording of arrays or tensors.
+        """Makes a recording from arrays or tensors.
 
         Args:
             readings: ``(R, T + 1, C)``, or a list of ``(T + 1, C)`` of different lengths.
-            actions: ``(R, T, A)`` or a list of ``(T, A)``; ``None`` where nothing is commanded.
+            actions: ``(R, T, A)`` or a list of ``(T, A)``; ``None`` if there are no commands.
             channel_names: Names of the C channels.
             action_names: Names of the A actions.
-            time_step: Seconds between readings; may be left out where ``time`` is given.
+            time_step: Seconds between measurements; may be left out if ``time`` is given.
             rewards: ``(R, T)`` or a list of ``(T,)``.
             time: Time stamps in s, ``(R, T + 1)`` or a list of ``(T + 1,)``.
             channel_units: Units of the channels.
             action_units: Units of the actions.
 
         Raises:
-            DataError: The arrays do not fit each other or are not valid data.
+            DataError: The arrays do not match each other or are not valid data.
         """
         values = as_arrays(readings, "readings")
         times = () if time is None else as_arrays(time, "time")
@@ -131,21 +131,21 @@ class Recording:
 
     @cached_property
     def estimates(self) -> dict[tuple[tuple[int, int, int], ...], StateEstimate]:
-        """Estimated states at the starts of segments, by the segments, as far as they were made.
+        """Cache that maps a tuple of segments to their estimated initial states.
 
-        Smoothing costs as much as hundreds of simulations, and every model of a recording starts
-        from the same states.
+        Smoothing costs as much as hundreds of simulations, and the initial states are the same for
+        every model of a recording.
         """
         return {}
 
     @cached_property
     def rate_changes(self) -> Array:
-        """By how much each channel's rate changes in a time step, root mean square, ``(C,)``."""
+        """Root-mean-square change of each channel's rate during a time step, ``(C,)``."""
         return states.rate_changes(self.readings, self.time_step)
 
 
 def _check_columns(recording: "Recording") -> None:
-    """Raises a DataError where names, units, or the time step are wrong."""
+    """Raises a DataError if names, units or the time step are wrong."""
     names = (*recording.channel_names, *recording.action_names)
     rollout_checks.check_names(names, "column")
     taken = set(rollout_checks.RESERVED_NAMES) & set(names)
@@ -166,7 +166,7 @@ def _check_columns(recording: "Recording") -> None:
 
 
 def _check_arrays(recording: "Recording") -> None:
-    """Raises a DataError where shapes do not fit, values are not finite, or time is not even."""
+    """Raises a DataError if shapes differ, values are not finite or sampling is not constant."""
     per_rollout: dict[str, Sequence[Array] | None] = {
         "actions": recording.actions,
         "time": recording.time,

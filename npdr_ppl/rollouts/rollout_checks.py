@@ -24,27 +24,29 @@ __all__ = [
 ]
 
 RESERVED_NAMES = ("rollout", "time", "reward", "step")
-"""Names with a meaning of their own in every file format."""
+"""Names that have a fixed meaning in every file format."""
 
 MAX_FILE_BYTES = 2**30
-"""Larger files are refused before they are read: a day at 1 kHz with ten channels is below it."""
+"""Largest file that is read, in bytes; an hour at 1 kHz with ten channels takes less."""
 
 MAX_MAGNITUDE = 1e100
-"""No reading in SI units is larger, and its square is still a finite float64."""
+"""Largest magnitude of a value. No measurement in SI units is larger, and the square of this
+number is still a finite float64."""
 
 MAX_STEP_JITTER = 0.1
-"""Deviation of a time step from the median step that still counts as constant sampling; time
-stamps rounded to milliseconds at 30 Hz deviate by 0.03."""
+"""Largest deviation of a time step from the median step that counts as constant sampling, as a
+fraction of the median step. Time stamps rounded to milliseconds at 30 Hz deviate by 0.03."""
 
 MAX_RATE_DIFFERENCE = 0.01
-"""Relative difference between the time steps of two rollouts that a clock may explain."""
+"""Largest relative difference between the time steps of two rollouts that is attributed to the
+clock."""
 
 _FORBIDDEN_IN_NAMES = re.compile(r"[,;\"'/\\]")
 _MAX_NAME_LENGTH = 100
 
 
 def shown(value: object, limit: int = 40) -> str:
-    """Returns a printable, shortened form of anything, for messages."""
+    """Returns a printable, shortened form of any value, for messages."""
     is_text = isinstance(value, str | bytes)
     shown_whole = repr(value) if is_text else str(value)
     if not shown_whole.isprintable():
@@ -56,7 +58,7 @@ def shown(value: object, limit: int = 40) -> str:
 
 @contextmanager
 def named(path: str | PathLike[str]) -> Iterator[None]:
-    """Puts a file's name before the message of every DataError raised inside the block."""
+    """Prefixes the message of every DataError raised inside the block with a file's name."""
     try:
         yield
     except DataError as error:
@@ -69,7 +71,7 @@ def check_file(path: str | PathLike[str]) -> Path:
     """Returns ``path`` if it names a file of acceptable size.
 
     Raises:
-        DataError: It is missing, a directory, not a regular file, unreadable, empty or huge.
+        DataError: It is missing, a directory, not a regular file, unreadable, empty or too large.
     """
     path = Path(path)
     with named(path):
@@ -96,7 +98,7 @@ def check_file(path: str | PathLike[str]) -> Path:
 
 
 def _neighbour(path: Path) -> str:
-    """Returns a question for a file of nearly the same name, if there is one."""
+    """Returns a suggestion of a file with nearly the same name, if there is one."""
     try:
         beside = [other.name for other in path.parent.iterdir()]
     except (OSError, ValueError):
@@ -106,14 +108,14 @@ def _neighbour(path: Path) -> str:
 
 
 def check_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
-    """Returns column names as a tuple after checking that every format can carry them.
+    """Returns column names as a tuple after checking that every format can store them.
 
     Args:
         names: Names of columns.
-        kind: What they name, for the message: ``"channel"``, ``"action"`` or ``"column"``.
+        kind: Their kind, for the message: ``"channel"``, ``"action"`` or ``"column"``.
 
     Raises:
-        DataError: A name is empty, repeated, or has characters that a format cannot carry.
+        DataError: A name is empty, repeated, or has characters that a format cannot store.
     """
     seen: set[str] = set()
     for position, name in enumerate(names, start=1):
@@ -137,7 +139,7 @@ def check_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
 
 
 def check_finite(values: NDArray[np.float64], names: Sequence[str], where: str) -> None:
-    """Raises a DataError where values ``(T, len(names))`` are not finite or absurdly large."""
+    """Raises a DataError if values ``(T, len(names))`` are not finite or above MAX_MAGNITUDE."""
     with np.errstate(invalid="ignore"):
         is_bad = ~(np.abs(values) <= MAX_MAGNITUDE)
     if is_bad.any():
@@ -149,7 +151,7 @@ def check_finite(values: NDArray[np.float64], names: Sequence[str], where: str) 
 
 
 def check_time(time: NDArray[np.float64], where: str) -> None:
-    """Raises a DataError unless time stamps ``(T + 1,)``, in s, rise in equal steps."""
+    """Raises a DataError unless time stamps ``(T + 1,)``, in s, increase in equal steps."""
     steps = np.diff(time)
     if (steps <= 0).any():
         at = int(np.argmax(steps <= 0))
@@ -167,16 +169,16 @@ def check_time(time: NDArray[np.float64], where: str) -> None:
 
 
 def canonical_time_step(times: Sequence[NDArray[np.float64]]) -> float:
-    """Returns the one time step, in s, behind the time stamps of all rollouts.
+    """Returns the common time step, in s, of the time stamps of all rollouts.
 
-    Time stamps ``k·Δt`` give back exactly ``Δt``; others give the mean step of the longest
-    rollout, rounded to 12 digits so that the rounding of the stamps does not show.
+    Time stamps ``k·Δt`` give exactly ``Δt``. Others give the mean step of the longest rollout,
+    rounded to 12 digits to remove the rounding errors of the stamps.
 
     Args:
         times: Time stamps of each rollout, ``(T + 1,)``, in s.
 
     Raises:
-        DataError: The rollouts were sampled at different rates, or the step is absurd.
+        DataError: The rollouts were sampled at different rates, or the step is implausible.
     """
     longest = max(times, key=len)
     num_steps = len(longest) - 1

@@ -1,4 +1,4 @@
-"""What rollouts show of themselves in a notebook."""
+"""Tables and plots of rollouts in a notebook."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from npdr_ppl.rollouts.recording import Recording
 __all__ = ["plot_rollouts", "rollouts_html"]
 
 MAX_DRAWN = 50
-"""Rollouts that are drawn over each other; of more, the first ones."""
+"""Greatest number of rollouts in one plot; the others are left out."""
 
 
 def rollouts_html(rollouts: Recording) -> str:
@@ -40,7 +40,7 @@ def rollouts_html(rollouts: Recording) -> str:
 
 
 def plot_rollouts(rollouts: Recording, axes: Any = None) -> NDArray[Any]:
-    """Draws every channel over time and returns the axes; see :meth:`Rollouts.plot`."""
+    """Plots every channel over time and returns the axes; see :meth:`Rollouts.plot`."""
     count = len(rollouts.channel_names) + len(rollouts.action_names)
     drawn = panels(axes, count, columns=1, size=(7.5, 1.4))
     row = 0
@@ -59,7 +59,7 @@ def plot_rollouts(rollouts: Recording, axes: Any = None) -> NDArray[Any]:
 
 
 def _channels(rollouts: Recording) -> list[tuple[str, Any, Any, Any]]:
-    """Returns kind, names, units and values ``(T, C)`` per rollout of sensors and of actions."""
+    """Returns kind, names, units and values, for sensors and for actions; values per rollout."""
     return [
         ("sensor", rollouts.channel_names, rollouts.channel_units, rollouts.readings),
         ("action", rollouts.action_names, rollouts.action_units, rollouts.actions),

@@ -1,4 +1,4 @@
-"""Segments: rollouts cut into stretches that are simulated from re-synchronised states."""
+"""Segments: pieces of rollouts, each simulated from an initial state taken from the data."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -25,20 +25,20 @@ __all__ = [
 ]
 
 InitialState = Literal["estimated", "recorded", "uncertain"]
-"""How the state at a segment's start is found: the readings are smoothed and differentiated, or
-taken as the truth, or smoothed and every simulation starts from a draw within the smoother's
-error."""
+"""How the state at a segment's start is found. ``estimated``: the measurements are smoothed and
+differentiated. ``recorded``: the measurements are taken as exact. ``uncertain``: every simulation
+draws its initial state from the estimate and its error."""
 
 DEFAULT_HISTORY = 64
-"""Steps of past commands handed over by default: 64 ms at 1 kHz, beyond any input delay of a
-working control loop, and nothing compared with the size of a segment."""
+"""Default number of past commands per segment, in steps: 64 ms at 1 kHz. This is longer than any
+input delay of a working control loop and small compared with a segment."""
 
 
 def columns_of(wanted: Sequence[str], names: Sequence[str]) -> list[int]:
     """Returns the positions of ``wanted`` in ``names``.
 
     Raises:
-        DataError: Some are not there; the message names them.
+        DataError: Some are missing; the message names them.
     """
     missing = [name for name in wanted if name not in names]
     if missing:
@@ -82,7 +82,7 @@ def cut(
         rollouts: The rollouts.
         layout: Rollout, first step and end of each segment, in the order of the rollouts.
         initial_state: How the state at a segment's start is found.
-        history: Steps of past commands to hand over.
+        history: Steps of past commands to include.
         dtype: Floating-point type of the tensors.
     """
     num_steps = max(stop - start for _, start, stop in layout)
@@ -121,7 +121,7 @@ def cut(
 def observation(
     rollouts: Recording, inputs: Inputs | int | None, channels: Sequence[str] | None
 ) -> Tensor:
-    """Returns the readings after each step; see :meth:`Rollouts.observation`."""
+    """Returns the measurements after each step; see :meth:`Rollouts.observation`."""
     names = rollouts.channel_names if channels is None else tuple(channels)
     columns = columns_of(names, rollouts.channel_names)
     if isinstance(inputs, Inputs):
@@ -146,19 +146,19 @@ def stitch(
 ) -> list[Tensor]:
     """Joins simulated segments into series of the states *before* each step, per rollout.
 
-    Each segment contributes the value it started from and its readings but the last, so that the
-    series of a rollout compares with :meth:`Rollouts.series`, as the paper's metrics need.
+    Each segment contributes its initial value and all simulated values but the last. The series of
+    a rollout can then be compared with :meth:`Rollouts.series`, as the paper's metrics need.
 
     Args:
-        trajectory: Readings after each step, ``(..., S, K, C)``.
-        inputs: What was simulated, S segments of K steps.
+        trajectory: Simulated values after each step, ``(..., S, K, C)``.
+        inputs: Inputs of the simulation, S segments of K steps.
         channels: Names of the trajectory's channels; those of the inputs if ``None``.
 
     Returns:
         One ``(..., T, C)`` per rollout.
 
     Raises:
-        DataError: A channel has no start value because it was not recorded.
+        DataError: A channel has no initial value because it was not recorded.
         ShapeError: The trajectory does not fit the inputs.
     """
     names = inputs.channel_names if channels is None else tuple(channels)
@@ -192,7 +192,7 @@ def _layout(lengths: Sequence[int], segment_length: int | None) -> list[tuple[in
 
 
 def _estimated(rollouts: Recording, layout: Sequence[tuple[int, int, int]]) -> StateEstimate:
-    """Returns the estimate at the segments' starts, ``(S, C)``; made once per recording."""
+    """Returns the estimated initial states of the segments, ``(S, C)``; computed only once."""
     known, key = rollouts.estimates, tuple(layout)
     if key not in known:
         known[key] = _estimate(rollouts, layout)

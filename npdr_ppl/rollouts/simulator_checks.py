@@ -1,4 +1,4 @@
-"""Checks that a recording fits a simulator: its columns, their units, no rollout twice."""
+"""Checks that a recording fits a simulator: columns, units and no duplicate rollouts."""
 
 import math
 from collections.abc import Sequence
@@ -13,13 +13,13 @@ from npdr_ppl.rollouts.recording import Recording
 __all__ = ["OTHER_UNITS", "check_channels", "check_duplicates", "check_units"]
 
 OTHER_UNITS = {"rad": ("degrees", 180 / math.pi), "m": ("millimetres", 1000.0)}
-"""What people record instead of SI units, and how many of them one SI unit has."""
+"""Common units other than SI: by SI unit, the other unit's name and how many equal one SI unit."""
 
 
 def check_duplicates(rollouts: Recording) -> None:
-    """Raises a DataError where two rollouts are the same to the last bit.
+    """Raises a DataError if two rollouts are identical to the last bit.
 
-    Two recordings of a device never are; the same file was probably added twice.
+    Two recordings of a device never are, so the same file was probably added twice.
     """
     seen: dict[bytes, int] = {}
     for index, (readings, actions) in enumerate(
@@ -42,25 +42,26 @@ def check_channels(
 ) -> None:
     """Checks that the data have the columns a simulator needs, and no others.
 
-    A rate may be missing where the channel that it is the rate of was recorded: its value at a
-    segment's start is then estimated.
+    A velocity may be missing if its position was recorded; its initial values are then estimated
+    from the position.
 
     Args:
         rollouts: The data.
         channels: Expected state or sensor channels.
         actions: Expected actions.
-        allow_extra: Accept channels that are not expected; extra actions never are.
+        allow_extra: Accept channels that are not expected. Extra actions are never accepted.
 
     Raises:
-        DataError: A column is missing, extra, or an action was read as a channel.
+        DataError: A column is missing or extra, or an action was read as a channel.
     """
     recorded = set(rollouts.channel_names)
     for action in actions:
         if action.name in recorded and action.name not in rollouts.action_names:
             raise DataError(
                 f"{action.name} is an action, but its cells in the last row of each rollout are "
-                "not empty; empty them if that row is the reading after the last step, otherwise "
-                f"append such a row (or, in Python, read with actions=[{action.name!r}])."
+                "not empty; empty them if that row is the one measured after the last step, "
+                "otherwise append such a row (or, in Python, read with "
+                f"actions=[{action.name!r}])."
             )
     missing = [a.name for a in actions if a.name not in rollouts.action_names]
     missing += [c.name for c in channels if c.name not in recorded and c.rate_of not in recorded]
@@ -80,11 +81,11 @@ def check_channels(
 
 
 def check_units(rollouts: Recording, channels: Sequence[Channel]) -> None:
-    """Looks for columns in other units than declared, degrees or millimetres, or of wrong sign.
+    """Checks the units and signs of columns, e.g. finds degrees or millimetres instead of SI.
 
-    Two things tell: a range that leaves the declared bounds by the factor between the units, and
-    a position whose derivative is so many times the reading of its own rate. Declared units are
-    compared where the data carry units.
+    Two symptoms show another unit. A range exceeds the declared bounds by the factor between the
+    units, or a position's derivative differs from the measured rate by this factor. If the data
+    have units, these are compared with the declared ones.
 
     Args:
         rollouts: The data.
@@ -119,7 +120,7 @@ def _column(rollouts: Recording, name: str) -> list[NDArray[np.float64]]:
 def _check_range(rollouts: Recording, channel: Channel) -> None:
     largest = max(float(np.max(np.abs(values))) for values in _column(rollouts, channel.name))
     bound = max(abs(channel.lower), abs(channel.upper))
-    # A few per cent of overshoot is a sensor's business, several times the bound is not.
+    # Sensors may exceed a bound by a few per cent, but not by several times the bound.
     if math.isfinite(bound) and largest > 3 * bound:
         other, factor = OTHER_UNITS.get(channel.unit.removesuffix("/s"), ("", 0.0))
         is_other = largest <= 1.1 * bound * factor
@@ -131,10 +132,10 @@ def _check_range(rollouts: Recording, channel: Channel) -> None:
 
 
 def _check_rate(rollouts: Recording, rate: str, position: str, unit: str) -> None:
-    """Compares how far the position went with the integral of its rate.
+    """Compares the displacement of a position with the integral of its rate.
 
-    Net displacements over a window are insensitive to quantisation and to a driver's low-pass,
-    both of which spoil a comparison of derivatives sample by sample.
+    Net displacements over a window of 0.1 s are insensitive to quantisation and to the low-pass
+    filter of a driver. Both would disturb a comparison of derivatives at each sample.
     """
     window = max(1, round(0.1 / rollouts.time_step))
     moved: list[NDArray[np.float64]] = []
@@ -146,7 +147,7 @@ def _check_rate(rollouts: Recording, rate: str, position: str, unit: str) -> Non
         integrated.append((area[stride::stride] - area[:-stride:stride]) * rollouts.time_step)
     x, y = np.concatenate(integrated), np.concatenate(moved)
     size = float(np.linalg.norm(x)) * float(np.linalg.norm(y))
-    # Without agreement in shape the ratio says nothing about units.
+    # If the two curves differ in shape, their ratio says nothing about units.
     if size == 0 or abs(float(x @ y)) < 0.7 * size:
         return
     if float(x @ y) < 0:

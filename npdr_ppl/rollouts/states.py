@@ -1,4 +1,4 @@
-"""Estimates values and time derivatives from readings, robust to quantisation and noise."""
+"""Estimates values and time derivatives from quantised and noisy measurements."""
 
 import functools
 from collections.abc import Sequence
@@ -12,29 +12,30 @@ __all__ = ["StateEstimate", "estimate_departures", "estimate_states", "rate_chan
 Array = NDArray[np.float64]
 
 DEGREE = 3
-"""Degree of the local polynomials; a cubic follows the jerk of a swing-up over tens of samples."""
+"""Degree of the local polynomials; a cubic fits the jerk of a swing-up over tens of samples."""
 
 HALF_WIDTHS = (2, 3, 4, 5, 7, 9, 12, 16, 21, 28, 37, 49, 65, 86, 114, 151, 200)
-"""Candidate windows, in samples to each side, growing by about 4/3."""
+"""Half-widths of the candidate windows, in samples; each is about 4/3 of the one before."""
 
 NEIGHBOURS = (-2, -1, 0, 1, 2)
-"""Where else the window is chosen, in samples: the median of the choices is taken, so that one
-chance disagreement between small windows does not stop the growth."""
+"""Offsets, in samples, of the steps at which a window is chosen. The median of these choices is
+used, so that one chance disagreement between small windows does not stop the growth."""
 
 RATE_SAMPLES = 200
-"""Steps of each rollout at which the change of a rate is looked at."""
+"""Number of steps in each rollout at which the change of a rate is evaluated."""
 
 CONFIDENCE = 2.0
-"""Half-width of the compared confidence intervals, in standard errors."""
+"""Half-width of the confidence intervals that are compared, in standard errors."""
 
 NEGLIGIBLE = 1e-12
-"""Share of the largest difference between readings below which one is no count of an encoder."""
+"""Differences between measurements below this fraction of the largest difference are not used to
+find the encoder resolution."""
 
 ERROR_RATIOS = 3.0, 4.0
-"""Root-mean-square errors of values and rates in standard errors: the window grows until bias
-shows, so bias is most of the error. Simulated swing-ups with encoders of 2048 counts and up to one
-count of noise gave 2.7 to 3.6 for both, recordings with normal noise of four other rigs 2.8 to 3.3
-for values and 3.6 to 4.7 for rates."""
+"""Root-mean-square errors of values and rates, in standard errors. The window grows until bias
+becomes visible, so most of the error is bias. Simulated swing-ups with an encoder resolution of
+2048 counts and up to one count of noise gave 2.7 to 3.6 for both. Recordings of four other rigs
+with normal noise gave 2.8 to 3.3 for values and 3.6 to 4.7 for rates."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,11 @@ class StateEstimate:
 def estimate_states(readings: Array, steps: NDArray[np.int64], time_step: float) -> StateEstimate:
     """Estimates every channel and its time derivative at chosen steps.
 
-    A cubic is fitted to a window around each step. The window is chosen, for each step, channel
-    and for value and rate apart, by the intersection of confidence intervals: it grows while its
-    interval still meets those of all smaller windows, i.e. until bias shows. No global smoothness
-    is assumed, so a swing-up's slow and fast spells each get their own window, and the ends of a
-    rollout are windows with one side only.
+    A cubic is fitted to a window around each step. Each step and channel has one window for its
+    value and one for its rate, chosen by the intersection of confidence intervals. A window grows
+    while its interval still overlaps those of all smaller windows, i.e. until bias becomes
+    visible. No global smoothness is assumed, so slow and fast parts of a swing-up get different
+    windows. At the ends of a rollout, windows are one-sided.
 
     Args:
         readings: ``(T + 1, C)``, constant sampling, in the channels' units.
@@ -87,16 +88,16 @@ def estimate_departures(
     steps: NDArray[np.int64],
     time_step: float,
 ) -> StateEstimate:
-    """Estimates by how much readings and their rates depart from a prediction at chosen steps.
+    """Estimates the differences of measurements and rates from a prediction at chosen steps.
 
-    What a model leaves of the readings is smoother than they are: where commands change, their
-    rates are kinked, which a polynomial takes for a bias and answers with a small window. Where
-    nothing but the prediction's end stops a window, errors are the standard errors.
+    These differences are smoother than the measurements themselves. The rates of measurements have
+    kinks where commands change; a polynomial shows a bias there and gets a small window. If a
+    window is limited only by the prediction's end, its errors are the standard errors.
 
     Args:
         readings: ``(T + 1, C)``, constant sampling, in the channels' units.
-        predicted: The same channels predicted around each of P steps, ``(W, C)`` each.
-        first: Index of the row that each prediction begins with, ``(P,)``.
+        predicted: Predictions of the same channels around each of P steps, ``(W, C)`` each.
+        first: Index of the first row of each prediction, ``(P,)``.
         steps: Indices of the rows wanted, ``(P,)``.
         time_step: Seconds between rows.
     """
@@ -107,7 +108,7 @@ def estimate_departures(
         (int(step - row), len(window))
         for step, row, window in zip(steps, first, predicted, strict=True)
     ]
-    # Windows of one shape are smoothed at once, as channels of one recording.
+    # Windows of the same shape are smoothed together, as channels of one recording.
     for shape in sorted(set(shapes)):
         place, size = shape
         which = [i for i, other in enumerate(shapes) if other == shape]
@@ -126,7 +127,7 @@ def estimate_departures(
 
 
 def rate_changes(readings: Sequence[Array], time_step: float) -> Array:
-    """Returns by how much each channel's rate changes in a time step, root mean square, ``(C,)``.
+    """Returns the root-mean-square change of each channel's rate during a time step, ``(C,)``.
 
     Args:
         readings: One ``(T + 1, C)`` per rollout, constant sampling, in the channels' units.
@@ -143,9 +144,9 @@ def rate_changes(readings: Sequence[Array], time_step: float) -> Array:
 def _adaptive(
     readings: Array, steps: NDArray[np.int64], noises: Array, num_changes: NDArray[np.int64]
 ) -> tuple[Array, Array, Array, Array, NDArray[np.bool_]]:
-    """Returns values, rates per row, their standard errors, and what bias stopped; ``(P, C)``.
+    """Returns values, rates per row and their standard errors, ``(P, C)``, and a mask.
 
-    The last is ``(2, P, C)``: whether a window of values or of rates could have grown on.
+    The mask ``(2, P, C)`` tells, for values and rates, whether bias limited the window.
     """
     num_rows = len(readings)
     widths = [w for w in HALF_WIDTHS if w < num_rows] or [HALF_WIDTHS[0]]
@@ -171,7 +172,7 @@ def _noises(readings: Array) -> Array:
 
 
 def _num_changes(readings: Array) -> NDArray[np.int64]:
-    """Returns how often each channel's reading has changed up to each row, ``(T + 1, C)``."""
+    """Returns how often each channel's value has changed up to each row, ``(T + 1, C)``."""
     is_change = np.diff(readings, axis=0, prepend=readings[:1]) != 0
     return np.cumsum(is_change, axis=0)
 
@@ -179,9 +180,9 @@ def _num_changes(readings: Array) -> NDArray[np.int64]:
 def _fit(
     readings: Array, steps: NDArray[np.int64], half_width: int, num_changes: NDArray[np.int64]
 ) -> tuple[Array, Array]:
-    """Fits one window: value and rate per row, and their standard errors for unit noise.
+    """Fits one window and returns (value, rate per row) and their standard errors for unit noise.
 
-    Both are ``(2, P, C)``.
+    Both arrays have the shape ``(2, P, C)``.
     """
     last = len(readings) - 1
     left = np.maximum(steps - half_width, 0)
@@ -194,8 +195,8 @@ def _fit(
         weights = _weights(int(before), int(after))
         windows = readings[steps[rows, None] + np.arange(-before, after + 1)]
         fit[:, rows] = np.einsum("kn,pnc->kpc", weights, windows)
-        # A reading that stays on one encoder count repeats the same error: a window holds only
-        # as many independent ones as the reading took values.
+        # Equal consecutive encoder values repeat the same error. A window therefore holds only
+        # one independent error per run of equal values.
         size = before + after + 1
         independent = 1 + num_changes[right[rows]] - num_changes[left[rows]]
         norms = np.linalg.norm(weights, axis=1)
@@ -203,10 +204,10 @@ def _fit(
     return fit, error
 
 
-# One-sided windows near a recording's ends have extents of their own, some 1700 in all.
+# One-sided windows near a recording's ends have different extents, about 1700 in total.
 @functools.lru_cache(maxsize=4096)
 def _weights(before: int, after: int) -> Array:
-    """Returns the weights ``(2, before + after + 1)`` of a window for value and rate per row."""
+    """Returns a window's weights for value and rate per row, ``(2, before + after + 1)``."""
     offsets = np.arange(-before, after + 1, dtype=np.float64)
     scale = max(before, after, 1)
     degree = min(DEGREE, before + after)
@@ -217,23 +218,24 @@ def _weights(before: int, after: int) -> Array:
 
 
 def _noise(readings: Array) -> float:
-    """Returns the standard deviation of one channel's reading errors.
+    """Returns the standard deviation of one channel's measurement errors.
 
-    The larger of what third differences show, where any smooth motion is negligible, and of the
-    error of rounding to the encoder's count, which a motion at rest would hide.
+    It is the larger of two estimates. Third differences show the noise, because smooth motion is
+    negligible in them. The encoder resolution gives the rounding error, which stays invisible
+    while the joint is at rest.
     """
     differences = np.diff(readings)
     size = np.abs(differences[differences != 0])
     if size.size == 0:
         return 0.0
-    # A filtered reading that comes to rest fades away below any count.
+    # A filtered signal that comes to rest has differences far below the encoder resolution.
     size = size[size > NEGLIGIBLE * size.max()]
     noise = 0.0
     third = np.diff(differences, n=2)
     third = third[differences[1:-1] != 0]
     if third.size:
-        # Independent errors of variance s² have third differences of variance 20 s²; the median
-        # of their absolute values, for normal errors, is 0.6745 standard deviations.
+        # Independent errors of variance s² have third differences of variance 20 s². The median
+        # absolute value of normal errors is 0.6745 standard deviations.
         noise = float(np.median(np.abs(third))) / 0.6745 / np.sqrt(20)
     count = float(size.min())
     remainder = np.abs(size / count - np.round(size / count))

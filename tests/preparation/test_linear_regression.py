@@ -281,7 +281,7 @@ def test_recordings_that_do_not_do_are_refused():
     with pytest.raises(DataError, match="differentiates position readings, but angle"):
         linear_regression_of(pendulum, rollouts.select(["velocity"]))
     short = record(Pendulum(), TRUTH[Pendulum], 0.02, 40)
-    with pytest.raises(DataError, match="at least 64 readings"):
+    with pytest.raises(DataError, match="at least 64 samples"):
         regress(pendulum, short)
     with pytest.raises(DataError, match="too few for 2 base parameters"):
         regress(pendulum, rollouts, position_cutoff=5.0, parallel_cutoff=1.0)

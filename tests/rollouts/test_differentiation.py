@@ -55,7 +55,7 @@ def test_cutoffs_can_be_chosen():
     assert cutoffs(readings, STEP, Smoothing(30.0)) == (30.0, pytest.approx(12.0))
     with pytest.raises(DataError, match="below half the sampling rate, 250 Hz, got 300 Hz"):
         cutoffs(readings, STEP, Smoothing(300.0))
-    with pytest.raises(DataError, match="at least 64 readings, got one of 20"):
+    with pytest.raises(DataError, match="at least 64 samples, got one of 20"):
         cutoffs([swing(TIME)[:20]], STEP, Smoothing())
     with pytest.raises(DataError, match="parallel_cutoff must be a positive frequency"):
         Smoothing(parallel_cutoff=0.0)

@@ -1,9 +1,9 @@
-"""Words for places in a scene: what parameters, commands and sensors are bound to.
+"""Names of quantities in a scene that parameters, commands and sensors refer to.
 
-A place is written as its kind, its name and what of it is meant: ``"link lower mass"``,
-``"joint elbow damping"``, ``"body ball restitution"``, ``"joint elbow position"``, ``"body ball
-x"``. Bodies are named by the builder, joints and links as in the URDF; where several bodies have
-one of the same name, the body's goes in front: ``"joint left/elbow position"``.
+A place is written as kind, name and quantity: ``"link lower mass"``, ``"joint elbow damping"``,
+``"body ball restitution"``, ``"joint elbow position"``, ``"body ball x"``. The builder names the
+bodies; joints and links are named as in the URDF. If several bodies have a joint or link of the
+same name, the body's name is put in front: ``"joint left/elbow position"``.
 """
 
 from collections.abc import Mapping
@@ -25,12 +25,12 @@ JOINT_FIELDS = ("position", "velocity")
 
 @dataclass(frozen=True)
 class Place:
-    """A place in a scene.
+    """A quantity of a joint, link, body or the world.
 
     Attributes:
         kind: ``"joint"``, ``"link"``, ``"body"`` or ``"world"``.
         name: Name of the joint, link or body.
-        field: What of it is meant.
+        field: The quantity.
     """
 
     kind: str
@@ -48,11 +48,11 @@ class Command:
     Attributes:
         channel: The channel; its bounds limit the command.
         target: ``"joint <name> torque"``, ``velocity`` or ``position``. A torque is held during a
-            step; velocity and position are what Bullet's motor of the joint aims at.
-        rated: Typical magnitude, by which effects scale their priors.
-        max_force: Greatest torque or force of the motor; ``None`` for no limit to speak of.
-        position_gain: Share of a position error that the motor removes per substep.
-        velocity_gain: Share of a velocity error that the motor removes per substep.
+            step; a velocity or position is the setpoint of Bullet's joint motor.
+        rated: Typical magnitude, with which effects scale their priors.
+        max_force: Greatest torque or force of the motor; ``None`` for practically no limit.
+        position_gain: Fraction of a position error that the motor removes per substep.
+        velocity_gain: Fraction of a velocity error that the motor removes per substep.
     """
 
     channel: Channel
@@ -66,7 +66,7 @@ class Command:
         """Checks the target.
 
         Raises:
-            ModelError: It is not a joint's torque, velocity or position.
+            ModelError: The target is not a joint's torque, velocity or position.
         """
         parse_place(self.target, {"joint": get_args(CommandMode)})
 
@@ -78,14 +78,14 @@ class Command:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor channel and what it reads.
+    """A sensor channel and the quantity that it measures.
 
     Attributes:
         channel: The channel.
-        source: ``"joint <name> position"`` or ``velocity``; or of a body or link its centre of
+        source: ``"joint <name> position"`` or ``velocity``. For a body or link: its centre of
             mass ``x``, ``y``, ``z`` (m), orientation ``roll``, ``pitch``, ``yaw`` (rad), velocity
             ``vx``, ``vy``, ``vz`` (m/s) or angular velocity ``wx``, ``wy``, ``wz`` (rad/s).
-        rated: Typical magnitude, by which effects scale their priors.
+        rated: Typical magnitude, with which effects scale their priors.
     """
 
     channel: Channel
@@ -96,7 +96,7 @@ class Sensor:
         """Checks the source.
 
         Raises:
-            ModelError: There is nothing like it to read.
+            ModelError: There is no such quantity to measure.
         """
         parse_place(self.source, _SENSOR_FIELDS)
 
@@ -117,7 +117,7 @@ def parse_place(text: str, fields: Mapping[str, tuple[str, ...]]) -> Place:
     """Parses ``"<kind> <name> <field>"``; the world has no name.
 
     Args:
-        text: The words.
+        text: The text to parse.
         fields: Possible fields by kind.
 
     Raises:
@@ -133,4 +133,4 @@ def parse_place(text: str, fields: Mapping[str, tuple[str, ...]]) -> Place:
         f"{kind}{'' if kind == 'world' else ' <name>'} {' | '.join(names)}"
         for kind, names in fields.items()
     )
-    raise ModelError(f"{text!r} is no place in a scene that would do here; known are: {known}.")
+    raise ModelError(f"{text!r} is no place in a scene that fits here; known are: {known}.")

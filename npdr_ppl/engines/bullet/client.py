@@ -1,4 +1,4 @@
-"""Connections to PyBullet in DIRECT mode: no window, no other process."""
+"""Connections to PyBullet in DIRECT mode: without a window and without another process."""
 
 import ctypes
 import os
@@ -11,13 +11,13 @@ __all__ = ["connect", "connected"]
 
 
 def connect() -> Any:
-    """Returns a client of a physics server of its own; its methods are PyBullet's functions."""
-    with _quiet():  # it greets
+    """Returns a client of a new physics server; its methods are PyBullet's functions."""
+    with _quiet():  # the import prints a message
         import pybullet
         from pybullet_utils.bullet_client import BulletClient
 
         class QuickClient(BulletClient):
-            """Keeps each function once it was asked for; the base wraps it anew every time."""
+            """Caches each function; the base class wraps it anew at every access."""
 
             def __getattr__(self, name: str) -> Any:
                 function = super().__getattr__(name)
@@ -29,7 +29,7 @@ def connect() -> Any:
 
 @contextmanager
 def connected() -> Iterator[Any]:
-    """Connects for the length of a block, in which native code keeps its remarks to itself."""
+    """Connects for the duration of a block, in which native code prints nothing."""
     with _quiet():
         client = connect()
         try:
@@ -42,7 +42,7 @@ def connected() -> Iterator[Any]:
 def _quiet() -> Iterator[None]:
     """Keeps native code from writing to standard output and standard error inside the block.
 
-    A command's output may be JSON, and Bullet writes to it whatever comes to its mind.
+    A command's output may be JSON, and messages from Bullet would make it invalid.
     """
     streams = (sys.stdout, sys.stderr)
     with ExitStack() as stack:
@@ -58,6 +58,6 @@ def _quiet() -> Iterator[None]:
             stack.callback(os.close, kept)
             stack.callback(os.dup2, kept, descriptor)
             os.dup2(nowhere, descriptor)
-        # Text that waits in native buffers has to go the same way.
+        # Text that is still in native buffers must be discarded, too.
         stack.callback(flush, None)
         yield

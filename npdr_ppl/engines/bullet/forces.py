@@ -16,20 +16,20 @@ Joint = tuple[int, int]
 
 
 def is_dry(effect: ForceEffect) -> bool:
-    """Returns whether an effect has a dry friction."""
+    """Returns whether an effect contains dry friction."""
     return type(effect).dry_friction is not ForceEffect.dry_friction
 
 
 class JointForces:
     """The forces of effects at the joints of a scene.
 
-    Smooth forces are evaluated in the state at a substep's start. Dry friction is Bullet's own
-    motor of the joint: it aims at rest with the friction's bound for its greatest force, so that
-    the solver finds what Coulomb's law asks for within the substep, stiction included.
+    Smooth forces are evaluated in the state at a substep's start. Dry friction uses Bullet's joint
+    motor with a target velocity of zero and the friction's bound as its greatest force. The solver
+    then finds the force of Coulomb's law within the substep, including stiction.
 
     Args:
         scene: The scene, in its initial state.
-        effects: Effects with the joint that each acts on.
+        effects: Effects, each with its joint.
         parameters: Values of all their parameters.
         time_step: Seconds per substep.
         start_time: Seconds since the rollout began.

@@ -10,7 +10,7 @@ from npdr_ppl.language.channels import Parameter
 
 __all__ = ["BoundParameter"]
 
-# Field: unit, argument of changeDynamics, position in getDynamicsInfo (None where it is not told).
+# Field: unit, argument of changeDynamics, index in getDynamicsInfo (None if not contained).
 _DYNAMICS: dict[str, tuple[str, str, int | None]] = {
     "mass": ("kg", "mass", 0),
     "friction": ("1", "lateralFriction", 1),
@@ -33,11 +33,11 @@ _FIELDS = {
 
 
 class BoundParameter:
-    """A domain parameter and the place in a scene where it counts.
+    """A domain parameter and the quantity of a scene that it sets.
 
-    A mass scales the link's moments of inertia with it. Poses of a body are those of its centre
-    of mass; an offset is added to where the builder put it, and one of an angle turns the body
-    about the world's axes through that centre.
+    A mass also scales the link's moments of inertia. Poses of a body are those of its centre of
+    mass. An offset is added to the builder's pose; an angle offset rotates the body about axes
+    through that centre that are parallel to the world's axes.
 
     Args:
         name: Name of the parameter.
@@ -45,7 +45,7 @@ class BoundParameter:
             :mod:`npdr_ppl.engines.bullet.channels`.
 
     Raises:
-        ModelError: There is nothing like it to change.
+        ModelError: There is no such quantity to change.
     """
 
     def __init__(self, name: str, text: str) -> None:
@@ -53,7 +53,7 @@ class BoundParameter:
         self.place: Place = parse_place(text, _FIELDS)
 
     def declaration(self, scene: Scene) -> Parameter:
-        """Returns the parameter with its unit, and the scene's own value as the nominal one."""
+        """Returns the parameter with its unit; its nominal value is that of the scene."""
         return Parameter(self.name, self.unit, self._present(scene), str(self.place))
 
     @property
@@ -69,7 +69,7 @@ class BoundParameter:
         return "m" if field.removesuffix("_offset") in ("x", "y", "z") else "rad"
 
     def apply(self, scene: Scene, value: float) -> None:
-        """Gives the place its value."""
+        """Sets the value in a scene."""
         client, place = scene.client, self.place
         if place.kind == "world":
             client.setGravity(0.0, 0.0, -value)
@@ -98,7 +98,7 @@ class BoundParameter:
             if position is None:
                 return scene.damping
             value = float(client.getDynamicsInfo(body, link)[position])
-            return max(value, 0.0)  # Bullet has -1 for a stiffness that was never given
+            return max(value, 0.0)  # Bullet returns -1 for a stiffness that was never set
         if place.field in _SHIFTS:
             return 0.0
         position, orientation = client.getBasePositionAndOrientation(body)
@@ -106,7 +106,7 @@ class BoundParameter:
         return float(pose[POSE_FIELDS.index(place.field)])
 
     def _move(self, client: Any, body: int, value: float) -> None:
-        """Puts a body elsewhere."""
+        """Changes the pose of a body."""
         position, orientation = client.getBasePositionAndOrientation(body)
         place = POSE_FIELDS.index(self.place.field.removesuffix("_offset"))
         if self.place.field not in _SHIFTS:
@@ -123,10 +123,10 @@ class BoundParameter:
 
 
 def _set_mass(client: Any, body: int, link: int, value: float) -> None:
-    """Changes a mass at constant shape: moments of inertia go with it.
+    """Changes a mass at constant shape: moments of inertia are scaled by the same factor.
 
-    Left alone, Bullet takes the moments of the collision shape where there is one, whatever the
-    URDF says, and keeps the old ones where there is none.
+    Otherwise, if a collision shape exists, Bullet would take the moments of that shape instead of
+    the URDF's moments. Without a collision shape, it would keep the old moments.
     """
     info = client.getDynamicsInfo(body, link)
     mass, moments = info[0], info[2]

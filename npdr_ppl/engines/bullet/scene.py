@@ -1,4 +1,4 @@
-"""What a builder made: bodies, joints and links by name."""
+"""Access to the bodies, joints and links of a scene by name."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,13 +29,13 @@ body ids by name."""
 class Urdf:
     """Builds a scene of one robot from a URDF file.
 
-    Inertias are those of the file; PyBullet's own default computes them from collision shapes.
+    Inertias are those of the file; PyBullet's default is to compute them from collision shapes.
 
     Attributes:
-        path: The file; workers have to find it there, too.
-        name: What the body is called.
+        path: The file; workers must find it at the same path.
+        name: Name of the body.
         is_fixed: Whether the base is fixed to the world.
-        position: Where the base goes, in metres.
+        position: Position of the base, in metres.
     """
 
     path: str | PathLike[str]
@@ -55,20 +55,20 @@ class Urdf:
                 useFixedBase=self.is_fixed,
                 flags=client.URDF_USE_INERTIA_FROM_FILE,
             )
-        except Exception as error:  # PyBullet's own error has no class that could be named
+        except Exception as error:  # PyBullet exports no class for its error
             raise ModelError(f"{path} is not a URDF file that Bullet can load.") from error
         return {self.name: body}
 
 
 class Scene:
-    """A world with everything in it.
+    """A world with all its bodies.
 
-    Motors that Bullet gives to every joint are switched off, and damping of bodies is what the
-    settings say, so that nothing acts that was not asked for.
+    Bullet's default joint motors are switched off, and the settings define the damping of bodies.
+    Only requested forces act.
 
     Args:
         client: PyBullet's client.
-        build: Fills the world.
+        build: Builds the bodies in the world.
         parameters: The parameters by name, for the builder.
         settings: Settings of the engine.
         time_step: Seconds per step, substeps included.
@@ -108,7 +108,7 @@ class Scene:
         """Returns body and index of a joint, link or body.
 
         Raises:
-            ModelError: There is none of that name, or several.
+            ModelError: None or several have that name.
         """
         if place.kind == "body":
             known = {name: (body, -1) for name, body in self.bodies.items()}
@@ -129,7 +129,7 @@ class Scene:
     def reader(self, sensors: Sequence[Sensor]) -> Callable[[], Sequence[float]]:
         """Returns a function that reads sensors in the present state of the world.
 
-        What is read by one of Bullet's functions is asked for once, however many sensors show it.
+        Each function of Bullet is called once, even if several sensors use its result.
         """
         sources: dict[Any, Callable[[], Any]] = {}
         columns = []
@@ -138,7 +138,7 @@ class Scene:
             sources.setdefault(key, function)
             columns.append((list(sources).index(key), column))
         functions = list(sources.values())
-        if len(functions) == 1 and len(columns) > 1:  # a joint's position and velocity, say
+        if len(functions) == 1 and len(columns) > 1:  # e.g. a joint's position and velocity
             (function,) = functions
             chosen = itemgetter(*(column for _, column in columns))
             return lambda: chosen(function())
@@ -150,11 +150,11 @@ class Scene:
         return read
 
     def place_joint(self, joint: tuple[int, int], position: float, velocity: float) -> None:
-        """Puts a joint into a state."""
+        """Sets the state of a joint."""
         self.client.resetJointState(*joint, position, velocity)
 
     def place_body(self, body: int, values: Mapping[str, float]) -> None:
-        """Gives a body's base a pose and a velocity; fields that are not given stay.
+        """Sets pose and velocity of a body's base; fields that are not given stay unchanged.
 
         Args:
             body: Its id.
@@ -178,13 +178,13 @@ class Scene:
                 body, [pose[f] for f in POSE_FIELDS[:3]], orientation
             )
         rates |= {field: values[field] for field in RATE_FIELDS if field in values}
-        # Moving a body sets its velocity to zero, so the velocity comes last.
+        # Moving a body sets its velocity to zero, so the velocity is set last.
         client.resetBaseVelocity(
             body, [rates[f] for f in RATE_FIELDS[:3]], [rates[f] for f in RATE_FIELDS[3:]]
         )
 
     def _index(self, name: str, body: int) -> None:
-        """Notes a body's joints and links, and makes them passive."""
+        """Records a body's joints and links, and makes them passive."""
         client = self.client
         client.changeDynamics(body, -1, linearDamping=self.damping, angularDamping=self.damping)
         base = client.getBodyInfo(body)[0].decode()
@@ -210,7 +210,7 @@ class Scene:
             table[name] = value
 
     def _source(self, place: Place) -> tuple[Any, int, Callable[[], Any]]:
-        """Returns a key of what shows a place, the place's column in it, and how to read it."""
+        """Returns the key of a function, the column of the place in its result, the function."""
         client = self.client
         body, index = self.find(place)
         if place.kind == "joint":

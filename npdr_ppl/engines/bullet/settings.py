@@ -1,4 +1,4 @@
-"""Settings of the engine: a part of the model, so they are fixed and recorded."""
+"""Settings of the engine; they are part of the model, so they are fixed and recorded."""
 
 from dataclasses import dataclass
 
@@ -12,17 +12,17 @@ class BulletSettings:
     """How Bullet integrates and resolves contacts; ``None`` stands for Bullet's own default.
 
     Attributes:
-        time_step: Seconds per step of a simulator that is not told another by its inputs.
-        substeps: Integration steps per time step; more cost in proportion.
+        time_step: Seconds per step, unless the inputs of a simulation specify another value.
+        substeps: Integration steps per time step; run time is proportional to it.
         gravity: Acceleration of gravity (x, y, z), in m/s².
         solver_iterations: Iterations of the contact and motor solver.
         contact_breaking_threshold: Distance in metres below which contacts are kept. Bullet's
-            0.02 m lets small bodies collide before they touch, which eats restitution: take 1e-5
+            0.02 m lets small bodies collide before they touch, which reduces restitution: use 1e-5
             for a ball of a few centimetres.
-        contact_erp: Share of a contact's penetration that a step corrects; it adds energy.
+        contact_erp: Fraction of a contact's penetration that a step corrects; it adds energy.
         restitution_velocity_threshold: Speed in m/s below which contacts do not bounce.
-        damping: Linear and angular damping of every body, in 1/s. Bullet's default of 0.04 is
-            friction that nobody asked for.
+        damping: Linear and angular damping of every body, in 1/s. Bullet's default of 0.04 would
+            add unwanted friction.
     """
 
     time_step: float = 0.01
@@ -38,7 +38,7 @@ class BulletSettings:
         """Checks the ranges.
 
         Raises:
-            ModelError: A setting is out of its range.
+            ModelError: A setting is outside its range.
         """
         if self.time_step <= 0 or self.substeps < 1 or self.solver_iterations < 1:
             raise ModelError(
@@ -47,10 +47,10 @@ class BulletSettings:
             )
 
     def engine_parameters(self) -> dict[str, float]:
-        """Returns what ``setPhysicsEngineParameter`` takes after a reset.
+        """Returns the arguments of ``setPhysicsEngineParameter`` after a reset.
 
-        The contact-breaking threshold is always among them: it belongs to the process and not to
-        the simulation, and survives a reset.
+        The contact-breaking threshold is always included: it belongs to the process, not to the
+        simulation, and a reset does not restore it.
         """
         chosen = {
             "numSolverIterations": self.solver_iterations,

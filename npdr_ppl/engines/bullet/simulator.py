@@ -28,23 +28,23 @@ __all__ = ["BulletSimulator"]
 class BulletSimulator(SteppedSimulator):
     """A scene of PyBullet, simulated on workers in DIRECT mode.
 
-    The scene is built anew for each simulation, because contacts and solver caches would carry
-    something of the last one over. Every joint that moves is a force port, commands and sensors
-    are ports, and ``gravity`` is one of the environment.
+    The scene is rebuilt for each simulation; otherwise, contacts and solver caches of the previous
+    simulation would influence it. Every joint that moves is a force port, commands and sensors are
+    ports, and ``gravity`` is an environment port.
 
-    A subclass can override :meth:`start` and :meth:`drive` for what channels cannot express, e.g.
-    a body that is moved along a path.
+    A subclass can override :meth:`start` and :meth:`drive` for actions that channels cannot
+    express, e.g. a body that is moved along a path.
 
     Args:
         scene: A builder, or a URDF file of one robot with a fixed base.
         parameters: Domain parameters by name: a place in the scene such as ``"link lower mass"``,
             ``"joint elbow damping"``, ``"body ball restitution"``, ``"body wall x_offset"`` or
             ``"world gravity"``, whose value in the scene is the nominal one; or the declaration
-            of a parameter that the builder takes care of.
-        actions: Commands of joints; bare channels are left to :meth:`drive`.
-        sensors: What is read after each step.
-        states: Sensors whose value at a segment's start is put into the scene; ``None`` for all
-            those of joints and bodies. What is not put in starts as the builder left it.
+            of a parameter that the builder uses.
+        actions: Commands of joints; channels without a command must be handled by :meth:`drive`.
+        sensors: Sensors that are measured after each step.
+        states: Sensors whose values at a segment's start are set in the scene; ``None`` for all
+            sensors of joints and bodies. Other states begin as the builder set them.
         settings: Settings of the engine.
 
     Raises:
@@ -94,16 +94,16 @@ class BulletSimulator(SteppedSimulator):
             by_name = {p.name: p for p in given} | found
             self.parameters = tuple(by_name[name] for name in declared)
             self.ports = self._find_ports(built)
-            built.reader(self._sensors)  # says so now if something is not there
+            built.reader(self._sensors)  # raises an error if something does not exist
 
     @property
     def name(self) -> str:
-        """Name for messages: that of the class, and of the URDF file where there is one."""
+        """Name for messages: name of the class, with the name of the URDF file if there is one."""
         file = f"({str(self._build.path)!r})" if isinstance(self._build, Urdf) else ""
         return f"{type(self).__name__}{file}"
 
     def recorded_settings(self) -> dict[str, Any]:
-        """Returns the settings of the engine and the text of the URDF file, where there is one."""
+        """Returns the settings of the engine and the text of the URDF file, if there is one."""
         settings = {"engine": "bullet", **asdict(self.settings)}
         if isinstance(self._build, Urdf):
             settings["urdf"] = recorded_files(self._build.path)
@@ -114,8 +114,8 @@ class BulletSimulator(SteppedSimulator):
 
         Raises:
             ModelError: Dry friction is attached to a joint whose motor follows a velocity or a
-                position: Bullet has one motor per joint. Or an effect has to see its joint before
-                each step.
+                position, but Bullet has one motor per joint. Or an effect needs acceleration and
+                inertia of its joint before each step.
         """
         changed = super().with_effects(*effects)
         driven = {
@@ -159,7 +159,7 @@ class BulletSimulator(SteppedSimulator):
         )
 
     def start(self, scene: Scene, parameters: Mapping[str, float], segment: Segment) -> None:
-        """Puts the scene into a segment's initial state.
+        """Sets the scene to a segment's initial state.
 
         Args:
             scene: The scene, with its parameters.
@@ -182,13 +182,13 @@ class BulletSimulator(SteppedSimulator):
             scene.place_body(body, values)
 
     def drive(self, scene: Scene, segment: Segment, step: int, substep: int) -> None:
-        """Moves things in a way that no joint command can, before a substep.
+        """Moves bodies in a way that joint commands cannot, before a substep.
 
-        By default there are none.
+        By default it does nothing.
 
         Args:
             scene: The scene.
-            segment: What is simulated; ``segment.actions[step]`` is the present command.
+            segment: The segment; ``segment.actions[step]`` is the present command.
             step: Number of the step, from 0.
             substep: Number of the substep within it, from 0.
         """
@@ -196,7 +196,7 @@ class BulletSimulator(SteppedSimulator):
     def _forces(
         self, scene: Scene, parameters: Mapping[str, float], segment: Segment
     ) -> JointForces | None:
-        """Returns the forces of effects at joints, where there are any."""
+        """Returns the forces of effects at joints, if there are any."""
         effects = [e for e in self.effects if isinstance(e, ForceEffect)]
         if not effects:
             return None
@@ -205,7 +205,7 @@ class BulletSimulator(SteppedSimulator):
         return JointForces(scene, pairs, parameters, step, segment.start_time)
 
     def _change_environment(self, scene: Scene, parameters: Mapping[str, float]) -> None:
-        """Lets effects turn gravity."""
+        """Applies environment effects to gravity."""
         gravity: Any = scene.gravity
         effects = [e for e in self.effects if isinstance(e, EnvironmentEffect)]
         for effect in effects:
@@ -246,7 +246,7 @@ class BulletSimulator(SteppedSimulator):
             info = scene.client.getJointInfo(*joint)
             turns = info[2] == scene.client.JOINT_REVOLUTE
             unit, coordinate = ("N m", "rad") if turns else ("N", "m")
-            # A URDF says zero, and Bullet sometimes a thousand, where nothing was said.
+            # Unspecified limits are zero in a URDF, and sometimes a thousand in Bullet.
             effort = rated.get(name, info[10] if 0.0 < info[10] < 1000.0 else 1.0)
             speed = info[11] if 0.0 < info[11] < 1000.0 else 1.0
             port = Port(name, "force", unit, effort, speed, 1.0, coordinate, joint in driven)

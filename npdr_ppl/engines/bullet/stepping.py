@@ -1,4 +1,4 @@
-"""One step of a scene: commands, forces of effects, and what a subclass drives."""
+"""One step of a scene: commands, forces of effects, and motions that a subclass drives."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ __all__ = ["BulletSimulation", "Drive", "stepping"]
 Joint = tuple[int, int]
 
 Drive = Callable[[Scene, Segment, int, int], None]
-"""Moves things in a scene before a substep; see :meth:`BulletSimulator.drive`."""
+"""Moves bodies of a scene before a substep; see :meth:`BulletSimulator.drive`."""
 
-# What Bullet's motors take for no limit.
+# Greatest force of Bullet's motors that is practically no limit.
 _NO_LIMIT = 1e9
 
 
 @dataclass(frozen=True)
 class BulletSimulation:
-    """A simulation under way; see :class:`~npdr_ppl.engines.pooled.stepped_simulator.Simulation`.
+    """A running simulation; see :class:`~npdr_ppl.engines.pooled.stepped_simulator.Simulation`.
 
     Attributes:
-        advance: Makes all substeps of a step.
+        advance: Performs all substeps of a step.
         read: Reads the sensors.
     """
 
@@ -41,15 +41,15 @@ def stepping(
     forces: JointForces | None,
     drive: Drive | None,
 ) -> Callable[[int], None]:
-    """Returns a function that makes all substeps of a step.
+    """Returns a function that performs all substeps of a step.
 
     Args:
         scene: The scene, in its initial state.
-        segment: Holds the actions of each step by the time that it is made.
+        segment: The segment; the actions of a step must be set before the step.
         commands: Commands of joints, with their columns in the actions.
         substeps: Integration steps per step.
         forces: Forces of effects at joints.
-        drive: What else moves.
+        drive: Moves other bodies before each substep, if given.
     """
     motors, torques = [], []
     for column, command in commands:
@@ -87,13 +87,13 @@ def stepping(
                 control(body, index, torque_control, force=present[column])
             step_simulation()
 
-    # Most scenes have nothing to add up, and steps are short enough for that to be seen.
+    # Most scenes have no forces to sum, and the sum would take a noticeable part of a step.
     is_simple = len({joint for _, joint in torques}) == len(torques)
     return advance_simply if is_simple and forces is None and drive is None else advance
 
 
 def _motor(client: Any, command: Command, joint: tuple[int, int]) -> Any:
-    """Returns a function that has a joint's motor follow a velocity or a position."""
+    """Returns a function that lets a joint's motor follow a velocity or a position."""
     control = client.setJointMotorControl2
     force = _NO_LIMIT if command.max_force is None else command.max_force
     if command.place.field == "velocity":

@@ -31,10 +31,10 @@ class ClosedLoopSimulator(Simulator):
     ) -> Episodes:
         """Simulates closed-loop episodes of a batch of policies, domains and initial states.
 
-        The batch shape B is what the three broadcast to: keep policies on one axis, domains on
-        another and states on a third. Commands are limited to the channels' bounds, then pass the
-        action effects; policies see readings, and the first reading is true. Before the start
-        commands were zero.
+        The three broadcast to the batch shape B: keep policies on one axis, domains on another and
+        states on a third. Commands are limited to the channels' bounds and then pass the action
+        effects. Policies receive measurements; the first measurement has no errors. Commands
+        before the start are zero.
 
         Args:
             parameters: Domain and effect parameters; missing ones are nominal.
@@ -43,12 +43,12 @@ class ClosedLoopSimulator(Simulator):
             num_steps: Greatest number of steps.
             reward: Reward of a step.
             time_step: Seconds per step; ``None`` for the simulator's.
-            record: Whether to return readings and commands; recording is not compiled.
-            compile: Replaces the simulator's choice; an engine that is compiled ignores it.
-            expected_calls: How many calls of this size are to come, so that ``auto`` can tell
-                whether compilation pays back.
+            record: Whether to return measurements and commands; recording is not compiled.
+            compile: Replaces the simulator's choice; engines that are compiled already ignore it.
+            expected_calls: Number of calls of this size to expect; ``auto`` then decides whether
+                compilation saves time.
             internal_model: Parameters that the policies' own model has in every domain, as on a
-                device whose parameters nobody knows; ``None`` for each domain's own.
+                device with unknown parameters; ``None`` for the parameters of each domain.
 
         Raises:
             ModelError: A parameter is unknown, or the policy's channels are not the simulator's.
@@ -70,4 +70,4 @@ class ClosedLoopSimulator(Simulator):
 
     @abstractmethod
     def run_episodes(self, request: EpisodeRequest) -> Episodes:
-        """Simulates the episodes of a request that has been checked; see :meth:`roll_out`."""
+        """Simulates the episodes of a checked request; see :meth:`roll_out`."""

@@ -1,4 +1,4 @@
-"""Commands given so far, as action effects see them: recorded ones and those of a live loop."""
+"""Present and past commands for action effects, from a recording or from a running loop."""
 
 import copy
 from collections.abc import Sequence
@@ -13,10 +13,10 @@ __all__ = ["CommandRecord", "RecentCommands", "RecordedCommands", "commands_at"]
 
 
 class CommandRecord:
-    """All commands of one action channel in a batch of segments, past ones included.
+    """All commands of one action channel in a batch of segments, including past ones.
 
-    Before the oldest command on record a segment saw zero if it starts its rollout, and
-    otherwise, for want of anything better, the oldest command itself.
+    Commands before the oldest recorded one are zero if the segment is the first of its rollout.
+    Otherwise they are unknown and assumed equal to the oldest one.
 
     Args:
         inputs: The segments; their actions may carry batch dimensions.
@@ -37,7 +37,7 @@ class CommandRecord:
         known = torch.cat((inputs.past_actions, inputs.actions), dim=-2)[..., column]
         known = known.to(dtype).clamp(*limits)
         before = torch.where(inputs.start == 0, torch.zeros_like(known[..., 0]), known[..., 0])
-        # Time first, so that the commands of one step lie side by side.
+        # Time is the first axis, so that the commands of one step are contiguous in memory.
         self._table = torch.cat((before[..., None], known), dim=-1).movedim(-1, 0).contiguous()
         self._batch_shape: torch.Size | None = batch_shape
         segments = self._table.shape[1:]
@@ -63,7 +63,7 @@ class CommandRecord:
         return present.expand(self._batch_shape).reshape(-1)
 
     def view(self, step: int) -> "RecordedCommands":
-        """Returns the record as it is seen at a step."""
+        """Returns a view of the record at a step."""
         return RecordedCommands(
             self.at(step), self.table, self.rows, self.first + step, self.stride
         )
@@ -131,7 +131,7 @@ class RecentCommands(Commands):
 
     def delayed(self, steps: Tensor) -> Tensor:
         """Returns the command of ``steps`` steps ago, at most as many as there are."""
-        # A chain of selections instead of a gather: it stays in registers once compiled.
+        # A chain of selections stays in registers after compilation, unlike a gather.
         command = self._present
         for age, earlier in enumerate(self._past, start=1):
             command = torch.where(steps >= age, earlier, command)

@@ -1,8 +1,8 @@
-"""Compiling time loops: when it pays, how kernels are shared, and what happens where it fails.
+"""Compiles time loops: decides when to compile, shares kernels, and handles failures.
 
 A kernel is the loop body unrolled over a few steps, compiled by torch.compile for flat batches of
-any size. Kernels are shared between objects that are equal in all that the traced code can see,
-so that a model that makes a new simulator on every call does not compile it on every call.
+any size. Objects share a kernel if they are equal in everything that the traced code uses. A model
+that makes a new simulator on every call is therefore compiled only once.
 """
 
 import functools
@@ -39,38 +39,41 @@ _T = TypeVar("_T")
 
 _LOGGER = logging.getLogger(__name__)
 
-# What an eager loop costs per time step, for Python and for calling some forty operations, and on
-# top of that per simulation and time step; and what compiling the loop costs. Measured with the
-# Furuta swing-up, policy and reward included: processor time of one core, float32, batches of 200
-# to 200 000, nothing in the compiler's cache on disk. With dry friction or a Runge-Kutta method
-# all three are about twice as large, so that the comparison stands. Compiled loops take a tenth.
+# Costs of an eager loop per time step, for Python and for calling about forty operations, and
+# additional costs per simulation and time step; then the costs of compiling the loop. All are
+# processor times of one core, measured with the Furuta swing-up including policy and reward, in
+# float32, for batches of 200 to 200 000, with an empty compiler cache on disk. With dry friction
+# or a Runge-Kutta method all three are about twice as large, so the comparison remains valid.
+# Compiled loops take a tenth of the time of eager ones.
 _EAGER_SECONDS_PER_TIME_STEP = 150e-6
 _EAGER_SECONDS_PER_SIMULATION_STEP = 20e-9
 _COMPILE_SECONDS = 10.0
 
-# Steps that one call of a compiled kernel may take; what a call costs, and on top of that per
-# simulation for its state's way to memory and back; what a step more costs to compile, 3 s for the
-# paper's equations and 12 s with friction. Measured as above.
+# Possible numbers of steps per call of a compiled kernel; costs of a call, and additional costs
+# per simulation for reading and writing its state; costs of compiling one more step, which are 3 s
+# for the paper's equations and 12 s with friction. Measured as above.
 _STEPS_PER_CALL = (2, 5, 10)
 _CALL_SECONDS = 250e-6
 _CALL_SECONDS_PER_SIMULATION = 40e-9
 _COMPILE_SECONDS_PER_STEP = 8.0
 
-# Shapes, types and devices that one kernel may specialise to. Beyond the limit torch raises,
-# because kernels are compiled with fullgraph=True; it would silently run eagerly otherwise.
+# Number of combinations of shape, type and device for which one kernel may be compiled. Beyond
+# this limit torch raises an error because of fullgraph=True; otherwise it would silently run
+# eagerly.
 _RECOMPILE_LIMIT = 64
 
-# One fused pass over memory per call, however long the unrolled body is; inputs are checked here.
-# The processor says which vector instructions it has; that the C++ compiler knows them too is
-# not tried out first, which takes 20 s: where it does not, loops run eagerly.
+# One fused pass over memory per call for unrolled bodies of any length; inputs are checked here.
+# Vector instructions are chosen by the processor. A test whether the C++ compiler supports them
+# would take 20 s and is skipped; if the compiler does not, loops run eagerly.
 _OPTIONS = (("max_fusion_size", 100_000), ("size_asserts", False), ("cpp.vec_isa_ok", True))
 
-# Attributes that traced code does not read: priors of effects, values and defaults of policies'
-# parameters.
+# Attributes that traced code does not read: priors of effects, and values and defaults of the
+# parameters of policies.
 _INVISIBLE = frozenset({"_priors", "parameters", "parameter_info", "compile"})
 
-# Characters that an error quotes from each end of the compiler's own message: what failed comes
-# first, what the C++ compiler said last, and its command line fills pages between them.
+# Number of characters that an error quotes from the start and from the end of torch's message. The
+# start says what failed, and the end is the output of the C++ compiler. Its long command line is
+# between them.
 _QUOTED = 2_000
 
 
@@ -82,20 +85,20 @@ def is_worthwhile(
     batch_size: int,
     expected_calls: int = 1,
 ) -> bool:
-    """Returns whether to compile a time loop: whether running it eagerly would take longer.
+    """Returns whether to compile a time loop because running it eagerly would take longer.
 
-    Depends on nothing but the arguments and the compiler at hand, because compiled and eager
-    loops round differently, and a result should not depend on what ran before it.
+    The decision depends only on the arguments and on the available compiler. Compiled and eager
+    loops round differently, and a result should not depend on earlier computations.
 
     Args:
         mode: The caller's choice.
         device: Device of the computation.
         num_steps: Time steps of one call.
         batch_size: Simulations that advance together.
-        expected_calls: How many calls of this size are to come.
+        expected_calls: Number of calls of this size to expect.
 
     Raises:
-        DependencyError: Compilation is demanded, but there is no compiler.
+        DependencyError: Compilation is required, but there is no compiler.
     """
     per_time_step = _EAGER_SECONDS_PER_TIME_STEP + batch_size * _EAGER_SECONDS_PER_SIMULATION_STEP
     eager_seconds = expected_calls * num_steps * per_time_step
@@ -113,30 +116,30 @@ def is_worthwhile(
 
 
 def steps_per_call(*, num_steps: int, batch_size: int, expected_calls: int = 1) -> int:
-    """Returns how many time steps a compiled kernel had better take at a time.
+    """Returns the number of time steps per call of a compiled kernel that saves most time.
 
     Args:
         num_steps: Time steps of one simulation.
         batch_size: Simulations that advance together.
-        expected_calls: How many simulations of this size are to come.
+        expected_calls: Number of simulations of this size to expect.
     """
     per_call = _CALL_SECONDS + batch_size * _CALL_SECONDS_PER_SIMULATION
     calls = expected_calls * num_steps * per_call / _COMPILE_SECONDS_PER_STEP
-    # Calls and compilation together are least at the square root, and flat about it.
+    # The total cost of calls and compilation has a flat minimum at the square root.
     wanted = math.sqrt(2.0 * calls)
     return max((n for n in _STEPS_PER_CALL if n <= wanted), default=_STEPS_PER_CALL[0])
 
 
 def with_fallback(mode: CompileMode, is_compiled: bool, run: Callable[[bool], _T]) -> _T:
-    """Returns ``run(is_compiled)``, or ``run(False)`` where ``auto`` meets a failing compiler.
+    """Returns ``run(is_compiled)``, or ``run(False)`` if compilation fails in mode ``auto``.
 
     Args:
         mode: The caller's choice.
-        is_compiled: What :func:`is_worthwhile` made of it.
-        run: The computation, compiled or not; must start anew when it is called again.
+        is_compiled: The decision of :func:`is_worthwhile`.
+        run: The computation, compiled or not; it must start from the beginning at every call.
 
     Raises:
-        CompilationError: Compilation is demanded and fails.
+        CompilationError: Compilation is required and fails.
     """
     if not is_compiled:
         return run(False)
@@ -165,20 +168,20 @@ def _log_once(message: str) -> None:
 
 @dataclass(frozen=True)
 class _Kernel:
-    """A function to compile, equal to others of the same signature."""
+    """A function to compile; kernels with the same signature are equal."""
 
     key: Hashable
     function: Callable[..., Any] = field(compare=False)
 
 
 def compiled(key: Hashable, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns ``function`` compiled, or what was compiled before under the same key.
+    """Returns ``function`` compiled, or the function compiled before with the same key.
 
-    What is returned raises a :class:`CompilationError` where compilation fails, the next time
-    without another attempt.
+    If compilation fails, the returned function raises a :class:`CompilationError`. Further calls
+    raise it without another attempt.
 
     Args:
-        key: Signature of everything that the function closes over, floating type and device.
+        key: Signature of all objects that the function closes over, floating type and device.
         function: Pure function of nested tuples and dictionaries of tensors.
     """
     # The number of threads is fixed when code is generated.
@@ -192,7 +195,7 @@ def _compile(kernel: _Kernel) -> Callable[..., Any]:
         warnings.simplefilter("ignore", DeprecationWarning)
         importlib.import_module("torch._inductor.compile_fx")
         from torch._dynamo.exc import TorchDynamoException
-    # The stubs of torch.compile do not know its latest options.
+    # The type stubs of torch.compile lack its latest options.
     function = torch.compile(  # pyright: ignore[reportCallIssue]
         kernel.function,
         fullgraph=True,
@@ -200,7 +203,7 @@ def _compile(kernel: _Kernel) -> Callable[..., Any]:
         recompile_limit=_RECOMPILE_LIMIT,
         isolate_recompiles=True,
     )
-    # As text: the error itself would keep alive every tensor of the failed attempt.
+    # Stored as text, because the error object would keep all tensors of the failed attempt alive.
     failure: str | None = None
 
     def run(*arguments: Any) -> Any:
@@ -222,20 +225,20 @@ def _compile(kernel: _Kernel) -> Callable[..., Any]:
 def mark_sizes_dynamic(tree: Any) -> None:
     """Marks the leading size of every tensor as variable, for the next compilation.
 
-    torch.compile(dynamic=True) would do, but it also turns every number that the code reads from
-    an object into a variable; that made the Furuta loop 1.7 times slower.
+    torch.compile(dynamic=True) would also work, but it turns every number that the code reads from
+    an object into a variable. That makes the Furuta loop 1.7 times slower.
     """
     for leaf in pytree.tree_leaves(tree):
-        # Torch gives the sizes 0 and 1 kernels of their own.
+        # Torch compiles separate kernels for the sizes 0 and 1.
         if isinstance(leaf, Tensor) and leaf.ndim and leaf.shape[0] > 1:
             torch._dynamo.maybe_mark_dynamic(leaf, 0)
 
 
 def signature(thing: Any) -> Hashable:
-    """Returns a value that is equal for objects which traced code cannot tell apart.
+    """Returns a value that is equal for objects that traced code cannot distinguish.
 
-    Tensors and functions count by identity (a kernel keeps alive what it closes over); other
-    objects by type and attributes.
+    Tensors and functions are compared by identity, because a kernel keeps the objects that it
+    closes over alive. Other objects are compared by type and attributes.
     """
     if isinstance(thing, Mapping):
         return tuple(sorted((str(key), signature(value)) for key, value in thing.items()))

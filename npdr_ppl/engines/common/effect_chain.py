@@ -1,4 +1,4 @@
-"""Effects on their way through a step, whatever engine moves the state in between."""
+"""Applies effects before, during and after a step, for every engine."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -24,23 +24,24 @@ from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["EffectChain", "Moments", "State", "Tables", "needed_histories"]
 
-# Histories come in multiples of this many steps, so that draws of a delay share a compiled kernel.
+# Lengths of histories are rounded up to multiples of this number of steps, so that different draws
+# of a delay share a compiled kernel.
 _HISTORY_GRAIN = 4
 
 
 Moments = tuple[Tensor | None, ...]
-"""First moment of each action about a step's middle; ``None`` for one that is constant."""
+"""First moment of each action about a step's middle; ``None`` for a constant action."""
 
 
 class State(NamedTuple):
-    """What the next step needs; every tensor has the flat batch shape ``(N,)``.
+    """Data that the next step needs; every tensor has the flat batch shape ``(N,)``.
 
     Attributes:
         positions: Generalised positions.
         velocities: Generalised velocities.
         force_memory: Own state of each force effect.
         action_memory: Own state of each action effect.
-        past_commands: Past commands that each action effect may ask for, latest first.
+        past_commands: Past commands that each action effect may need, latest first.
         sensor_memory: Own state of each sensor effect for each of its channels.
     """
 
@@ -53,7 +54,7 @@ class State(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """What stays constant during a simulation.
+    """Data that stay constant during a simulation.
 
     Attributes:
         constants: The model author's constants.
@@ -65,22 +66,22 @@ class Tables(NamedTuple):
 
 
 class EffectChain(ABC):
-    """Passes commands and readings through the effects attached to a simulator.
+    """Passes commands and measurements through the effects attached to a simulator.
 
-    What moves the state is an engine's own matter.
+    Subclasses advance the state with their engine.
 
     Args:
         simulator: The system and its effects.
         joints: Names of the force ports, in the order of the coordinates that they act on.
         time_step: Seconds per step.
-        histories: Past commands that each action effect may ask for, then past values of each
-            sensor effect; see :func:`needed_histories`.
+        histories: Number of past commands that each action effect may need, then of past values
+            that each sensor effect may need; see :func:`needed_histories`.
 
     Attributes:
-        force_effects: Place in ``Tables.effects``, effect and joint of each force effect.
-        action_effects: Place, effect and action channel of each action effect.
-        sensor_effects: Place, effect and sensor channels of each sensor effect.
-        needs_joints: Whether a force effect asks for :class:`Joint` before every step.
+        force_effects: Index in ``Tables.effects``, effect and joint of each force effect.
+        action_effects: Index, effect and action channel of each action effect.
+        sensor_effects: Index, effect and sensor channels of each sensor effect.
+        needs_joints: Whether a force effect needs a :class:`Joint` before every step.
     """
 
     def __init__(
@@ -122,7 +123,7 @@ class EffectChain(ABC):
 
     @property
     def num_positions(self) -> int:
-        """How many of the simulator's states are positions; the others are velocities."""
+        """Number of the simulator's states that are positions; the others are velocities."""
         return len(self.simulator.states) // 2
 
     @abstractmethod
@@ -140,7 +141,7 @@ class EffectChain(ABC):
         Args:
             positions: Positions among the states, ``(N,)`` each.
             velocities: Velocities among the states, ``(N,)`` each.
-            actions: What reaches the dynamics, ``(N,)`` each.
+            actions: Actions after all effects, ``(N,)`` each.
             tables: Constants of the simulation.
         """
 
@@ -154,8 +155,8 @@ class EffectChain(ABC):
             state: State at the step's start.
             actions: Mean of each action over the step, ``(N,)`` each.
             tables: Constants of the simulation.
-            moments: First moment of each about the step's middle; none if all are constant. An
-                engine that holds its actions for a step leaves them out.
+            moments: First moment of each action about the step's middle; empty if all are
+                constant. An engine that holds actions during a step ignores them.
         """
 
     def at_joints(
@@ -182,14 +183,15 @@ class EffectChain(ABC):
             positions: Positions, ``(N,)`` each.
             velocities: Velocities, ``(N,)`` each.
             tables: Constants of the simulation.
-            commands: What each action channel saw for long before the start, or before the past
-                that the action effects are still to be taken through, ``(N,)`` each.
-            readings: What each sensor reported at the start, ``(N,)`` each; ``None`` for the
+            commands: Constant command of each action channel before the start, or, with
+                ``num_past``, before these past steps, ``(N,)`` each.
+            readings: Measurement of each sensor at the start, ``(N,)`` each; ``None`` for the
                 true value.
             time: Seconds since the rollout began, ``(N,)``.
-            commands_before: What each action channel saw at a step before 0; ``None`` for
-                ``commands``.
-            num_past: Steps before the start that the action effects are to be taken through.
+            commands_before: Returns the command of each action channel at a step before 0;
+                ``None`` for ``commands``.
+            num_past: Steps before the start through which the caller will advance the action
+                effects.
         """
         step, split = self.time_step, len(self.action_effects)
         earlier = time - num_past * step
@@ -241,7 +243,7 @@ class EffectChain(ABC):
         time: Tensor,
     ) -> tuple[tuple[Any, ...], ...]:
         """Returns the sensor effects' own state at the start; see :meth:`start`."""
-        # Only what some effect asks for is computed: short simulations start often.
+        # Only values that an effect needs are computed, because short simulations start often.
         if not self.sensor_effects:
             return ()
         true = self.true_readings(positions, velocities, tables)
@@ -299,7 +301,7 @@ class EffectChain(ABC):
     ) -> tuple[list[Components], Moments]:
         """Divides actions that change within a step among its substeps.
 
-        Each gets its part of a line that has the mean and the moment of the whole.
+        An action is replaced by a straight line with the same mean and moment over the step.
 
         Args:
             actions: Mean of each action, see :meth:`move`.
@@ -307,7 +309,7 @@ class EffectChain(ABC):
             substeps: Number of substeps.
 
         Returns:
-            The mean of each action in each substep, and what is left of its moment in each.
+            The mean of each action in each substep, and its moment within a substep.
         """
         own = tuple(None if m is None else m / substeps**3 for m in moments)
         if all(moment is None for moment in own):
@@ -333,14 +335,14 @@ class EffectChain(ABC):
 
         Args:
             state: State at the step's start.
-            commands: One per action channel, within the channel's limits already: a limit sits
-                where the command enters the device, and recordings hold limited commands.
+            commands: One per action channel, already within the channel's limits: a device limits
+                commands at its input, and recordings contain limited commands.
             tables: Constants of the simulation.
-            records: Where the whole past of each channel is on record, a view of it.
+            records: Views of the recorded commands of each channel, if the whole past is recorded.
 
         Returns:
-            The state with the action effects' memory advanced, what reaches the dynamics, and its
-            moments; see :meth:`move`.
+            The state with the action effects' memory advanced, the actions after all effects, and
+            their moments; see :meth:`move`.
         """
         if not self.action_effects:
             return state, commands, ()
@@ -349,8 +351,8 @@ class EffectChain(ABC):
         memory, past = list(state.action_memory), list(state.past_commands)
         is_raw = [True] * len(present)
         for k, (place, effect, channel) in enumerate(self.action_effects):
-            # The first effect of a chain can look into the record; later ones see what those
-            # before them made of it, and keep a history of that.
+            # The first effect of a chain can use the record. Later effects receive the output of
+            # the effect before them and keep a history of it.
             command = present[channel]
             if records is not None and is_raw[channel]:
                 seen = records[channel]
@@ -368,7 +370,7 @@ class EffectChain(ABC):
         return changed, tuple(present), tuple(moments)
 
     def read(self, state: State, tables: Tables) -> tuple[State, Components]:
-        """Returns the state with the sensor effects' memory advanced, and the readings."""
+        """Returns the state with the sensor effects' memory advanced, and the measurements."""
         true = self.true_readings(state.positions, state.velocities, tables)
         return self.report(state, true, tables)
 
@@ -397,14 +399,14 @@ class EffectChain(ABC):
         *,
         before_step: bool = False,
     ) -> tuple[Tensor | None, ...]:
-        """Returns the smooth force of all effects at each joint; ``None`` where there is none.
+        """Returns the sum of smooth effect forces at each joint; ``None`` if there is no force.
 
         Args:
             positions: Position of each joint, ``(N,)`` each.
             velocities: Their rates.
-            state: Holds the effects' memory.
+            state: State with the effects' memory.
             tables: Constants of the simulation.
-            before_step: Whether to leave out the effects that have not seen their joint yet.
+            before_step: Whether to leave out effects that still need their :class:`Joint`.
         """
         forces: list[Tensor | None] = [None] * len(positions)
         for k, (place, effect, joint) in enumerate(self.force_effects):
@@ -417,7 +419,7 @@ class EffectChain(ABC):
         return tuple(forces)
 
     def force_moments(self, state: State, tables: Tables) -> tuple[Tensor | None, ...]:
-        """Returns the moments of the forces within the step that has begun, per joint."""
+        """Returns the moments of the forces within the present step, per joint."""
         moments: list[Tensor | None] = [None] * len(state.positions)
         for k, (place, effect, joint) in enumerate(self.force_effects):
             if effect.needs_joint:
@@ -426,11 +428,11 @@ class EffectChain(ABC):
         return tuple(moments)
 
     def begin_step(self, state: State, joints: Sequence[Joint | None], tables: Tables) -> State:
-        """Shows the joints to the force effects that ask for them.
+        """Passes the joints to the force effects that need them.
 
         Args:
             state: State at the step's start.
-            joints: Each joint; ``None`` where no effect asks.
+            joints: Each joint; ``None`` if no effect needs it.
             tables: Constants of the simulation.
         """
         memory = list(state.force_memory)
@@ -472,7 +474,7 @@ class EffectChain(ABC):
 def needed_histories(
     effects: tuple[Effect, ...], parameters: tuple[Mapping[str, Tensor], ...], time_step: float
 ) -> tuple[int, ...]:
-    """Returns how much of the past action and then sensor effects ask for, rounded up.
+    """Returns how many past steps action effects, then sensor effects, need, rounded up.
 
     Args:
         effects: The effects attached to a simulator.
@@ -489,7 +491,7 @@ def needed_histories(
 
 
 def _add(totals: list[Tensor | None], place: int, part: Tensor | None) -> None:
-    """Adds to a total; ``None`` is nothing, and costs no operation."""
+    """Adds to a total; ``None`` counts as zero and needs no operation."""
     total = totals[place]
     if part is not None:
         totals[place] = part if total is None else total + part

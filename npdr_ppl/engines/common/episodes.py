@@ -1,4 +1,4 @@
-"""What is asked of a closed loop, and what comes of it."""
+"""Requests for closed-loop episodes, and their results."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -21,14 +21,14 @@ reward of the step."""
 
 
 class FeedbackPolicy(Protocol):
-    """What the loop asks of a policy; see :class:`npdr_ppl.policies.base.Policy`."""
+    """Interface of a policy for the loop; see :class:`npdr_ppl.policies.base.Policy`."""
 
     observations: tuple[str, ...]
     actions: tuple[str, ...]
     parameters: Tensor
 
     def constants(self, domain: Mapping[str, Tensor]) -> Any:
-        """Returns what ``act`` needs, computed once per episode."""
+        """Returns the constants for ``act``, computed once per episode."""
         ...
 
     def initial_memory(self, observation: tuple[Tensor, ...]) -> Any:
@@ -51,7 +51,7 @@ class Episodes:
     Attributes:
         returns: Sum of rewards, ``B``; ``None`` without a reward.
         lengths: Steps until the episode ended, ``B``.
-        readings: What the sensors reported, the start included, ``B + (steps + 1, sensors)``;
+        readings: Measurements, including those at the start, ``B + (steps + 1, sensors)``;
             ``None`` unless recorded.
         commands: Commands before any limit, ``B + (steps, actions)``; ``None`` unless recorded.
     """
@@ -63,12 +63,12 @@ class Episodes:
 
 
 class EpisodeBatch(NamedTuple):
-    """The three that make a batch, of one floating type and on one device.
+    """Policies, domains and shape of a batch, of one floating type and on one device.
 
     Attributes:
         policy: The policies.
-        domain: All parameters, missing ones nominal.
-        shape: The batch's shape B, to which all three broadcast.
+        domain: All parameters; those not given are nominal.
+        shape: The batch's shape B, to which policies, domains and initial states broadcast.
     """
 
     policy: FeedbackPolicy
@@ -78,7 +78,7 @@ class EpisodeBatch(NamedTuple):
 
 @dataclass(frozen=True)
 class EpisodeRequest:
-    """Episodes that an engine is to run.
+    """Request to an engine to run episodes.
 
     Attributes:
         parameters: Domain and effect parameters; missing ones are nominal.
@@ -87,10 +87,10 @@ class EpisodeRequest:
         num_steps: Greatest number of steps.
         reward: Reward of a step.
         time_step: Seconds per step.
-        record: Whether to return readings and commands.
+        record: Whether to return measurements and commands.
         compile: Replaces the simulator's choice.
-        expected_calls: How many calls of this size are to come.
-        internal_model: Parameters of the policies' own model; ``None`` for each domain's own.
+        expected_calls: Number of calls of this size to expect.
+        internal_model: Parameters of the policies' own model; ``None`` for those of each domain.
     """
 
     parameters: Mapping[str, Tensor]
@@ -105,13 +105,13 @@ class EpisodeRequest:
     internal_model: Mapping[str, float] | None = None
 
     def believed(self, domain: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Returns what the policy's own model takes for a domain's parameters."""
+        """Returns the parameters that the policy's own model assumes in a domain."""
         given = self.internal_model or {}
         like = next(iter(domain.values()))
         return {**domain, **{name: like.new_tensor(value) for name, value in given.items()}}
 
     def check(self, simulator: Simulator) -> None:
-        """Raises a ModelError where parameters or channels are not the simulator's."""
+        """Raises a ModelError if parameters or channels are not the simulator's."""
         simulator.check_parameters(self.parameters)
         sensors = [sensor.name for sensor in simulator.sensors]
         missing = [name for name in self.policy.observations if name not in sensors]
@@ -125,7 +125,7 @@ class EpisodeRequest:
     def batch(
         self, simulator: Simulator, dtype: torch.dtype, device: torch.device
     ) -> EpisodeBatch:
-        """Returns policies and domains as the engine computes with them."""
+        """Returns policies and domains with the type and on the device of the engine."""
         policy = copy.copy(self.policy)
         policy.parameters = policy.parameters.to(dtype=dtype, device=device)
         domain = simulator.complete(self.parameters, dtype, device)

@@ -31,8 +31,9 @@ class Integrator:
             returns the next q and v. The acceleration at the start is an argument because dry
             friction has computed it already.
         order: The global error is O(h^order).
-        rate_lag: Part of a step between a velocity and the position's derivative, in whichever
-            direction: staggered methods know velocities between the positions.
+        rate_lag: Time shift between a velocity and the derivative of the position, in either
+            direction, as a fraction of a step. Staggered methods compute velocities at times
+            between those of the positions.
     """
 
     name: str
@@ -43,7 +44,7 @@ class Integrator:
 
 def _advance(x: Components, rate: Components, time: float) -> Components:
     """Returns x + time · rate."""
-    # One operation instead of two: eager simulations are bound by the number of operations.
+    # One operation instead of two, because the number of operations limits eager simulations.
     return tuple(torch.add(a, b, alpha=time) for a, b in zip(x, rate, strict=True))
 
 
@@ -65,7 +66,7 @@ def _semi_implicit_euler(
 def _midpoint(
     acceleration: Acceleration, q: Components, v: Components, a: Components, h: float
 ) -> tuple[Components, Components]:
-    """Advances by the rates at the middle of the step, which half an Euler step leads to."""
+    """Advances by the rates at the middle of the step, which half an Euler step predicts."""
     middle = _advance(v, a, 0.5 * h)
     rates = acceleration(_advance(q, v, 0.5 * h), middle)
     return _advance(q, middle, h), _advance(v, rates, h)
@@ -108,7 +109,7 @@ def integrator(name: str) -> Integrator:
     """Returns the integrator called ``name``.
 
     Raises:
-        ModelError: There is none of that name.
+        ModelError: There is no integrator of that name.
     """
     try:
         return INTEGRATORS[name]

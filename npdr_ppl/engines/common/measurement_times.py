@@ -1,9 +1,9 @@
-"""Readings that are late or early: the states behind them and before them.
+"""Initial states from late or early measurements, and sensor values before a segment.
 
-A segment starts from what was read there. If the sensors lag by d, that is the state d ago, and
-the segment starts from where the recorded commands have led since. For as long as d a late sensor
-also reports what was true before the segment. States are moved in time with the simulator's own
-accelerations in the middle of each span, without effects.
+A segment starts from measured states. If a sensor lags by d, it shows the state of d seconds ago,
+which is advanced by d under the recorded commands. During the first d seconds of the segment, such
+a sensor still reports values from before the segment. States are moved in time with the
+simulator's own accelerations at the middle of each time span, without effects.
 """
 
 import math
@@ -26,10 +26,10 @@ def sensor_leads(
     parameters: tuple[Mapping[str, Tensor], ...],
     time: Tensor,
 ) -> dict[int, Tensor]:
-    """Returns by how many seconds each sensor channel's readings are ahead, where they are.
+    """Returns the lead in seconds of sensor channels whose measurements are early or late.
 
     Args:
-        effects: Place in ``parameters``, effect and channels.
+        effects: Index in ``parameters``, effect and channels.
         parameters: Parameters of all effects by short name.
         time: Seconds since the rollout began, ``(N,)``.
     """
@@ -48,15 +48,15 @@ def catch_up(
     leads: Sequence[Tensor | None],
     time_step: float,
 ) -> Components:
-    """Returns the state now behind one that was read too early or too late.
+    """Returns the present state, computed from states that were measured too early or too late.
 
-    A position whose rate is no state stays as it was read.
+    A position whose rate is not a state stays as measured.
 
     Args:
         simulator: The system, whose effects are left out.
-        states: Positions as read, then velocities as read or derived from positions, ``(N,)``.
+        states: Measured positions, then velocities, measured or derived from positions, ``(N,)``.
         accelerations: See :data:`Accelerations`.
-        leads: By how many seconds each state's reading is ahead.
+        leads: Lead of each state's measurement, in seconds; negative if it is late.
         time_step: Seconds per step.
     """
     ages = [None if lead is None else -lead for lead in leads]
@@ -81,14 +81,16 @@ def earlier_changes(
     time_step: float,
     num_steps: int,
 ) -> dict[int, tuple[Tensor, ...]]:
-    """Returns how the sensor channels differed before the start, latest first; 0 if no states.
+    """Returns the differences of earlier sensor values from those at the start, latest first.
+
+    They are zero for sensors that are not states.
 
     Args:
         simulator: The system, whose effects are left out.
         states: Positions, then velocities at the start, ``(N,)``.
         accelerations: See :data:`Accelerations`.
         time_step: Seconds per step.
-        num_steps: How many steps to go back.
+        num_steps: Number of steps before the start.
     """
     names = [state.name for state in simulator.states]
     found: dict[int, list[Tensor]] = {column: [] for column in range(len(simulator.sensors))}
@@ -111,15 +113,15 @@ def _moved(
     ages: Sequence[Tensor | None],
     spans: Sequence[Tensor | None],
 ) -> Components:
-    """Returns the states so many seconds later, under the commands of one step.
+    """Returns the states after the times ``spans``, under the commands of one step.
 
     Args:
         simulator: The system.
-        states: The states, each of its own time.
+        states: The states, each at its own time.
         accelerations: See :data:`Accelerations`.
         step: The step.
-        ages: How many seconds ago each was true; ``None`` for now.
-        spans: By how many seconds to move each; ``None`` to leave it.
+        ages: Age of each state, in seconds; ``None`` for the present state.
+        spans: Time by which to move each state, in seconds; ``None`` to leave it unchanged.
     """
     halves = [None if span is None else 0.5 * span for span in spans]
     middle = _under(simulator, states, accelerations(states, step), ages, halves)
@@ -133,7 +135,7 @@ def _under(
     ages: Sequence[Tensor | None],
     spans: Sequence[Tensor | None],
 ) -> Components:
-    """Returns the states so many seconds later, under constant accelerations; see _moved."""
+    """Returns the states after ``spans``, under constant accelerations; see _moved."""
     result = list(states)
     places = {state.name: i for i, state in enumerate(simulator.states)}
     for j, acceleration in enumerate(accelerations, start=len(states) - len(accelerations)):
@@ -142,7 +144,7 @@ def _under(
         i = places.get(simulator.states[j].rate_of or "")
         if i is None or (span := spans[i]) is None:
             continue
-        # From the velocity at the span's end, which may be known of another time.
+        # Uses the velocity at the end of the span; it may be known at a different time.
         velocity, position_age = result[j], _difference(ages[i], span)
         velocity_age = _difference(ages[j], spans[j])
         if position_age is not None:

@@ -1,4 +1,4 @@
-"""The loop of a policy and a simulator that steps in this process: reward and termination too."""
+"""The loop of policy and simulator in one process, with reward and termination."""
 
 import copy
 from typing import Any, NamedTuple
@@ -19,13 +19,14 @@ from npdr_ppl.engines.common.integrators import Components
 
 __all__ = ["LoopBody", "PolicyLoop", "begin", "run_compiled", "run_eagerly"]
 
-# Simulations that a compiled kernel advances through the whole episode before the next block, so
-# that memory stays bounded. Measured: larger is faster up to here, because calls cost 50 µs each.
+# Number of simulations in a block. A compiled kernel runs one block through the whole episode
+# before the next block, which limits memory. Measurements show that larger blocks are faster up to
+# this size, because each call costs 50 µs.
 _BLOCK = 1 << 16
 
 
 class PolicyLoop(NamedTuple):
-    """What the loop carries from step to step."""
+    """State of the loop between two steps."""
 
     state: State
     readings: Components
@@ -36,13 +37,13 @@ class PolicyLoop(NamedTuple):
 
 
 class LoopBody:
-    """The loop's body; everything in it is fixed before the first step.
+    """The loop's body, which does not change after the first step.
 
     Args:
         stepper: Advances the state.
-        policy: What acts.
+        policy: The policy.
         reward: Reward of a step, if any.
-        steps_per_call: Steps of :meth:`run`.
+        steps_per_call: Number of steps per call of :meth:`run`.
     """
 
     def __init__(
@@ -54,8 +55,8 @@ class LoopBody:
     ) -> None:
         simulator = stepper.simulator
         self.stepper, self.steps_per_call = stepper, steps_per_call
-        # Without its parameters and their defaults, so that a compiled body cannot hold on to some
-        # by mistake.
+        # Parameters and their defaults are removed, so a compiled body cannot keep old ones by
+        # mistake.
         self.policy = copy.copy(policy)
         del self.policy.parameters
         vars(self.policy).pop("parameter_info", None)
@@ -94,7 +95,7 @@ class LoopBody:
         for value, (lower, upper) in zip(
             (*state.positions, *state.velocities), self.bounds, strict=True
         ):
-            # Written so that a NaN counts as outside.
+            # These comparisons are false for NaN, so NaN counts as outside the bounds.
             if lower == -upper:
                 is_running = is_running & (value.abs() <= upper)
             else:
@@ -112,7 +113,7 @@ class LoopBody:
 
 
 def begin(body: LoopBody, states: Components, tables: Tables) -> PolicyLoop:
-    """Returns the loop before its first step, at rest with respect to commands."""
+    """Returns the loop before its first step, with zero commands in the past."""
     zero = torch.zeros_like(states[0])
     simulator, num_positions = body.stepper.simulator, body.stepper.num_positions
     positions, velocities = states[:num_positions], states[num_positions:]
@@ -134,7 +135,7 @@ def run_eagerly(
     shape: torch.Size,
     record: bool,
 ) -> Episodes:
-    """Runs all steps one by one, and records them if asked to."""
+    """Runs all steps one by one, and records them if ``record`` is true."""
     readings, commands = [loop.readings], []
     for k in range(num_steps):
         loop, chosen = body.step(loop, tables, constants, k * body.stepper.time_step)
@@ -154,7 +155,7 @@ def run_compiled(
     num_steps: int,
     shape: torch.Size,
 ) -> Episodes:
-    """Runs all steps block by block, and the few that do not fill a kernel call eagerly."""
+    """Runs all steps block by block; remaining steps that do not fill a call run eagerly."""
     loop = flatten(loop, loop.total.shape, expand=True)
     key = body.signature, loop.total.dtype, loop.total.device.type
     run, at_once = compiled(key, body.run), body.steps_per_call
@@ -174,8 +175,8 @@ def run_compiled(
         part, block_tables, block_constants = pytree.tree_map_only(
             Tensor, block, (loop, tables, constants)
         )
-        # A tensor that comes in twice, as a rate and a filter's memory of it, is another kind of
-        # argument, for which torch compiles anew; in the first state none has met another yet.
+        # The first call is eager. After it, a tensor may occur twice among the arguments, e.g. as
+        # a rate and as a filter's memory of it. Torch would compile both cases separately.
         for start in starts[:1]:
             part = body.run(part, block_tables, block_constants, start)
         mark_sizes_dynamic((part, block_tables, block_constants))
@@ -198,7 +199,7 @@ def _episodes(
     readings: list[Components] | None = None,
     commands: list[Components] | None = None,
 ) -> Episodes:
-    """Returns the loop's outcome in the batch's shape."""
+    """Returns the loop's results in the batch's shape."""
     returns = None if reward is None else loop.total.reshape(shape)
     lengths = loop.length.long().reshape(shape)
     if readings is None or commands is None:

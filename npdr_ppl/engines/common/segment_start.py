@@ -1,4 +1,4 @@
-"""How segments start: from what was recorded, back through the sensor effects to the truth."""
+"""True initial states of segments: recorded values with the sensor effects removed."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -17,11 +17,11 @@ __all__ = ["RecordedStart", "recorded_start", "true_start", "with_past_commands"
 
 
 class RecordedStart(NamedTuple):
-    """What is known of the segments' start; tensors of the flat batch shape ``(N,)``.
+    """Data at the start of the segments; tensors of the flat batch shape ``(N,)``.
 
     Attributes:
         states: Each state component as recorded or estimated from records.
-        readings: What each sensor reported; ``None`` where that is not on record.
+        readings: Measurement of each sensor; ``None`` if it was not recorded.
         time: Seconds since the rollout began.
         is_derived: Whether each state component is the rate of a recorded position.
     """
@@ -32,7 +32,7 @@ class RecordedStart(NamedTuple):
     is_derived: tuple[bool, ...]
 
     def part(self, first: int, last: int) -> "RecordedStart":
-        """Returns what is known of some of the N simulations."""
+        """Returns the data of some of the N simulations."""
         return RecordedStart(
             tuple(value[first:last] for value in self.states),
             tuple(None if value is None else value[first:last] for value in self.readings),
@@ -42,7 +42,7 @@ class RecordedStart(NamedTuple):
 
 
 def recorded_start(simulator: Simulator, inputs: Inputs, shape: torch.Size) -> RecordedStart:
-    """Returns what is known of the segments' start.
+    """Returns the recorded data at the start of the segments.
 
     Args:
         simulator: The simulator.
@@ -72,15 +72,15 @@ def true_start(
     recorded: RecordedStart,
     records: Sequence[CommandRecord],
 ) -> Components:
-    """Returns the true state behind what was recorded through the sensor effects.
+    """Returns the true state, computed from recorded values by removing the sensor effects.
 
-    A velocity that was derived from readings of its position has that sensor's scale and timing,
-    and none of the offset or scale of the sensor for velocities.
+    A velocity that was derived from position measurements has the scale and timing of the position
+    sensor. It does not have the offset or scale of the velocity sensor.
 
     Args:
         chain: The effects.
         tables: The effects' parameters.
-        recorded: What is known of the start.
+        recorded: The recorded data at the start.
         records: Commands of each action channel.
     """
     if not chain.sensor_effects:
@@ -97,7 +97,8 @@ def true_start(
                 rate = true[i]
                 if sensors.get(state.rate_of or "") in columns:
                     rate = effect.initial_rate(rate, tables.effects[place])
-                # At a rollout's first sample velocities are read; see Simulator.initial_states.
+                # At the first sample of a rollout, measured velocities are used; see
+                # Simulator.initial_states.
                 value = torch.where(recorded.time == 0.0, value, rate)
             true[i] = value
     leads = sensor_leads(chain.sensor_effects, tables.effects, recorded.time)
@@ -124,14 +125,14 @@ def with_past_commands(
     records: tuple[CommandRecord, ...],
     num_steps: int,
 ) -> State:
-    """Returns the state with the action effects' memory as the recorded past made it.
+    """Returns the state after the recorded past commands have updated the action effects' memory.
 
     Args:
         chain: The effects.
-        state: State at the segments' start, as if the oldest command had been given for long.
+        state: State at the start of the segments, as if the oldest command had been constant.
         tables: The effects' parameters.
         records: Commands of each action channel.
-        num_steps: Steps of the past that are on record.
+        num_steps: Number of past steps that were recorded.
     """
     if chain.action_effects:
         for step in range(-num_steps, 0):

@@ -1,8 +1,8 @@
-"""Effects on commands and readings of a whole batch, for engines that see neither.
+"""Effects on commands and measurements of a whole batch, applied outside the engine.
 
-In open loop commands do not depend on what the simulation does, and it does not depend on what
-sensors make of it. So both kinds of effect stay outside of the engine, where torch treats all
-simulations at once; only forces have to go in.
+In open loop, commands do not depend on the simulation, and the simulation does not depend on
+measurements. Both kinds of effect are therefore computed outside the engine, for all simulations
+at once in torch. Only force effects must be computed inside the engine.
 """
 
 import copy
@@ -30,12 +30,12 @@ __all__ = ["Signals", "needs_accelerations"]
 
 
 def needs_accelerations(effect: SensorEffect) -> bool:
-    """Returns whether an effect needs states at other times, which take the engine's rates."""
+    """Returns whether an effect needs states at other times, i.e. the engine's accelerations."""
     return effect.needs_past or type(effect).lead is not SensorEffect.lead
 
 
 class Signals:
-    """The way of commands to an engine, and of its readings back.
+    """Applies effects to commands for an engine and to sensor values from it.
 
     Args:
         simulator: Declares actions, sensors and effects.
@@ -44,7 +44,7 @@ class Signals:
         shape: The batch shape and the segments, of numel N.
 
     Attributes:
-        start_times: Seconds from the rollout's beginning to each segment's start, ``(N,)``.
+        start_times: Seconds from the start of the rollout to each segment's start, ``(N,)``.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Signals:
             histories = needed_histories(part.effects, effects, inputs.time_step)
             return _SignalChain(part, (), inputs.time_step, histories), flatten(effects, shape)
 
-        # Commands are all known before the engine runs, and readings only after.
+        # All commands are known before the engine runs, and measurements only afterwards.
         self._action_chain, self._action_parameters = chain(ActionEffect)
         self._sensor_chain, self._sensor_parameters = chain(SensorEffect)
         columns = {name: i for i, name in enumerate(inputs.action_names)}
@@ -74,13 +74,13 @@ class Signals:
 
     @property
     def has_action_effects(self) -> bool:
-        """Whether what reaches the engine differs between simulations of the same segment."""
+        """Whether actions for the engine may differ between simulations of the same segment."""
         return bool(self._action_chain.action_effects)
 
     def initial_states(self) -> Tensor:
         """Returns the true state at each segment's start, ``(N, states)``.
 
-        An offset or a wrong scale of a sensor is taken out of what was read there.
+        Offsets and scale errors of sensors are removed from the measurements.
         """
         tables = Tables(None, self._sensor_parameters)
         components = true_start(self._sensor_chain, tables, self._recorded, ())
@@ -89,7 +89,7 @@ class Signals:
         return torch.stack(components, dim=-1)
 
     def actions(self) -> Tensor:
-        """Returns what reaches the engine, ``(N, steps, actions)``."""
+        """Returns the actions for the engine after all effects, ``(N, steps, actions)``."""
         chain, tables = self._action_chain, Tables(None, self._action_parameters)
         past = self._inputs.past_actions.shape[-2]
         settled = commands_at(self._records, -1 - past)
@@ -104,7 +104,7 @@ class Signals:
         return torch.stack(steps, dim=-2)
 
     def readings(self, values: Tensor, initial_states: Tensor) -> Tensor:
-        """Returns what the sensors make of true values after each step.
+        """Returns the measurements of true values after each step.
 
         Args:
             values: True values, ``(N, steps, sensors)``.
@@ -125,7 +125,7 @@ class Signals:
         """Returns each sensor's true value at the segments' start."""
         simulator = self._sensor_chain.simulator
         states = {s.name: initial_states[:, i] for i, s in enumerate(simulator.states)}
-        # A value that is neither a state nor recorded is that after the first step.
+        # If a value is neither a state nor recorded, the value after the first step is used.
         return tuple(
             states.get(sensor.name, values[:, 0, place] if reading is None else reading)
             for place, (sensor, reading) in enumerate(
@@ -135,22 +135,22 @@ class Signals:
 
 
 class _SignalChain(EffectChain):
-    """Effects between a command and the engine, or between the engine and a reading."""
+    """Effects between commands and the engine, or between the engine and measurements."""
 
     def true_readings(
         self, positions: Components, velocities: Components, tables: Tables
     ) -> Components:
-        """Returns the true values at the start, which are the constants here."""
+        """Returns the true values at the start, which ``tables.constants`` contains."""
         return tables.constants
 
     def accelerations(
         self, positions: Components, velocities: Components, actions: Components, tables: Tables
     ) -> Components:
-        """Is the engine's own matter; effects that need it are not attached."""
+        """Not available from the engine; effects that need accelerations cannot be attached."""
         raise NotImplementedError
 
     def move(
         self, state: State, actions: Components, tables: Tables, moments: Moments = ()
     ) -> State:
-        """Is the engine's own matter."""
+        """Not used; the engine advances the state."""
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""What files describe a robot, so that a run can be made again when they have changed."""
+"""Records the files that describe a robot, so that a run can be repeated after they change."""
 
 import hashlib
 import importlib
@@ -12,7 +12,7 @@ import numpy as np
 
 __all__ = ["recorded_files", "recorded_mjcf"]
 
-# Attributes of MJCF's compiler that name folders of further files.
+# Attributes of MJCF's compiler element that name folders of further files.
 _FOLDERS = ("assetdir", "meshdir", "texturedir")
 
 
@@ -23,8 +23,8 @@ def recorded_files(source: str | PathLike[str]) -> dict[str, Any]:
         source: Path of the file.
 
     Returns:
-        ``file``: its name; ``text``: texts by path relative to its folder, included files among
-        them; ``assets``: SHA-256 of meshes and the like, ``None`` for those that are not found.
+        ``file``: its name; ``text``: texts of this file and included files, by path relative to
+        its folder; ``assets``: SHA-256 of other files such as meshes, ``None`` if not found.
     """
     path = Path(source)
     texts: dict[str, str] = {}
@@ -39,9 +39,9 @@ def recorded_files(source: str | PathLike[str]) -> dict[str, Any]:
 
 
 def recorded_mjcf(source: Any) -> dict[str, Any]:
-    """Returns what :func:`recorded_files` does, or of a ``mujoco.MjModel`` its SHA-256 alone.
+    """Returns the result of :func:`recorded_files`, or only the SHA-256 of a ``mujoco.MjModel``.
 
-    A compiled model no longer knows the text that it was made from.
+    A compiled model does not contain the text from which it was made.
 
     Args:
         source: Path of an MJCF file, or a ``mujoco.MjModel``.
@@ -63,12 +63,12 @@ def _read(folder: Path, name: str, texts: dict[str, str]) -> None:
     tree = _parsed(texts[name])
     if tree is not None:
         for include in tree.iter("include"):
-            # MuJoCo looks for all of them beside the first file.
+            # MuJoCo searches for all of them in the folder of the first file.
             _read(folder, include.get("file", ""), texts)
 
 
 def _parsed(text: str) -> ElementTree.Element | None:
-    """Returns the XML of a text; an engine may be more forgiving than a parser."""
+    """Returns the XML of a text, or ``None``: an engine may accept text that is not valid XML."""
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError:
@@ -76,7 +76,7 @@ def _parsed(text: str) -> ElementTree.Element | None:
 
 
 def _references(tree: ElementTree.Element) -> Iterator[str]:
-    """Yields the names of other files than included ones."""
+    """Yields the names of referenced files other than included ones."""
     for element in tree.iter():
         name = element.get("file") or element.get("filename")
         if name and element.tag != "include":

@@ -1,4 +1,4 @@
-"""Paths to what an environment keeps in attributes: ``"mass"``, ``"model.opt.gravity[2]"``."""
+"""Paths to values in an environment's attributes: ``"mass"``, ``"model.opt.gravity[2]"``."""
 
 import re
 from collections.abc import Callable
@@ -20,7 +20,7 @@ _PART = re.compile(r"\.?([A-Za-z_]\w*)|\[(-?\d+(?:\s*,\s*-?\d+)*)\]")
 
 @dataclass(frozen=True)
 class Path:
-    """A place in an object: names with dots between them, numbers of entries in brackets.
+    """Path to a value in an object: names separated by dots, indices in brackets.
 
     Attributes:
         text: The path.
@@ -32,7 +32,7 @@ class Path:
         """Checks the form.
 
         Raises:
-            ModelError: It is no such path.
+            ModelError: The text is not such a path.
         """
         if not self.text or self.text[0] in ".[" or _PART.sub("", self.text):
             raise ModelError(
@@ -48,24 +48,24 @@ class Path:
         return tuple(parts)
 
     def get(self, root: Any) -> Any:
-        """Returns what is there.
+        """Returns the value at the path.
 
         Raises:
-            ModelError: There is nothing.
+            ModelError: The path does not exist.
         """
         for part in self._parts:
             root = self._next(root, part)
         return root
 
     def getter(self) -> Callable[[Any], Any]:
-        """Returns a quick form of :meth:`get`, for a path that is known to be there."""
+        """Returns a faster form of :meth:`get`, for a path that is known to exist."""
         return attrgetter(self.text) if "[" not in self.text else self.get
 
     def set(self, root: Any, value: Any) -> None:
-        """Puts a value there.
+        """Sets the value at the path.
 
         Raises:
-            ModelError: There is no such place.
+            ModelError: The path does not exist.
         """
         *way, last = self._parts
         for part in way:
@@ -90,9 +90,9 @@ class Attribute:
     """A number in an environment's attributes, as a domain parameter.
 
     Attributes:
-        path: Where it is on the unwrapped environment, e.g. ``"m"`` or ``"model.body_mass[1]"``.
+        path: Its path in the unwrapped environment, e.g. ``"m"`` or ``"model.body_mass[1]"``.
         unit: SI unit.
-        description: A few words for tables.
+        description: Short description for tables.
     """
 
     path: str
@@ -115,6 +115,6 @@ class Attribute:
 
 
 def vector(value: Any) -> NDArray[np.float64]:
-    """Returns numbers as a flat copy: environments may reuse their arrays."""
+    """Returns numbers as a flat copy, because environments may reuse their arrays."""
     copied = np.array(value, dtype=np.float64)
     return copied if copied.ndim == 1 else copied.reshape(-1)

@@ -1,4 +1,4 @@
-"""Gymnasium environments: how they are made, and what channels their boxes are."""
+"""Creates Gymnasium environments and converts their box spaces to channels."""
 
 import importlib
 from collections.abc import Sequence
@@ -31,10 +31,10 @@ def make_environment(name: str, *, is_checked: bool = True) -> Any:
 
     Args:
         name: Its id, e.g. ``"Pendulum-v1"``.
-        is_checked: Whether Gymnasium watches that its steps keep to the rules.
+        is_checked: Whether Gymnasium checks that the environment's steps follow its interface.
 
     Raises:
-        ModelError: There is no such environment, or what it needs is not installed.
+        ModelError: There is no such environment, or a package that it needs is not installed.
     """
     gymnasium = load_gymnasium()
     try:
@@ -64,7 +64,7 @@ def limited_channels(
         name: The environment's name, for messages.
 
     Raises:
-        ModelError: The box has another number of entries.
+        ModelError: The box has a different number of entries.
     """
     own = box_channels(space, "action")
     if actions is None:

@@ -24,50 +24,50 @@ __all__ = ["GymnasiumSimulator"]
 
 Array = NDArray[np.float64]
 
-# Environments outside Python know 32-bit seeds only.
+# Environments that are not written in Python often accept only 32-bit seeds.
 _SEEDS = 2**31
 
-# Relative difference of time steps that rounding of a recording's time stamps explains.
+# Time steps with a smaller relative difference count as equal: time stamps are rounded.
 _SAME_STEP = 1e-6
 
 
 class GymnasiumSimulator(SteppedSimulator):
     """An environment whose parameters and initial state are set, simulated on workers.
 
-    Functions are given the environment without its wrappers, and travel to workers. For every
-    simulation parameters are set, the environment is reset, then the state is put in. That an
-    environment terminates or truncates an episode is ignored: its dynamics go on as far as it
-    lets them.
+    Functions receive the environment without its wrappers and are sent to workers. In every
+    simulation, first the parameters are set, then the environment is reset, then its state is set.
+    If an environment terminates or truncates an episode, the simulation continues as far as the
+    environment allows.
 
-    Action and sensor channels are ports; what acts inside of the environment is its own matter.
+    Action and sensor channels are ports. Effects cannot act on forces inside the environment.
 
     Args:
         environment: Id of a registered environment, or a function that makes one.
         parameters: Domain parameters by name: an :class:`Attribute` of the environment, whose
-            value there is the nominal one; or a declaration, for ``set_parameters``.
+            present value is the nominal one; or a declaration, for ``set_parameters``.
         set_parameters: Called with the environment and all parameters by name after attributes
-            have been set, for what depends on several or is set by a method.
+            have been set; use it for values that depend on several parameters or need a method.
         states: Components of the state, in the order in which they are set.
         set_state: Called with the environment and a state ``(states,)``; or the path of the
-            attribute that is the state, e.g. ``"state"``.
-        sensors: What is read after each step; ``None`` for the states, or, where there are none,
-            the observation's entries, ``observation_0`` and so on.
-        read: Maps the environment and an observation to the readings ``(sensors,)``; or the path
-            of an attribute. ``None`` takes the attribute that is the state where sensors are
-            states, and the observation otherwise; until the first step that is the reset's, which
-            knows nothing of the state that was put in.
-        actions: Names and units of the commands; ``None`` for ``action_0`` and so on. Those of a
-            box have its limits.
-        act: Maps the environment and commands ``(actions,)`` to what it takes for an action,
-            needed where that is no box.
-        rated: Typical magnitudes by channel, by which effects scale their priors; an action's is
-            otherwise its limit.
+            attribute that contains the state, e.g. ``"state"``.
+        sensors: Channels that are measured after each step. ``None`` for the states, or, if there
+            are no states, the entries of the observation, ``observation_0`` and so on.
+        read: Maps the environment and an observation to the measurements ``(sensors,)``; or the
+            path of an attribute. ``None`` uses the attribute of the state if all sensors are
+            states, and the observation otherwise. Before the first step, the observation is that
+            of the reset and does not show the state that was set.
+        actions: Names and units of the commands; ``None`` for ``action_0`` and so on. If the
+            action space is a box, the commands have its limits.
+        act: Maps the environment and commands ``(actions,)`` to an action of the environment;
+            needed if the action space is not a box.
+        rated: Typical magnitudes by channel, with which effects scale their priors. The default
+            for an action is its limit.
         time_step: Seconds per step; ``None`` for the environment's attribute ``dt``.
-        is_deterministic: Whether its steps are free of random numbers.
+        is_deterministic: Whether the steps use no random numbers.
 
     Raises:
         DependencyError: Gymnasium is not installed.
-        ModelError: The environment does not exist, or what is said of it does not hold.
+        ModelError: The environment does not exist, or an argument does not fit it.
 
     Example:
         >>> GymnasiumSimulator(
@@ -113,7 +113,7 @@ class GymnasiumSimulator(SteppedSimulator):
         self._read = read
         made = self.set_up()
         try:
-            made.reset(seed=0)  # some attributes are there only after it
+            made.reset(seed=0)  # some attributes exist only after a reset
             self._declare(made, parameters or {}, sensors, actions, time_step)
             self.ports = self._find_ports(rated or {})
             self._try_out(made)
@@ -131,7 +131,7 @@ class GymnasiumSimulator(SteppedSimulator):
         return make if isinstance(make, str) else getattr(make, "__qualname__", repr(make))
 
     def recorded_settings(self) -> dict[str, Any]:
-        """Returns which environment it is, and the engine's version."""
+        """Returns the environment's name and the engine's version."""
         version = load_gymnasium().__version__
         return {
             "engine": "gymnasium",
@@ -141,7 +141,7 @@ class GymnasiumSimulator(SteppedSimulator):
         }
 
     def check_inputs(self, inputs: Inputs) -> None:
-        """Raises a DataError where the inputs' channels or time step do not fit."""
+        """Raises a DataError if the inputs' channels or time step do not fit."""
         super().check_inputs(inputs)
         self._check_step(inputs.time_step, DataError)
 
@@ -152,7 +152,7 @@ class GymnasiumSimulator(SteppedSimulator):
 
     def set_up(self) -> Any:
         """Makes an environment."""
-        # Going on after an episode's end is what is wanted here, not a mistake to warn of.
+        # Steps after the end of an episode are intended here, so no warning is needed.
         load_gymnasium().logger.min_level = load_gymnasium().logger.ERROR
         if isinstance(self._make, str):
             return make_environment(self._make, is_checked=False)
@@ -241,7 +241,7 @@ class GymnasiumSimulator(SteppedSimulator):
         )  # fmt: skip
 
     def _try_out(self, environment: Any) -> None:
-        """Begins a simulation in the state after a reset, so that mistakes show now."""
+        """Begins a simulation in the state after a reset, to find mistakes at construction."""
         inner = environment.unwrapped
         nominal = {parameter.name: parameter.nominal for parameter in self.parameters}
         start = np.zeros(len(self.states))
@@ -262,7 +262,7 @@ class GymnasiumSimulator(SteppedSimulator):
 
 
 class _Simulation:
-    """An environment whose episode is running, as the engine's workers step it."""
+    """A running episode of an environment, which workers advance step by step."""
 
     def __init__(
         self,
@@ -285,7 +285,7 @@ class _Simulation:
             self._reading = _observed if read is None else read
 
     def read(self) -> Array:
-        """Returns the present readings."""
+        """Returns the present measurements."""
         return vector(self._reading(self._inner, self._observation))
 
     def advance(self, step: int) -> None:

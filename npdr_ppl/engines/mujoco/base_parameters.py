@@ -1,17 +1,17 @@
 """Inverse dynamics of any MJCF, linear in its inertial and friction parameters.
 
-A rigid body b with mass m, first moment h = m c and inertia I about its frame's origin needs, for
-the angular velocity ω, angular acceleration α and proper acceleration a (acceleration less
-gravity) of that origin, all in the body's frame, the wrench
+A rigid body b has the mass m, the first moment h = m c and the inertia I about the origin of its
+frame. Its origin has the angular velocity ω, the angular acceleration α and the proper
+acceleration a (acceleration minus gravity). In the body's frame, this motion needs the wrench
 
     f = m a + α × h + ω × (ω × h),    n = I α + ω × (I ω) + h × a,
 
-which is linear in (m, h, I). Its generalised force is J_bᵀ (f, n) with the body's Jacobian; joints
-add armature · v̇ + damping · v + frictionloss · sign v. Summed over bodies and joints that is
+which is linear in (m, h, I). Its generalised force is J_bᵀ (f, n) with the body's Jacobian J_b.
+Joints add armature · v̇ + damping · v + frictionloss · sign v. The sum over bodies and joints is
 
     Y(q, v, v̇) π = τ,
 
-with τ the applied forces less those of springs and the like, which are taken as known.
+where τ is the applied forces plus other passive forces, e.g. of springs, which must be known.
 
 Reference: C. G. Atkeson, C. H. An, J. M. Hollerbach, Estimation of inertial parameters of
 manipulator loads and links, 1986, Eqs. 2–10; P. M. Wensing, S. Kim, J.-J. E. Slotine, Linear
@@ -71,8 +71,8 @@ def load_mjcf(source: Any) -> Any:
 class MujocoInverseDynamics:
     """The linear form of a model's inverse dynamics.
 
-    Contacts, joint limits and equality constraints are no part of it: equality constraints are
-    refused, and motions should be free of the others.
+    It does not contain contacts, joint limits and equality constraints. Models with equality
+    constraints are refused, and motions should be free of contacts and joint limits.
 
     Args:
         model: A ``mujoco.MjModel``.
@@ -89,7 +89,7 @@ class MujocoInverseDynamics:
     def __post_init__(self) -> None:
         """Checks the model."""
         if self.model.nv == 0:
-            raise ModelError("The MJCF has no joints, so that no motion tells its parameters.")
+            raise ModelError("The MJCF has no joints, so motions do not depend on its parameters.")
         if self.model.neq:
             raise ModelError(
                 f"The MJCF has {self.model.neq} equality constraints; inverse dynamics is linear "
@@ -109,7 +109,7 @@ class MujocoInverseDynamics:
 
     @property
     def dof_names(self) -> tuple[str, ...]:
-        """Names of the degrees of freedom; a joint that has several numbers them."""
+        """Names of the degrees of freedom; those of the same joint are numbered."""
         names = []
         for dof in range(self.model.nv):
             joint = int(self.model.dof_jntid[dof])
@@ -120,7 +120,7 @@ class MujocoInverseDynamics:
         return tuple(names)
 
     def nominal(self) -> Array:
-        """Returns π of the model as it stands, ``(P,)``."""
+        """Returns π of the unchanged model, ``(P,)``."""
         model = self.model
         values = []
         for body in self.bodies:
@@ -148,12 +148,12 @@ class MujocoInverseDynamics:
         return self._evaluate(positions, velocities, accelerations)[0]
 
     def targets(self, positions: Array, velocities: Array, applied: Array) -> Array:
-        """Returns τ, ``(N, nv)``: applied forces and what springs, tendons and fluids add.
+        """Returns τ, ``(N, nv)``: applied forces plus forces of springs, tendons and fluids.
 
         Args:
             positions: MuJoCo's qpos, ``(N, nq)``.
             velocities: Its qvel, ``(N, nv)``.
-            applied: Applied generalised forces, those of actuators included, ``(N, nv)``.
+            applied: Applied generalised forces, including those of actuators, ``(N, nv)``.
 
         Raises:
             ShapeError: The shapes do not fit the model.
@@ -166,7 +166,7 @@ class MujocoInverseDynamics:
         return applied + self._evaluate(positions, velocities, np.zeros_like(velocities))[1]
 
     def _evaluate(self, positions: Array, velocities: Array, accelerations: Array) -> Any:
-        """Returns Y, and the passive forces but the joints' own damping."""
+        """Returns Y, and the passive forces without the damping of the joints."""
         mujoco: Any = importlib.import_module("mujoco")
         model, bodies = self.model, self.bodies
         self._check_shapes(positions, velocities, accelerations)
@@ -185,7 +185,7 @@ class MujocoInverseDynamics:
             for k, body in enumerate(bodies):
                 frame = mujoco.mjtObj.mjOBJ_XBODY
                 mujoco.mj_objectVelocity(model, data, frame, body, twist, 1)
-                # Includes minus gravity, as MuJoCo's accelerations do.
+                # MuJoCo's accelerations include minus gravity.
                 mujoco.mj_objectAcceleration(model, data, frame, body, acceleration, 1)
                 mujoco.mj_jacBody(model, data, linear, angular, body)
                 axes = data.xmat[body].reshape(3, 3)
@@ -226,7 +226,9 @@ def actuator_forces(model: Any, positions: Array, velocities: Array, controls: A
     """
     mujoco: Any = importlib.import_module("mujoco")
     if model.na:
-        raise ModelError("Actuators with states have no force that position and control tell.")
+        raise ModelError(
+            "Actuators with states have forces that do not follow from the control alone."
+        )
     data = mujoco.MjData(model)
     forces = np.zeros((len(positions), model.nv))
     for n in range(len(positions)):
@@ -239,10 +241,10 @@ def actuator_forces(model: Any, positions: Array, velocities: Array, controls: A
 
 
 def is_physical(parameters: Array, num_bodies: int) -> NDArray[np.bool_]:
-    """Returns which parameter sets can exist.
+    """Returns which parameter sets are physically possible.
 
-    A body can exist if its mass is positive and its pseudo-inertia, the 4 × 4 matrix of its
-    mass distribution's moments, is positive definite: then its principal moments also satisfy
+    A body is possible if its mass is positive and its pseudo-inertia, the 4 × 4 matrix of the
+    moments of its mass distribution, is positive definite. Its principal moments then also satisfy
     the triangle inequality. Damping, dry friction and armature must not be negative.
 
     Args:
@@ -295,7 +297,7 @@ def with_parameters(model: Any, parameters: Array) -> Any:
             inertia[i, j] = inertia[j, i] = product
         inertia = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
         moments, axes = np.linalg.eigh(inertia)
-        # Right-handed, or there is no rotation to the principal axes.
+        # The axes must be right-handed; otherwise no rotation leads to them.
         axes[:, 2] *= np.sign(np.linalg.det(axes))
         changed.body_mass[body], changed.body_ipos[body] = mass, centre
         changed.body_inertia[body] = moments

@@ -12,20 +12,21 @@ from npdr_ppl.engines.mujoco.parameters import Assignments
 
 __all__ = ["make_batch", "prepared_copy", "quiet", "state_view"]
 
-# MuJoCo's friction yields: it decays a joint's speed over the time constant of ``solref`` and lets
-# a stuck joint creep. These values are the hardest that it admits: the greatest impedance, and a
-# time constant of two steps, with which the speed is gone after one.
+# MuJoCo's friction is soft: it reduces a joint's speed over the time constant of ``solref`` and
+# lets a stuck joint creep. These values are the hardest allowed: the greatest impedance, and a
+# time constant of two steps, with which the joint stops after one step.
 _CRISP_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 _CRISP_STEPS = 2.0
 
-# Up to so many simulations, giving each its own values is quicker than changing a model for all.
+# Up to this number of simulations, setting values in each one is faster than changing a shared
+# model.
 _FEW = 64
 
 
 def make_batch(
     model: Any, assignments: Assignments, num_simulations: int, num_threads: int
 ) -> Any:
-    """Returns a ``mujoco.batch.Batch`` whose models hold the assigned values.
+    """Returns a ``mujoco.batch.Batch`` whose models have the assigned values.
 
     Args:
         model: A ``mujoco.MjModel``, which is not changed.
@@ -35,8 +36,8 @@ def make_batch(
     """
     mujoco: Any = importlib.import_module("mujoco")
     module: Any = importlib.import_module("mujoco.batch")
-    # Constants such as inverse inertias follow from some fields; deriving them costs microseconds
-    # per simulation, so only where such a field was written.
+    # Constants such as inverse inertias depend on some fields. Computing them costs microseconds
+    # per simulation, so this is done only if such a field was changed.
     followed = set(getattr(mujoco.MjModel, "_setconst_inputs", ())) or {a for a, _ in assignments}
     shared = {}
     if num_simulations > _FEW:
@@ -52,7 +53,8 @@ def make_batch(
     for (array, place), value in own.items():
         batch.expand(array).reshape(num_simulations, -1)[:, place] = value.numpy()
     if any(array in followed for array, _ in own):
-        # A simulation whose values have no such constants is lost, and its warnings say so.
+        # If these constants do not exist for some values, that simulation is lost; its warnings
+        # record this.
         try:
             batch.set_const()
         except module.SimulationError:
@@ -63,7 +65,8 @@ def make_batch(
 def state_view(batch: Any, name: str) -> Any:
     """Returns a live view of a part of a batch's states, ``(N, …)``.
 
-    As ``batch.bind``, which makes an ``MjData`` for it; that takes longer than a short simulation.
+    This is ``batch.bind`` without its temporary ``MjData``, which costs more than a short
+    simulation.
 
     Args:
         batch: A ``mujoco.batch.Batch``.
@@ -79,14 +82,15 @@ def state_view(batch: Any, name: str) -> Any:
 def prepared_copy(model: Any, step: float, crisp: tuple[int, ...]) -> Any:
     """Returns a copy of a model, ready for a batch.
 
-    Commands are limited before they pass the action effects, so the engine's own limit is off: a
-    gain that is too high may well exceed it.
+    The engine's own limits on commands are switched off. Commands are limited before they pass the
+    action effects, and an effect such as a gain above 1 may exceed the limits.
 
     Args:
         model: A ``mujoco.MjModel``.
         step: Seconds per engine step.
-        crisp: Degrees of freedom whose dry friction is as hard as the engine admits; without
-            friction nothing changes, so that an effect of no strength changes nothing.
+        crisp: Degrees of freedom whose dry friction is made as hard as the engine allows. This
+            changes nothing while the friction is zero, so an effect of zero strength has no
+            influence.
     """
     mujoco: Any = importlib.import_module("mujoco")
     own = copy.copy(model)
@@ -100,13 +104,13 @@ def prepared_copy(model: Any, step: float, crisp: tuple[int, ...]) -> Any:
 
 @contextmanager
 def quiet(handler: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Hands the engine's warnings to a function, by default one that drops them.
+    """Passes the engine's warnings to a function, by default one that ignores them.
 
-    Otherwise the engine prints each and writes it to a file in the present folder, one per lost
-    simulation and step; the batch counts those anyway. A handler of the user's own stays.
+    Otherwise the engine prints a warning per lost simulation and step and writes it to a file in
+    the current folder. The batch counts the warnings anyway. A handler set by the user is kept.
 
     Args:
-        handler: What to do with a warning.
+        handler: Function that is called with each warning.
     """
     mujoco: Any = importlib.import_module("mujoco")
     if mujoco.get_mju_user_warning() is not None:

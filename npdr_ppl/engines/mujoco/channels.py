@@ -35,8 +35,8 @@ class Component:
     """One component of the state.
 
     Attributes:
-        channel: Its name, unit and what it is the rate of.
-        address: Its place in MuJoCo's qpos or qvel.
+        channel: Its name and unit, and the channel of which it is the rate.
+        address: Its index in MuJoCo's qpos or qvel.
         is_velocity: Whether it is in qvel.
     """
 
@@ -51,7 +51,7 @@ class Reading:
 
     Attributes:
         channel: Its name and unit.
-        address: Its place in MuJoCo's sensordata.
+        address: Its index in MuJoCo's sensordata.
         stage: 1 if it depends on positions, 2 on velocities, 3 on accelerations.
     """
 
@@ -68,8 +68,8 @@ def state_components(model: Any) -> tuple[Component, ...]:
 
     A hinge or slide called ``elbow`` has ``elbow`` and ``elbow_velocity``. A free joint called
     ``root`` has ``root_x``, ``root_y``, ``root_z`` and the quaternion ``root_qw`` … ``root_qz``,
-    with ``root_x_velocity`` … and, about the body's own axes, ``root_x_spin`` …; a ball joint has
-    the rotational part.
+    with ``root_x_velocity`` … and, about the body's own axes, ``root_x_spin`` …. A ball joint has
+    the rotational part only.
     """
     mujoco: Any = importlib.import_module("mujoco")
     positions: list[tuple[str, str]] = []
@@ -96,7 +96,7 @@ def state_components(model: Any) -> tuple[Component, ...]:
 
 
 def mjcf_sensors(model: Any) -> tuple[Reading, ...]:
-    """Returns every number of every sensor element; vectors have ``_x``, ``_y``, ``_z`` behind."""
+    """Returns every number of every sensor element; vector components end in ``_x`` and so on."""
     result = []
     for sensor, name in enumerate(element_names(model, "sensor")):
         size, first = int(model.sensor_dim[sensor]), int(model.sensor_adr[sensor])
@@ -112,15 +112,15 @@ def mjcf_sensors(model: Any) -> tuple[Reading, ...]:
 def choose(
     known: Mapping[str, Component | Reading], selection: Selection, what: str
 ) -> tuple[Any, ...]:
-    """Returns the chosen things under their new names.
+    """Returns the chosen components or sensors under their new names.
 
     Args:
-        known: Things by name.
+        known: Components or sensors by name.
         selection: Names, or new names mapped to old ones; ``None`` for all.
-        what: Word for messages.
+        what: Their kind, for messages.
 
     Raises:
-        ModelError: A name is unknown, or chosen twice.
+        ModelError: A name is unknown or chosen twice.
     """
     if selection is None:
         return tuple(known.values())
@@ -143,8 +143,8 @@ def choose(
 def action_channels(model: Any, taken: Sequence[str]) -> tuple[Channel, ...]:
     """Returns a channel per actuator, with the bounds of its control range.
 
-    An actuator without a name is called after its joint, ``elbow_command``, as is one whose name
-    a state or sensor has already.
+    An actuator is named after its joint, e.g. ``elbow_command``, if it has no name or if a state
+    or sensor already has its name.
 
     Args:
         model: A ``mujoco.MjModel``.
@@ -166,7 +166,7 @@ def action_channels(model: Any, taken: Sequence[str]) -> tuple[Channel, ...]:
 
 
 def _action_unit(model: Any, actuator: int) -> str:
-    """Returns the unit of a control where the file tells it, ``"1"`` otherwise."""
+    """Returns the unit of a control if the file determines it, ``"1"`` otherwise."""
     joint = actuated_joint(model, actuator)
     if joint is None:
         return "1"
@@ -180,7 +180,7 @@ def _action_unit(model: Any, actuator: int) -> str:
     return units["force"] if gain == 1.0 and has_unit_gear else "1"
 
 
-# Units of sensors by the ending of MuJoCo's constants.
+# Units of sensors, by the end of the names of MuJoCo's constants.
 _SENSOR_UNITS = {
     "ACCELEROMETER": "m/s²",
     "VELOCIMETER": "m/s",
@@ -207,7 +207,7 @@ _SENSOR_UNITS = {
 
 
 def _sensor_unit(model: Any, sensor: int) -> str:
-    """Returns the unit of a sensor, ``"1"`` where the file does not tell it."""
+    """Returns the unit of a sensor, ``"1"`` if the file does not determine it."""
     mujoco: Any = importlib.import_module("mujoco")
     kind = mujoco.mjtSensor(int(model.sensor_type[sensor])).name.removeprefix("mjSENS_")
     if kind.startswith("JOINT"):

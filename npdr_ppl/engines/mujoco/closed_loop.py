@@ -1,4 +1,4 @@
-"""Closed loop in MuJoCo: batches of policies in batches of domains."""
+"""Closed loop in MuJoCo: batches of policies in batches of simulated domains."""
 
 from dataclasses import replace
 

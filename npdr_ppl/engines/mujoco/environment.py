@@ -1,4 +1,4 @@
-"""What environment ports of a MuJoCo model stand for: gravity, payloads and contact."""
+"""Environment ports of a MuJoCo model: gravity, payloads and contact."""
 
 import importlib
 from collections.abc import Mapping, Sequence
@@ -16,8 +16,9 @@ from npdr_ppl.language.effects import Effect, EnvironmentEffect
 
 __all__ = ["EnvironmentPort", "environment_ports", "with_environment"]
 
-# Contact coefficients: what holds each, and the power of the coefficient that it is. A contact's
-# stiffness goes as the inverse square of its time constant. Restitution has no number of its own.
+# Contact coefficients: the arrays and columns that contain each, and the power of the coefficient
+# to which a number is proportional. A contact's stiffness is proportional to the inverse square of
+# its time constant. MuJoCo has no number for restitution.
 _CONTACT = {
     "friction": (("geom_friction", 0, 1.0), ("pair_friction", 0, 1.0), ("pair_friction", 1, 1.0)),
     "rolling": (("geom_friction", 2, 1.0), ("pair_friction", 3, 1.0), ("pair_friction", 4, 1.0)),
@@ -26,7 +27,7 @@ _CONTACT = {
 
 
 class EnvironmentPort:
-    """An environment port with the body whose mass it is, if it is a payload.
+    """An environment port, with the body that carries the payload if it is a payload port.
 
     Attributes:
         port: The port.
@@ -43,8 +44,8 @@ def environment_ports(
 ) -> tuple[EnvironmentPort, ...]:
     """Returns gravity, a payload on every last link and floating base, and contact.
 
-    Each only where the file has it. A payload sits at its body's centre of mass, and its port is
-    called ``payload``, or ``<body>.payload`` where there are several.
+    A port exists only if the file has such a quantity. A payload is at the centre of mass of its
+    body. Its port is called ``payload``, or ``<body>.payload`` if there are several.
 
     Args:
         model: A ``mujoco.MjModel``.
@@ -73,14 +74,14 @@ def with_environment(
     parameters: Sequence[Mapping[str, Tensor]],
     assignments: Assignments,
 ) -> Assignments:
-    """Returns what to write into the model, as environment effects change it.
+    """Returns the values to write into the model after environment effects have changed them.
 
     Args:
         model: A ``mujoco.MjModel``.
         ports: Its environment ports.
         effects: All effects of a simulator.
         parameters: Parameters of each by short name, in float64.
-        assignments: What to write without them.
+        assignments: Values to write without these effects.
     """
     by_name = {port.port.name: port for port in ports}
     result = dict(assignments)
@@ -108,7 +109,7 @@ def with_environment(
                     for row in range(len(table)):
                         place = row * table.shape[1] + column
                         number = float(table[row, column])
-                        # Negative numbers of solref are a stiffness, which goes the other way.
+                        # Negative values of solref are a stiffness, the inverse of compliance.
                         exponent = -1.0 if number < 0.0 and "solref" in array else power
                         value = present(array, place, number)
                         result[array, place] = value * factors[name] ** exponent
@@ -130,7 +131,7 @@ def _loaded_bodies(model: Any, driven: NDArray[np.bool_]) -> list[int]:
 
 
 def _has_contacts(model: Any) -> bool:
-    """Returns whether two geoms may collide of which one moves."""
+    """Returns whether two geoms may collide, at least one of which moves."""
     if model.npair:
         return True
     mujoco: Any = importlib.import_module("mujoco")

@@ -1,7 +1,7 @@
 """Readable names for the numbers of a MuJoCo model, e.g. ``"body hand mass"``.
 
 They have the form *element name quantity component*, as in ``"geom floor friction sliding"``. The
-name may be a pattern (``"geom * friction sliding"``), and options have none (``"option gravity"``,
+name may be a pattern (``"geom * friction sliding"``). Options have no name (``"option gravity"``,
 the vector's magnitude).
 """
 
@@ -32,9 +32,9 @@ class Entry(NamedTuple):
     """One number of a model.
 
     Attributes:
-        array: The array of the ``MjModel`` that holds it, ``"opt.…"`` for options.
-        place: Its place in the flat array.
-        factor: What it is per unit of the field.
+        array: The array of the ``MjModel`` that contains it, ``"opt.…"`` for options.
+        place: Its index in the flat array.
+        factor: Ratio of its value to the value of the field.
         nominal: Its value in the file.
     """
 
@@ -49,9 +49,9 @@ class Field:
     """A quantity of a model, one number or several.
 
     Attributes:
-        text: The name it was found by.
+        text: The name with which it was found.
         unit: Its unit.
-        entries: The numbers that it stands for.
+        entries: The numbers of the model that it sets.
     """
 
     text: str
@@ -60,16 +60,16 @@ class Field:
 
     @property
     def nominal(self) -> float | None:
-        """Value of all its entries in the file; ``None`` if they differ."""
+        """Value of the field in the file; ``None`` if its entries have different values."""
         values = [entry.nominal / entry.factor for entry in self.entries if entry.factor]
         spread = max(values) - min(values)
         return values[0] if spread <= 1e-9 * max(map(abs, values)) else None
 
 
 class _Quantity(NamedTuple):
-    """Where a quantity of an element is kept.
+    """Where a quantity of an element is stored.
 
-    The unit may name that of a joint's force, position or inertia; see :func:`joint_units`.
+    The unit may refer to a joint's force, position or inertia; see :func:`joint_units`.
     """
 
     array: str
@@ -127,7 +127,7 @@ _QUANTITIES: dict[str, dict[str, _Quantity]] = {
     },
 }
 
-# Components whose unit is not their quantity's.
+# Components whose unit differs from the unit of their quantity.
 _UNITS = {
     ("geom", "friction", "torsional"): "m",
     ("geom", "friction", "rolling"): "m",
@@ -147,7 +147,7 @@ _COUNTS = {
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Returns the end of a message about an unknown word: the nearest known one, or all."""
+    """Returns the end of a message about an unknown word: the nearest known word, or all."""
     known = list(known)
     close = difflib.get_close_matches(word, known, n=1)
     if close:
@@ -156,13 +156,13 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def element_names(model: Any, kind: str) -> list[str]:
-    """Returns the names of a model's elements of a kind; nameless ones are ``<kind>_<number>``."""
+    """Returns names of a model's elements of a kind, ``<kind>_<number>`` for unnamed ones."""
     count = int(getattr(model, _COUNTS[kind]))
     return [getattr(model, kind)(i).name or f"{kind}_{i}" for i in range(count)]
 
 
 def actuator_names(model: Any) -> list[str]:
-    """Returns the names of actuators; nameless ones are called after their joint."""
+    """Returns the names of actuators; unnamed ones are named after their joint."""
     joints, names = element_names(model, "joint"), []
     for actuator, name in enumerate(element_names(model, "actuator")):
         joint = actuated_joint(model, actuator)
@@ -188,10 +188,10 @@ def find_field(model: Any, text: str) -> Field:
 
     Args:
         model: A ``mujoco.MjModel``.
-        text: The name; see the module's text.
+        text: The name; see the docstring of the module.
 
     Raises:
-        ModelError: The model has no such element or quantity; the message names the nearest.
+        ModelError: The model has no such element or quantity; the message suggests the nearest.
     """
     words = text.split()
     if not words or words[0] not in _QUANTITIES:
@@ -215,7 +215,7 @@ def find_field(model: Any, text: str) -> Field:
         raise ModelError(f"{text!r} mixes the units {', '.join(sorted(units))}.")
     entries = [e for i in chosen for e in _entries(model, kind, i, info, component)]
     if quantity == "kp":
-        # A position servo's force is kp (control − position): its gain and minus its bias.
+        # A position servo's force is kp (control − position), so kp sets gain and minus bias.
         bias = _QUANTITIES["actuator"]["bias"]
         for e in [e for i in chosen for e in _entries(model, kind, i, bias, "position")]:
             entries.append(e._replace(factor=-1.0))
@@ -247,7 +247,7 @@ def _halves(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
 
 
 def _split(kind: str, rest: list[str], text: str) -> tuple[str, str, str]:
-    """Splits the words behind the element into name, quantity and component (or nothing)."""
+    """Splits the words after the element into name, quantity and component (empty if none)."""
     quantities = _QUANTITIES[kind]
     for size in (1, 2):
         if len(rest) < size or (len(rest) == size and kind != "option"):
@@ -276,7 +276,7 @@ def _option(model: Any, text: str, quantity: str, component: str) -> Field:
         return Field(text, info.unit, (Entry(info.array, place, 1.0, float(values[place])),))
     if len(values) == 1:
         return Field(text, info.unit, (Entry(info.array, 0, 1.0, float(values[0])),))
-    # The vector's magnitude: its direction stays.
+    # Sets the magnitude of the vector and keeps its direction.
     size = float(np.linalg.norm(values))
     if size == 0.0:
         raise ModelError(f"{text!r} is zero in the file, so only its components can be set.")

@@ -1,4 +1,4 @@
-"""Joints of a batch as force effects see them before a step."""
+"""Joint quantities of a batch that force effects need before a step."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,11 +14,11 @@ __all__ = ["JointStates"]
 
 
 class JointStates:
-    """Accelerations, inertias and drives that the engine has computed last.
+    """Accelerations, inertias and drive forces that the engine computed last.
 
-    An acceleration includes the forces of contacts, limits and the file's own dry friction. An
-    inverse inertia is that of the free mechanism, a diagonal entry of M⁻¹, and a drive's force all
-    that the actuators exert at the joint, servos' feedback and back-EMF included.
+    Accelerations include the forces of contacts, limits and the file's own dry friction. An
+    inverse inertia is a diagonal entry of M⁻¹, without constraints. A drive force is the total
+    force of the actuators at the joint, including servo feedback and back-EMF.
 
     Args:
         batch: A ``mujoco.batch.Batch`` of N simulations.
@@ -29,7 +29,7 @@ class JointStates:
         model = batch.model
         self._acceleration = batch.bind("qacc")
         self._drive = batch.bind("qfrc_actuator")
-        # The lower triangle, row by row without its zeros.
+        # M is stored as the non-zero entries of its lower triangle, row by row.
         self._inertia = batch.bind("M")
         self._size = int(model.nv)
         counts = np.asarray(model.M_rownnz)
@@ -51,7 +51,7 @@ class JointStates:
         values = self._inertia[:, self._entries]
         inertia[:, self._rows, self._columns] = values
         inertia[:, self._columns, self._rows] = values
-        # A lost simulation may have no inverse, which is no reason to stop the others.
+        # The matrix of a lost simulation may be singular; this must not stop the others.
         inverse = torch.linalg.inv_ex(torch.from_numpy(inertia)).inverse
         acceleration = torch.from_numpy(self._acceleration.copy())
         drive = torch.from_numpy(self._drive.copy())

@@ -46,8 +46,8 @@ class MujocoMechanism(ClosedLoopSimulator):
 
     Attributes:
         model: The ``mujoco.MjModel``.
-        components: Where each state is kept.
-        readings: Where each sensor's value is kept.
+        components: Where MuJoCo stores each state.
+        readings: Where MuJoCo stores each sensor's value.
         force_ports: The force ports with the coordinates they act on.
     """
 
@@ -75,7 +75,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         is_path = isinstance(source, str | PathLike)
         self._label = Path(source).name if is_path else "a model"
         self.substeps, self.num_threads = substeps, num_threads
-        # Engine steps for each that was asked for; see MujocoSimulator.with_finer_steps.
+        # Engine steps per requested engine step; see MujocoSimulator.with_finer_steps.
         self.refinement = 1
         self.time_step = time_step or (substeps or 1) * float(self.model.opt.timestep)
         self._declare_channels(states, sensors, units or {}, bounds or {})
@@ -89,7 +89,7 @@ class MujocoMechanism(ClosedLoopSimulator):
             *derive_ports(self.model, self.force_ports, self.actions, self.readings),
             *(port.port for port in self._environment),
         )
-        # Derivations that do not fit should say so now.
+        # This reports wrong derivations at construction.
         self.bindings.assignments({}, self.nominal())
         self.initial_positions = self._initial_positions(keyframe)
 
@@ -104,7 +104,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         return tuple(port.port.name for port in self.force_ports)
 
     def recorded_settings(self) -> dict[str, Any]:
-        """Returns the text of the MJCF and what the parameters set in it, and the version."""
+        """Returns the MJCF's text, the fields that parameters set, and the engine's version."""
         return {
             "engine": "mujoco",
             "version": importlib.import_module("mujoco").__version__,
@@ -116,16 +116,16 @@ class MujocoMechanism(ClosedLoopSimulator):
 
     @property
     def is_rate(self) -> tuple[bool, ...]:
-        """Whether each state is a velocity, those of balls and free bodies included."""
+        """Whether each state is a velocity, also of ball joints and free bodies."""
         return tuple(component.is_velocity for component in self.components)
 
     def num_substeps(self, time_step: float) -> int:
-        """Returns the engine steps per control step of so many seconds."""
+        """Returns the engine steps per control step of ``time_step`` seconds."""
         suggested = max(1, round(time_step / float(self.model.opt.timestep)))
         return self.refinement * (self.substeps or suggested)
 
     def histories(self, given: Mapping[str, Tensor], time_step: float) -> tuple[int, ...]:
-        """Returns how much of the past each action effect and then each sensor effect asks for.
+        """Returns how many past steps each action effect, then each sensor effect, needs.
 
         Args:
             given: Given parameters.
@@ -143,7 +143,7 @@ class MujocoMechanism(ClosedLoopSimulator):
             given: Given parameters, ``(N,)`` or numbers, in float64.
             num_simulations: N.
             time_step: Seconds per control step.
-            time: Seconds from the rollout's beginning to each segment's middle.
+            time: Seconds from the start of the rollout to the middle of each segment.
         """
         complete = self.complete(given, torch.float64, torch.device("cpu"))
         domain = self.changed(complete, time)
@@ -159,14 +159,14 @@ class MujocoMechanism(ClosedLoopSimulator):
         return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)
 
     def _prepared(self, step: float, assigned: set[tuple[str, int]]) -> Any:
-        """Returns a model for batches; one that was made before serves again."""
+        """Returns a model for batches, from a cache if possible."""
         dofs = {
             port.velocity
             for port in self.force_ports
             for effect in self.effects
             if isinstance(effect, ForceEffect) and effect.port == port.port.name
         }
-        # Where the file has dry friction, or a parameter sets it, the file's solver stays.
+        # If the file has dry friction, or a parameter sets it, the file's solver settings stay.
         crisp = tuple(
             dof
             for dof in sorted(dofs)
@@ -188,7 +188,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         """Sets states, sensors and actions."""
         known = {c.channel.name: c for c in state_components(self.model)}
         chosen: tuple[Component, ...] = choose(known, states, "state")
-        # Positions first, as everywhere.
+        # Positions come first, as everywhere.
         self.components = tuple(sorted(chosen, key=lambda component: component.is_velocity))
 
         def finished(channel: Channel) -> Channel:
@@ -200,8 +200,8 @@ class MujocoMechanism(ClosedLoopSimulator):
         things: dict[str, Component | Reading] = {
             r.channel.name: r for r in mjcf_sensors(self.model)
         }
-        # A sensor element that is called like a state is most often that state's sensor; the state
-        # is what the name means.
+        # A sensor element with the name of a state usually measures that state; the name then
+        # stands for the state.
         things |= {
             channel.name: Component(channel, c.address, c.is_velocity)
             for channel, c in zip(self.states, self.components, strict=True)
@@ -224,7 +224,7 @@ class MujocoMechanism(ClosedLoopSimulator):
                 )
 
     def _initial_positions(self, keyframe: str | None) -> Any:
-        """Returns the qpos of components that are no states."""
+        """Returns the qpos of components that are not states."""
         if keyframe is None:
             return np.array(self.model.qpos0)
         names = element_names(self.model, "key")

@@ -6,8 +6,8 @@ The file's inverse dynamics are linear in its inertial and friction parameters, 
     π = π₀ + D (θ − θ₀)    so that    (Y D) θ = τ − Y (π₀ − D θ₀),
 
 the domain parameters are base parameters themselves. That holds for masses, inertias, dampings,
-dry frictions and armatures, and for factors on them; not for lengths, and gravity and actuators
-are outside Y.
+dry frictions and armatures, and for factors on them. It does not hold for lengths, nor for gravity
+and actuators, which are not part of Y.
 """
 
 import copy
@@ -36,18 +36,18 @@ _LINEAR_ARRAYS = {
     "dof_damping",
     "dof_frictionloss",
     "dof_armature",
-    # The first moment is linear in it; affinity is checked, so that inertias about the origin,
-    # which are not, count only where they do not matter.
+    # The first moment is linear in it. Inertias about the origin are not, but the check below
+    # rejects bindings for which this matters.
     "body_ipos",
 }
 
 
 def bound_inverse_dynamics(simulator: MujocoMechanism) -> InverseDynamics | None:
-    """Returns the linear form, or ``None`` where a simulator does not have it.
+    """Returns the linear form, or ``None`` if a simulator does not have it.
 
-    It needs hinges and slides that are all states, no equality constraints, actuators without
-    states, and parameters that the file's inertial and friction parameters are affine in. Motions
-    should be free of contacts and away from joint limits.
+    All joints must be hinges or slides and states of the simulator. There must be no equality
+    constraints and no actuators with states. The file's inertial and friction parameters must be
+    affine in the domain parameters. Motions should be free of contacts and away from joint limits.
     """
     model, bindings = simulator.model, simulator.bindings
     is_simple = model.nv > 0 and model.nq == model.nv and not model.neq and not model.na
@@ -73,7 +73,7 @@ def bound_inverse_dynamics(simulator: MujocoMechanism) -> InverseDynamics | None
     slopes = np.stack(columns, axis=-1) / steps
     together = inertial(nominal + 0.5 * steps)
     error = np.abs(together - start - slopes @ (0.5 * steps))
-    # Rounding leaves 1e-16 of the sizes; a product of parameters leaves a quarter of it.
+    # Relative errors are 1e-16 for affine functions (rounding) and 1/4 for products of parameters.
     if np.any(error > 1e-9 * (np.abs(together) + np.abs(start) + np.abs(slopes) @ steps)):
         return None
     return BoundInverseDynamics(simulator, start - slopes @ nominal, slopes)
@@ -136,7 +136,7 @@ def _table(columns: tuple[Tensor, ...]) -> Array:
 
 
 def _written(model: Any, assignments: "Assignments") -> Any:
-    """Returns a copy of a model with values of its arrays changed."""
+    """Returns a copy of a model with changed values in its arrays."""
     changed = copy.copy(model)
     for (array, place), value in assignments.items():
         getattr(changed, array).reshape(-1)[place] = float(value)

@@ -20,14 +20,14 @@ def run_all_steps(
 ) -> Array:
     """Returns the true values of sensors after every control step, ``(n, steps, sensors)``.
 
-    From the step on at which the engine warns of a simulation, its values are NaN.
+    If the engine warns about a simulation, its values are NaN from that step on.
 
     Args:
         batch: A ``mujoco.batch.Batch`` of n simulations, in their initial states.
-        controls: What reaches the actuators in each engine step of a control step, or in all of
-            them, ``(n, steps, substeps or 1, actuators)``.
+        controls: Actuator commands after all effects, for each engine step of a control step or
+            one for all of them, ``(n, steps, substeps or 1, actuators)``.
         substeps: Engine steps per control step.
-        sensors: What to report.
+        sensors: The sensors to report.
     """
     mujoco: Any = importlib.import_module("mujoco")
     module: Any = importlib.import_module("mujoco.batch")
@@ -35,8 +35,8 @@ def run_all_steps(
     num, num_actuators = len(controls), controls.shape[-1]
     controls = np.broadcast_to(controls, (num, num_steps, substeps, num_actuators))
     controls = controls.reshape(num, num_steps * substeps, num_actuators)
-    # Sensors of position and velocity describe the state before an engine step, so that theirs
-    # after the last step takes another.
+    # Sensors of position and velocity describe the state before an engine step. Their values after
+    # the last step therefore need one more engine step.
     if any(isinstance(s, Reading) and s.stage < ACCELERATION_STAGE for s in sensors):
         controls = np.concatenate((controls, controls[:, -1:]), axis=1)
     bits = mujoco.mjtState
@@ -100,8 +100,8 @@ def _gather(
 def _first_lost(times: Array, step: float) -> NDArray[np.int64]:
     """Returns the engine step at which each simulation was lost, at most one too early.
 
-    A lost simulation is reset, or repeats its last record; either way its clock is wrong from
-    then on, or from the next step.
+    A lost simulation is reset or repeats its last record. In both cases its recorded time is wrong
+    from this step or the next one on.
 
     Args:
         times: Recorded times of lost simulations, ``(n, engine steps)``.

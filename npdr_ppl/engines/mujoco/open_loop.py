@@ -1,8 +1,8 @@
-"""Open loop in MuJoCo: recorded commands replayed, in one native call where nothing is in the way.
+"""Open loop in MuJoCo: recorded commands are replayed, in one native call if possible.
 
-Action effects depend on commands alone and sensor effects on readings alone, so that commands pass
-the former before, and readings the latter after, the engine has run all steps on its own. Only
-forces of effects have to be evaluated between engine steps.
+Action effects depend on commands only and sensor effects on measurements only. Commands can
+therefore pass the action effects before the engine runs all steps in one call, and measurements
+the sensor effects after it. Only force effects have to be evaluated between engine steps.
 """
 
 import logging
@@ -30,7 +30,7 @@ __all__ = ["CHUNK_BYTES", "replay"]
 logger = logging.getLogger(__name__)
 
 CHUNK_BYTES = 1 << 28
-"""Memory for the commands and records of the simulations that run at a time."""
+"""Bound, in bytes, on the memory for commands and records of simulations that run together."""
 
 
 def replay(simulator: MujocoMechanism, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
@@ -47,7 +47,7 @@ def replay(simulator: MujocoMechanism, parameters: Mapping[str, Tensor], inputs:
         inputs.batch_shape, *(value.shape for value in given.values())
     )
     shape = torch.Size((*batch_shape, inputs.num_segments))
-    # Behind the batch, an axis for the segments.
+    # The axis of the segments follows the axes of the batch.
     given = flatten({name: value[..., None] for name, value in given.items()}, shape)
     run = _Replay(simulator, given, inputs, shape)
     size, step = shape.numel(), run.chunk_size
@@ -70,7 +70,7 @@ def replay(simulator: MujocoMechanism, parameters: Mapping[str, Tensor], inputs:
 
 
 class _Replay:
-    """What all chunks of a replay share.
+    """Data that all chunks of a replay share.
 
     Args:
         simulator: The simulator.
@@ -97,14 +97,14 @@ class _Replay:
 
     @property
     def chunk_size(self) -> int:
-        """How many simulations run at a time."""
+        """Number of simulations that run together."""
         model = self.simulator.model
         num_steps = self.inputs.num_steps * self.simulator.num_substeps(self.inputs.time_step)
         width = 1 + model.nq + model.nv + model.nu + model.nsensordata
         return max(1, CHUNK_BYTES // (8 * width * (num_steps + 1)))
 
     def chunk(self, first: int, last: int) -> Tensor:
-        """Returns the readings of some of the simulations, ``(n, steps, sensors)``."""
+        """Returns the measurements of some of the simulations, ``(n, steps, sensors)``."""
 
         def part(value: Tensor) -> Tensor:
             return value[first:last] if value.ndim else value
@@ -137,7 +137,7 @@ class _Replay:
         readings = torch.from_numpy(true)
         if not chain.sensor_effects:
             return readings
-        # Into a table of its own: effects remember true values.
+        # Written to a separate table, because effects keep references to true values.
         reported = torch.empty_like(readings)
         for k in range(self.inputs.num_steps):
             state, values = chain.report(state, readings[:, k].unbind(-1), tables)
@@ -145,9 +145,9 @@ class _Replay:
         return reported
 
     def _commands(self, shape: torch.Size) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Returns limited commands, ``(rows, steps, actions)``, and each simulation's row.
+        """Returns limited commands, ``(rows, steps, actions)``, and the row of each simulation.
 
-        Rows are few, one per segment, that many simulations share.
+        There is one row per segment, which many simulations share.
         """
         actions = self.inputs.actions[..., self.columns]
         lower, upper = torch.tensor(self.limits, dtype=torch.float64).reshape(-1, 2).unbind(-1)
@@ -157,7 +157,7 @@ class _Replay:
         return commands.reshape(num_rows, *commands.shape[-2:]), rows
 
     def _records(self, chain: MujocoStepper, first: int, last: int) -> tuple[CommandRecord, ...]:
-        """Returns the commands of each action channel, if an effect looks at them."""
+        """Returns the commands of each action channel, if an effect needs them."""
         if not (chain.action_effects or chain.sensor_effects):
             return ()
         return tuple(
@@ -174,9 +174,9 @@ class _Replay:
         first: int,
         last: int,
     ) -> NDArray[np.float64]:
-        """Returns what reaches the dynamics, ``(n, steps, engine steps per step, actions)``.
+        """Returns actions after all effects, ``(n, steps, engine steps per step, actions)``.
 
-        One engine step stands for all of a step under constant actions.
+        Without action effects, the third axis has size 1.
         """
         controls = self.commands[self.rows[first:last], :, None]
         if not chain.action_effects:
@@ -200,7 +200,7 @@ class _Replay:
         tables: Tables,
         controls: NDArray[np.float64],
     ) -> Tensor:
-        """Runs one step after the other."""
+        """Runs the steps one by one."""
         steps = []
         for k in range(self.inputs.num_steps):
             actions = [part.unbind(-1) for part in torch.from_numpy(controls[:, k]).unbind(1)]

@@ -1,4 +1,4 @@
-"""Domain parameters of a MuJoCo model: which numbers of the file each one sets."""
+"""Domain parameters of a MuJoCo model and the numbers of the file that they set."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ Assignments = dict[tuple[str, int], Tensor]
 class Scale:
     """A factor on the nominal values of one or more fields: ``Scale("body hand mass", …)``.
 
-    Unlike values, a factor can go over fields that differ: a payload of the same shape and
-    another density is ``Scale("body hand mass", "body hand inertia")``.
+    A factor can apply to fields with different values. For example, a change of density at
+    constant shape is ``Scale("body hand mass", "body hand inertia")``.
 
     Attributes:
         fields: Names of the fields.
@@ -38,8 +38,8 @@ class Scale:
 
 
 Binding = str | Sequence[str] | Scale | Parameter
-"""What a parameter sets: a field, several fields of one nominal value, a factor on fields, or
-nothing by itself (a :class:`~npdr_ppl.language.channels.Parameter` that derived fields use)."""
+"""Target of a parameter: a field, several fields of equal nominal value, a factor on fields, or
+none (a :class:`~npdr_ppl.language.channels.Parameter` that only derived fields use)."""
 
 
 class Bindings:
@@ -47,15 +47,15 @@ class Bindings:
 
     Args:
         model: A ``mujoco.MjModel``.
-        parameters: What each parameter sets, by its name.
+        parameters: The target of each parameter, by its name.
         derived: Fields that are functions of the parameters, by the field's name.
 
     Attributes:
-        parameters: The parameters with units and the file's values as nominal ones.
-        arrays: Names of the model's arrays that anything is written to.
+        parameters: The parameters with their units; nominal values are those of the file.
+        arrays: Names of the model's arrays that the bindings change.
 
     Raises:
-        ModelError: A field does not exist, or a binding makes no sense.
+        ModelError: A field does not exist, or a binding is invalid.
     """
 
     def __init__(
@@ -87,12 +87,12 @@ class Bindings:
 
     @property
     def arrays(self) -> set[str]:
-        """Names of the model's arrays that anything is written to."""
+        """Names of the model's arrays that the bindings change."""
         groups = (*self._set.values(), *self._scaled.values(), tuple(self._derived))
         return {entry.array for fields in groups for field in fields for entry in field.entries}
 
     def names_setting(self, arrays: set[str]) -> set[str]:
-        """Returns the parameters that set a number of one of these arrays by themselves."""
+        """Returns the parameters that set a number in one of these arrays directly."""
         return {
             name
             for name, fields in {**self._set, **self._scaled}.items()
@@ -102,22 +102,22 @@ class Bindings:
     def assignments(
         self, given: Mapping[str, Tensor], parameters: Mapping[str, Tensor]
     ) -> Assignments:
-        """Returns what to write into the model.
+        """Returns the values to write into the model.
 
         Args:
-            given: Parameters that were given values, ``(N,)`` or numbers.
+            given: Values of the given parameters, ``(N,)`` or numbers.
             parameters: All parameters, nominal where not given.
 
         Raises:
-            ModelError: A derivation asks for a parameter that does not exist.
-            ShapeError: It returned something of another shape.
+            ModelError: A derivation uses a parameter that does not exist.
+            ShapeError: A derivation returned a value of the wrong shape.
         """
         result: Assignments = {}
         nominal = {parameter.name: parameter.nominal for parameter in self.parameters}
         for name, value in given.items():
             for field in self._set.get(name, ()):
                 for entry in field.entries:
-                    # The file's own number for the nominal value, which rounding might miss.
+                    # The nominal value gives exactly the file's number, without rounding errors.
                     result[entry.array, entry.place] = torch.where(
                         value == nominal[name], entry.nominal, value * entry.factor
                     )
@@ -143,7 +143,7 @@ class Bindings:
         return result
 
     def _check_targets(self) -> None:
-        """Raises a ModelError where two things set the same number."""
+        """Raises a ModelError if two bindings set the same number."""
         owners: dict[tuple[str, int], str] = {}
         groups = [
             *((name, fields) for name, fields in {**self._set, **self._scaled}.items()),

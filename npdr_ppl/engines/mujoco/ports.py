@@ -1,4 +1,4 @@
-"""Ports of a MuJoCo model, rated by what its actuators, masses and ranges allow."""
+"""Ports of a MuJoCo model; their ratings follow from its actuators, masses and ranges."""
 
 import importlib
 import math
@@ -18,13 +18,13 @@ Array = NDArray[np.float64]
 
 
 class ForcePort:
-    """A hinge or slide as a place where forces act.
+    """A hinge or slide on which forces of effects act.
 
     Attributes:
-        port: The port, rated.
+        port: The port with its ratings.
         joint: Number of the joint.
-        position: Its place in qpos.
-        velocity: Its place in qvel.
+        position: Its index in qpos.
+        velocity: Its index in qvel.
     """
 
     def __init__(self, port: Port, joint: int, position: int, velocity: int) -> None:
@@ -37,11 +37,12 @@ class ForcePort:
 def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
     """Returns the force ports of all hinges and slides.
 
-    A port is called like its joint, or ``<joint>_torque`` (``_force`` for slides) where a channel
-    has that name. It is rated by the greatest force of the actuators at the joint, or else by the
-    weight that the joint carries in the file's pose; the rated speed is what the rated force would
-    give the joint over a radian (half the range, or a metre), less where damping ends it sooner.
-    A joint is driven if an actuator moves it in the file's pose, through tendons and sites too.
+    A port has the name of its joint, or ``<joint>_torque`` (``_force`` for slides) if a channel
+    has that name. The rated force is the greatest force of the actuators at the joint; without
+    actuators, it is the weight that the joint carries in the file's pose. The rated speed is the
+    speed that the rated force would give the joint over a radian (half the range, or a metre), or
+    less if damping limits it. A joint is driven if an actuator moves it in the file's pose, also
+    through tendons and sites.
 
     Args:
         model: A ``mujoco.MjModel``.
@@ -69,7 +70,7 @@ def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
             speed = min(speed, rated / damping)
         if name in taken:
             name = f"{name}_{'force' if is_slide else 'torque'}"
-        if name in taken:  # by an actuator of that name, which is a port as well
+        if name in taken:  # for example by an actuator, which is a port as well
             name = f"{name}_at_joint"
         units = joint_units(model, joint)
         port = Port(
@@ -150,7 +151,7 @@ def driven_dofs(model: Any) -> NDArray[np.bool_]:
 
 
 def _actuator_ratings(model: Any) -> dict[int, float]:
-    """Returns the greatest summed force of the actuators at each joint that has some."""
+    """Returns the greatest total actuator force at each joint that has actuators."""
     ratings: dict[int, float] = {}
     for actuator in range(model.nu):
         joint = actuated_joint(model, actuator)
@@ -169,7 +170,7 @@ def _actuator_ratings(model: Any) -> dict[int, float]:
 
 
 def _weight(model: Any, data: Any, joint: int, is_slide: bool) -> float:
-    """Returns the force that the subtree's weight could at most put on a joint."""
+    """Returns the greatest force that the weight of the subtree can exert on a joint."""
     body = int(model.jnt_bodyid[joint])
     weight = float(model.body_subtreemass[body] * np.linalg.norm(model.opt.gravity))
     if is_slide:

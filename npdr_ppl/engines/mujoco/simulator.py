@@ -19,9 +19,9 @@ from npdr_ppl.language.linear_dynamics import InverseDynamics
 __all__ = ["MujocoSimulator"]
 
 _FINER = 2
-"""Engine steps of :meth:`MujocoSimulator.with_finer_steps`, of order four, for each of the
-simulator's own. Forces of effects are constant over an engine step whatever its order, so only
-shorter ones bring those closer to the truth."""
+"""Engine steps of :meth:`MujocoSimulator.with_finer_steps`, of order four, per engine step of the
+simulator itself. Forces of effects are constant over an engine step of any order, so only shorter
+steps make them more accurate."""
 
 
 class MujocoSimulator(MujocoMechanism):
@@ -30,38 +30,38 @@ class MujocoSimulator(MujocoMechanism):
     States are by default the position and the velocity of every hinge and slide, ``elbow`` and
     ``elbow_velocity``; see :func:`~npdr_ppl.engines.mujoco.channels.state_components` for other
     joints. Actions are the actuators with their control ranges, in the file's order. Forces of
-    effects are constant over an engine step; dry friction is the engine's own friction loss, the
-    set-valued law solved with all other constraints, made as hard as the engine admits where the
-    file has none of its own. A simulation that diverges is NaN from there on.
+    effects are constant over an engine step. Dry friction is the engine's own friction loss, the
+    set-valued law solved with all other constraints. If the file has no friction loss, it is made
+    as hard as the engine allows. A simulation that diverges is NaN from then on.
 
     Args:
         source: Path of an MJCF file, or a ``mujoco.MjModel``, which is not changed.
-        parameters: What each domain parameter sets, by its name: a field such as
-            ``"body hand mass"``, several fields of one value, a
+        parameters: The target of each domain parameter, by its name: a field such as
+            ``"body hand mass"``, several fields of equal value, a
             :class:`~npdr_ppl.engines.mujoco.parameters.Scale`, or a
             :class:`~npdr_ppl.language.channels.Parameter` that sets nothing by itself.
         derived: Fields that are functions of all parameters, by the field's name.
-        states: Names of the states to keep, or new names mapped to the default ones. Components
-            that are left out start where the file, or ``keyframe``, has them.
+        states: Names of the states to keep, or new names mapped to the default ones. Other
+            components have the initial values of the file, or of ``keyframe``.
         sensors: Names of states or of the file's sensor elements to report, or new names mapped
-            to those; ``None`` for the states. Sensors of accelerations and forces report what
-            acted during the last engine step.
-        units: Units of channels where the file does not tell them, by channel.
+            to those; ``None`` for the states. Sensors of accelerations and forces report the
+            values of the last engine step.
+        units: Units of channels that the file does not specify, by channel.
         bounds: Least and greatest values of states, by channel; episodes end beyond them.
-        time_step: Seconds per step; ``None`` for ``substeps`` times the file's.
-        substeps: Engine steps per step; ``None`` for as many as the file's time step suggests.
+        time_step: Seconds per step; ``None`` for ``substeps`` times the file's time step.
+        substeps: Engine steps per step; ``None`` to compute it from the file's time step.
         num_threads: Threads; ``None`` for as many as torch uses.
-        keyframe: The file's keyframe that holds the pose of components that are no states.
+        keyframe: The file's keyframe with the pose of components that are not states.
 
     Attributes:
         model: The ``mujoco.MjModel``.
-        components: Where each state is kept.
-        readings: Where each sensor's value is kept.
+        components: Where MuJoCo stores each state.
+        readings: Where MuJoCo stores each sensor's value.
         force_ports: The force ports with the coordinates they act on.
 
     Raises:
-        ModelError: The file is not MJCF, or a name in it does not exist; the message names the
-            nearest.
+        ModelError: The file is not MJCF, or it does not contain a given name; the message suggests
+            the nearest name.
 
     Example:
         >>> MujocoSimulator("models/furuta.xml", {"payload": "body pole mass"}).parameters
@@ -70,11 +70,11 @@ class MujocoSimulator(MujocoMechanism):
 
     @cached_property
     def inverse_dynamics(self) -> InverseDynamics | None:
-        """The inverse dynamics as a linear form, or ``None`` where there is none."""
+        """The inverse dynamics in linear form, or ``None`` if the model has no such form."""
         return bound_inverse_dynamics(self)
 
     def with_finer_steps(self) -> Self | None:
-        """Returns a copy with twice the engine steps, of order four; ``None`` if it is one."""
+        """Returns a copy with twice the engine steps, of order four; ``None`` for such a copy."""
         if self.refinement > 1:
             return None
         mujoco: Any = importlib.import_module("mujoco")
@@ -91,6 +91,6 @@ class MujocoSimulator(MujocoMechanism):
     def run_episodes(self, request: EpisodeRequest) -> Episodes:
         """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`.
 
-        The arguments for compilation change nothing: the engine is compiled.
+        The arguments for compilation have no effect, because the engine is compiled already.
         """
         return roll_out(self, request)

@@ -1,4 +1,4 @@
-"""A batch of MuJoCo simulations, one control step at a time, with effects."""
+"""Advances a batch of MuJoCo simulations with effects, one control step at a time."""
 
 import importlib
 from collections.abc import Sequence
@@ -22,22 +22,22 @@ ACCELERATION_STAGE = 3
 
 
 class MujocoStepper(EffectChain):
-    """Advances a batch that holds the physical state itself.
+    """Advances a batch whose engine stores the physical state.
 
-    Forces of effects are generalised forces, constant over an engine step and evaluated at its
-    start; dry friction is the engine's own friction loss, whose bound is rewritten before every
+    Forces of effects are generalised forces, evaluated at the start of an engine step and constant
+    during it. Dry friction is the engine's own friction loss; its bound is updated before every
     engine step.
 
     Args:
         simulator: The system and its effects.
-        batch: A ``mujoco.batch.Batch`` of N simulations, or ``None`` where only commands and
-            readings are to pass through effects.
+        batch: A ``mujoco.batch.Batch`` of N simulations, or ``None`` if only commands and
+            measurements pass through effects.
         time_step: Seconds per control step.
-        histories: Past commands that each action effect may ask for, then past values of each
-            sensor effect.
+        histories: Number of past commands that each action effect may need, then of past values
+            that each sensor effect may need.
 
     Attributes:
-        is_lost: Simulations that the engine warned of, ``(N,)``; they report NaN.
+        is_lost: Simulations about which the engine warned, ``(N,)``; they report NaN.
     """
 
     def __init__(
@@ -57,12 +57,12 @@ class MujocoStepper(EffectChain):
         self._ctrl = state_view(batch, "ctrl")
         stages = {s.stage for s in simulator.readings if isinstance(s, Reading)}
         self._sensordata = batch.bind("sensordata") if stages else None
-        # Position and velocity sensors lag an engine step behind the state until they are asked
-        # for anew; sensors of accelerations report what acted during the last engine step.
+        # Position and velocity sensors are one engine step behind the state until they are
+        # computed again. Acceleration sensors report the values of the last engine step.
         self._stage = max(stages - {ACCELERATION_STAGE}, default=0)
         self._has_accelerations = ACCELERATION_STAGE in stages
         self._applied = state_view(batch, "qfrc_applied") if self.force_effects else None
-        # The bounds of dry friction that the engine reads, and what they were without effects.
+        # The bounds of dry friction that the engine reads, and the bounds without effects.
         self._friction: tuple[np.ndarray, np.ndarray] | None = None
         self._joints = JointStates(batch, simulator.force_ports) if self.needs_joints else None
         self.is_lost = torch.zeros(batch.nsim, dtype=torch.bool)
@@ -74,15 +74,15 @@ class MujocoStepper(EffectChain):
 
     @property
     def num_positions(self) -> int:
-        """How many of the simulator's states are positions."""
+        """Number of the simulator's states that are positions."""
         return sum(not component.is_velocity for component in self.simulator.components)
 
     def place(self, components: tuple[Tensor, ...]) -> None:
-        """Puts the simulations into states, ``(N,)`` per component of the simulator's state."""
+        """Sets the simulations' states, ``(N,)`` per component of the simulator's state."""
         place_states(self.simulator, self._batch, components)
 
     def begin(self) -> None:
-        """Computes what the sensors report before the first step."""
+        """Computes the sensor values before the first step."""
         if self._sensordata is None:
             return
         stages: Any = importlib.import_module("mujoco").mjtStage
@@ -106,8 +106,8 @@ class MujocoStepper(EffectChain):
         return rates
 
     def _look(self, stage: int) -> None:
-        """Computes forward stages in the present state, which stays as it is."""
-        # The solver's first guess belongs to the state; a look must not change what follows.
+        """Computes forward stages in the present state without changing it."""
+        # The solver's first guess is part of the state and must not change here either.
         guess = state_view(self._batch, "warmstart")
         kept = guess.copy()
         self._guarded(self._batch.forward, stage=int(stage))
@@ -154,7 +154,7 @@ class MujocoStepper(EffectChain):
 
         Args:
             state: State at its start.
-            actions: What reaches the dynamics in each engine step, or in all of them.
+            actions: Actions after all effects, for each engine step or one for all of them.
             tables: Constants of the simulation.
         """
         if len(actions) == 1 and not self.force_effects:
@@ -185,9 +185,9 @@ class MujocoStepper(EffectChain):
         return state._replace(force_memory=memory)
 
     def _apply(self, state: State, tables: Tables, *, before_step: bool = False) -> None:
-        """Hands the effects' forces to the engine; see :meth:`applied_forces`.
+        """Passes the effects' forces to the engine; see :meth:`applied_forces`.
 
-        Before a step has begun without their dry friction.
+        With ``before_step``, their dry friction is left out.
         """
         assert self._applied is not None
         ports = self.simulator.force_ports
@@ -195,7 +195,7 @@ class MujocoStepper(EffectChain):
             state.positions, state.velocities, state, tables, before_step=before_step
         )
         if before_step:
-            # What effects that have to see their joint first exerted in the step before.
+            # Removes the previous step's forces of effects that need their joint's state first.
             self._applied[:] = 0.0
         for port, force in zip(ports, forces, strict=True):
             if force is not None:
@@ -231,7 +231,7 @@ class MujocoStepper(EffectChain):
 
 
 def place_states(simulator: MujocoMechanism, batch: Any, components: tuple[Tensor, ...]) -> None:
-    """Puts a batch into states; components that are no states of the simulator's stay put.
+    """Sets the states of a batch; other components get the simulator's initial positions.
 
     Args:
         simulator: The simulator.
@@ -246,7 +246,7 @@ def place_states(simulator: MujocoMechanism, batch: Any, components: tuple[Tenso
 
 
 def lost_simulations(batch: Any) -> np.ndarray:
-    """Returns which simulations the engine has warned of, ``(N,)``."""
+    """Returns about which simulations the engine has warned, ``(N,)``."""
     return np.asarray(np.asarray(batch.warning)[..., 1].any(axis=1))
 
 

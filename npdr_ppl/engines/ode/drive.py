@@ -1,4 +1,4 @@
-"""What moves a joint: its inertia as a force sees it, and the force that the actions exert."""
+"""The inertia of a joint with respect to a force on it, and the force that actions exert."""
 
 from typing import Any
 
@@ -19,16 +19,16 @@ def inverse_inertia(
     constants: Any,
     accelerations: Components,
 ) -> tuple[Components, ...]:
-    """Returns the rows of W = ∂a/∂f, as declared, or else probed with unit forces.
+    """Returns the rows of W = ∂a/∂f, as declared, or else computed with unit forces.
 
     Args:
         simulator: The system.
         positions: Generalised positions q.
         velocities: Generalised velocities.
-        actions: What reaches the dynamics.
+        actions: Actions after all effects.
         forces: Generalised forces of effects.
         constants: The system's constants.
-        accelerations: Accelerations under all these.
+        accelerations: Accelerations in this state, under these actions and forces.
     """
     declared = simulator.inverse_inertia(positions, velocities, constants)
     if declared:
@@ -57,10 +57,10 @@ def drive_forces(
         simulator: The system.
         positions: Generalised positions q.
         velocities: Generalised velocities.
-        actions: What reaches the dynamics.
+        actions: Actions after all effects.
         forces: Generalised forces of effects.
         constants: The system's constants.
-        accelerations: Accelerations under all these.
+        accelerations: Accelerations in this state, under these actions and forces.
         inertia: Rows of W.
     """
     still = tuple(torch.zeros_like(action) for action in actions)

@@ -1,20 +1,21 @@
-"""Dry friction as the set-valued law it is, solved within a step instead of smoothed.
+"""Dry friction as a set-valued law, solved within a step instead of smoothed.
 
 Over a step of h seconds the accelerations are affine in the generalised forces, a = a₀ + W f with
-the inverse inertia W. Coulomb's law asks for the force f_i within ±F_i that brings the joint to
-rest by the end of the step, or for ±F_i against the motion if it cannot:
+the inverse inertia W. By Coulomb's law, f_i is the force within ±F_i that brings the joint to rest
+by the end of the step, or ±F_i against the motion if no such force does:
 
     f minimises  ½ h fᵀ W f + (v + h a₀)ᵀ f   subject to |f_i| ≤ F_i.
 
-At rest this is stiction; in motion it is ∓F_i; there is no chatter, and the solution is a
-composition of clips, so gradients exist almost everywhere. F = 0 gives f = 0 exactly. That is good
-to first order, which does for integrators of that order.
+At rest this is stiction; in motion it is ∓F_i. There is no chatter. The solution is a composition
+of clips, so gradients exist almost everywhere. F = 0 gives f = 0 exactly. This method has first
+order, which is enough for integrators of first order.
 
-In truth a joint that comes to rest does so within the step and not at its end. Friction is against
-its motion until then; afterwards it holds the joint, or it breaks away under what exceeds F_i. The
-mean over the step, and the way that the joint is short of what that mean would make it go, are
-exact under constant accelerations, so that a reversal costs no accuracy. Bounds that depend on
-velocity are taken halfway through each of both phases.
+In reality, a joint comes to rest within the step and not at its end. Until then, friction is
+against its motion. Afterwards friction holds the joint, or the joint breaks away if the other
+forces exceed F_i. Two quantities are computed: the mean friction over the step, and the correction
+of the position, because the joint moves less far than under the mean friction. Both are exact
+under constant accelerations, so a reversal costs no accuracy. Bounds that depend on velocity are
+evaluated at the middle of each of the two phases.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,18 +28,18 @@ from npdr_ppl.engines.common.integrators import Components
 
 __all__ = ["DryFriction", "dry_friction_over_step", "solve_dry_friction", "stopping_friction"]
 
-# Projected Gauss–Seidel for more than two joints. The strongest coupling of the zoo, the Furuta
-# pendulum's, contracts errors by 0.56 per sweep, so 20 sweeps leave 1e-5 of them.
+# Sweeps of projected Gauss–Seidel for more than two joints. With the strongest coupling among the
+# included models, the Furuta pendulum's, a sweep reduces errors by 0.56, and 20 sweeps by 1e-5.
 _NUM_SWEEPS = 20
 
 
 class DryFriction(NamedTuple):
-    """Dry friction over one step; ``None`` at joints without.
+    """Dry friction over one step; ``None`` at joints without dry friction.
 
     Attributes:
-        forces: Means over the step.
+        forces: Mean forces over the step.
         is_held: Whether friction has brought the joint to rest by the step's end.
-        shortfalls: What is to be added to the positions.
+        shortfalls: Corrections to add to the positions.
     """
 
     forces: tuple[Tensor | None, ...]
@@ -55,7 +56,7 @@ def stopping_friction(
 ) -> DryFriction:
     """Returns dry friction that is constant over a step and stops joints at its end.
 
-    Good to first order, at less than half the price of :func:`dry_friction_over_step`. For the
+    It has first order and takes less than half the time of :func:`dry_friction_over_step`. For the
     arguments see :func:`solve_dry_friction`.
     """
     solved = solve_dry_friction(bounds, velocities, accelerations, inverse_inertia, step)
@@ -75,12 +76,12 @@ def dry_friction_over_step(
     inverse_inertia: tuple[Components, ...],
     step: float,
 ) -> DryFriction:
-    """Returns the dry friction at each joint over a step, reversals included.
+    """Returns the dry friction at each joint over a step in which joints may reverse.
 
     Args:
         limits: Greatest magnitude F_i per joint at the step's start, in its force unit; ``None``
             without friction.
-        bounds_at: Returns the same at other velocities.
+        bounds_at: Function that returns these limits at other velocities.
         velocities: Velocities v at the step's start.
         accelerations: Accelerations a₀ without dry friction at the step's start.
         inverse_inertia: Rows of W, the acceleration of joint i per unit force at joint j.
@@ -93,7 +94,7 @@ def dry_friction_over_step(
 
     first = {i: bound for i, bound in enumerate(limits) if bound is not None}
     resting = bounds({i: torch.zeros_like(velocities[i]) for i in first})
-    # What is the same tensor at rest does not depend on the velocity.
+    # If a bound is the same tensor object at rest, it does not depend on the velocity.
     varies = any(resting[i] is not first[i] for i in first)
     w = {i: inverse_inertia[i][i] for i in first}
     free = _free_accelerations(first, velocities, accelerations, inverse_inertia, step)
@@ -130,7 +131,7 @@ def dry_friction_over_step(
 
 
 def _under(acceleration: Tensor, inverse_inertia: Tensor, friction: Tensor) -> Tensor:
-    """Returns an acceleration under friction against it."""
+    """Returns an acceleration minus the deceleration due to friction."""
     return torch.addcmul(acceleration, inverse_inertia, friction, value=-1.0)
 
 
@@ -141,9 +142,10 @@ def _free_accelerations(
     inverse_inertia: tuple[Components, ...],
     step: float,
 ) -> dict[int, Tensor]:
-    """Returns the accelerations without a joint's own friction, with that of the others.
+    """Returns each joint's acceleration without its own friction, with that of the other joints.
 
-    Theirs is as if it stopped them at the step's end: that they stop in the same step is rare.
+    The other joints' friction is computed as if they stopped at the end of the step. Two joints
+    rarely stop in the same step.
     """
     if len(bounds) == 1:
         return {i: accelerations[i] for i in bounds}
@@ -156,16 +158,18 @@ def _free_accelerations(
 
 
 def _time_to_rest(velocity: Tensor, acceleration: Tensor, bound: Tensor, step: float) -> Tensor:
-    """Returns when friction has a joint at rest; the whole step if not in it, or if there is none.
+    """Returns the time after which a joint is at rest, in seconds.
+
+    It is the whole step if the joint does not stop within it or has no friction.
 
     Args:
         velocity: Velocity at the step's start.
-        acceleration: Acceleration under the friction of sliding.
+        acceleration: Acceleration under sliding friction.
         bound: Greatest magnitude of that friction.
-        step: Length of the step.
+        step: Length of the step, in seconds.
     """
     if acceleration.requires_grad:
-        # Infinity times no gradient is none.
+        # Avoids the gradient infinity times zero, which is NaN.
         acceleration = torch.where(acceleration == 0.0, 1.0, acceleration)
     time = -velocity / acceleration
     return torch.where((time >= 0.0) & (bound > 0.0), time, step).clamp_max(step)
@@ -193,7 +197,7 @@ def solve_dry_friction(
     limits = {i: bound for i, bound in enumerate(bounds) if bound is not None}
     joints = list(limits)
     forces: list[Tensor | float] = [0.0] * len(bounds)
-    # v + h a₀ + h W f = 0 at rest; divided by h, so that no step length appears below.
+    # At rest v + h a₀ + h W f = 0. It is divided by h, so h does not appear below.
     free = {i: velocities[i] / step + accelerations[i] for i in joints}
     w = inverse_inertia
     if len(joints) == 1:
@@ -222,9 +226,9 @@ def _solve_pair(
 ) -> tuple[Tensor, Tensor]:
     """Solves two coupled joints exactly.
 
-    Eliminating f_i leaves one increasing, piecewise linear condition on f_j with three pieces:
-    f_i at its lower bound, inside, at its upper bound. It is the median of three increasing lines,
-    and the root of a median is the median of the roots.
+    Eliminating f_i leaves one increasing, piecewise linear condition on f_j. It has three pieces:
+    f_i at its lower bound, between the bounds, and at its upper bound. The condition is the median
+    of three increasing lines, and the root of a median is the median of the roots.
     """
     wii, wij, wjj = w[i][i], w[i][j], w[j][j]
     coupling = wij.abs() * limits[i]

@@ -1,4 +1,4 @@
-"""A mechanical system whose accelerations are written in torch: what its model author declares."""
+"""Base class of mechanical systems whose authors write the accelerations in torch."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -28,14 +28,14 @@ class MechanicalSystem(ClosedLoopSimulator):
     state is the positions, then the velocities, in the order of ``joints``; every velocity names
     its position in ``rate_of``.
 
-    Computations run in the widest floating type among the given parameters and the inputs'
-    actions, on the actions' device.
+    Computations use the widest floating type among the given parameters and the inputs' actions,
+    on the device of the actions.
 
     Args:
         integrator: Name of the integration method; ``None`` for the model's default.
         substeps: Integration steps per time step.
-        compile: Whether to compile the time loop: ``auto`` where a compiler exists and one call
-            is large enough to pay back some ten seconds of compilation.
+        compile: Whether to compile the time loop. ``auto`` compiles if there is a compiler and
+            one call is large enough to save the about ten seconds that compilation takes.
 
     Attributes:
         joints: Names of the force ports, one per generalised coordinate.
@@ -77,38 +77,38 @@ class MechanicalSystem(ClosedLoopSimulator):
             positions: Generalised positions, one tensor per joint.
             velocities: Their rates.
             actions: Commands, limited to their channels' bounds and changed by action effects.
-            forces: Generalised forces of attached effects, to be added to the joints' own.
-            constants: What :meth:`constants` returned.
+            forces: Generalised forces of attached effects, to add to the joints' own forces.
+            constants: The result of :meth:`constants`.
         """
 
     def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Returns the quantities that environment ports stand for, by port name."""
+        """Returns the quantities of the environment ports, by port name."""
         return {}
 
     def constants(self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]) -> Any:
-        """Returns what :meth:`accelerations` needs, computed once per simulation.
+        """Returns the constants for :meth:`accelerations`, computed once per simulation.
 
-        Any nesting of tuples and dictionaries of tensors. By default the parameters by name,
-        overlaid by the environment's quantities.
+        Tuples and dictionaries of tensors may be nested. The default is a dictionary of the
+        parameters by name, in which the environment's quantities replace equal names.
         """
         return {**parameters, **environment}
 
     def inverse_inertia(
         self, positions: Components, velocities: Components, constants: Any
     ) -> tuple[Components, ...] | None:
-        """Returns the rows of W = ∂a/∂f, or ``None`` to have it probed with unit forces."""
+        """Returns the rows of W = ∂a/∂f, or ``None`` to compute it with unit forces."""
         return None
 
     def readings(
         self, positions: Components, velocities: Components, constants: Any
     ) -> Components:
-        """Returns the true value of every sensor channel; by default the states of that name."""
+        """Returns the true value of every sensor channel; by default the state of that name."""
         values = dict(zip((s.name for s in self.states), (*positions, *velocities), strict=True))
         return tuple(values[sensor.name] for sensor in self.sensors)
 
     @property
     def rate_lag(self) -> float:
-        """Part of a time step between the state's rates and the derivatives of its positions."""
+        """Time shift between velocities and derivatives of positions, as a fraction of a step."""
         return self.integrator.rate_lag / self.substeps
 
     def common_dtype(self, parameters: Mapping[str, Tensor], other: Tensor) -> torch.dtype:
@@ -130,10 +130,10 @@ class MechanicalSystem(ClosedLoopSimulator):
         """Returns the constants of a simulation, flat, and the lengths of effects' histories.
 
         Args:
-            parameters: What :meth:`complete` returned, each broadcasting to ``shape``.
+            parameters: The result of :meth:`complete`, each broadcasting to ``shape``.
             shape: Shape of the batch, of numel N.
             time_step: Seconds per step.
-            expand: Whether to expand what does not vary; see :func:`flatten`.
+            expand: Whether to expand constant values, too; see :func:`flatten`.
         """
         effects = tuple(effect.own_parameters(parameters) for effect in self.effects)
         environment = self.environment(parameters)
@@ -147,5 +147,5 @@ class MechanicalSystem(ClosedLoopSimulator):
 
 
 def _integrator(name: str) -> Integrator:
-    """Returns the integrator called ``name``, out of reach of the argument of that name."""
+    """Returns the integrator called ``name``; the argument ``integrator`` hides the function."""
     return integrator(name)

@@ -1,4 +1,4 @@
-"""Episodes of batches of policies in batches of domains."""
+"""Closed-loop episodes of batches of policies in batches of simulated domains."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Open loop: recorded commands replayed from the segments' initial states."""
+"""Open loop: recorded commands are replayed from the initial states of the segments."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -41,7 +41,7 @@ def replay(
         inputs.batch_shape, *(value.shape for value in domain.values())
     )
     shape = torch.Size((*batch_shape, inputs.num_segments))
-    # Behind the batch, an axis for the segments.
+    # The axis of the segments follows the axes of the batch.
     domain = {name: value[..., None] for name, value in domain.items()}
     begin = inputs.start.to(device=device, dtype=dtype) * inputs.time_step
     domain = simulator.changed(domain, begin + 0.5 * inputs.num_steps * inputs.time_step)
@@ -66,7 +66,7 @@ def _replay(
     dtype: torch.dtype,
     is_compiled: bool,
 ) -> Tensor:
-    """Returns all trajectories, ``shape + (steps, sensors)``, padded steps included."""
+    """Returns all trajectories, ``shape + (steps, sensors)``, including padded steps."""
     tables, histories = simulator.tables(domain, shape, inputs.time_step, expand=is_compiled)
     body = _Body(Stepper(simulator, inputs.time_step, histories))
     columns = {name: i for i, name in enumerate(inputs.action_names)}
@@ -88,14 +88,14 @@ def _replay(
         return state
 
     if not is_compiled:
-        # Without the bookkeeping for gradients that nobody asks for a step costs a seventh less.
+        # If no gradients are needed, not recording them saves a seventh of the time of a step.
         with torch.inference_mode(not has_gradient):
             run_eagerly(_start(body, tables, inputs, records, shape), 0, inputs.num_steps)
         return _joined(readings, shape, inputs.num_steps)
     state = _start(body, tables, inputs, records, shape)
     at_once = steps_per_call(num_steps=inputs.num_steps, batch_size=shape.numel())
-    # The first state would need its own kernel: in later ones a filter's memory is the last
-    # reading, the same tensor, and they carry gradients where there are any.
+    # The first state would need its own kernel. In later states, a filter's memory is the same
+    # tensor as the last measurement, and tensors may have gradients.
     first = min(at_once, inputs.num_steps)
     last = inputs.num_steps - (inputs.num_steps - first) % at_once
     state = run_eagerly(state, 0, first)
@@ -105,7 +105,7 @@ def _replay(
 
 
 def _joined(readings: list[Tensor], shape: torch.Size, num_steps: int) -> Tensor:
-    """Returns readings of one step and sensor after the other, ``shape + (steps, sensors)``."""
+    """Stacks measurements listed by step, then sensor, into ``shape + (steps, sensors)``."""
     return torch.stack(readings, dim=-1).reshape(*shape, num_steps, -1)
 
 
@@ -114,7 +114,7 @@ _View = tuple[Tensor, Tensor, Tensor | int, Tensor | int]
 
 
 class _Body:
-    """The loop's body; everything in it is fixed before the first step."""
+    """The loop's body, which does not change after the first step."""
 
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
@@ -158,7 +158,7 @@ def _run_compiled(
     steps: range,
     readings: list[Tensor],
 ) -> State:
-    """Runs steps with the compiled body, ``steps.step`` at a time, and appends their readings."""
+    """Runs the compiled body, ``steps.step`` steps per call, and appends the measurements."""
     position = state.positions[0]
     key = "replay", body.stepper.signature, position.dtype, position.device.type
     run = compiled(key, body.run)
@@ -169,7 +169,8 @@ def _run_compiled(
             tuple(record.at(k).contiguous() for record in records)
             for k in range(step, step + steps.step)
         )
-        # As tensors, because numbers would be compiled in. Without action effects nobody looks.
+        # Tensors, because numbers would become constants of the compiled code. They are needed
+        # for action effects only.
         views = tuple(
             (table, rows, torch.as_tensor(time), torch.as_tensor(stride))
             for table, rows, time, stride in _views(records, step)
@@ -188,7 +189,7 @@ def _start(
     records: tuple[CommandRecord, ...],
     shape: torch.Size,
 ) -> State:
-    """Returns the state at the segments' start, effects' memory included."""
+    """Returns the state at the start of the segments, including the effects' memory."""
     stepper = body.stepper
     simulator = stepper.simulator
     recorded = recorded_start(simulator, inputs, shape)

@@ -25,8 +25,8 @@ class Stepper(EffectChain):
     Args:
         simulator: The system and its effects.
         time_step: Seconds per step.
-        histories: Past commands that each action effect may ask for, then past values of each
-            sensor effect.
+        histories: Number of past commands that each action effect may need, then of past values
+            that each sensor effect may need.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class Stepper(EffectChain):
         super().__init__(simulator, simulator.joints, time_step, histories)
         self.simulator: MechanicalSystem = simulator
         self._substep = time_step / simulator.substeps
-        # Of the first order, positions are no better than that anyway.
+        # With a first-order integrator, moments would not make the positions more accurate.
         self._takes_moments = simulator.integrator.order > 1
 
     @property
@@ -85,7 +85,7 @@ class Stepper(EffectChain):
         is_uneven = any(moment is not None for moment in (*moments, *within))
         shifts: Components | None = None
         if self._takes_moments and is_uneven:
-            # Positions move by ∫ (h − t) a dt, of which the integrator sees ½ h² times the mean.
+            # Positions change by ∫ (h − t) a dt; the integrator uses ½ h² times the mean of a.
             late = simulator.accelerations(
                 *start, _shifted(actions, moments), _shifted(forces, within), constants
             )
@@ -104,10 +104,10 @@ class Stepper(EffectChain):
             else:
                 friction = dry_friction_over_step(bounds, bounds_at, *given)
             dry = tuple(0.0 if force is None else force for force in friction.forces)
-            # Accelerations are affine in the forces, so the first evaluation is not repeated.
+            # Accelerations are affine in the forces, so the first evaluation can be corrected.
             for joint, force in enumerate(friction.forces):
                 if force is not None:
-                    # Not fused, lest what friction holds creep by what that would round otherwise.
+                    # A fused operation rounds differently and would let a held joint creep.
                     first = tuple(
                         a + row[joint] * force for a, row in zip(first, inertia, strict=True)
                     )
@@ -115,9 +115,9 @@ class Stepper(EffectChain):
         if shifts is not None:
             q = tuple(qi + shift for qi, shift in zip(q, shifts, strict=True))
         if shifts is not None and any(moment is not None for moment in within):
-            # What moved further was faster on the way, and more was damped. Springs' and impacts'
-            # forces move things far within a step; where a command changes, this is below a
-            # hundredth of its delay and not worth another evaluation.
+            # A joint that moved further was faster during the step and was damped more. Forces of
+            # springs and impacts move joints far within a step. For a changing command, this
+            # correction is below a hundredth of its delay, so it is left out.
             h = self._substep
             faster = tuple(
                 vi + shift / h for vi, shift in zip(state.velocities, shifts, strict=True)
@@ -125,7 +125,7 @@ class Stepper(EffectChain):
             damped = simulator.accelerations(state.positions, faster, actions, forces, constants)
             v = tuple(vi + h * (b - a) for vi, a, b in zip(v, even, damped, strict=True))
         if friction is not None:
-            # Rounding must not leave a velocity whose sign then means something to a policy.
+            # A policy may use the sign of a velocity, so rounding errors at rest are set to zero.
             v = tuple(
                 vi if held is None else torch.where(held, 0.0, vi)
                 for vi, held in zip(v, friction.is_held, strict=True)
@@ -138,7 +138,7 @@ class Stepper(EffectChain):
         return state._replace(positions=q, velocities=v, force_memory=memory)
 
     def _joints(self, state: State, actions: Components, tables: Tables) -> tuple[Joint, ...]:
-        """Returns the joints as they are before the effects that ask for them act."""
+        """Returns the joints before the forces of the effects that need them are applied."""
         simulator, constants = self.simulator, tables.constants
         q, v = state.positions, state.velocities
         forces = self._forces(q, v, state, tables, (0.0,) * len(q), before_step=True)
@@ -160,7 +160,7 @@ class Stepper(EffectChain):
         *,
         before_step: bool = False,
     ) -> tuple[Any, ...]:
-        """Returns the smooth forces in a state of the integrator, on top of the dry ones."""
+        """Returns the sum of smooth forces in a state of the integrator and dry friction."""
         if not self.force_effects:
             return dry
         smooth = self.applied_forces(positions, velocities, state, tables, before_step=before_step)
@@ -168,7 +168,7 @@ class Stepper(EffectChain):
 
 
 def _shifted(values: tuple[Any, ...], moments: Moments) -> tuple[Any, ...]:
-    """Returns actions or forces with their moments added; no moments are none of any."""
+    """Returns actions or forces plus their moments; an empty ``moments`` adds nothing."""
     if not moments:
         return values
     return tuple(v if m is None else v + m for v, m in zip(values, moments, strict=True))

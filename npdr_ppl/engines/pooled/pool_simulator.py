@@ -1,4 +1,4 @@
-"""Simulators whose engine runs one simulation at a time, spread over workers."""
+"""Simulators whose engine runs one simulation at a time, distributed over workers."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -22,14 +22,14 @@ __all__ = ["PooledSimulator", "Segment"]
 
 @dataclass(frozen=True)
 class Segment:
-    """What one simulation is told.
+    """Inputs of one simulation.
 
     Attributes:
         initial_state: True state at the start, ``(states,)``, in the states' units.
-        actions: What reaches the dynamics during each step, ``(steps, actions)``: limited
-            commands, changed by action effects.
+        actions: Actions that act during each step, ``(steps, actions)``: limited commands after
+            all action effects.
         time_step: Seconds per step.
-        start_time: Seconds from the rollout's beginning to the segment's start.
+        start_time: Seconds from the start of the rollout to the start of the segment.
     """
 
     initial_state: np.ndarray
@@ -39,22 +39,23 @@ class Segment:
 
 
 class PooledSimulator(Simulator):
-    """A simulator that is given one segment and one set of parameters at a time.
+    """A simulator that receives one segment and one set of parameters at a time.
 
-    A subclass declares channels, parameters and ports, and writes :meth:`simulate_one`. The whole
-    of a batch goes to the workers of the enclosing :func:`npdr_ppl.workers` block, or to one
-    worker per core. A simulation that crashes, hangs, raises an error or returns NaN is run once
-    more; one that is lost for good has NaN for a trajectory.
+    A subclass declares channels, parameters and ports, and writes :meth:`simulate_one`. A batch is
+    run by the workers of the enclosing :func:`npdr_ppl.workers` block, or by one worker per core.
+    A simulation that crashes, hangs, raises an error or returns NaN is run once more. If it fails
+    again, its trajectory is NaN.
 
-    Effects on commands, readings and domain parameters are applied outside of the engine. Those on
-    forces and on the environment are up to :meth:`simulate_one`, which gets their parameters.
+    Effects on commands, measurements and domain parameters are applied outside the engine. Effects
+    on forces and on the environment must be applied by :meth:`simulate_one`, which receives their
+    parameters.
 
-    The simulator travels to workers, so it has to be picklable; connections to an engine belong
-    into :meth:`set_up`.
+    The simulator is sent to workers, so it must be picklable; :meth:`set_up` should open the
+    connections to an engine.
     """
 
     def set_up(self) -> Any:
-        """Returns what the simulations of one process share; see :class:`Task`."""
+        """Returns the object that all simulations of a process share; see :class:`Task`."""
         return None
 
     @abstractmethod
@@ -66,11 +67,11 @@ class PooledSimulator(Simulator):
         The result must not depend on what the process simulated before.
 
         Args:
-            workspace: What :meth:`set_up` returned.
+            workspace: The result of :meth:`set_up`.
             parameters: All parameters of the simulator, and of effects on forces and on the
                 environment, in the declared units.
             segment: The segment.
-            seed: Seed of everything random.
+            seed: Seed of all random numbers.
 
         Returns:
             True values of the sensors' channels after each step, ``(steps, sensors)``.
@@ -87,7 +88,7 @@ class PooledSimulator(Simulator):
         """Returns a copy with effects attached; see :meth:`Simulator.with_effects`.
 
         Raises:
-            ModelError: A sensor effect needs accelerations, which such an engine does not give.
+            ModelError: A sensor effect needs accelerations, which the engine does not provide.
         """
         changed = super().with_effects(*effects)
         for effect in effects:
@@ -100,21 +101,21 @@ class PooledSimulator(Simulator):
 
     @property
     def inner_effects(self) -> tuple[ForceEffect | EnvironmentEffect, ...]:
-        """The attached effects that :meth:`simulate_one` applies."""
+        """The attached effects that :meth:`simulate_one` must apply."""
         return tuple(e for e in self.effects if isinstance(e, ForceEffect | EnvironmentEffect))
 
 
 @dataclass(frozen=True)
 class _OneSimulation:
-    """What differs between the draws of a call.
+    """The data that differ between the draws of a call.
 
     Attributes:
         parameters: Values in the order of the task's names, ``(parameters,)``.
         initial_state: True state at the start, ``(states,)``.
         segment: Row of the task's table of actions.
         start_time: Seconds from the rollout's beginning to the segment's start.
-        num_steps: Steps that exist.
-        actions: The actions themselves, where no two draws share them.
+        num_steps: Number of steps without padding.
+        actions: The actions themselves, if draws do not share them.
     """
 
     parameters: np.ndarray
@@ -166,7 +167,7 @@ class _Simulate(Task):
 def _simulate(
     simulator: PooledSimulator, parameters: Mapping[str, Tensor], inputs: Inputs
 ) -> Tensor:
-    """Returns the readings of all parameters, segments and steps."""
+    """Returns the measurements of all parameters, segments and steps."""
     dtype, device = inputs.actions.dtype, inputs.actions.device
     for value in parameters.values():
         if value.is_floating_point():
@@ -202,7 +203,7 @@ def _task_and_payloads(
     signals: Signals,
     initial_states: Tensor,
 ) -> tuple[_Simulate, list[_OneSimulation]]:
-    """Splits a call into what all simulations share and what each has for itself."""
+    """Splits a call into data that all simulations share and data of each simulation."""
     inner = {name for effect in simulator.inner_effects for name in effect.parameter_names}
     names = tuple(p.name for p in simulator.parameters) + tuple(sorted(inner))
     matrix = torch.stack([domain[name].expand(shape).reshape(-1) for name in names], dim=-1)

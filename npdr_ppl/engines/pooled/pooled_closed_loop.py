@@ -1,4 +1,4 @@
-"""Closed loop on workers: one episode per draw, policy and effects next to the engine."""
+"""Closed loop on workers: one episode per draw; policy and effects run in the worker."""
 
 import copy
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ _ONE = torch.Size((1,))
 
 @dataclass(frozen=True)
 class _OneEpisode:
-    """What differs between the episodes of a call.
+    """The data that differ between the episodes of a call.
 
     Attributes:
         parameters: Values in the order of the task's names, ``(parameters,)``.
@@ -53,8 +53,8 @@ class _RunEpisode(Task):
 
     Attributes:
         simulator: The simulator.
-        names: Names of all parameters, effects' included.
-        request: What is asked for, without what differs between episodes.
+        names: Names of all parameters, including those of effects.
+        request: The request, without the data that differ between episodes.
     """
 
     simulator: SteppableSimulator
@@ -66,7 +66,7 @@ class _RunEpisode(Task):
         return self.simulator.set_up()
 
     def run(self, workspace: Any, draw: Draw) -> np.ndarray:
-        """Returns return and length, then readings and commands where they are recorded."""
+        """Returns return and length, then measurements and commands if they are recorded."""
         with torch.no_grad():
             return self._run(workspace, draw.payload, draw.seed)
 
@@ -108,7 +108,7 @@ class _RunEpisode(Task):
 
 
 def _padded(rows: list[Components], num_rows: int, num_columns: int) -> np.ndarray:
-    """Returns a record of so many rows, flat, zero after the last one."""
+    """Returns a flat record of ``num_rows`` rows, padded with zeros after the given rows."""
     table = np.zeros((num_rows, num_columns))
     for row, values in zip(table, rows, strict=False):
         row[:] = [float(value) for value in values]
@@ -116,15 +116,15 @@ def _padded(rows: list[Components], num_rows: int, num_columns: int) -> np.ndarr
 
 
 class _OneStepper(EffectChain):
-    """Advances one simulation, between the effects on its commands and on its readings.
+    """Advances one simulation and applies the effects on its commands and measurements.
 
-    Those on forces and on the environment are the engine's own matter.
+    The engine applies effects on forces and on the environment.
 
     Args:
         simulator: The system and its effects.
         simulation: The simulation, at its start.
-        segment: Where the simulation finds its actions.
-        parameters: All parameters, numbers.
+        segment: The segment from which the simulation takes its actions.
+        parameters: All parameters, as numbers.
 
     Attributes:
         tables: The effects' parameters.
@@ -141,7 +141,7 @@ class _OneStepper(EffectChain):
         part.effects = tuple(
             e for e in simulator.effects if isinstance(e, ActionEffect | SensorEffect)
         )
-        # Positions first, as rewards are given them.
+        # Positions come first, in the order of a reward's arguments.
         rates = simulator.is_rate
         order = sorted(range(len(rates)), key=lambda column: rates[column])
         part.states = tuple(simulator.states[column] for column in order)
@@ -154,14 +154,14 @@ class _OneStepper(EffectChain):
         self._simulation, self._segment = simulation, segment
         self._step = 0
         values = list(self._read())
-        # What an engine shows of a state that it was just given may be rounded, or of before.
+        # An engine may return a rounded or outdated state directly after the state was set.
         for column, value in zip(self._columns, segment.initial_state[order], strict=True):
             values[column] = torch.full(_ONE, float(value), dtype=torch.float64)
         self._values: Components = tuple(values)
 
     @property
     def num_positions(self) -> int:
-        """How many of the states are positions."""
+        """Number of states that are positions."""
         return sum(not is_rate for is_rate in self.simulator.is_rate)
 
     def states(self) -> Components:
@@ -177,7 +177,7 @@ class _OneStepper(EffectChain):
     def accelerations(
         self, positions: Components, velocities: Components, actions: Components, tables: Tables
     ) -> Components:
-        """Is the engine's own matter; effects that need it are not attached."""
+        """Not available from the engine; effects that need accelerations cannot be attached."""
         raise NotImplementedError
 
     def move(
@@ -225,7 +225,7 @@ def roll_out(simulator: SteppableSimulator, request: EpisodeRequest) -> Episodes
             rows(table), rows(policy.parameters), rows(request.initial_states), strict=True
         )
     ]
-    # What differs between episodes must not travel with each chunk.
+    # Data that differ between episodes must not be sent with each chunk.
     policy.parameters = policy.parameters.new_zeros(policy.parameters.shape[-1])
     shared = replace(request, parameters={}, policy=policy, initial_states=torch.zeros(0))
     seed = 0 if simulator.is_deterministic else int(torch.randint(2**62, ()))
@@ -239,7 +239,7 @@ def _collected(
     request: EpisodeRequest,
     shape: torch.Size,
 ) -> Episodes:
-    """Returns the workers' results in the batch's shape; lost episodes have NaN for a return."""
+    """Returns the workers' results in the batch's shape; the return of a lost episode is NaN."""
     num_readings = (request.num_steps + 1) * len(simulator.sensors)
     num_commands = request.num_steps * len(simulator.actions)
     width = 2 + (num_readings + num_commands if request.record else 0)

@@ -13,19 +13,19 @@ __all__ = ["Simulation", "SteppableSimulator"]
 
 
 class Simulation(Protocol):
-    """One simulation under way."""
+    """One running simulation."""
 
     def read(self) -> Sequence[float] | np.ndarray:
         """Returns the present true values of the sensors' channels, ``(sensors,)``."""
         ...
 
     def advance(self, step: int, /) -> None:
-        """Makes a step under ``segment.actions[step]``; steps come in order, from 0."""
+        """Performs a step with ``segment.actions[step]``; steps are called in order, from 0."""
         ...
 
 
 class SteppableSimulator(PooledSimulator, ClosedLoopSimulator):
-    """A simulator that is given one segment at a time and can stop after each step."""
+    """A simulator that receives one segment at a time and can stop after each step."""
 
     @abstractmethod
     def begin(
@@ -33,7 +33,7 @@ class SteppableSimulator(PooledSimulator, ClosedLoopSimulator):
     ) -> Simulation:
         """Begins a simulation; see :meth:`PooledSimulator.simulate_one` for the arguments.
 
-        In closed loop, row k of ``segment.actions`` is filled in just before step k.
+        In closed loop, row k of ``segment.actions`` is set directly before step k.
         """
 
     def simulate_one(

@@ -8,17 +8,17 @@ __all__ = ["Simulation", "SteppedSimulator"]
 
 
 class SteppedSimulator(SteppableSimulator):
-    """A simulator that is given one segment at a time and can stop after each step.
+    """A simulator that receives one segment at a time and can stop after each step.
 
-    A subclass writes :meth:`begin` instead of :meth:`simulate_one`. In closed loop every episode
-    is one draw for the workers, with policy, reward and effects evaluated next to the engine. An
-    episode that is lost for good has NaN for a return and no steps. All states have to be among
-    the sensors, because reward and bounds look at them.
+    A subclass writes :meth:`begin` instead of :meth:`simulate_one`. In closed loop, every episode
+    is one draw; the worker evaluates policy, reward and effects. The return of an episode that
+    finally failed is NaN, and its length is 0. All states must be among the sensors, because
+    reward and bounds need them.
     """
 
     def run_episodes(self, request: EpisodeRequest) -> Episodes:
         """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`.
 
-        The arguments for compilation change nothing.
+        The arguments for compilation have no effect.
         """
         return roll_out(self, request)

@@ -1,4 +1,4 @@
-"""The supervisors of one process: lent to chunks, kept between them, ended with it."""
+"""The supervisors of one process: reused for one chunk after another, stopped with it."""
 
 import atexit
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ class Crew:
 
     @contextmanager
     def supervisor(self) -> Iterator[Supervisor]:
-        """Lends a supervisor to the block."""
+        """Gives a supervisor to the block."""
         with self._lock:
             lent = self._idle.pop() if self._idle else Supervisor()
             self._busy.add(lent)
@@ -42,7 +42,7 @@ class Crew:
             return supervisor.run(chunk)
 
     def close(self) -> None:
-        """Ends all processes; a supervisor that is running ends its own when it returns."""
+        """Stops all processes; a running supervisor stops its own after its chunk."""
         with self._lock:
             ended, self._idle, self._busy = self._idle, [], set()
         for supervisor in ended:
@@ -53,8 +53,8 @@ class Crew:
 def _crew_of_this_process() -> Crew:
     """Returns the crew of a process that an executor owns.
 
-    Starting a process that has loaded an engine takes seconds, so it has to outlive the chunk that
-    needed it; between two chunks an executor keeps nothing but its process.
+    Starting a process and loading an engine takes seconds, so the process must be kept after its
+    chunk. An executor keeps only its own process between two chunks.
     """
     crew = Crew()
     atexit.register(crew.close)

@@ -1,4 +1,4 @@
-"""Executors: what hands chunks to workers, all of them joblib's but the serial one."""
+"""Executors, which pass chunks to workers; all but the serial one use joblib."""
 
 import logging
 from abc import ABC, abstractmethod
@@ -18,22 +18,22 @@ class ChunkExecutor(ABC):
     """Runs chunks on workers.
 
     Attributes:
-        num_workers: How many chunks run at once.
+        num_workers: Number of chunks that run at the same time.
     """
 
     num_workers: int
 
     @abstractmethod
     def run(self, chunks: Iterable[Chunk]) -> Iterator[ChunkResult]:
-        """Yields results in the order in which they come."""
+        """Yields results in the order in which they arrive."""
 
     @abstractmethod
     def close(self) -> None:
-        """Ends what was started here, and nothing else."""
+        """Stops everything that this executor started, and nothing else."""
 
 
 class _Serial(ChunkExecutor):
-    """One process, looked after by the caller's thread."""
+    """One process, supervised by the caller's thread."""
 
     num_workers = 1
 
@@ -51,12 +51,12 @@ class _Joblib(ChunkExecutor):
     """One of joblib's backends.
 
     Args:
-        num_workers: Workers; ``None`` for all there are.
+        num_workers: Number of workers; ``None`` for all available ones.
         backend: joblib's name of the backend.
-        settings: What else joblib's backend takes.
-        stack: Holds what has to be closed after joblib's backend.
-        crew: Supervisors where workers are threads of this process.
-        is_streaming: Whether the backend can hand over results while others are under way.
+        settings: Further arguments of joblib's backend.
+        stack: Resources to close after joblib's backend.
+        crew: Supervisors if workers are threads of this process.
+        is_streaming: Whether the backend can return results while other chunks are running.
     """
 
     def __init__(
@@ -71,11 +71,11 @@ class _Joblib(ChunkExecutor):
     ) -> None:
         from joblib import Parallel, effective_n_jobs, parallel_config
 
-        # Names of clusters are known to the configuration only, which counts for what is made
-        # inside the block.
+        # Only joblib's configuration accepts the names of clusters, and it applies to objects that
+        # are created inside this block.
         with parallel_config(backend=backend, n_jobs=num_workers or -1, **settings):
             self.num_workers = max(1, effective_n_jobs(num_workers or -1))
-            # Chunks are batches already, and small enough to travel as they are.
+            # Chunks are batches already, and small enough to be sent as they are.
             parallel: Any = Parallel(
                 return_as="generator_unordered" if is_streaming else "list",
                 batch_size=1,  # pyright: ignore[reportArgumentType]
@@ -94,18 +94,18 @@ class _Joblib(ChunkExecutor):
         yield from results
 
     def keep(self, stack: ExitStack) -> None:
-        """Takes over what has to be closed in the end."""
+        """Takes over resources that must be closed at the end."""
         self._stack = stack
 
     def close(self) -> None:
-        # Also the processes that threads are still waiting for.
+        # This includes processes for which threads are still waiting.
         if self._crew is not None:
             self._crew.close()
         self._stack.close()
 
 
 def open_executor(options: WorkerOptions) -> ChunkExecutor:
-    """Returns the executor that the options name; the caller closes it.
+    """Returns the executor that the options specify; the caller must close it.
 
     Raises:
         DependencyError: Dask or Ray is not installed.
@@ -122,7 +122,7 @@ def open_executor(options: WorkerOptions) -> ChunkExecutor:
             executor = _Joblib(number, "dask", {"client": client}, stack)
         elif options.executor == "ray":
             _connect_to_ray(options, stack)
-            # Its pool cannot stream: results come wave by wave.
+            # Ray's pool cannot stream, so results arrive wave by wave.
             executor = _Joblib(number, "ray", {}, stack, is_streaming=False)
         else:
             executor = _Joblib(number, "loky", {"inner_max_num_threads": 1}, stack)

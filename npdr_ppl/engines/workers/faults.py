@@ -1,4 +1,4 @@
-"""What went wrong in a run: which draws, in which way, and what it cost."""
+"""Faults of a run: the draws that failed, how they failed, and which were lost."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,18 +21,18 @@ class Fault(StrEnum):
 class Faults:
     """Faults of a run, or of several.
 
-    A draw is counted each time it fails, so that one that crashes twice has crashed twice, was
-    retried once and is lost.
+    A draw is counted each time it fails. A draw that crashes twice, for example, counts as crashed
+    twice, retried once and lost.
 
     Attributes:
-        num_draws: Draws run.
+        num_draws: Number of draws that were run.
         crashed: Indices of draws whose process ended, in the order of events.
         hung: Indices of draws whose process was killed at the time limit.
         nan: Indices of draws that returned NaN or infinity.
         raised: Indices of draws that raised an error.
-        retried: Indices of draws that were run again.
+        retried: Indices of draws that were repeated.
         lost: Indices of draws that have no result.
-        example: What one of the errors said.
+        example: Message of one of the errors.
     """
 
     num_draws: int = 0
@@ -46,13 +46,13 @@ class Faults:
 
     @classmethod
     def of(cls, fault: Fault, index: int, *, is_retried: bool, example: str = "") -> "Faults":
-        """Returns what one failed draw amounts to.
+        """Returns the faults of one failed draw.
 
         Args:
             fault: How it failed.
-            index: Which draw it was.
-            is_retried: Whether it is run again; if not, it is lost.
-            example: What its error said.
+            index: Index of the draw.
+            is_retried: Whether it will be repeated; if not, it is lost.
+            example: Message of its error.
         """
         kinds: dict[str, tuple[int, ...]] = dict.fromkeys(_KINDS, ())
         kinds[fault.value] = (index,)
@@ -60,7 +60,7 @@ class Faults:
         return cls(0, *(kinds[name] for name in _KINDS), example=example)
 
     def __add__(self, other: "Faults") -> "Faults":
-        """Returns the faults of both."""
+        """Returns the sum of both."""
         return Faults(
             self.num_draws + other.num_draws,
             *(getattr(self, name) + getattr(other, name) for name in _KINDS),
@@ -68,7 +68,7 @@ class Faults:
         )
 
     def __bool__(self) -> bool:
-        """Whether anything went wrong."""
+        """Whether there is any fault."""
         return any(getattr(self, name) for name in _KINDS)
 
     def counts(self) -> dict[str, int]:

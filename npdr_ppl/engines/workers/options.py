@@ -9,22 +9,22 @@ from npdr_ppl.errors import ModelError
 __all__ = ["Executor", "WorkerOptions"]
 
 Executor = Literal["loky", "dask", "ray", "threads", "serial"]
-"""What runs chunks of draws: processes of this machine, a Dask or Ray cluster, threads that each
-look after one process, or a single process."""
+"""Where chunks of draws run: in processes of this machine, on a Dask or Ray cluster, in one
+process per thread, or in a single process."""
 
 
 @dataclass(frozen=True)
 class WorkerOptions:
-    """How simulations are spread over workers; none of it changes their results.
+    """How simulations are distributed over workers; no option changes their results.
 
     Attributes:
-        executor: What runs chunks of draws.
-        num_workers: Workers; ``None`` for one per core, or all of a cluster.
+        executor: Executor that runs chunks of draws.
+        num_workers: Number of workers; ``None`` for one per core, or all of a cluster.
         address: Address of a running Dask scheduler or Ray head; ``None`` starts one here.
-        chunk_size: Draws that a worker is given at once; ``None`` makes about 16 chunks per
-            worker, of 32 draws at most.
-        time_limit: Seconds that one draw may take, after which its process is killed.
-        retries: How often a draw that crashed, hung, raised an error or returned NaN is run again.
+        chunk_size: Draws that a worker receives at once; ``None`` makes about 16 chunks per
+            worker, with at most 32 draws each.
+        time_limit: Seconds that one draw may take; after that, its process is killed.
+        retries: How often a draw that crashed, hung, raised an error or returned NaN is repeated.
     """
 
     executor: Executor = "loky"
@@ -38,7 +38,7 @@ class WorkerOptions:
         """Checks every option.
 
         Raises:
-            ModelError: An option is out of its range.
+            ModelError: An option is outside its range.
         """
         if self.executor not in get_args(Executor):
             known = ", ".join(get_args(Executor))

@@ -1,4 +1,4 @@
-"""Draws in, results out: chunks, waves, and what to do when an executor itself breaks."""
+"""Runs draws on workers in chunks and waves, and restarts an executor that broke."""
 
 import hashlib
 import logging
@@ -23,28 +23,29 @@ __all__ = ["Outcome", "Pool", "Progress"]
 _LOGGER = logging.getLogger(__name__)
 
 Progress = Callable[[float, str], None]
-"""Called with the fraction done and a short status."""
+"""Called with the completed fraction and a short status."""
 
 CHUNKS_PER_WORKER = 16
-"""Few enough to cost nothing, many enough for workers to finish at about the same time."""
+"""Default number of chunks per worker: few enough for negligible overhead, and enough for workers
+to finish at about the same time."""
 
 MAX_CHUNK_SIZE = 32
-"""Draws that a lost worker machine may cost a repetition of."""
+"""Greatest default number of draws in a chunk; so many are repeated if a worker machine fails."""
 
 WAVE = 32
-"""Chunks per worker that may be under way or wait for the caller: the bound on memory."""
+"""Chunks per worker that may be running or waiting for the caller; this limits memory."""
 
 MAX_BREAKDOWNS = 3
-"""How often an executor may break without a result in between."""
+"""How often an executor may break in a row, without a result in between."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a run.
+    """The outcome of a run.
 
     Attributes:
-        values: The result of each draw, in their order; ``None`` for a lost one.
-        faults: What went wrong.
+        values: The result of each draw, in the order of the draws; ``None`` for a lost draw.
+        faults: Faults of the run.
     """
 
     values: list[np.ndarray | None]
@@ -54,8 +55,8 @@ class Outcome:
 class Pool:
     """Runs draws of a task on workers.
 
-    A result depends on its draw and the run's seed alone: not on the number of workers, the
-    chunks, the executor, or on what happened to other draws.
+    A result depends only on its draw and the seed of the run. It does not depend on the number of
+    workers, the chunks, the executor or other draws.
 
     Args:
         options: Workers and their limits.
@@ -72,7 +73,7 @@ class Pool:
         self.close()
 
     def close(self) -> None:
-        """Ends what this pool started; a cluster at an address goes on."""
+        """Stops all processes that this pool started; a cluster at an address keeps running."""
         if self._executor is not None:
             executor, self._executor = self._executor, None
             executor.close()
@@ -89,16 +90,16 @@ class Pool:
         """Runs all draws and collects their results.
 
         Args:
-            task: What to run.
-            payloads: What to run it on, consumed as workers need it.
+            task: The task to run.
+            payloads: Inputs of the draws, taken from the iterable when workers need them.
             seed: Seed of the run.
-            num_draws: Number of payloads, where they have no length.
+            num_draws: Number of payloads, if they have no length.
             progress: Called after each chunk.
 
         Raises:
             SimulationError: The task cannot be loaded or set up, every draw raised an error, or
-                the executor breaks again and again.
-            NpdrError: The task says that it is wrong.
+                the executor broke several times in a row.
+            NpdrError: The task itself raised it, because no draw can succeed.
         """
         values: dict[int, np.ndarray | None] = {}
         faults = Faults()
@@ -117,10 +118,9 @@ class Pool:
     def stream(
         self, task: Task, payloads: Iterable[Any], *, seed: int = 0, num_draws: int | None = None
     ) -> Iterator[ChunkResult]:
-        """Yields results chunk by chunk, as they come; see :meth:`run`.
+        """Yields results chunk by chunk, as they arrive; see :meth:`run`.
 
-        No more than a wave of chunks is under way or waits for the caller, however many draws
-        there are.
+        For any number of draws, at most one wave of chunks is running or waits for the caller.
         """
         executor = self._opened()
         pickled = cloudpickle.dumps(task)
@@ -137,7 +137,7 @@ class Pool:
             yield from self._run_wave(wave)
 
     def _run_wave(self, wave: list[Chunk]) -> Iterator[ChunkResult]:
-        """Runs chunks, again where an executor broke before they were done."""
+        """Runs chunks, and repeats those that were not done when an executor broke."""
         left = {chunk.draws[0].index: chunk for chunk in wave}
         num_breakdowns = 0
         while left:
@@ -151,8 +151,8 @@ class Pool:
             except Exception as error:
                 if isinstance(error, NpdrError):
                     raise
-                # A worker's supervisor died, for want of memory for example: the executor may be
-                # beyond repair, and another one takes the chunks that are left.
+                # A worker's supervisor died, e.g. because memory ran out. The executor may not
+                # recover, so a new one runs the remaining chunks.
                 num_breakdowns += 1
                 self.close()
                 if num_breakdowns >= MAX_BREAKDOWNS:

@@ -1,4 +1,4 @@
-"""`workers`: which workers the simulations inside a block use, and what went wrong there."""
+"""`workers`: chooses the workers for simulations inside a block and counts their faults."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ class Workers:
 
     Attributes:
         pool: The pool.
-        faults: What went wrong so far.
+        faults: Faults so far.
         is_used: Whether any simulation has used them.
     """
 
@@ -35,17 +35,17 @@ class Workers:
 
 
 class FaultCollector:
-    """Sums up faults.
+    """Adds up faults.
 
     Attributes:
-        faults: What went wrong so far.
+        faults: Faults so far.
     """
 
     def __init__(self) -> None:
         self.faults = Faults()
 
     def counts(self) -> dict[str, int]:
-        """Returns counts by kind; empty where no worker was used."""
+        """Returns counts by kind; empty if no worker was used."""
         return self.faults.counts() if self.faults.num_draws else {}
 
 
@@ -64,14 +64,14 @@ def workers(
     time_limit: float = 60.0,
     retries: int = 1,
 ) -> Iterator[Workers]:
-    """Chooses the workers of simulations inside the block, and ends them with it.
+    """Chooses the workers for simulations inside the block, and stops them at its end.
 
-    Engines that run one simulation at a time use them for every batch. Batched ones need none, but
-    discovery fits its candidates side by side in the processes of ``"loky"``. See
+    Engines that run one simulation at a time use them for every batch. Batched engines need no
+    workers, but discovery fits its candidates in parallel in the processes of ``"loky"``. See
     :class:`~npdr_ppl.engines.workers.options.WorkerOptions` for the arguments.
 
     Raises:
-        ModelError: An option is out of its range.
+        ModelError: An option is outside its range.
 
     Example:
         >>> import npdr_ppl as npdr
@@ -92,7 +92,7 @@ def workers(
 
 @contextmanager
 def collect_faults() -> Iterator[FaultCollector]:
-    """Sums up what goes wrong inside the block."""
+    """Adds up the faults inside the block."""
     collector = FaultCollector()
     token = _COLLECTORS.set((*_COLLECTORS.get(), collector))
     try:
@@ -103,10 +103,10 @@ def collect_faults() -> Iterator[FaultCollector]:
 
 @contextmanager
 def report_progress(progress: Progress) -> Iterator[None]:
-    """Has simulations inside the block report how far they are.
+    """Lets simulations inside the block report their progress.
 
     Args:
-        progress: Called with the fraction of the present call to a simulator that is done.
+        progress: Called with the completed fraction of the present call to a simulator.
     """
     token = _PROGRESS.set(progress)
     try:
@@ -116,7 +116,7 @@ def report_progress(progress: Progress) -> Iterator[None]:
 
 
 def num_local_processes() -> int:
-    """Returns how many processes of this machine the block has for work of any kind; else one."""
+    """Returns the number of local processes of the block that can do any work; otherwise one."""
     chosen = _WORKERS.get()
     if chosen is None or chosen.pool.options.executor != "loky":
         return 1
@@ -127,7 +127,7 @@ def num_local_processes() -> int:
 
 
 def run_on_workers(task: Task, payloads: list, seed: int) -> Outcome:
-    """Runs draws on the workers of the block, or on one worker per core outside of any."""
+    """Runs draws on the workers of the block; outside a block, on one worker per core."""
     chosen = _WORKERS.get()
     if chosen is None:
         with Pool() as pool:

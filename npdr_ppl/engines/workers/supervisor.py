@@ -1,4 +1,4 @@
-"""One worker's process: started, given draws, watched, killed and replaced."""
+"""Supervises one worker's process: starts it, sends it draws, kills and replaces it."""
 
 import json
 import os
@@ -22,18 +22,19 @@ from npdr_ppl.errors import NpdrError, SimulationError
 __all__ = ["Chunk", "ChunkResult", "Supervisor"]
 
 SET_UP_SECONDS = 300.0
-"""Seconds that loading or setting up a task may take."""
+"""Time limit, in seconds, for loading a task and for setting it up."""
 
 MAX_FAILED_STARTS = 3
-"""Starts that may fail in a row: more than bad luck, less than a run's worth of them."""
+"""Number of process starts in a row that may fail: enough to tolerate chance failures, and few
+enough to stop early if every start fails."""
 
-# The template finds the same modules as this process, installed or not.
+# Lets the template import the same modules as this process, even modules that are not installed.
 _BOOT = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[2]); "
     "from npdr_ppl.engines.workers.template import main; main(int(sys.argv[1]))"
 )
 
-# One core per worker: threads of numerical libraries would only get in each other's way.
+# One core per worker, because threads of numerical libraries would compete for the cores.
 _ONE_THREAD = {
     name: "1"
     for name in (
@@ -47,15 +48,15 @@ _CRASHED: tuple[Any, Any] = Fault.CRASHED, ""
 
 @dataclass(frozen=True)
 class Chunk:
-    """Draws that travel together.
+    """Draws that are sent to a worker together.
 
     Attributes:
         task: The pickled task.
-        digest: Tells tasks apart.
-        path: Where the caller finds modules; workers of a cluster look there last.
+        digest: Identifies the task.
+        path: The caller's module search path; workers of a cluster use it after their own.
         draws: The draws.
         time_limit: Seconds that one draw may take.
-        retries: How often a failed draw is run again.
+        retries: How often a failed draw is repeated.
     """
 
     task: bytes
@@ -68,12 +69,12 @@ class Chunk:
 
 @dataclass
 class ChunkResult:
-    """What became of a chunk.
+    """The outcome of a chunk.
 
     Attributes:
         values: Results by index; ``None`` for a lost draw.
-        faults: What went wrong.
-        error: Why no draw of this task can succeed, if so.
+        faults: Faults of the chunk.
+        error: Reason why no draw of this task can succeed, if there is one.
     """
 
     values: dict[int, np.ndarray | None] = field(default_factory=dict)
@@ -82,10 +83,10 @@ class ChunkResult:
 
 
 class Supervisor:
-    """Runs chunks of draws in a process of its own, and survives whatever happens there.
+    """Runs chunks of draws in a separate process, and survives any failure of that process.
 
-    A process in which anything went wrong is not used again: another fork of the
-    :mod:`~npdr_ppl.engines.workers.template` takes its place.
+    After a fault the process is not used again. Another fork of the
+    :mod:`~npdr_ppl.engines.workers.template` replaces it.
     """
 
     def __init__(self) -> None:
@@ -94,7 +95,7 @@ class Supervisor:
         self._data: Connection | None = None
 
     def run(self, chunk: Chunk) -> ChunkResult:
-        """Runs all draws of a chunk; a fault is a part of the result, never an exception."""
+        """Runs all draws of a chunk; faults are part of the result and raise no exception."""
         result = ChunkResult()
         try:
             faults = self._run(chunk, result.values)
@@ -103,13 +104,13 @@ class Supervisor:
         except NpdrError as error:
             result.error = error
             self.close()
-        except BaseException:  # Ctrl-C, most likely
+        except BaseException:  # most likely Ctrl-C
             self.close()
             raise
         return result
 
     def close(self) -> None:
-        """Ends the worker's processes."""
+        """Stops the worker's processes."""
         if self._data is not None:
             self._data.close()
             self._data = None
@@ -119,7 +120,7 @@ class Supervisor:
         self._loaded = ""
 
     def _run(self, chunk: Chunk, values: dict[int, np.ndarray | None]) -> Faults:
-        """Fills in values and returns the faults."""
+        """Writes results to ``values`` and returns the faults."""
         faults = Faults()
         queue = deque(chunk.draws)
         is_sent = False
@@ -146,7 +147,7 @@ class Supervisor:
         return faults
 
     def _send(self, draws: Sequence[Draw]) -> bool:
-        """Hands over draws; returns whether the process was there to take them."""
+        """Sends draws; returns whether the process was alive to receive them."""
         assert self._data is not None
         try:
             self._data.send(list(draws))
@@ -155,7 +156,7 @@ class Supervisor:
         return True
 
     def _receive(self, seconds: float) -> tuple[Any, Any]:
-        """Returns the process's next answer, or the fault that takes its place."""
+        """Returns the process's next answer, or a fault if there was none."""
         assert self._data is not None
         try:
             if not self._data.poll(seconds):
@@ -173,7 +174,7 @@ class Supervisor:
         for _ in range(MAX_FAILED_STARTS):
             try:
                 data = self._loaded_template(chunk).spawn()
-            except (EOFError, OSError):  # the template is gone, killed from outside
+            except (EOFError, OSError):  # the template was killed from outside
                 self.close()
                 continue
             self._data = data
@@ -202,7 +203,7 @@ class Supervisor:
         return self._template
 
     def _wake(self, chunk: Chunk) -> None:
-        """Makes sure that what is left from the last chunk is alive and of the same task."""
+        """Keeps the processes of the last chunk only if they are alive and have the same task."""
         if self._template is None:
             return
         try:
@@ -213,7 +214,7 @@ class Supervisor:
             self.close()
 
     def _rest(self) -> None:
-        """Lets the processes end by themselves if no chunk follows for long."""
+        """Lets the processes stop by themselves if no chunk follows for a long time."""
         if self._template is not None:
             with suppress(OSError):
                 self._template.tell("rest")
@@ -232,15 +233,15 @@ class Supervisor:
 def _environment() -> dict[str, str]:
     """Returns the environment of a template.
 
-    Dask has the allocator of its workers hand back memory at once, which makes an engine that
-    builds a scene for each draw fault every page anew, and three times as slow.
+    Dask sets its workers' allocator to return memory to the system at once. An engine that builds
+    a scene for each draw would then request every page again and be three times as slow.
     """
     kept = {name: v for name, v in os.environ.items() if name != "MALLOC_TRIM_THRESHOLD_"}
     return kept | _ONE_THREAD
 
 
 class _Template:
-    """The template process, seen from its supervisor."""
+    """The supervisor's interface to the template process."""
 
     def __init__(self) -> None:
         if not hasattr(os, "fork"):
@@ -250,7 +251,7 @@ class _Template:
             [sys.executable, "-c", _BOOT, str(theirs.fileno()), json.dumps(sys.path)],
             pass_fds=(theirs.fileno(),),
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,  # engines chatter, and a command's output may be JSON
+            stdout=subprocess.DEVNULL,  # engines print, but a command's output may be JSON
             env=_environment(),
             start_new_session=True,
         )
@@ -267,13 +268,13 @@ class _Template:
         """Sends a command and returns the answer.
 
         Raises:
-            EOFError, OSError: The template is gone, or does not answer in time.
+            EOFError, OSError: The template has ended or does not answer in time.
         """
         self.tell(command, *values)
         return self._answer()
 
     def spawn(self) -> Connection:
-        """Forks a child and returns our end of its connection."""
+        """Forks a child and returns this side's end of its connection."""
         ours, theirs = socket.socketpair()
         with ours, theirs:
             self.tell("spawn")
@@ -283,7 +284,7 @@ class _Template:
             return Connection(ours.detach())
 
     def close(self) -> None:
-        """Ends the template and its child."""
+        """Stops the template and its child."""
         self._control.close()
         self._channel.close()
         try:
@@ -292,7 +293,7 @@ class _Template:
             self._process.kill()
             self._process.wait()
         if self._process.returncode != 0 and self._child is not None:
-            # It was killed and could not end its child any more.
+            # The template was killed and could not stop its child.
             with suppress(ProcessLookupError):
                 os.kill(self._child, signal.SIGKILL)
 

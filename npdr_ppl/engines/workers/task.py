@@ -1,4 +1,4 @@
-"""What a worker does: one draw after the other, with what it has set up once."""
+"""Tasks of workers: a task is set up once and then runs one draw after another."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Draw:
 
     Attributes:
         index: Position in the run.
-        payload: What to simulate.
+        payload: Input of the simulation.
         run_seed: Seed of the run.
         attempt: How often the draw has failed before.
     """
@@ -29,17 +29,17 @@ class Draw:
 
     @property
     def seed(self) -> int:
-        """Seed of this draw, wherever and however often it runs."""
+        """Seed of this draw; the same on every worker and in every attempt."""
         return derived_seed(self.run_seed, "draw", self.index)
 
 
 class Task(ABC):
-    """A function of draws with a set-up of its own; pickled by cloudpickle and sent to workers."""
+    """A function of draws with a set-up; it is pickled by cloudpickle and sent to workers."""
 
     def set_up(self) -> Any:
-        """Returns what draws share within one process, e.g. a connection to an engine.
+        """Returns an object that draws of one process share, e.g. a connection to an engine.
 
-        It is called anew in each process, also in one that takes the place of another.
+        It is called once in each process, also in a process that replaces another.
         """
         return None
 
@@ -48,10 +48,10 @@ class Task(ABC):
         """Returns the draw's result, which depends on the draw alone.
 
         Args:
-            workspace: What :meth:`set_up` returned.
+            workspace: The result of :meth:`set_up`.
             draw: The draw.
 
         Raises:
-            NpdrError: The task itself is wrong, so that no draw can succeed; any other exception
-                costs this draw only.
+            NpdrError: The task itself is wrong, so no draw can succeed. Any other exception makes
+                only this draw fail.
         """

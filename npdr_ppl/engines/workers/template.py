@@ -1,12 +1,11 @@
 """A process that has loaded a task and forks the process that simulates.
 
-Loading Python, torch and an engine takes seconds; a fork of a process that has loaded them takes
-milliseconds. So a simulation that crashes or has to be killed costs little more than itself: the
-template stays as it was, and forks again. Nothing is ever simulated in the template, and it has
-one thread only, which is what makes forks safe.
+Loading Python, torch and an engine takes seconds. Forking a process that has loaded them takes
+milliseconds. If a simulation crashes or must be killed, the template just forks again, so little
+time is lost. The template itself never simulates and has only one thread, which makes forks safe.
 
-Commands come from the :class:`~npdr_ppl.engines.workers.supervisor.Supervisor` at the other end
-of a socket; when that end closes, for whatever reason, the template ends with its child.
+The :class:`~npdr_ppl.engines.workers.supervisor.Supervisor` sends commands through a socket. When
+its end of the socket closes for any reason, the template stops its child and itself.
 """
 
 import ctypes
@@ -29,19 +28,20 @@ from npdr_ppl.errors import NpdrError
 __all__ = ["IDLE_SECONDS", "main"]
 
 IDLE_SECONDS = 300.0
-"""After so long without work a template ends; workers of a cluster may outlive a run by days."""
+"""A template stops after this time without work, in seconds, because workers of a cluster may
+keep running for days after a run."""
 
 PR_SET_PDEATHSIG = 1
 """Linux's prctl option for the signal that a process gets when its parent ends."""
 
 
 def main(control_fd: int) -> None:
-    """Obeys a supervisor until it is gone.
+    """Executes the commands of a supervisor until the supervisor ends.
 
     Args:
-        control_fd: Descriptor of the socket whose other end the supervisor holds.
+        control_fd: Descriptor of the socket to the supervisor.
     """
-    # Ctrl-C is for the supervisor; its end of the socket closes when it is done.
+    # The supervisor handles Ctrl-C and then closes its end of the socket.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = socket.socket(fileno=control_fd)
     control = Connection(os.dup(control_fd))
@@ -77,11 +77,11 @@ def main(control_fd: int) -> None:
         pass
     finally:
         _end(child)
-        os._exit(0)  # at once, because taking torch apart would take longer than all the rest
+        os._exit(0)  # immediately, because the regular clean-up of torch is slow
 
 
 def _load(pickled: bytes, path: Sequence[str]) -> tuple[Task | None, str]:
-    """Unpickles a task, which imports what it needs; returns why not, if it fails."""
+    """Unpickles a task and imports its modules; returns the task and an error message."""
     sys.path.extend(folder for folder in path if folder not in sys.path)
     try:
         return pickle.loads(pickled), ""
@@ -90,14 +90,14 @@ def _load(pickled: bytes, path: Sequence[str]) -> tuple[Task | None, str]:
 
 
 def _end_with(parent: int) -> None:
-    """Has the kernel kill this process when its parent ends.
+    """Lets the kernel kill this process when its parent ends.
 
-    A template that is killed cannot end its child, which in the middle of a draw does not see that
-    nobody waits for its answer. Systems without prctl leave the child to its draw.
+    A killed template cannot stop its child, and a child does not notice this during a draw. On
+    systems without prctl, the child therefore continues until its draw is done.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # already gone
+    if os.getppid() != parent:  # the parent has ended already
         os._exit(0)
 
 
@@ -115,9 +115,8 @@ def _end(child: int | None) -> int:
 def _simulate(task: Task | None, data: Connection) -> None:
     """Runs groups of draws in a child, and never returns.
 
-    Every draw is answered as soon as it is done, so that the supervisor knows which one a crash
-    or a hang belongs to. After a failure the process ends, because nobody knows what state it was
-    left in.
+    Each result is sent as soon as its draw is done, so the supervisor knows which draw crashed or
+    hung. After a failure the process stops, because its state is unknown.
     """
     code = 0
     try:
@@ -140,13 +139,13 @@ def _simulate(task: Task | None, data: Connection) -> None:
         traceback.print_exc()
         code = 1
     finally:
-        # Without the template's own clean-up, which is not the child's business.
+        # Skips the clean-up of the template, which the child must not run.
         sys.stderr.flush()
         os._exit(code)
 
 
 def _answer(task: Task, workspace: Any, draw: Draw) -> tuple[Any, Any]:
-    """Returns what went wrong with a draw, or nothing and its value."""
+    """Returns the fault of a draw and its message, or ``None`` and its value."""
     try:
         value = np.asarray(task.run(workspace, draw))
         return (None, value) if bool(np.isfinite(value).all()) else (Fault.NAN, "")
@@ -155,7 +154,7 @@ def _answer(task: Task, workspace: Any, draw: Draw) -> tuple[Any, Any]:
 
 
 def _failure(error: Exception) -> tuple[Any, Any]:
-    """Returns the answer for an exception: our own say that the task is wrong."""
+    """Returns the answer for an exception; an NpdrError means that the task is wrong."""
     if isinstance(error, NpdrError):
         return "refused", error
     return Fault.RAISED, f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""Files that are either written whole or not at all."""
+"""Files that are written completely or not at all."""
 
 import os
 import tempfile
@@ -12,9 +12,9 @@ __all__ = ["replacing"]
 
 @contextmanager
 def replacing(path: str | PathLike[str]) -> Iterator[Path]:
-    """Yields a temporary path beside ``path`` that takes its place when the block succeeds.
+    """Yields a temporary path in the same folder that replaces ``path`` if the block succeeds.
 
-    A reader, or a run killed half-way, sees the old file or the new one, never a part.
+    Even if the program is killed, readers see either the old file or the complete new one.
     """
     target = Path(path)
     handle, name = tempfile.mkstemp(

@@ -1,4 +1,4 @@
-"""CSV files: a strict reader that names what is wrong, and an exact writer."""
+"""CSV files: a strict reader that reports each error precisely, and an exact writer."""
 
 import csv
 import io
@@ -18,20 +18,20 @@ from npdr_ppl.rollouts.recording import Recording
 
 __all__ = ["read_csv", "write_csv"]
 
-# What float() accepts beyond this - underscores, other scripts' digits, "nan" - is a mistake here.
+# float() also accepts underscores, digits of other scripts and "nan", which are mistakes here.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NUMBER_CHARACTERS = frozenset("0123456789+-.eE")
 
 _UNIT_IN_NAME = re.compile(r"\s*[\[(].*[\])]$")
 
 NOT_A_NUMBER = frozenset({"nan", "na", "n/a", "null", "none"})
-"""How programs write a reading that is missing."""
+"""Words that programs write for a missing measurement, in lower case."""
 
 GAP = (
-    "; interpolate single missing readings, and cut the rollout in two at longer gaps (the "
+    "; interpolate single missing values, and cut the rollout in two at longer gaps (the "
     "actions of a rollout's last row stay empty)"
 )
-"""What to do about it."""
+"""End of the message about a missing measurement: what to do."""
 
 
 def read_csv(path: str | PathLike[str], actions: Sequence[str] | None) -> Recording:
@@ -129,7 +129,7 @@ def _numbers(name: str, cells: list[str], lines: list[int]) -> NDArray[np.float6
         try:
             values = np.array([float(cell) if cell else math.nan for cell in cells])
         except ValueError:
-            pass  # the search below finds the cell
+            pass  # the loop below finds the wrong cell
         else:
             is_infinite = np.isinf(values)
             if not is_infinite.any():

@@ -1,4 +1,4 @@
-"""Parquet, NPZ, NetCDF and xarray: exact, with units, and without pickles."""
+"""Reads and writes Parquet, NPZ, NetCDF and xarray: exact, with units and without pickles."""
 
 import json
 import zipfile
@@ -52,7 +52,7 @@ _NPZ_ARRAYS = {  # name of each array and its number of dimensions
 
 
 def load(path: AnyPath) -> Recording:
-    """Reads rollouts in the format that the suffix names; see :meth:`Rollouts.load`."""
+    """Reads rollouts in the format given by the suffix; see :meth:`Rollouts.load`."""
     readers = {
         ".csv": lambda file: read_csv(file, None),
         ".parquet": lambda file: read_parquet(file, None),
@@ -72,14 +72,14 @@ def load(path: AnyPath) -> Recording:
 
 @contextmanager
 def _refusing(format_name: str) -> Iterator[None]:
-    """Turns whatever a file library raises over a malformed file into one sentence."""
+    """Turns any error that a file library raises for a malformed file into a DataError."""
     try:
         yield
     except DataError:
         raise
     except MemoryError:
         raise DataError(f"the {format_name} file does not fit into memory.") from None
-    # Decoders of corrupt bytes raise nearly anything; all of it means the same to the caller.
+    # Decoders raise nearly any error for corrupt bytes; for the caller all mean the same.
     except Exception as error:
         raise DataError(f"not a readable {format_name} file ({type(error).__name__}).") from None
 
@@ -111,7 +111,7 @@ def read_parquet(path: AnyPath, actions: Sequence[str] | None) -> Recording:
     with rollout_checks.named(path):
         columns: dict[str, NDArray[np.float64]] = {}
         with _refusing("Parquet"):
-            # One file object, not a path: a path may be taken for a data set of many files.
+            # A file object, because pyarrow may take a path for a data set of many files.
             with path.open("rb") as file:
                 table = pq.ParquetFile(file).read()
             rollout_checks.check_names(table.column_names, "column")
@@ -128,7 +128,7 @@ def read_parquet(path: AnyPath, actions: Sequence[str] | None) -> Recording:
 
 
 def _with_time_step(rollouts: Recording, time_step: Any) -> Recording:
-    """Restores the exact time step, which time stamps carry only up to rounding."""
+    """Restores the exact time step, which cannot be computed from rounded time stamps."""
     if not isinstance(time_step, float):
         raise DataError("the time step in the file's metadata is not a number.")
     return replace(rollouts, time_step=time_step)
@@ -199,7 +199,7 @@ def read_npz(path: AnyPath) -> Recording:
 
 
 def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Returns the arrays of an NPZ file after checking that none expands without bounds."""
+    """Returns the arrays of an NPZ file after checking their uncompressed sizes."""
     with zipfile.ZipFile(path) as archive:
         total = sum(member.file_size for member in archive.infolist())
         if total > rollout_checks.MAX_FILE_BYTES:
@@ -216,7 +216,7 @@ def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
         for name in wanted:
             size = archive.getinfo(f"{name}.npy").file_size
             with archive.open(f"{name}.npy") as file:
-                # The header states the size that the reader would allocate before reading on.
+                # The header states the size that the reader would allocate before it reads data.
                 version = np.lib.format.read_magic(file)
                 reader = {
                     (1, 0): np.lib.format.read_array_header_1_0,
@@ -335,10 +335,11 @@ def read_netcdf(path: AnyPath) -> Recording:
 
     path = rollout_checks.check_file(path)
     with rollout_checks.named(path), _refusing("NetCDF"):
-        # h5netcdf begins like this, and where it fails leaves an object that complains at its end.
+        # h5netcdf opens files in the same way. If that failed inside it, its half-made object
+        # would report a second error when it is deleted.
         with h5py.File(path, "r") as file:
             dict(file.attrs)
-        # Seconds since nothing in particular: no calendar is to be applied.
+        # Times are seconds without a date, so they must not be decoded with a calendar.
         with xr.open_dataset(
             path, engine="h5netcdf", decode_times=False, decode_timedelta=False
         ) as dataset:

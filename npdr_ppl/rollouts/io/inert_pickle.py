@@ -1,9 +1,10 @@
-"""Reads pickles of arrays and plain records without running anything they contain.
+"""Reads pickles of arrays and plain records without running any code from them.
 
-A pickle is a program for a stack machine that may call any function. The machine below knows the
-instructions that build numbers, text, containers, arrays and records, and calls nothing: a class
-is a name, an instance is a :class:`Record`, and the few functions that pickled arrays need are
-recognised by name and computed here. Everything else is refused.
+A pickle is a program for a stack machine that may call any function. The machine below knows only
+the instructions that build numbers, text, containers, arrays and records, and it calls no
+function of the pickle. A class is only a name, and an instance becomes a :class:`Record`. The few
+functions that pickled arrays need are recognised by name and implemented here. Everything else is
+refused.
 """
 
 import io
@@ -47,11 +48,11 @@ _MAX_INSTRUCTIONS = 5_000_000
 
 @dataclass
 class Record:
-    """An instance of some class, reduced to its name and its fields; it has no behaviour.
+    """An instance of some class, reduced to the class name and the fields, without methods.
 
     Attributes:
         kind: Module and name of the class, separated by a space.
-        arguments: What its constructor would have been given, e.g. a named tuple's entries.
+        arguments: Arguments of the constructor, e.g. a named tuple's entries.
         fields: The instance's attributes.
     """
 
@@ -62,7 +63,7 @@ class Record:
 
 @dataclass(frozen=True)
 class _Global:
-    """A module and a name, separated by a space, as in a pickle; never looked up."""
+    """A module and a name, separated by a space, as in a pickle; it is never imported."""
 
     name: str
 
@@ -72,8 +73,8 @@ class _PickledArray:
     """An array whose shape, type and bytes follow in a BUILD instruction.
 
     Attributes:
-        is_joblib: Whether the bytes follow behind the instruction instead, as joblib puts them.
-        values: The array once it is built.
+        is_joblib: Whether the bytes follow after the instruction instead, as joblib writes them.
+        values: The array after it has been built.
     """
 
     is_joblib: bool = False
@@ -87,29 +88,29 @@ class _PickledDtype:
 
 
 class _Mark:
-    """The marker that ends a run of stack entries."""
+    """A marker on the stack; the entries above it belong together."""
 
 
 def read_pickle(data: bytes, records: Collection[str]) -> Any:
-    """Returns the object that a pickle describes, built of inert parts only.
+    """Returns the object that a pickle describes, built without calling code from the pickle.
 
     Arrays may be pickled by NumPy or written by joblib, with or without its alignment padding.
 
     Args:
         data: The pickle.
-        records: Classes that may occur, as ``"module name"``; they come back as :class:`Record`.
+        records: Classes that may occur, as ``"module name"``; they become :class:`Record`.
 
     Raises:
-        DataError: The pickle is damaged or asks for anything else than data.
+        DataError: The pickle is damaged or contains anything but data.
     """
     try:
         with warnings.catch_warnings():
-            # How the standard library answers a damaged escape sequence in an old string.
+            # The standard library warns so about a damaged escape sequence in an old string.
             warnings.simplefilter("error", DeprecationWarning)
             return _Machine(io.BytesIO(data), len(data), frozenset(records)).run()
     except DataError:
         raise
-    # A malformed program ends in whatever its operands provoke; all of it means "damaged".
+    # A malformed pickle can cause any of these errors; all of them mean "damaged".
     except (
         AttributeError,
         DeprecationWarning,
@@ -130,7 +131,7 @@ class _Machine:
     """One run of the stack machine.
 
     Attributes:
-        file: The pickle, read as far as the present instruction.
+        file: The pickle, read up to the current instruction.
         size: Bytes of the whole file.
         records: Classes that may occur.
         is_nested: Whether this pickle lies inside another one.
@@ -156,8 +157,8 @@ class _Machine:
             "EMPTY_TUPLE": tuple,
             "MARK": _Mark,
         }
-        # genops decodes one instruction at a time and leaves the file right behind it, which is
-        # where joblib puts the raw bytes of an array.
+        # genops decodes one instruction at a time and leaves the file position right after it.
+        # joblib writes the raw bytes of an array there.
         for count, (opcode, operand, _) in enumerate(pickletools.genops(self.file)):
             argument: Any = operand
             if count > _MAX_INSTRUCTIONS:
@@ -188,7 +189,7 @@ class _Machine:
         raise EOFError
 
     def named(self, name: str) -> _Global:
-        """Returns a stand-in for a module's member, if it is one that data need."""
+        """Returns a placeholder for a module's member, if data may contain this member."""
         if name in _FUNCTIONS or name in self.records or name in (_JOBLIB_ARRAY, _NDARRAY):
             return _Global(name)
         raise DataError(
@@ -274,7 +275,7 @@ class _Machine:
             raise DataError(f"the pickle makes a {member} of arguments.")
 
     def build(self) -> None:
-        """Gives the topmost object its state; an array of joblib's then follows in the file."""
+        """Sets the state of the topmost object; the data of a joblib array follow in the file."""
         state, target = self.stack.pop(), self.stack[-1]
         if isinstance(target, _PickledDtype):
             if (
@@ -302,8 +303,8 @@ class _Machine:
             raise TypeError
         shape, dtype = fields["shape"], fields["dtype"]
         if isinstance(dtype, _PickledDtype) and dtype.code in _LABEL_DTYPES:
-            # joblib puts a whole pickle of such an array here; it gets no more rights than this
-            # one, and may not nest further.
+            # joblib writes a complete pickle of such an array here. The same restrictions apply
+            # to it, and it must not contain another one.
             if self.is_nested:
                 raise TypeError
             return _Machine(self.file, self.size, self.records, is_nested=True).run()
@@ -348,7 +349,7 @@ _STEPS: dict[str, Callable[[_Machine], None]] = {
 
 
 def _plain(value: Any) -> Any:
-    """Returns the array behind a finished array's stand-in, anything else as it is."""
+    """Returns the array of a finished placeholder, and any other value unchanged."""
     if isinstance(value, _Mark) or (isinstance(value, _PickledArray) and value.values is None):
         raise TypeError
     return value.values if isinstance(value, _PickledArray) else value
@@ -363,7 +364,7 @@ def _num_bytes(shape: Any, dtype: Any) -> int:
 
 
 def _array(content: Any, shape: Any, dtype: Any, order: Any) -> NDArray[Any]:
-    """Returns an array made of bytes, or of labels, that are already in memory."""
+    """Returns an array made from bytes, or from text labels, that are already in memory."""
     if isinstance(dtype, _PickledDtype) and dtype.code in _LABEL_DTYPES:
         is_text = isinstance(content, list) and all(isinstance(entry, str) for entry in content)
         if not is_text or shape != (len(content),):

@@ -1,4 +1,4 @@
-"""Imports rollouts recorded with SimuRLacra, without running their pickles."""
+"""Imports rollouts recorded with SimuRLacra, without running code from their pickles."""
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
@@ -61,7 +61,7 @@ def _rollout(fields: Mapping[str, Any], names: Mapping[str, str]) -> Recording:
 
 
 def _spaces(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the declared spaces, which carry the columns' names."""
+    """Returns the declared spaces, which contain the column names."""
     info = fields.get("rollout_info")
     specification = info.get("env_spec") if isinstance(info, dict) else None
     if not _is(specification, _SPECIFICATION):

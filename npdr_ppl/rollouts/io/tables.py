@@ -1,4 +1,4 @@
-"""The table layout that CSV and Parquet share: one row per reading, rollouts one after another."""
+"""The table layout of CSV and Parquet: one row per sample, rollouts one after another."""
 
 from collections.abc import Mapping, Sequence
 
@@ -21,7 +21,7 @@ def from_table(
     lines: Sequence[int] | None = None,
     units: Mapping[str, str] | None = None,
 ) -> Recording:
-    """Cuts a table into rollouts.
+    """Splits a table into rollouts.
 
     Args:
         columns: Values by name, ``(N,)`` each, NaN where a cell is empty.
@@ -31,7 +31,7 @@ def from_table(
         units: Units by column name.
 
     Raises:
-        DataError: The table breaks the layout.
+        DataError: The table does not have this layout.
     """
     names = rollout_checks.check_names(list(columns), "column")
     for required in ("rollout", "time"):
@@ -100,7 +100,7 @@ def to_table(rollouts: Recording) -> dict[str, Array]:
 
 
 class _Location:
-    """Turns a row's index into the words that name it in a message."""
+    """Describes the position of a row in a message."""
 
     def __init__(self, lines: Sequence[int] | None) -> None:
         self._lines = lines
@@ -110,7 +110,7 @@ class _Location:
 
 
 def _rollout_bounds(rollout: Array, at: _Location) -> NDArray[np.int64]:
-    """Returns the first row of each rollout, and the number of rows at the end."""
+    """Returns the first row of each rollout, followed by the total number of rows."""
     is_bad = ~((rollout >= 0) & (rollout < 1e9) & (np.floor(rollout) == rollout))
     if is_bad.any():
         row = int(np.argmax(is_bad))
@@ -141,7 +141,7 @@ def _stepwise_columns(
     last_rows: NDArray[np.int64],
     actions: Sequence[str] | None,
 ) -> set[str]:
-    """Returns the columns that have one value per step instead of one per reading."""
+    """Returns the columns that have one value per step instead of one per sample."""
     is_empty = {name: np.isnan(columns[name][last_rows]) for name in data}
     if actions is not None:
         unknown = [name for name in actions if name not in data or name == "reward"]
