@@ -1,25 +1,25 @@
-"""ABC: rejection with a local-linear regression adjustment, the floor for every other method.
+"""ABC: rejection with a local-linear regression adjustment, the baseline for all other methods.
 
-The simulations nearest to the observation are kept, and their parameters moved to where a linear
-regression on the features says that they would be at the observation (Beaumont, Zhang & Balding
-2002, *Approximate Bayesian computation in population genetics*, Eqs. 3-5). With the distance rho_i
-of a simulation and the largest accepted one, delta,
+The simulations nearest to the observation are kept. A linear regression on the features predicts
+how their parameters would change at the observation, and they are moved accordingly (Beaumont,
+Zhang & Balding 2002, *Approximate Bayesian computation in population genetics*, Eqs. 3-5). With
+the distance rho_i of a simulation and the largest accepted one, delta,
 
     w_i = 1 - (rho_i / delta)^2,        z_i* = z_i - A (f_i - f_o),
 
 where A minimises sum_i w_i ||z_i - a - A (f_i - f_o)||^2. The posterior is a mixture of Gaussian
-kernels around the z_i* that are drawn towards their mean, so that the mixture has their mean and
-covariance instead of a wider one (Liu & West 2001, *Combined parameter and state estimation in
-simulation-based filtering*),
+kernels. Their centres are the z_i* moved towards their mean, so that the mixture has the mean and
+covariance of the z_i* instead of a wider covariance (Liu & West 2001, *Combined parameter and
+state estimation in simulation-based filtering*),
 
     q(z) = sum_i w_i N(z; c z_i* + (1 - c) mean, h^2 Cov[z*]),        c^2 + h^2 = 1.
 
-Parameters of every round come from the prior, and a later round only adds simulations: no
-importance weights are needed, none can degenerate, and the accepted ones get nearer.
+In every round the parameters come from the prior; a later round only adds simulations. No
+importance weights are needed, so none can degenerate, and the accepted simulations get nearer.
 
-Distances are Euclidean in the normal scores of the features, see
-:mod:`npdr_ppl.inference.parts.training.preconditioning`: a scale as robust as the median absolute
-deviation, and bounded.
+Distances are Euclidean in the normal scores of the features
+(:mod:`npdr_ppl.inference.parts.training.preconditioning`). This scale is as robust as the median
+absolute deviation, and bounded.
 """
 
 import math
@@ -43,27 +43,28 @@ from npdr_ppl.inference.parts.training.simulation_checks import (
 __all__ = ["ABC", "ABCState", "KernelDensity"]
 
 MIN_SIMULATIONS = 10
-"""Simulations below which there is no covariance to estimate."""
+"""Minimum number of simulations: fewer do not determine a covariance."""
 
 RIDGE = 1e-3
 """Penalty of the regression on features of unit variance, relative to the sum of the weights."""
 
 JITTER = 1e-6
-"""Added to the correlation of the adjusted parameters: they may coincide."""
+"""Added to the correlation of the adjusted parameters, because they may coincide."""
 
 FRACTIONS = (0.05, 0.1, 0.2, 0.35, 0.6, 1.0)
-"""Bandwidths to choose from, as fractions of Silverman's."""
+"""Bandwidths tried, as fractions of Silverman's."""
 
 MAX_LEFT_OUT = 500
-"""Points left out, one at a time, to choose the bandwidth."""
+"""Maximum number of points left out, one at a time, to choose the bandwidth."""
 
 CHUNK = 1024
-"""Points whose density is evaluated at once: each has a term for every accepted simulation."""
+"""Points whose density is evaluated in one batch. It bounds the memory, because each point has a
+term for every accepted simulation."""
 
 
 @dataclass(frozen=True)
 class ABCState(State):
-    """What the next round needs.
+    """The data that the next round needs.
 
     Attributes:
         z: Parameters of all successful simulations, ``(n, d)``.
@@ -80,7 +81,7 @@ class ABC(Backend):
 
     Args:
         accept: Fraction of the simulations that is accepted.
-        min_accepted: Simulations accepted at least, as far as there are so many.
+        min_accepted: Minimum number of accepted simulations; all are accepted if there are fewer.
         is_adjusted: Whether the accepted parameters are adjusted by regression.
     """
 
@@ -109,7 +110,7 @@ class ABC(Backend):
         """Returns the state before any simulation.
 
         Raises:
-            BackendError: The problem wants a network trained on raw arrays.
+            BackendError: The problem needs a network trained on raw arrays.
         """
         check_problem(problem)
         if problem.build_network is not None:
@@ -163,7 +164,7 @@ class ABC(Backend):
         preconditioner = fit_preconditioner(state.z, state.x)
         rows, distance = self._nearest(problem, state, preconditioner)
         weight = 1 - (distance / distance.max().clamp(min=torch.finfo().tiny)) ** 2
-        # Where all are equally far, as all features may be constant, all count the same.
+        # If all distances are equal, e.g. with constant features, all weights are equal.
         weight = weight if weight.sum() > 0 else torch.ones_like(weight)
         z = state.z[rows].double()
         if self.is_adjusted:
@@ -175,7 +176,7 @@ class ABC(Backend):
     def _nearest(
         self, problem: Problem, state: ABCState, preconditioner: Preconditioner
     ) -> tuple[Tensor, Tensor]:
-        """Returns which simulations are accepted and their distances, both ``(k,)``."""
+        """Returns the indices of the accepted simulations and their distances, both ``(k,)``."""
         observed = preconditioner.features(problem.observation.cpu().float()[None])
         distance = (preconditioner.features(state.x) - observed).norm(dim=-1)
         count = max(round(self.accept * len(distance)), self.min_accepted)
@@ -206,7 +207,7 @@ class ABC(Backend):
 
 
 def _adjust(z: Tensor, offset: Tensor, weight: Tensor) -> Tensor:
-    """Moves parameters to the observation along a weighted ridge regression.
+    """Adjusts parameters to the observation by a weighted ridge regression.
 
     Args:
         z: Accepted parameters, ``(k, d)``.
@@ -244,11 +245,11 @@ def _likeliest_width(points: Tensor, share: Tensor, widths: Sequence[float]) -> 
 
 
 class KernelDensity(Density):
-    """A mixture of Gaussian kernels with the mean and covariance of the points it is made of.
+    """A mixture of Gaussian kernels with the mean and covariance of the points.
 
     The bandwidth h is a fraction of Silverman's (1986, Eq. 4.14) for the effective number of
-    points: the one under which each point is most likely given the others, because Silverman's is
-    meant for a single Gaussian and blurs modes and ridges.
+    points. Silverman's bandwidth is meant for a single Gaussian and blurs modes and ridges. The
+    fraction is therefore the one with the greatest leave-one-out likelihood.
 
     Args:
         points: Points z*, ``(k, d)``, in float64.

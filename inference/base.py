@@ -1,4 +1,4 @@
-"""The protocol of a backend: ask for parameters, tell it simulations, read off a density.
+"""The protocol of a backend: ask for parameters, tell it simulations, get a density.
 
 A backend works in *reference coordinates* z: a d-dimensional real space in which the prior is the
 standard normal wherever the model's distributions allow it. It never calls the simulator, so the
@@ -21,7 +21,7 @@ __all__ = ["Backend", "Density", "Problem", "RoundInfo", "State"]
 
 @dataclass(frozen=True)
 class Problem:
-    """What a backend knows about the model and the data.
+    """The model and the data, as a backend sees them.
 
     Attributes:
         num_parameters: Dimension d of the reference coordinates.
@@ -30,12 +30,12 @@ class Problem:
         log_prior: Log density of the prior at points ``(n, d)``, shape ``(n,)``.
         is_prior_standard_normal: Whether the prior is exactly N(0, I).
         build_network: Makes an untrained embedding network for arrays of the observation's shape,
-            learnt jointly with the estimator; ``None`` if the features are final.
+            trained jointly with the estimator; ``None`` if no network is trained.
         device: Where to train.
         log_likelihood: Log density of the recording at points ``(n, d)``, shape ``(n,)``,
             differentiable, for models that have one; ``None`` for black boxes.
-        regression: Returns the problem in the form of a linear regression, computed when asked
-            for; ``None`` if no simulator is behind it.
+        regression: Returns the problem in the form of a linear regression, computed on request;
+            ``None`` for a problem without a simulator.
     """
 
     num_parameters: int
@@ -63,21 +63,21 @@ class Density(ABC):
 
 @dataclass(frozen=True)
 class State:
-    """What the next round needs; each backend extends it."""
+    """The data that the next round needs; each backend extends it."""
 
     round: int
 
 
 @dataclass(frozen=True)
 class RoundInfo:
-    """What a person wants to see of a round.
+    """Figures about one round, for the user.
 
     Attributes:
-        num_simulations: Simulations told this round.
+        num_simulations: Number of simulations given to the backend in this round.
         num_failed: Of these, how many were dropped because they were not finite.
         seconds: Training time.
         losses: Figures by name, e.g. ``validation_log_prob`` per member.
-        faults: Counts of what went wrong at workers, by kind; empty where none were used.
+        faults: Number of worker faults by kind; empty if no workers were used.
     """
 
     num_simulations: int
@@ -90,20 +90,21 @@ class RoundInfo:
 class Backend(ABC):
     """An inference method, INFER of Algorithm 1 (Muratore et al. 2021).
 
-    A backend is immutable: its options are constructor arguments, everything that changes is in
-    the state. :meth:`ask` and :meth:`tell` draw from torch's global stream; the caller seeds it.
+    A backend is immutable: its options are constructor arguments, and everything that changes is
+    in the state. :meth:`ask` and :meth:`tell` draw from torch's global stream; the caller seeds
+    it.
 
     Attributes:
         name: Word that selects it, e.g. ``"snpe-c"``.
         summary: One line for tables.
-        uses_simulations: Whether it learns from simulations. One that does not asks for none, is
-            told none, and has its posterior after one round.
-        is_sequential: Whether later rounds learn from earlier ones. If not, a caller with a budget
-            spends it in one round.
-        amortises: Whether a state after one round from the prior holds the posterior given any
-            observation, and not only the problem's.
-        continues: Whether a loop over policies and real rollouts starts an iteration from the
-            posterior of the one before, as NPDR does, or, like BayesSim, from the prior.
+        uses_simulations: Whether it learns from simulations. If not, it requests and receives
+            none, and has its posterior after one round.
+        is_sequential: Whether later rounds learn from earlier ones. If not, a caller with a
+            simulation budget should spend it in one round.
+        amortises: Whether a state after one round from the prior holds the posterior for any
+            observation, not only for the problem's.
+        continues: Whether a loop over policies and real rollouts starts each iteration from the
+            previous posterior, as NPDR does. If not, it starts from the prior, as BayesSim does.
     """
 
     name: ClassVar[str]
@@ -126,7 +127,8 @@ class Backend(ABC):
     ) -> Tensor | None:
         """Proposes a first round near the posterior of an earlier inference of the same model.
 
-        ``None`` if the method cannot correct for such a proposal and has to start from the prior.
+        Returns ``None`` if the method cannot correct for such a proposal and must start from the
+        prior.
         """
         return None
 
@@ -143,7 +145,7 @@ class Backend(ABC):
 
         Args:
             problem: The problem given to :meth:`init`.
-            state: The present state.
+            state: The current state.
             z: Parameters simulated, ``(n, d)``.
             x: Their features, ``(n,) + observation.shape``; rows that are not finite failed.
             progress: Called with the fraction done and a short status.
@@ -161,8 +163,8 @@ class Backend(ABC):
     ) -> Iterator[list[Density]]:
         """Yields the posterior of every ensemble member given each of several observations.
 
-        Only a backend that :attr:`amortises` can do so. One that can share work between
-        observations overrides this.
+        Only a backend whose :attr:`amortises` is true supports this. Backends that can share work
+        between observations override this method.
 
         Args:
             problem: The problem given to :meth:`init`.

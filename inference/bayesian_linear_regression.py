@@ -1,11 +1,11 @@
 """Bayesian linear regression on inverse dynamics: a posterior in closed form, without simulations.
 
-The equations of motion of a mechanism are linear in base parameters β, which regression on
-recorded motion and commands finds at once; Muratore et al. (2021) compare with it in Table 2. The
-conjugate posterior over β (:mod:`npdr_ppl.inference.parts.samplers.conjugate`) knows nothing of
-what is plausible: among its draws are negative dampings, masses off the prior's support and worse.
-They are counted and left out, so that the posterior over the parameters is, with the free
-coordinates z_f that β does not tell (a motor's constants, say),
+The equations of motion of a mechanism are linear in base parameters β. Regression on recorded
+motion and commands gives them in one step; Muratore et al. (2021) compare with it in Table 2. The
+conjugate posterior over β (:mod:`npdr_ppl.inference.parts.samplers.conjugate`) ignores
+plausibility: some of its draws have negative dampings or masses outside the prior's support. Such
+draws are counted and left out. Let z_f be the free coordinates that β does not determine, for
+example a motor's constants. The posterior over the parameters is then
 
     q(z) ∝ p(z_f) · t(β(z)) |∂β/∂z_β|   on the plausible set,
 
@@ -37,24 +37,24 @@ __all__ = ["BayesianLinearRegression", "LinearRegressionState", "RegressionDensi
 logger = logging.getLogger(__name__)
 
 NUM_DRAWS = 20_000
-"""Draws of which the implausible ones are counted."""
+"""Number of draws from which the share of implausible ones is counted."""
 
 CHUNK = 65_536
-"""Draws mapped at once."""
+"""Number of draws mapped in one batch."""
 
 PATIENCE = 20.0
-"""How many times more draws than expected are tried before sampling is given up."""
+"""Sampling stops with an error after this many times the expected number of draws."""
 
 STEP = 5e-3
-"""Step in z of the central differences of β; parameters may be sampled in float32, whose rounding
-is then 1e-4 of the difference, and the formula's own error is 1e-5."""
+"""Step in z of the central differences of β. Parameters may be sampled in float32, whose rounding
+is then 1e-4 of the difference; the formula's own error is 1e-5."""
 
 Undetermined = Literal["prior", "nominal"]
 
 
 @dataclass(frozen=True)
 class LinearRegressionState(State):
-    """What the next round needs.
+    """The data that the next round needs.
 
     Attributes:
         posterior: Posterior over the base parameters; ``None`` before the first round.
@@ -70,14 +70,14 @@ class BayesianLinearRegression(Backend):
     """Conjugate regression of inverse dynamics; see the module's text for the method.
 
     Args:
-        position_cutoff: Cut-off in Hz of the filter that smooths position readings before they
-            are differentiated; ``None`` to choose it by the readings' spectrum.
-        parallel_cutoff: Cut-off in Hz of the filter that both sides of the equations pass;
-            ``None`` for 0.4 of the other.
-        undetermined: What becomes of parameters that motion cannot tell: ``"prior"`` draws them
-            from the prior, ``"nominal"`` holds them at the simulator's nominal values. The density
-            over z is then that of the determined coordinates alone, given the others, and does
-            not look at these.
+        position_cutoff: Cut-off in Hz of the filter that smooths position measurements before they
+            are differentiated; ``None`` to choose it from the measurements' spectrum.
+        parallel_cutoff: Cut-off in Hz of the filter applied to both sides of the equations;
+            ``None`` for 0.4 times ``position_cutoff``.
+        undetermined: Treatment of parameters that the motion does not determine: ``"prior"`` draws
+            them from the prior, ``"nominal"`` holds them at the simulator's nominal values. With
+            ``"nominal"`` the density over z is that of the determined coordinates given the
+            others, and does not depend on the values passed for the latter.
     """
 
     name: ClassVar[str] = "bayesian-linear-regression"
@@ -101,7 +101,7 @@ class BayesianLinearRegression(Backend):
         """Returns the state before the regression.
 
         Raises:
-            BackendError: Nothing behind the problem has inverse dynamics.
+            BackendError: The problem has no simulator with inverse dynamics.
         """
         check_problem(problem)
         if problem.regression is None:
@@ -112,7 +112,7 @@ class BayesianLinearRegression(Backend):
         return LinearRegressionState(round=0, posterior=None, plausible=math.nan)
 
     def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
-        """Asks for nothing: returns ``(0, d)``."""
+        """Requests no simulations: returns ``(0, d)``."""
         return torch.empty(0, problem.num_parameters)
 
     def tell(
@@ -123,9 +123,9 @@ class BayesianLinearRegression(Backend):
         x: Tensor,
         progress: Callable[[float, str], None] | None = None,
     ) -> tuple[LinearRegressionState, RoundInfo]:
-        """Does the regression; simulations are checked and not looked at.
+        """Does the regression; simulations are checked but not used.
 
-        The figures are ``implausible`` and ``draws``, counts of the draws left out and tried,
+        The figures are ``implausible`` and ``draws``, the numbers of draws left out and tried,
         ``implausible_share``, and ``base``, the mean and standard deviation of every base
         parameter.
 
@@ -238,8 +238,8 @@ class RegressionDensity(Density):
         undetermined: See :class:`BayesianLinearRegression`.
 
     Raises:
-        BackendError: Free coordinates should follow a prior that is not N(0, I), or be held at
-            nominal values that the prior does not reach.
+        BackendError: Free coordinates would have to follow a prior that is not N(0, I), or be held
+            at nominal values outside the prior's support.
     """
 
     def __init__(
@@ -272,8 +272,8 @@ class RegressionDensity(Density):
         """Draws from the whole posterior over β, the implausible part included.
 
         Returns:
-            Points ``(num_draws, d)`` and the mask ``(num_draws,)`` of those that are plausible;
-            the others hold any values.
+            Points ``(num_draws, d)`` and the mask ``(num_draws,)`` of the plausible ones; the
+            values of the others have no meaning.
         """
         base = self.posterior.sample(num_draws)
         if self.undetermined == "prior":

@@ -1,9 +1,9 @@
 """BayesSim: mixture density networks on summary statistics of trajectories.
 
 Ramos, Possas & Fox (2019), *BayesSim: adaptive domain randomization via probabilistic inference
-for robotics simulators*, https://arxiv.org/abs/1906.01728. A mixture of Gaussians whose
-parameters are functions of the features is fitted to simulations from the prior by maximum
-likelihood, and read off at the observation. The functions are
+for robotics simulators*, https://arxiv.org/abs/1906.01728. A mixture of Gaussians is fitted to
+simulations from the prior by maximum likelihood. Its parameters are functions of the features; the
+posterior is the mixture at the features of the observation. The functions are
 
 * ``features="neural"``: a fully connected network, or
 * ``features="fourier"``: linear in fixed Fourier features of a kernel
@@ -15,9 +15,9 @@ likelihood, and read off at the observation. The functions are
   and whose bandwidth s is the median distance between simulations. Only the linear head is
   trained.
 
-Further rounds, with which Muratore et al. (2021) ran it, draw from the posterior and are corrected
-as in :mod:`npdr_ppl.inference.snpe_a`. The paper does so after training; see
-:mod:`npdr_ppl.inference.parts.bases.mixture_backend` for why we do it within.
+Muratore et al. (2021) ran BayesSim with further rounds. These draw from the posterior and are
+corrected as in :mod:`npdr_ppl.inference.snpe_a`. The paper corrects after training;
+:mod:`npdr_ppl.inference.parts.bases.mixture_backend` explains why we correct during training.
 """
 
 from collections.abc import Sequence
@@ -72,7 +72,7 @@ class BayesSim(MixtureBackend):
         """Returns the state before any simulation.
 
         Raises:
-            BackendError: A kernel is to be laid over features that are still to be learnt.
+            BackendError: Fourier features were chosen, but the embedding is a trained network.
         """
         if self.features == "fourier" and problem.build_network is not None:
             raise BackendError(
@@ -93,7 +93,7 @@ class BayesSim(MixtureBackend):
         preconditioner: Preconditioner,
         simulations: Simulations,
     ) -> Sequence[MixtureDensityNetwork]:
-        """Returns the networks, with the bandwidth that the simulations' features call for."""
+        """Returns the networks, with the bandwidth set from the simulations' features."""
         networks = self._networks(problem)
         for network in networks:
             if isinstance(network.hidden, FourierFeatures):

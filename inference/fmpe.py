@@ -3,9 +3,9 @@
 Wildberger, Dax, Buchholz, Green, Macke & Schoelkopf (2023), *Flow matching for scalable
 simulation-based inference*, https://arxiv.org/abs/2305.17161, after Lipman, Chen, Ben-Hamu, Nickel
 & Le (2023), *Flow matching for generative modeling*, https://arxiv.org/abs/2210.02747. The
-posterior is the law of the end point of an ordinary differential equation that starts from the
-standard normal and whose velocity is a network, trained by regression on a conditional velocity
-that is known in closed form.
+posterior is the distribution of the end point of an ordinary differential equation that starts
+from the standard normal. Its velocity is a network, trained by regression on a conditional
+velocity that is known in closed form.
 
 On the optimal-transport path (Lipman et al., Eq. 22; Wildberger et al., Eq. 6) noise u_0 ~ N(0, I)
 goes to parameters u_1 as
@@ -13,7 +13,7 @@ goes to parameters u_1 as
     u_t = (1 - (1 - sigma) t) u_0 + t u_1,        0 <= t <= 1.
 
 We scale that path to unit variance and measure time by an angle. With tan(phi) = t / (1 - (1 -
-sigma) t) and y = u_t / r, r^2 = (1 - (1 - sigma) t)^2 + t^2, it reads
+sigma) t) and y = u_t / r, r^2 = (1 - (1 - sigma) t)^2 + t^2, it becomes
 
     y_phi = cos(phi) u_0 + sin(phi) u_1,        dy/dphi = cos(phi) u_1 - sin(phi) u_0,
 
@@ -21,11 +21,12 @@ and for small sigma the paper's loss with t uniform is, term by term, the loss
 
     E || v(y_phi, phi, f) - cos(phi) u_1 + sin(phi) u_0 ||^2
 
-with phi uniform: the factor r^2 between the two errors cancels dphi/dt. What is gained is that the
-target has one scale at all times, and that a zero velocity is right wherever u_1 given f is N(0,
-I) - which the preconditioner, see :mod:`npdr_ppl.inference.parts.training.preconditioning`, makes
-it for linear-Gaussian problems. A network that starts at zero starts at that posterior, and the
-solver's steps are spent on what is not Gaussian.
+with phi uniform: the factor r^2 between the two errors cancels dphi/dt. This has two advantages.
+The target has the same scale at all times, and a zero velocity is right wherever u_1 given f is
+N(0, I). For linear-Gaussian problems the preconditioner
+(:mod:`npdr_ppl.inference.parts.training.preconditioning`) ensures the latter. A network that
+starts at zero therefore starts at that posterior, and the solver's steps are needed for the
+non-Gaussian part only.
 
 Sequential rounds use truncated proposals, see :mod:`npdr_ppl.inference.parts.bases.truncated`.
 """
@@ -50,7 +51,8 @@ from npdr_ppl.randomness import seeded
 __all__ = ["FMPE", "flow_matching_loss"]
 
 VALIDATION_DRAWS = 8
-"""Noise draws and angles at which a held-out row is judged, the same ones in every epoch."""
+"""Noise draws and angles per held-out row at which the loss is evaluated; the same in every
+epoch."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +62,10 @@ class FMPE(TruncatedBackend):
     Args:
         hidden: Width of the velocity network's two residual blocks.
         context: Width of the network that turns features and time into the blocks' modulation.
-        draws: Noise draws and angles per row and step of the training.
+        draws: Noise draws and angles per row and training step.
         sigma: Standard deviation sigma of the noise that is left at the end of the path, in units
             of the preconditioned parameters.
-        steps: Steps of the solver.
+        steps: Number of steps of the solver.
 
     The other options are those of
     :class:`~npdr_ppl.inference.parts.bases.truncated.TruncatedBackend`.
@@ -131,12 +133,12 @@ class FMPE(TruncatedBackend):
     def _loss(
         self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
     ) -> Loss:
-        """Returns the objective of the present round on the training device."""
+        """Returns the objective of the current round on the training device."""
         f = preconditioner.features(simulations.x.to(problem.device))
         u = preconditioner.whiten(simulations.z.to(problem.device), f)
 
         def loss(velocity: LogProb, rows: Tensor) -> Tensor:
-            # Angles of a row are stratified: they share out the path between them.
+            # Angles of a row are stratified: each lies in its own part of the path.
             shape = (*rows.shape, self.draws)
             part = (torch.rand(shape) + torch.arange(self.draws)) / self.draws
             noise = torch.randn(*shape, u.shape[-1])

@@ -2,18 +2,18 @@
 
 Papamakarios, Sterratt & Murray (2019), *Sequential Neural Likelihood*,
 https://arxiv.org/abs/1805.07226, Algorithm 1. A conditional flow learns the density of the
-features, max sum_n log q(x_n | z_n), over all rounds' simulations, whatever proposal they came
-from; each round proposes draws of the present posterior, proportional to p(z) q(x_o | z).
+features, max sum_n log q(x_n | z_n), from the simulations of all rounds and all proposals. Each
+round proposes draws of the current posterior, proportional to p(z) q(x_o | z).
 
-The flow sees the features' normal scores s as whitened residuals u = L^-1 (s(x) - m(z)) of their
-regression on a polynomial m of the parameters, whose degree the leave-one-out error chooses. Where
-x is a smooth function of z with Gaussian noise, as readings of a deterministic simulator are,
-little is left to learn.
+The features' normal scores s are regressed on a polynomial m of the parameters. The degree of m is
+the one with the least leave-one-out error. The input of the flow is the whitened residuals u =
+L^-1 (s(x) - m(z)). Where x is a smooth function of z with Gaussian noise, as the measurements of a
+deterministic simulator are, little is left to learn.
 
-Of many features, such as the readings of a trajectory, the flow sees the few combinations that
-vary most with the parameters, in units of their scatter at given parameters (Fisher's linear
-discriminants). With noise that is Gaussian and the same for all parameters, combinations that span
-E[x | z] are a sufficient statistic.
+If there are many features, such as the measurements of a trajectory, the flow gets a few
+combinations of them. They are those that vary most with the parameters, in units of their scatter
+at given parameters (Fisher's linear discriminants). With noise that is Gaussian and the same for
+all parameters, combinations that span E[x | z] are a sufficient statistic.
 """
 
 from dataclasses import dataclass
@@ -54,14 +54,15 @@ class NLE(LikelihoodBackend):
 
     Args:
         flow: Kind of flow, see :class:`~npdr_ppl.inference.parts.flows.flows.FlowNetwork`.
-        transforms: Transforms of a flow.
+        transforms: Number of transforms of a flow.
         hidden: Widths of the hidden layers of each transform's conditioner.
-        bins: Bins of a spline.
-        max_features: Combinations of the features that the flow sees at most.
-        coordinates: ``"normal"``, in which every prior is, or ``"bounded"``, Phi of them, in
-            which uniform priors are. A parameter near its range's end hardly moves in the first,
-            and what it does there is learnt badly; choose the second where a posterior, a
-            hierarchical one above all, reaches the ends of uniform ranges.
+        bins: Number of bins of a spline.
+        max_features: Maximum number of combinations of the features that the flow gets.
+        coordinates: ``"normal"``, in which every prior is standard normal, or ``"bounded"``, Phi
+            of them, in which uniform priors are uniform. In normal coordinates a parameter near
+            the end of its range hardly changes, so its effect there is learnt badly. Choose
+            bounded ones where a posterior, above all a hierarchical one, reaches the ends of
+            uniform ranges.
 
     The other options are those of
     :class:`~npdr_ppl.inference.parts.bases.neural_backend.NeuralBackend`.
@@ -95,7 +96,7 @@ class NLE(LikelihoodBackend):
         """Returns the state before any simulation.
 
         Raises:
-            BackendError: The features are learnt jointly.
+            BackendError: The features come from a network that is trained jointly.
         """
         self._check_fixed_features(problem)
         return super().init(problem)

@@ -2,25 +2,25 @@
 
 Hermans, Begy & Louppe (2020), https://arxiv.org/abs/1903.04057, as generalised by Miller, Weniger
 & Forre (2022), *Contrastive Neural Ratio Estimation*, https://arxiv.org/abs/2210.06170: a
-classifier h(z, x) is asked which of K parameters, if any, a simulation x came from. With the
+classifier h(z, x) decides which of K parameters, if any, a simulation x came from. With the
 parameters z_1 ... z_K of K rows, and g = gamma / K, it minimises (their Eqs. 8 and 9)
 
     -1 / (1 + gamma)  E log [ 1 / (1 + g sum_k exp h(z_k, x)) ]        all z_k independent of x
     -gamma / (1 + gamma)  E log [ g exp h(z_1, x) / (1 + g sum_k exp h(z_k, x)) ]    z_1 x's own
 
-whose optimum is h(z, x) = log p(x | z) - log p~(x), with p~ the marginal under whatever proposals
-the parameters came from: a likelihood up to a function of x, in every round (Durkan, Murray &
+whose optimum is h(z, x) = log p(x | z) - log p~(x), where p~ is the marginal under the proposals
+of the parameters. In every round this is a log likelihood up to a function of x (Durkan, Murray &
 Papamakarios 2020).
 
 We depart from the paper in the form of the classifier,
 
     h(z, x) = log N(z; A f + b, L L^T) / N(z; m, S) + a(z)^T b(f) + c(z) + w^T [r(z) + s(f)]_+.
 
-The first term is the ratio of a linear-Gaussian model, where training starts. The networks a and b
-enter by their inner product, the form that the likelihood of any exponential family has; r and s
-by ridge functions of their sum, which is what a likelihood of x - g(z) needs. With these forms all
-pairs of a mini-batch cost little more than the pairs that belong together, and every simulation is
-shown a hundred parameters instead of a few.
+The first term is the ratio of a linear-Gaussian model, from which training starts. The networks a
+and b enter by their inner product, the form of the likelihood of any exponential family. The
+networks r and s enter by ridge functions of their sum, the form that a likelihood of x - g(z)
+needs. With these forms, evaluating all pairs of a mini-batch costs little more than the matching
+pairs. Each simulation is therefore compared with a hundred parameters instead of a few.
 """
 
 import math
@@ -133,9 +133,9 @@ class NRE(LikelihoodBackend):
     Args:
         hidden: Widths of the hidden layers of both networks.
         rank: Length of their inner product.
-        units: Units that see the sum of their outputs.
-        num_atoms: Parameters K that a simulation is shown.
-        gamma: Odds of the right one being among them.
+        units: Number of units applied to the sum of their outputs.
+        num_atoms: Number of parameters K with which a simulation is compared.
+        gamma: Odds that the right one is among them.
 
     The other options are those of
     :class:`~npdr_ppl.inference.parts.bases.neural_backend.NeuralBackend`.
@@ -170,7 +170,7 @@ class NRE(LikelihoodBackend):
         """Returns the state before any simulation.
 
         Raises:
-            BackendError: The features are learnt jointly.
+            BackendError: The features come from a network that is trained jointly.
         """
         self._check_fixed_features(problem)
         return super().init(problem)
@@ -190,7 +190,7 @@ class NRE(LikelihoodBackend):
 
         members = []
         for k in range(self.members):
-            with seeded(0, "untrained networks"):  # the caller's stream must not notice
+            with seeded(0, "untrained networks"):  # leaves the caller's random stream unchanged
                 network = self._networks(problem)[k]
             network.load_state_dict({name: value[k] for name, value in state.weights.items()})
             network = network.to(problem.device).requires_grad_(False).eval()
@@ -247,8 +247,9 @@ def contrastive_loss(
 ) -> Tensor:
     """Returns the loss of Miller et al. (2022, Eqs. 8 and 9) for each row.
 
-    Rows come in random order and are taken in groups of K + 1. A row's K independent parameters
-    are those of the others of its group; in the second term its own take the place of one.
+    Rows come in random order and are split into groups of K + 1. A row's K independent parameters
+    are those of the other rows of its group. In the second term the row's own parameters replace
+    one of them.
 
     Args:
         v: Standardised parameters, ``(N, d)``.
@@ -256,10 +257,10 @@ def contrastive_loss(
         spread: Parameters times the whitening matrix, ``(N, d)``.
         f: Standardised features, ``(N, F)``.
         log_ratio: The linear-Gaussian part of h, from v and u.
-        num_atoms: Parameters K at most.
-        gamma: Odds of the row's own being among them.
+        num_atoms: Maximum number of parameters K.
+        gamma: Odds that the row's own are among them.
         correction: The networks' part of h, of all members and pairs.
-        rows: Numbers of the rows, ``(members, n)``.
+        rows: Indices of the rows, ``(members, n)``.
 
     Returns:
         The loss, ``(members, n)``.
@@ -272,7 +273,7 @@ def contrastive_loss(
         for start in starts
     ]
     rest = n - len(starts) * size
-    if rest:  # in a group with rows of the last one
+    if rest:  # grouped with rows of the last group
         last = _group_loss(v, u, spread, f, log_ratio, gamma, correction, rows[:, n - size :])
         losses.append(last[:, size - rest :])
     return torch.cat(losses, dim=1)
@@ -288,7 +289,7 @@ def _group_loss(
     correction: LogProb,
     rows: Tensor,
 ) -> Tensor:
-    """Returns the loss of rows that are shown each other's parameters, ``(members, K + 1)``."""
+    """Returns the loss of the rows of a group, ``(members, K + 1)``."""
     size = rows.shape[1]
     # Pairs (i, j): features of row i, parameters of row j.
     own, other = spread[rows][:, :, None], spread[rows][:, None]
@@ -296,7 +297,7 @@ def _group_loss(
     h = h + correction(v[rows], f[rows])
     log_odds = math.log(gamma / (size - 1))
     itself = torch.eye(size, dtype=torch.bool, device=rows.device)
-    # Of the others, the next one makes room for the row's own.
+    # The row's own parameters replace those of the next row.
     replaced = itself.roll(1, dims=1)
     independent = h.masked_fill(itself, -torch.inf).logsumexp(-1)
     joint = h.masked_fill(replaced, -torch.inf).logsumexp(-1)

@@ -1,9 +1,9 @@
-"""NUTS: the reference, for models whose recording has a differentiable density.
+"""NUTS: the reference method for models whose recording has a differentiable density.
 
 Hoffman & Gelman (2014), https://arxiv.org/abs/1111.4246, in Pyro's implementation, over the
-reference coordinates z, where the prior is close to N(0, I). It takes no simulations from the
-caller: the density evaluates the simulator itself. Chains become ensemble members, so that ArviZ's
-r-hat across members is that of the chains.
+reference coordinates z, where the prior is close to N(0, I). It needs no simulations from the
+caller, because the density evaluates the simulator itself. Each chain is an ensemble member, so
+that ArviZ's r-hat across members is that of the chains.
 """
 
 import logging
@@ -31,13 +31,13 @@ __all__ = ["NUTS", "NUTSState"]
 logger = logging.getLogger(__name__)
 
 NUM_START_PARTICLES = 200
-"""Particles tempered towards the posterior from which chains start: far from it a step of NUTS
-takes as many evaluations as it may."""
+"""Number of particles tempered towards the posterior; chains start from these. Far from the
+posterior, a step of NUTS would take the maximum number of evaluations."""
 
 
 @dataclass(frozen=True)
 class NUTSState(State):
-    """What NUTS has drawn.
+    """The draws of NUTS.
 
     Attributes:
         draws: Draws of every chain, ``(chains, num_samples, d)``; empty before the first round.
@@ -52,9 +52,9 @@ class NUTS(Backend):
 
     Args:
         chains: Number of chains, run one after another.
-        num_samples: Draws kept of each.
-        warmup: Steps before, in which step size and mass matrix adapt.
-        max_tree_depth: Doublings of a trajectory at most.
+        num_samples: Number of draws kept per chain.
+        warmup: Number of steps before these, in which step size and mass matrix adapt.
+        max_tree_depth: Maximum number of doublings of a trajectory.
     """
 
     name: ClassVar[str] = "nuts"
@@ -85,7 +85,7 @@ class NUTS(Backend):
         return NUTSState(0, torch.empty(self.chains, 0, problem.num_parameters))
 
     def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
-        """Returns no parameters, ``(0, d)``: nothing has to be simulated by the caller."""
+        """Returns no parameters, ``(0, d)``: the caller simulates nothing."""
         return torch.empty(0, problem.num_parameters)
 
     def tell(
@@ -96,7 +96,7 @@ class NUTS(Backend):
         x: Tensor,
         progress: Callable[[float, str], None] | None = None,
     ) -> tuple[NUTSState, RoundInfo]:
-        """Runs the chains anew; simulations are not looked at. See :meth:`Backend.tell`."""
+        """Runs the chains anew; simulations are ignored. See :meth:`Backend.tell`."""
         start = perf_counter()
         finite_rows(problem, z, x, 0)
         state = _own(state)
@@ -137,7 +137,7 @@ class NUTS(Backend):
         return NUTSState(state.round + 1, torch.stack(draws)), info
 
     def densities(self, problem: Problem, state: State) -> list[Density]:
-        """Returns the posterior as every chain saw it."""
+        """Returns the posterior of every chain."""
         state = _own(state)
         if not state.draws.shape[1]:
             raise BackendError("There is no posterior yet: tell the backend simulations first.")
@@ -173,7 +173,7 @@ def _density(problem: Problem) -> LogDensity:
     if problem.log_likelihood is None:
         raise BackendError(
             "nuts needs a model whose recording has a differentiable density: a differentiable, "
-            "deterministic simulator whose readings have noise, simulate(..., noise=...)."
+            "deterministic simulator with measurement noise, simulate(..., noise=...)."
         )
     return problem.log_likelihood
 

@@ -1,19 +1,18 @@
-"""Online BayesSim: BayesSim whose network goes on learning from one posterior to the next.
+"""Online BayesSim: BayesSim whose networks are trained further in every round.
 
 Possas, Barcelos, Oliveira, Fox & Ramos (2020), *Online BayesSim for combined simulator parameter
-inference and policy improvement*, IROS. Learning about the simulator's parameters alternates with
-improving the controller: every time, simulations are drawn from the present posterior, and the
+inference and policy improvement*, IROS. Inference of the simulator's parameters alternates with
+improvement of the controller. Each time, simulations are drawn from the current posterior, and the
 network is trained further on them. Here a round
 
-1. draws from the present posterior, the prior at first,
-2. goes on from the networks of the round before, for few epochs, with the
-   first round's preconditioner, without which their weights would lose their meaning,
-3. corrects for the proposals as :mod:`npdr_ppl.inference.parts.bases.mixture_backend`
-describes; by keeping
-   the earlier simulations, each with its own proposal, we depart from the paper.
+1. draws from the current posterior, or from the prior in the first round,
+2. continues training the previous round's networks for a few epochs; it keeps the first round's
+   preconditioner, because the weights are valid only with it,
+3. corrects for the proposals as :mod:`npdr_ppl.inference.parts.bases.mixture_backend` describes.
+   Unlike the paper, we keep the earlier simulations, each with its own proposal.
 
-The controller is not this file's business; ``continues`` tells a loop that has one to go on from
-the posterior of its last iteration, where BayesSim goes back to the prior.
+This file does not improve the controller. A loop that does so reads ``continues`` and starts each
+iteration from the last iteration's posterior, whereas BayesSim starts from the prior.
 """
 
 from collections.abc import Sequence
@@ -33,12 +32,12 @@ __all__ = ["OnlineBayesSim"]
 class OnlineBayesSim(BayesSim):
     """Online BayesSim; see the module's text for the method.
 
-    The options are those of :class:`~npdr_ppl.inference.bayessim.BayesSim`; ``epochs`` are those
-    of one round.
+    The options are those of :class:`~npdr_ppl.inference.bayessim.BayesSim`; ``epochs`` is the
+    number per round.
     """
 
     name: ClassVar[str] = "online-bayessim"
-    summary: ClassVar[str] = "BayesSim that goes on from its last posterior and networks"
+    summary: ClassVar[str] = "BayesSim that continues from its last posterior and networks"
     continues: ClassVar[bool] = True
 
     epochs: int = 10
@@ -56,7 +55,7 @@ class OnlineBayesSim(BayesSim):
         preconditioner: Preconditioner,
         simulations: Simulations,
     ) -> Sequence[MixtureDensityNetwork]:
-        """Returns the networks of the round before."""
+        """Returns the networks of the previous round."""
         if state.round == 0:
             return super()._starting_networks(problem, state, preconditioner, simulations)
         return self._trained_networks(problem, state)

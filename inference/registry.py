@@ -29,7 +29,7 @@ BUILT_IN = {
     "snpe-a": "npdr_ppl.inference.snpe_a:SNPEA",
     "snpe-c": "npdr_ppl.inference.snpe_c:SNPEC",
 }
-"""Backends of this package by name; each is imported when it is asked for."""
+"""Backends of this package by name; each is imported on first use."""
 
 
 def _locations() -> dict[str, str]:

@@ -7,16 +7,16 @@ conditional density estimation*, https://arxiv.org/abs/1605.06376. Each round r
    (Algorithm 1),
 2. simulates features x_n ~ p(x | z_n),
 3. fits a mixture density network and divides by the proposal, p(z | x) ~
-   q~(z | x) p(z) / p~_r(z), analytically (Algorithm 2, Proposition 1); the next proposal is the
-   Gaussian with the moments of the result at x_o (the paper's networks have a single Gaussian
-   until the last round).
+   q~(z | x) p(z) / p~_r(z), analytically (Algorithm 2, Proposition 1). The next proposal is the
+   Gaussian with the moments of the result at x_o. (The paper's networks have a single Gaussian
+   until the last round.)
 
 The prior is N(0, I), so that the quotient of Gaussians is known for every model. The division
-takes place inside the likelihood rather than after training, which makes it exact and proper
-whatever the network, and lets all rounds' simulations count: see
-:mod:`npdr_ppl.inference.parts.bases.mixture_backend`, also for how this differs from the paper.
-It is the form in which Greenberg et al. (2019, https://arxiv.org/abs/1905.07488) train mixtures
-without atoms.
+takes place inside the likelihood rather than after training. It is therefore exact and gives a
+proper density for any network, and the simulations of all rounds can be used.
+:mod:`npdr_ppl.inference.parts.bases.mixture_backend` gives details and the differences from the
+paper. Greenberg et al. (2019, https://arxiv.org/abs/1905.07488) train mixtures without atoms in
+this form.
 """
 
 from dataclasses import dataclass

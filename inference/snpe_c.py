@@ -7,26 +7,27 @@ Lueckmann et al. (2017). Each round r of Algorithm 1
 1. draws parameters z_n from a proposal p_r(z), the prior in the first round,
 2. simulates features x_n ~ p(x | z_n),
 3. trains a conditional flow q(z | x) on the simulations so far, so that q(z | x_o) tends to the
-   posterior, whatever the proposals were.
+   posterior for all proposals.
 
-Two kinds of proposals do that:
+Two kinds of proposals have this property:
 
 * ``"truncated"`` (Deistler et al. 2022, https://arxiv.org/abs/2210.04815): the prior restricted to
-  the region that holds all but a fraction epsilon of the present posterior's mass, where plain
+  the region that holds all but a fraction epsilon of the current posterior's mass. In it plain
   maximum likelihood, max sum_n log q(z_n | x_n), needs no correction; see
   :mod:`npdr_ppl.inference.parts.bases.truncated`.
-* ``"atomic"`` (Greenberg et al. 2019, Eqs. 4 and 6): the present posterior itself. A row's
-  parameters z_n must be told from M - 1 others of the batch,
+* ``"atomic"`` (Greenberg et al. 2019, Eqs. 4 and 6): the current posterior itself. The network
+  must identify a row's parameters z_n among M - 1 others of the batch,
 
       q~(z_n | x_n) = [q(z_n | x_n) / p(z_n)] / sum_m [q(z_m | x_n) / p(z_m)],
 
   with the prior p; rows from the prior also enter by plain maximum likelihood (the combined loss
-  of their Appendix A.3), which ties down q where the proposals never go.
+  of their Appendix A.3). This determines q where no proposal was drawn.
 
-The flows are trained on preconditioned data, see
-:mod:`npdr_ppl.inference.parts.training.preconditioning`, all members in one pass, see
-:mod:`npdr_ppl.inference.parts.flows.stacked_flow`. All hold out the same simulations, to which
-their common base is fitted afterwards, see :mod:`npdr_ppl.inference.parts.flows.flow_base`.
+The flows are trained on preconditioned data
+(:mod:`npdr_ppl.inference.parts.training.preconditioning`), all members in one pass
+(:mod:`npdr_ppl.inference.parts.flows.stacked_flow`). All members hold out the same simulations.
+Their common base density is fitted to these afterwards
+(:mod:`npdr_ppl.inference.parts.flows.flow_base`).
 """
 
 from collections.abc import Iterator, Mapping
@@ -63,10 +64,10 @@ __all__ = ["SNPEC", "atomic_loss"]
 PROPOSALS = ("truncated", "atomic")
 
 SCALE, FREEDOM = "base.scale", "base.freedom"
-"""Names under which the flows' base is kept with the weights."""
+"""Names under which the parameters of the flows' base density are stored with the weights."""
 
 MIN_HELD_OUT = 20
-"""Held-out simulations below which the flows' base is not fitted."""
+"""Minimum number of held-out simulations to fit the flows' base density."""
 
 
 @dataclass(frozen=True)
@@ -75,12 +76,12 @@ class SNPEC(TruncatedBackend):
 
     Args:
         flow: Kind of flow, see :class:`~npdr_ppl.inference.parts.flows.flows.FlowNetwork`.
-        transforms: Transforms of a flow.
+        transforms: Number of transforms of a flow.
         hidden: Widths of the hidden layers of each transform's conditioner.
-        bins: Bins of a spline.
+        bins: Number of bins of a spline.
         proposals: ``"truncated"`` or ``"atomic"``.
-        num_atoms: Atoms M of the atomic loss.
-        calibrates: Whether the flows' base is fitted to the held-out simulations, see
+        num_atoms: Number of atoms M of the atomic loss.
+        calibrates: Whether the flows' base density is fitted to the held-out simulations, see
             :mod:`npdr_ppl.inference.parts.flows.flow_base`.
 
     The other options are those of
@@ -144,7 +145,7 @@ class SNPEC(TruncatedBackend):
         return [load_member(build, own, k).to(problem.device) for k in range(self.members)]
 
     def _training_rows(self, problem: Problem, state: NeuralState) -> Tensor:
-        """Returns which simulations to train on, ``(n,)``; the atomic loss corrects for all."""
+        """Returns which simulations to train on, ``(n,)``; the atomic loss can use all."""
         if self.proposals == "atomic":
             return NeuralBackend._training_rows(self, problem, state)
         return super()._training_rows(problem, state)
@@ -162,7 +163,7 @@ class SNPEC(TruncatedBackend):
         )
 
     def _evaluator(self, problem: Problem) -> Evaluator:
-        """Returns how all networks are evaluated at once, faster than by torch's own means."""
+        """Returns the joint evaluation of all networks, which is faster than torch's own."""
         return super()._evaluator(problem) if problem.build_network else stacked_log_prob
 
     def _training_data(
@@ -180,10 +181,10 @@ class SNPEC(TruncatedBackend):
         weights: Mapping[str, Tensor],
         held_out: Tensor,
     ) -> dict[str, Tensor]:
-        """Fits the flows' base to the held-out simulations, those from the prior if atomic.
+        """Fits the flows' base density to the held-out simulations (atomic: those from the prior).
 
-        Simulations of an atomic loss's later proposals do not follow the posterior's density, so
-        that nothing can be fitted to them.
+        With the atomic loss, simulations from later proposals do not follow the posterior's
+        density and cannot be used for the fit.
         """
         numbers = held_out[0]
         if self.proposals == "atomic":
@@ -199,7 +200,7 @@ class SNPEC(TruncatedBackend):
             squares.append((base**2).sum(-1))
             log_dets.append(log_det)
         fitted = fit_base(torch.stack(squares), torch.stack(log_dets), u.shape[1])
-        # Like all weights with the members first, although it is the same for all of them.
+        # The first dimension is the members, as in all weights; all members have the same base.
         values = {SCALE: fitted.scale, FREEDOM: fitted.freedom}
         return {
             name: torch.full((self.members,), value, dtype=torch.float64)
@@ -209,7 +210,7 @@ class SNPEC(TruncatedBackend):
     def _loss(
         self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
     ) -> Loss:
-        """Returns the objective of the present round on the training device."""
+        """Returns the objective of the current round on the training device."""
         z = simulations.z.to(problem.device)
         u, f = self._training_data(problem, preconditioner, simulations)
         if self.proposals == "truncated" or not simulations.rounds.any():
@@ -245,13 +246,13 @@ def atomic_loss(
     Args:
         u: Parameters whitened by their own row's regression, ``(N, d)``.
         f: Standardised features, ``(N, ...)``.
-        spread: Parameters times the whitening matrix, L^-1 z, ``(N, d)``: what u differs by
-            between two parameters at the same features.
+        spread: Parameters times the whitening matrix, L^-1 z, ``(N, d)``. At the same features,
+            the values of u of two parameters differ by the difference of these.
         log_prior: Log density of the prior, ``(N,)``.
         is_prior: Whether a row was drawn from the prior, ``(N,)``.
         num_atoms: Atoms M.
         log_prob: Log densities of all members.
-        rows: Numbers of the rows, ``(members, n)``.
+        rows: Indices of the rows, ``(members, n)``.
 
     Returns:
         The loss of each row, ``(members, n)``.

@@ -17,7 +17,7 @@ __all__ = ["TargetEntry", "ZooEntry", "targets", "zoo"]
 
 @dataclass(frozen=True)
 class ZooEntry:
-    """A model of the zoo; its module is imported when it is asked for.
+    """A model of the zoo; its module is imported on first use.
 
     Attributes:
         name: Name on the command line.
@@ -116,7 +116,7 @@ def zoo() -> dict[str, ZooEntry]:
 
 @dataclass(frozen=True)
 class TargetEntry:
-    """A target domain of the zoo; its module is imported when it is made.
+    """A target domain of the zoo; its module is imported on first use.
 
     Attributes:
         name: Name on the command line.
@@ -149,7 +149,7 @@ _TARGETS = tuple(
 def targets() -> dict[str, TargetEntry]:
     """Returns the target domains of the zoo by name.
 
-    Of the random pendulums, one stands for all; ``furuta_target`` makes the others.
+    Only one of the random pendulums is listed; ``furuta_target`` makes the others.
 
     Example:
         >>> sorted(targets())

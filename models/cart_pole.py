@@ -38,7 +38,7 @@ class CartPoleConstants(NamedTuple):
 
 
 class CartPoleInverseDynamics(InverseDynamics):
-    """The equations of :class:`CartPole` as they stand, gravity's moment apart from the pole's."""
+    """The equations of :class:`CartPole`; the pole's gravity torque is a separate combination."""
 
     base = (
         BaseParameter("total_mass", "kg", "M + m"),
@@ -71,7 +71,7 @@ class CartPoleInverseDynamics(InverseDynamics):
         return torch.stack((cart, pole), dim=-2)
 
     def targets(self, motion: Motion) -> Tensor:
-        """Returns the force on the cart, and no torque on the pole, ``(N, 2)``, in N and N m."""
+        """Returns the force on the cart in N and a zero torque in N m, ``(N, 2)``."""
         (force,) = motion.actions
         return torch.stack((force, torch.zeros_like(force)), dim=-1)
 
@@ -138,7 +138,7 @@ class CartPole(ODESimulator):
     joints = ("rail", "hinge")
     ports = (
         Port("force", "action", "N", rated=20.0),
-        # A push of middling strength, and the pole's greatest gravity torque.
+        # A moderate push, and the pole's maximum gravity torque.
         Port("rail", "force", "N", rated=10.0, rated_speed=1.0, coordinate="m"),
         Port("hinge", "force", "N m", rated=0.6, rated_speed=5.0, is_driven=False),
         Port("cart_position", "sensor", "m", rated=1.0),
@@ -159,7 +159,7 @@ class CartPole(ODESimulator):
     def constants(
         self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]
     ) -> CartPoleConstants:
-        """Combines the parameters, once."""
+        """Combines the parameters once."""
         p = parameters
         moment = 0.5 * p["pole_mass"] * p["pole_length"]
         total_mass = p["cart_mass"] + p["pole_mass"]
@@ -219,7 +219,7 @@ def cart_pole(inputs: Inputs, *, noise: Noise | None = None) -> Tensor:
 
     Args:
         inputs: Segments with :class:`CartPole`'s channels.
-        noise: Noise of the readings.
+        noise: Measurement noise.
     """
     parameters = {
         "cart_mass": pyro.sample("cart_mass", dist.Uniform(0.3, 2.0)),  # kg

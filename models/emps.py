@@ -22,7 +22,7 @@ __all__ = ["Emps", "EmpsInverseDynamics", "emps"]
 class EmpsInverseDynamics(InverseDynamics):
     """(M/K) q̈ + (F_v/K) q̇ = u: the equation of :class:`Emps` in volts, with the drive's gain K.
 
-    The motion shows M/K and F_v/K only; the masses follow once K is given.
+    The motion determines M/K and F_v/K only; M and F_v follow if K is known.
     """
 
     base = (
@@ -60,13 +60,13 @@ class EmpsInverseDynamics(InverseDynamics):
 class Emps(ODESimulator):
     """M q̈ = K u − F_v q̇, with position q, motor voltage u and the drive's gain K.
 
-    Dry friction and the amplifier's offset, which the drive has, are effects of the catalogue:
-    attach ``CoulombFriction("carriage")`` and ``Bias("carriage")``.
+    The real drive also has dry friction and an amplifier offset. These are effects of the
+    catalogue: attach ``CoulombFriction("carriage")`` and ``Bias("carriage")``.
 
     Reference: A. Janot, M. Gautier, M. Brunot, Data set and reference models of EMPS, Workshop on
     Nonlinear System Identification Benchmarks, 2019. It gives M = 95.1 kg and F_v = 203.5 N s/m,
     the nominal values here, Coulomb friction 20.4 N, and an offset of −3.2 N on the side of the
-    inertia, which is a bias of +3.2 N.
+    inertia, equal to a bias of +3.2 N.
     """
 
     states = (
@@ -133,8 +133,8 @@ def emps(inputs: Inputs, *, noise: Noise | None = None) -> Tensor:
     """The positioning system with unknown mass and viscous friction; the drive's gain is known.
 
     Args:
-        inputs: Segments with the action ``voltage``, and readings of ``position`` at least.
-        noise: Noise of the readings.
+        inputs: Segments with the action ``voltage``, and measurements of at least ``position``.
+        noise: Measurement noise.
     """
     parameters = {
         "mass": pyro.sample("mass", dist.Uniform(50.0, 150.0)),  # kg

@@ -52,12 +52,12 @@ class Furuta(ODESimulator):
                                           − c₁ sin 2α θ̇ α̇ + c₂ sin α α̇²
         c₂ cos α θ̈ + c₃ α̈ = −D_p α̇ + (c₁/2) sin 2α θ̇² − c₄ sin α
 
-    A thin rod would have c₃ in place of c₁; the paper's equations, kept here, put its mass at
-    its centre wherever the arm turns it.
+    For a thin rod, c₃ would replace c₁. The paper's equations are kept here: where the arm turns
+    the pole, they treat it as a point mass at its centre.
 
     Gravity enters as a vector in the base's frame, z up, the arm along x at θ = 0. The pole's
-    centre is L_r r + (L_p/2)(sin α t − cos α z) with r = (cos θ, sin θ, 0) and t = ∂r/∂θ, the
-    arm is balanced, so the generalised forces of gravity g are
+    centre is L_r r + (L_p/2)(sin α t − cos α z) with r = (cos θ, sin θ, 0) and t = ∂r/∂θ, and the
+    arm is balanced. The generalised forces of gravity g are therefore
 
         Q_θ = M_p (L_r t − (L_p/2) sin α r)·g,    Q_α = M_p (L_p/2)(cos α t + sin α z)·g.
 
@@ -89,7 +89,7 @@ class Furuta(ODESimulator):
     joints = ("arm", "pole")
     ports = (
         Port("voltage", "action", "V", rated=4.0),
-        # The motor's stall torque at 4 V, and the pole's greatest gravity torque.
+        # The motor's stall torque at 4 V, and the pole's maximum gravity torque.
         Port("arm", "force", "N m", rated=0.02, rated_speed=10.0),
         Port("pole", "force", "N m", rated=0.015, rated_speed=20.0, is_driven=False),
         Port("arm_angle", "sensor", "rad", rated=1.0),
@@ -110,20 +110,20 @@ class Furuta(ODESimulator):
     def constants(
         self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]
     ) -> FurutaConstants:
-        """Combines the parameters, once."""
+        """Combines the parameters once."""
         p = parameters
         pole_mass, arm_length = p["pole_mass"], p["arm_length"]
         moment = 0.5 * pole_mass * p["pole_length"]  # M_p L_p/2
         c1 = 0.5 * moment * p["pole_length"]
         inverse_c3 = 0.75 / c1
-        end_mass = pole_mass  # what the arm's end carries
+        end_mass = pole_mass  # mass at the arm's end
         payload = environment["payload"]
         if isinstance(payload, Tensor):
             extra = payload * p["pole_length"]
             end_mass = end_mass + payload
             moment = moment + extra
             c1 = c1 + extra * p["pole_length"]
-            # As a factor, which without payload is exactly 1.
+            # A factor that is exactly 1 without payload.
             inverse_c3 = inverse_c3 / (1.0 + extra * p["pole_length"] * inverse_c3)
         c2 = moment * arm_length
         motor_gain = p["motor_constant"] / p["motor_resistance"]
@@ -156,7 +156,7 @@ class Furuta(ODESimulator):
         forces: Forces,
         constants: FurutaConstants,
     ) -> Components:
-        """Returns (θ̈, α̈), the pole's equation divided by c₃ and eliminated."""
+        """Returns (θ̈, α̈). The pole's equation is divided by c₃ and α̈ is eliminated."""
         k = constants
         theta, alpha = positions
         theta_rate, alpha_rate = velocities
@@ -193,7 +193,7 @@ class Furuta(ODESimulator):
 
 
 class SwingUpReward:
-    """exp(−(eᵀQe + r V²)), e from the upright state with the pole angle wrapped the short way.
+    """exp(−(eᵀQe + r V²)), where e is the error from upright, its pole angle wrapped to ±π.
 
     Args:
         arm_angle_weight: Q of the arm angle: 1.0 in the paper's simulations, 0.3 on its device.
@@ -222,7 +222,7 @@ class SwingUpReward:
     def __call__(
         self, positions: Components, velocities: Components, commands: Components
     ) -> Tensor:
-        """Returns the reward of a step, at most 1, from its start state and its command."""
+        """Returns the reward of a step, at most 1, from its initial state and its command."""
         arm, pole, arm_rate, pole_rate = self.weights
         error = positions[1] - math.pi
         error = error - 2.0 * math.pi * torch.round(error * (0.5 / math.pi))
@@ -233,7 +233,7 @@ class SwingUpReward:
 
 
 def initial_states(num_states: int, generator: torch.Generator) -> Tensor:
-    """Draws states near hanging: uniform ±(2, 1, 0.5, 0.5) degrees and degrees per second.
+    """Draws states near hanging: uniform ±(2, 1, 0.5, 0.5) in degrees and degrees per second.
 
     Args:
         num_states: Number of states.
@@ -247,11 +247,11 @@ def initial_states(num_states: int, generator: torch.Generator) -> Tensor:
 
 
 def furuta(inputs: Inputs, *, noise: Noise | None = None) -> Tensor:
-    """The Furuta pendulum under the zoo's prior, whose dampings reach plausible values.
+    """The Furuta pendulum with the zoo's prior, which covers plausible dampings.
 
     Args:
         inputs: Segments with :class:`Furuta`'s channels.
-        noise: Noise of the readings.
+        noise: Measurement noise.
     """
     parameters = _rigid_body_prior()
     parameters["arm_damping"] = pyro.sample("arm_damping", dist.Uniform(0.0, 1e-3))
@@ -260,11 +260,11 @@ def furuta(inputs: Inputs, *, noise: Noise | None = None) -> Tensor:
 
 
 def furuta_paper(inputs: Inputs, *, noise: Noise | None = None) -> Tensor:
-    """The Furuta pendulum under the paper's prior, for reproducing its tables.
+    """The Furuta pendulum with the paper's prior, for reproducing the paper's tables.
 
     Args:
         inputs: Segments with :class:`Furuta`'s channels.
-        noise: Noise of the readings.
+        noise: Measurement noise.
     """
     parameters = _rigid_body_prior()
     parameters["arm_damping"] = pyro.sample("arm_damping", dist.Uniform(0.0, 2.5e-5))
@@ -285,7 +285,7 @@ _PRIOR_RANGES = {
 
 
 def _rigid_body_prior() -> dict[str, Tensor]:
-    """Samples everything but the dampings."""
+    """Samples all parameters except the dampings."""
     nominal = {parameter.name: parameter.nominal for parameter in Furuta.parameters}
     return {
         name: pyro.sample(name, dist.Uniform(low * nominal[name], high * nominal[name]))

@@ -1,8 +1,8 @@
-"""Furuta pendulums with one hidden effect that decides whether a policy works.
+"""Furuta pendulums with one hidden effect that determines whether a policy works.
 
 The random rigs of :mod:`npdr_ppl.models.furuta_targets` have small effects, which many policies
-tolerate. Here each rig has one effect, as large as it can be found on a device that was built or
-wired carelessly, and nothing else beyond the paper's equations.
+tolerate. Here each rig has one large effect, as on a carelessly built or wired device. Otherwise
+it follows the paper's equations.
 """
 
 from typing import Literal, get_args
@@ -21,25 +21,26 @@ HIDDEN: tuple[Hidden, ...] = get_args(Hidden)
 """The kinds of hidden effects."""
 
 DELAY = (0.015, 0.025)
-"""Delay of the voltage, in s: 8 to 12 control periods, a bus and a busy computer in the loop."""
+"""Range of the delay of the voltage, in s: 8 to 12 control periods, as with a bus and a busy
+computer."""
 
 MORE_FRICTION = (3.0, 5.0)
-"""Dry friction relative to that of the random rigs, whose means are the two numbers below."""
+"""Range of the dry friction relative to the random rigs, whose means are the two numbers below."""
 
 ARM_FRICTION, POLE_FRICTION = 1e-3, 1e-4
 """Mean dry friction of the random rigs' joints, in N m."""
 
 DEAD_ZONE = (0.3, 0.6)
-"""Half width of the amplifier's dead zone, in V; its limit is ±4 V."""
+"""Range of the half width of the amplifier's dead zone, in V; its limit is ±4 V."""
 
 OFF = 0.15
-"""Greatest relative difference of a rig's parameters from the nominal ones."""
+"""Maximum relative difference of a rig's parameters from the nominal ones."""
 
 
 def hidden_rig(kind: Hidden, seed: int) -> FurutaRig:
     """Draws a rig with one hidden effect.
 
-    Masses, lengths and the motor are up to 15 % off nominal, dampings lie in the random rigs'
+    Masses, lengths and the motor are up to 15 % off nominal; dampings lie in the random rigs'
     ranges.
 
     Args:

@@ -1,4 +1,4 @@
-"""The Furuta pendulum's equations of motion as linear regression wants them."""
+"""The Furuta pendulum's equations of motion in the form for linear regression."""
 
 from collections.abc import Mapping
 
@@ -13,14 +13,14 @@ __all__ = ["FurutaInverseDynamics"]
 class FurutaInverseDynamics(InverseDynamics):
     """The equations of :class:`~npdr_ppl.models.furuta.Furuta` in volts.
 
-    With its symbols and the motor's gain K = k_m/R_m, division by K leaves the voltage alone on
-    the right and makes the back-EMF a damping:
+    The symbols are the same. Division by the motor's gain K = k_m/R_m leaves only the voltage on
+    the right and turns the back-EMF into a damping:
 
         [c₀ θ̈ + c₁ (sin²α θ̈ + sin 2α θ̇ α̇) + c₂ (cos α α̈ − sin α α̇²) + (D_r + K k_m) θ̇]/K = V
         [c₁ (⁴⁄₃ α̈ − ½ sin 2α θ̇²) + c₂ cos α θ̈ + c₄ sin α + D_p α̇]/K = 0
 
-    The motion therefore shows six combinations; motor and gravity must be given, and the masses
-    are in proportion to K.
+    The motion therefore determines six combinations. Motor and gravity must be known, and the
+    masses are proportional to K.
     """
 
     base = (

@@ -1,4 +1,4 @@
-"""A Furuta pendulum in another engine: a rig whose recordings no equation of ours has made."""
+"""A Furuta pendulum in MuJoCo: its recordings do not come from our own equations of motion."""
 
 import importlib
 import math
@@ -19,11 +19,11 @@ __all__ = ["FurutaRecording", "FurutaRig"]
 Array = NDArray[np.float64]
 
 VoltageController = Callable[[Array, float], float | Array]
-"""Maps the four readings and the time in seconds to a voltage, before any limit."""
+"""Maps the four measurements and the time in seconds to a voltage, before any limit."""
 
 _XML = Path(__file__).with_name("furuta.xml")
 
-# Lets a body be a point mass: MuJoCo wants inertias above 1e-15 kg m²; the pole's is 3e-5.
+# For point masses: MuJoCo requires inertias above 1e-15 kg m²; the pole's is 3e-5 kg m².
 _POINT_INERTIA = 1e-10
 
 
@@ -33,8 +33,8 @@ class FurutaRecording:
 
     Attributes:
         time: Time of each state, ``(K + 1,)``.
-        readings: What the sensors reported: arm angle, pole angle and their rates, ``(K + 1, 4)``.
-        voltage: Voltage after the limit, as recordings hold it, ``(K,)``.
+        readings: Measured arm angle, pole angle and their rates, ``(K + 1, 4)``.
+        voltage: Voltage after the limit, as stored in recordings, ``(K,)``.
         commands: Voltage before the limit, ``(K,)``.
         true_states: Positions and rates of the bodies, ``(K + 1, 4)``.
     """
@@ -48,21 +48,21 @@ class FurutaRecording:
 
 @dataclass(frozen=True)
 class FurutaRig:
-    """A Quanser Qube in MuJoCo, with what the paper's equations leave out.
+    """A Quanser Qube in MuJoCo, with effects that the paper's equations leave out.
 
-    With all effects off it follows :class:`~npdr_ppl.models.furuta.Furuta` as closely as the
-    integrators allow.
+    With all effects off it equals :class:`~npdr_ppl.models.furuta.Furuta` up to the error of the
+    integrators.
 
     Attributes:
         parameters: Domain parameters by :class:`Furuta`'s names; missing ones are nominal.
         arm_friction: Dry friction of the arm's joint, in N m.
         pole_friction: Dry friction of the pole's joint, in N m.
-        input_delay: Delay of the voltage, in s, rounded to the physics' half milliseconds.
-        voltage_dead_zone: Half width of the amplifier's dead zone, in V: it puts out
-            sign(u) max(|u| − δ, 0), while recordings hold u.
-        velocity_time_constant: Time constant of the filter that turns differences of encoder
-            readings into rates, in s; 0 reports true rates.
-        encoder_counts: Encoder counts per turn; 0 reports true angles.
+        input_delay: Delay of the voltage, in s, rounded to multiples of the 0.5 ms physics step.
+        voltage_dead_zone: Half width δ of the amplifier's dead zone, in V: its output is sign(u)
+            max(|u| − δ, 0), while recordings contain u.
+        velocity_time_constant: Time constant, in s, of the filter that computes rates from
+            differences of encoder angles; 0 reports true rates.
+        encoder_counts: Encoder resolution in steps per turn; 0 reports true angles.
         tilt: Roll and pitch of gravity in the base's frame, in rad; see the effect ``tilt``.
     """
 
@@ -119,20 +119,20 @@ class FurutaRig:
         """Runs one episode; it ends early where a state leaves its bounds.
 
         Args:
-            controller: What commands the voltage, a number or an array ``(1,)``.
-            num_steps: Greatest number of steps K.
+            controller: Returns the voltage, a number or an array ``(1,)``.
+            num_steps: Maximum number of steps K.
             initial_state: Arm angle, pole angle and rates, ``(4,)``; ``None`` for hanging.
-            time_step: Seconds between commands, a multiple of the physics' half millisecond.
+            time_step: Seconds between commands, a multiple of the physics step of 0.5 ms.
         """
         mujoco: Any = importlib.import_module("mujoco")
         model = self.model()
         data = mujoco.MjData(model)
         start = np.zeros(4) if initial_state is None else np.asarray(initial_state, float)
         data.qpos[:], data.qvel[:] = start[:2], start[2:]
-        position, velocity = data.qpos, data.qvel  # views, for the whole episode
+        position, velocity = data.qpos, data.qvel  # views that stay valid for the whole episode
         physics_step = float(model.opt.timestep)
         num_substeps = round(time_step / physics_step)
-        # A voltage arrives some whole steps and some substeps after it was commanded.
+        # The delay of a voltage is a number of whole steps plus a number of substeps.
         whole, late = divmod(round(self.input_delay / physics_step), num_substeps)
         voltages = [0.0] * (whole + 1)
         limit, dead_zone = Furuta.actions[0].upper, self.voltage_dead_zone
@@ -146,7 +146,7 @@ class FurutaRig:
         angles, rates = _encoded(state[:2], count), state[2:]
         readings = [angles + rates]
         commands: list[float] = []
-        # Four numbers at a time are quicker as floats than as arrays.
+        # For four numbers, floats are faster than arrays.
         for step in range(num_steps):
             command = _voltage(controller(np.array(readings[-1]), step * time_step))
             commands.append(command)
@@ -188,7 +188,7 @@ class FurutaRig:
 
 
 def _encoded(angles: list[float], count: float) -> list[float]:
-    """Returns angles to the nearest encoder count of this size in rad; 0 keeps them."""
+    """Returns angles rounded to the encoder resolution in rad; 0 leaves them unchanged."""
     return [round(angle / count) * count for angle in angles] if count else angles
 
 

@@ -25,7 +25,7 @@ class FurutaTarget(TargetDomain):
 
     Args:
         name: Name in tables and files.
-        rig: The rig, which stays hidden.
+        rig: The hidden rig.
     """
 
     sensors = Furuta.sensors
@@ -87,8 +87,8 @@ def _scaled(factors: dict[str, float]) -> dict[str, float]:
     return {name: factor * nominal[name] for name, factor in factors.items()}
 
 
-# The presets' viscous friction is ten and twenty times nominal, which is next to none: inside the
-# zoo model's prior instead of at its edge.
+# The nominal viscous friction is almost zero, at the edge of the zoo model's prior. The presets'
+# friction is ten and twenty times nominal, inside the prior.
 _PRESETS = {
     "furuta-easy": FurutaRig(
         parameters={"arm_damping": 5e-5, "pole_damping": 5e-6}, velocity_time_constant=0.002
@@ -109,7 +109,7 @@ _PRESETS = {
         pole_friction=5e-5,
         velocity_time_constant=0.002,
     ),
-    # A shorter arm and a longer pole are what breaks a policy made for the nominal pendulum.
+    # A policy made for the nominal pendulum fails with a shorter arm and a longer pole.
     "furuta-hard": FurutaRig(
         parameters=_scaled(
             {
@@ -128,12 +128,12 @@ _PRESETS = {
     ),
 }
 
-# Gravity is what it is everywhere, and the dampings have ranges of their own.
+# Gravity is the same for all rigs, and the dampings have their own ranges.
 _NOT_SCALED = ("gravity", "arm_damping", "pole_damping")
 
 
 def _random_rig(seed: int) -> FurutaRig:
-    """Draws a rig; the order of the draws is part of what a seed means."""
+    """Draws a rig; another order of the draws would change the rig of a seed."""
     generator = np.random.default_rng(seed)
     scaled = [p.name for p in Furuta.parameters if p.name not in _NOT_SCALED]
     parameters = _scaled({name: generator.uniform(0.75, 1.25) for name in scaled})

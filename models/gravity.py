@@ -7,7 +7,7 @@ __all__ = ["GravityVector", "downward"]
 GravityVector = tuple[Tensor | float, Tensor | float, Tensor | float]
 """Acceleration of gravity along x, y and z (up) of the base, in m/s².
 
-A component that is the number 0.0 is absent by construction and costs nothing.
+A component given as the number 0.0 is left out of the equations and needs no computation.
 """
 
 

@@ -22,7 +22,7 @@ __all__ = ["Pendulum", "PendulumInverseDynamics", "pendulum"]
 
 
 class PendulumInverseDynamics(InverseDynamics):
-    """The equation of :class:`Pendulum` as it stands; mass and length follow under known g."""
+    """The equation of :class:`Pendulum`; mass and length follow if g is known."""
 
     base = (
         BaseParameter("inertia", "kg m²", "m l²/3"),
@@ -107,14 +107,14 @@ class Pendulum(ODESimulator):
     def constants(
         self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]
     ) -> dict[str, Tensor]:
-        """Divides the equation by the inertia m l²/3, once."""
+        """Divides the equation by the inertia m l²/3 once."""
         mass, length = parameters["mass"], parameters["length"]
         forward, _, up = environment["gravity"]
         inverse = 3.0 / (mass * length * length)
         lever = 1.5 / length
         payload = environment["payload"]
         if isinstance(payload, Tensor):
-            # As factors, which without payload are exactly 1.
+            # Factors that are exactly 1 without payload.
             share = payload / mass
             inverse = inverse / (1.0 + 3.0 * share)
             lever = lever * ((1.0 + 2.0 * share) / (1.0 + 3.0 * share))
@@ -155,7 +155,7 @@ def pendulum(inputs: Inputs, *, noise: Noise | None = None) -> Tensor:
 
     Args:
         inputs: Segments with the channels ``angle``, ``velocity`` and the action ``torque``.
-        noise: Noise of the readings.
+        noise: Measurement noise.
     """
     mass = pyro.sample("mass", dist.Uniform(0.3, 1.7))  # kg
     length = pyro.sample("length", dist.Uniform(0.3, 1.7))  # m

@@ -24,14 +24,14 @@ _XML = Path(__file__).with_name("two_link_arm.xml")
 
 
 class TwoLinkArm(MujocoSimulator):
-    """Two uniform thin rods, each turned by a motor at its joint; both angles are 0 hanging.
+    """Two uniform thin rods, each driven by a motor at its joint; both angles are 0 when hanging.
 
-    The elbow's angle is relative to the upper link. A payload sits at the lower link's centre,
-    where MuJoCo's port has it.
+    The elbow's angle is relative to the upper link. A payload is at the lower link's centre, the
+    place of MuJoCo's port.
 
     Args:
-        substeps: Engine steps per step.
-        num_threads: Threads; ``None`` for as many as torch uses.
+        substeps: Number of engine steps per step.
+        num_threads: Number of threads; ``None`` for as many as torch uses.
     """
 
     def __init__(self, *, substeps: int = 1, num_threads: int | None = None) -> None:
@@ -67,7 +67,7 @@ def two_link_arm(inputs: Inputs, *, noise: Noise | None = None) -> Tensor:
 
     Args:
         inputs: Segments with :class:`TwoLinkArm`'s channels.
-        noise: Noise of the readings.
+        noise: Measurement noise.
     """
     parameters = {
         "upper_mass": pyro.sample("upper_mass", dist.Uniform(0.6, 1.8)),  # kg

@@ -1,4 +1,4 @@
-"""What a policy is: a batched feedback law with named, bounded parameters."""
+"""The base class of policies: a batched feedback law with named, bounded parameters."""
 
 import copy
 import math
@@ -37,8 +37,8 @@ class PolicyParameter:
 class Policy(ABC):
     """Maps observations to commands, for batches of policies and domains at once.
 
-    The parameters of a batch of policies are one tensor whose leading dimensions broadcast
-    against the domains' and the initial states': keep policies on an axis of their own.
+    The parameters of a batch of policies are one tensor. Its leading dimensions broadcast against
+    those of the domains and of the initial states, so keep policies on their own axis.
 
     Args:
         parameters: Values, shape ``(..., len(parameter_info))``; ``None`` for the defaults.
@@ -46,8 +46,8 @@ class Policy(ABC):
     Attributes:
         observations: Names of the sensor channels that the policy reads.
         actions: Names of the action channels that it commands.
-        parameter_info: Names, defaults and bounds of its parameters; set before this constructor
-            runs where their number depends on the instance.
+        parameter_info: Names, defaults and bounds of its parameters. If their number depends on
+            the instance, set it before this constructor runs.
         parameters: The values.
     """
 
@@ -86,7 +86,8 @@ class Policy(ABC):
     def constants(self, domain: Mapping[str, Tensor]) -> Any:
         """Returns what :meth:`act` needs, computed once per episode.
 
-        Any nesting of tuples and dictionaries of tensors; by default the parameters by name.
+        The result is any nesting of tuples and dictionaries of tensors; by default the parameters
+        by name.
 
         Args:
             domain: Domain parameters of the episodes, for policies with an internal model.
@@ -100,16 +101,16 @@ class Policy(ABC):
     def controller(
         self, domain: Mapping[str, Tensor]
     ) -> Callable[[NDArray[np.float64], float], NDArray[np.float64]]:
-        """Returns one policy as a function of readings and time, for devices and other engines.
+        """Returns one policy as a function of measurements and time, for devices and engines.
 
-        The function carries the policy's memory, so it serves one episode.
+        The function keeps the policy's memory, so use it for one episode only.
 
         Args:
             domain: Domain parameters for the policy's internal model.
 
         Returns:
-            Function of the observed readings, ``(observations,)``, and of the time in seconds; it
-            returns the commands in the order of ``actions``, ``(actions,)``, before any limit.
+            Function of the observed measurements, ``(observations,)``, and of the time in seconds.
+            It returns the commands in the order of ``actions``, ``(actions,)``, before any limit.
         """
         constants = self.constants(domain)
         memory: list[Any] = []
@@ -130,8 +131,8 @@ class Policy(ABC):
     ) -> tuple[tuple[Tensor, ...], Any]:
         """Returns the commands of a step, before any limit, and the next memory.
 
-        Everything that varies between episodes comes in through the arguments: ``parameters``
-        are out of reach here, because one compiled loop serves all of them.
+        Everything that varies between episodes is an argument. This method must not use
+        ``parameters``, because one compiled loop serves all policies.
 
         Args:
             observation: One tensor per observed channel, of the batch's shape.

@@ -1,7 +1,7 @@
-"""CMA-ES: an evolution strategy that adapts its covariance along the path that it has taken.
+"""CMA-ES: an evolution strategy that adapts its covariance to the steps taken so far.
 
 Hansen (2016), *The CMA evolution strategy: a tutorial*, as implemented by the package ``cmaes``.
-It sees ranks of returns only, so their scale does not matter.
+It uses only the ranks of the returns, so their scale does not matter.
 """
 
 from collections.abc import Sequence
@@ -28,16 +28,16 @@ __all__ = ["CMAES", "CMAESState"]
 
 @dataclass(frozen=True)
 class CMAESState(SearchState):
-    """What the next iteration needs: all that CMA-ES was told, which it is told again.
+    """The data that the next iteration needs: all candidates and returns, which are replayed.
 
-    So the state needs nothing of the package's insides. Replaying costs 0.1 ms per iteration so
-    far for seven parameters, more for more.
+    The state is thus independent of the package's internals. With seven parameters replaying takes
+    0.1 ms per past iteration, with more parameters longer.
 
     Attributes:
-        start: Parameters at which the search began, ``(P,)``.
-        exploration: Standard deviations at first, ``(P,)``.
-        candidates: Parameters tried, ``(generations, population, P)``; iterations that taught
-            nothing are left out.
+        start: Initial parameters, ``(P,)``.
+        exploration: Initial standard deviations, ``(P,)``.
+        candidates: Parameters tried, ``(generations, population, P)``; iterations with equal
+            returns are left out.
         returns: Their returns, ``(generations, population)``.
     """
 
@@ -51,12 +51,13 @@ class CMAESState(SearchState):
 class CMAES(PolicySearch[CMAESState]):
     """CMA-ES with bounds; see the module's text. It deploys the mean of its distribution.
 
-    On the Furuta pendulum it trails PoWER for some ten iterations and is on a par after forty.
+    On the Furuta pendulum it is behind PoWER for about ten iterations and equal after forty.
 
     Args:
-        population: Candidates per iteration. Small populations need fewer simulations of quiet
-            returns; the default suits noisy ones and simulators that run batches.
-        exploration: Standard deviations at first, one number or one per parameter.
+        population: Number of candidates per iteration. With returns that have little noise, small
+            populations need fewer simulations. The default suits noisy returns and batched
+            simulators.
+        exploration: Initial standard deviations, one number or one per parameter.
     """
 
     name: ClassVar[str] = "cma-es"
@@ -89,7 +90,7 @@ class CMAES(PolicySearch[CMAESState]):
         )
 
     def ask(self, state: CMAESState, generator: torch.Generator) -> Tensor:
-        """Draws candidates, again where they are out of bounds; see :meth:`PolicySearch.ask`."""
+        """Draws candidates, anew if they are out of bounds; see :meth:`PolicySearch.ask`."""
         optimiser = _replayed(state)
         optimiser.reseed_rng(int(torch.randint(2**32, (), generator=generator)))
         rows = [optimiser.ask() for _ in range(state.returns.shape[1])]
@@ -98,7 +99,8 @@ class CMAES(PolicySearch[CMAESState]):
     def tell(self, state: CMAESState, candidates: Tensor, returns: Tensor) -> CMAESState:
         """Adds a generation; see :meth:`PolicySearch.tell`.
 
-        One whose returns are all the same is left out: their order would be that of the rows.
+        A generation with equal returns is left out, because its ranks would be the order of the
+        rows.
         """
         candidates, returns = checked(state, candidates, returns, state.returns.shape[1])
         state = counted(state, candidates, returns)
@@ -116,16 +118,16 @@ class CMAES(PolicySearch[CMAESState]):
 
 
 def _replayed(state: CMAESState) -> CMA:
-    """Returns the optimiser after all generations; it holds nothing that is not in the state."""
+    """Returns the optimiser after all generations, built from the state alone."""
     optimiser = CMA(
         mean=state.start.numpy(),
         sigma=1.0,
         cov=state.exploration.square().diag().numpy(),
         bounds=torch.stack((state.space.lower, state.space.upper), 1).numpy(),
         population_size=state.returns.shape[1],
-        seed=0,  # never used: asking seeds anew
+        seed=0,  # never used: ask() sets the seed
     )
     for candidates, returns in zip(state.candidates, state.returns, strict=True):
-        # It minimises, and sorts failures, now +∞, to the end.
+        # It minimises; failures become +∞ and are sorted to the end.
         optimiser.tell(list(zip(candidates.numpy(), (-returns).tolist(), strict=True)))
     return optimiser

@@ -13,7 +13,7 @@ __all__ = ["FurutaSwingUp"]
 
 
 class SwingUpConstants(NamedTuple):
-    """Coefficients of :class:`FurutaSwingUp`, energies already in volts."""
+    """Coefficients of :class:`FurutaSwingUp`; energies are converted to volts."""
 
     kinetic: Tensor
     potential: Tensor
@@ -27,25 +27,25 @@ class SwingUpConstants(NamedTuple):
 
 
 class FurutaSwingUp(Policy):
-    """The hybrid controller of the paper's device.
+    """The hybrid controller used on the paper's device.
 
-    Within 20° of upright, |1 + cos α| < 1 − cos 20°, a PD law on the error, the pole's wrapped
-    the short way:
+    Within 20° of upright, |1 + cos α| < 1 − cos 20°, it is a PD law on the error. The pole's error
+    is wrapped to ±π:
 
         V = K · (0 − θ, π − α, −θ̇, −α̇);
 
-    otherwise energy shaping, with the pole's energy about its centre,
+    otherwise it is energy shaping, with the pole's energy about its centre,
 
         E = ½ (M_p L_p²/12) α̇² + ½ M_p g L_p (1 − cos α),
         a = clip(k_E (E − E_ref) sign(α̇ cos α) − k_θ θ, ±5 m/s²),   V = (R_m/k_m) M_r L_r a.
 
-    sign(0) is taken as 1, because a law that rests where the pole rests never starts against dry
-    friction.
+    sign(0) is taken as 1. With 0 the energy term would vanish while the pole rests, and dry
+    friction could keep it at rest.
 
     Args:
         parameters: log E_ref, log k_E, k_θ and the four gains K, shape ``(..., 7)``.
-        internal_model: Parameters of the policy's own model (the simulator's names), e.g. the
-            most likely ones; missing ones are the episode's own domain parameters.
+        internal_model: Parameters of the policy's own model, with the simulator's names, e.g. the
+            most likely ones. Missing ones are taken from the episode's domain parameters.
 
     Reference: Muratore et al., Neural Posterior Domain Randomization, CoRL 2021.
     """

@@ -13,12 +13,12 @@ from npdr_ppl.policies.base import Policy, PolicyParameter
 __all__ = ["AngleFeatures", "Features", "Linear", "Units", "affine", "feature_names", "units"]
 
 Units = tuple[tuple[Tensor, ...], ...]
-"""Per output its weights, then its bias. One tensor each, because loops flatten the batch: a
-tensor with an axis for the inputs would not broadcast to the batch's shape."""
+"""For each output its weights, then its bias. Each is a separate tensor, because loops flatten the
+batch: a tensor with an axis for the inputs would not broadcast to the batch's shape."""
 
 
 class Features(Protocol):
-    """Functions of the observations that a policy sees in their place."""
+    """Functions of the observations that a policy uses instead of the observations."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -32,7 +32,7 @@ class Features(Protocol):
 
 @dataclass(frozen=True)
 class AngleFeatures:
-    """Sine and cosine in place of each angle, so that full turns make no difference.
+    """Sine and cosine in place of each angle, so that full turns have no effect.
 
     Attributes:
         observations: Names of the policy's observations, in order.
@@ -74,7 +74,7 @@ class Linear(Policy):
         observations: Names of the sensor channels o.
         actions: Names of the A action channels.
         features: φ, F of them; ``None`` for the observations themselves.
-        max_gain: Bound of the magnitude of gains and biases.
+        max_gain: Maximum magnitude of gains and biases.
         parameters: K row by row, each row followed by its b, shape ``(..., A (F + 1))``; named
             ``<action>.<feature>`` and ``<action>.bias``; zero by default.
     """
@@ -137,8 +137,8 @@ def units(parameters: Tensor, num_outputs: int) -> Units:
 def affine(units: Units, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     """Returns W x + b, one tensor per output.
 
-    Unrolled into one operation per weight, since the weights differ between the simulations of a
-    batch; compiled loops keep all of it in registers.
+    It is unrolled into one operation per weight, because the weights differ between the
+    simulations of a batch. Compiled loops keep all values in registers.
     """
     outputs = []
     for *weights, total in units:

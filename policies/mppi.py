@@ -1,4 +1,4 @@
-"""Model-predictive path integral control: replanning by weighted random roll-outs of a model."""
+"""Model-predictive path integral control: plans from weighted random rollouts of a model."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -23,9 +23,9 @@ class Plan:
 
     Attributes:
         commands: Planned commands, ``(N, H, A)``.
-        time: Seconds at which the first of them is due.
-        past: Commands of the H steps before, oldest first, zero before the start, ``(N, H, A)``.
-        num_replans: How often it was planned anew; numbers the random stream.
+        time: Time of the first of them, in seconds.
+        past: Commands of the previous H steps, oldest first, zero before the start, ``(N, H, A)``.
+        num_replans: Number of plans so far; it selects the random stream.
     """
 
     commands: Tensor
@@ -35,41 +35,42 @@ class Plan:
 
 
 class MPPI(Policy):
-    """Replans a sequence of commands every few steps and executes its beginning.
+    """Plans a sequence of commands, executes its first steps and plans again.
 
-    From the present readings, K candidate sequences V_k = clip(U + ε_k) around the former plan U
-    are simulated under M domains ξ_m at once; the next plan is their mean with weights
+    From the current measurements, K candidate sequences V_k = clip(U + ε_k) around the previous
+    plan U are simulated under M domains ξ_m at once. The next plan is their mean with weights
 
         w_k ∝ exp(R̄_k / λ),   R̄_k = (1/M) Σ_m Σ_h r(x_{m,k,h+1}, V_{k,h}).
 
-    ε are Gaussian knots spread evenly over the horizon and joined linearly, scaled to the same
-    standard deviation everywhere; white noise shakes a device instead of moving it. ε_0 is zero,
-    so that the former plan always competes. As in the paper with base distribution U (α = 1),
-    commands cost only what the reward makes of them. A candidate that leaves the states' bounds
-    earns from then on the least reward of any step, whatever the reward's sign.
+    ε interpolates linearly between Gaussian knots at equal distances over the horizon, and is
+    scaled to the same standard deviation at every step. White noise would shake a device instead
+    of moving it. ε_0 is zero, so that the previous plan is always a candidate. Commands have no
+    cost apart from the reward, as in the paper with base distribution U (α = 1). From the step at
+    which a candidate leaves the states' bounds, it gets the least reward of any step, whatever the
+    reward's sign.
 
-    Averaging returns over posterior draws (M > 1) makes the plan robust to what the posterior
-    leaves open; M = 1 with the most likely sample is the usual controller.
+    Averaging returns over posterior draws (M > 1) makes the plan robust to the uncertainty of the
+    posterior. M = 1 with the most likely sample is the usual controller.
 
-    It is for devices and for batches of a few episodes: loops cannot compile it, because its
-    memory is a plan and not a number per simulation. For speed give it a simulator made with
+    Use it on devices and for batches of a few episodes. Loops cannot compile it, because its
+    memory is a plan and not a number per simulation. For speed, pass a simulator made with
     ``compile="always"`` instead. Episodes of a batch share the random numbers, so that each is
-    planned as if alone. It has no parameters to search over; their floating type is that of the
-    plan on devices.
+    planned as if alone. It has no parameters to search over; the floating type of its empty
+    parameters is that of the plan on devices.
 
     Args:
-        simulator: The internal model; its effects act, with the past commands known. Any
-            simulator will do that reports its full state and starts from a given one; a batched
-            engine plans in milliseconds, one on workers takes K M H steps of its own per plan.
-        reward: Reward of a step, from the readings at its end and the limited command.
-        horizon: Steps of the plan H.
-        num_samples: Candidate sequences K.
+        simulator: The internal model. Its effects are simulated, with the past commands known. It
+            must report its full state and start from a given state. A batched engine plans in
+            milliseconds; an engine on workers takes K M H single steps per plan.
+        reward: Reward of a step, from the measurements at its end and the limited command.
+        horizon: Number of steps of the plan H.
+        num_samples: Number of candidate sequences K.
         temperature: λ, in units of the return over the horizon.
         noise: Standard deviation of ε per action in its unit, A numbers.
         domains: Parameters of the internal model, scalars or M draws ``(M,)``; missing ones are
             the episode's own, as in :class:`~npdr_ppl.policies.furuta_swing_up.FurutaSwingUp`.
-        num_knots: Knots of the noise over the horizon, 2 … H; ``None`` for white noise.
-        replan_every: Steps of the plan that are executed before the next is made.
+        num_knots: Number of knots of the noise over the horizon, 2 … H; ``None`` for white noise.
+        replan_every: Number of steps of the plan that are executed before the next plan.
         time_step: Seconds per step of the plan, a multiple of the loop's step; ``None`` for the
             simulator's. Commands are held within a step.
         seed: Seed of ε.
@@ -120,7 +121,7 @@ class MPPI(Policy):
             )
         if len(noise) != len(self.actions):
             raise ShapeError(
-                f"Each of {', '.join(self.actions)} has its noise, but got {len(noise)} numbers."
+                f"Each of {', '.join(self.actions)} needs one noise, but got {len(noise)} numbers."
             )
         if any(value.ndim > 1 for value in self.domains.values()):
             raise ShapeError("Domains of MPPI are scalars or draws (M,), not further batches.")
@@ -135,14 +136,14 @@ class MPPI(Policy):
         self._columns = [sensors.index(name) for name in self.observations]
 
     def constants(self, domain: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Returns the episode's own parameters where the internal model has no others."""
+        """Returns the parameters of the internal model; missing ones are the episode's own."""
         known = {parameter.name for parameter in self.simulator.parameters}
         known |= {name for effect in self.simulator.effects for name in effect.parameter_names}
         known -= set(self.domains)
         return {name: value for name, value in domain.items() if name in known}
 
     def initial_memory(self, observation: tuple[Tensor, ...]) -> Plan:
-        """Returns a plan of no commands that is due to be replaced."""
+        """Returns a plan of zero commands that the first step replaces."""
         nothing = observation[0].new_zeros(observation[0].numel(), self.horizon, len(self.actions))
         return Plan(nothing, 0.0, nothing, 0)
 
@@ -153,7 +154,7 @@ class MPPI(Policy):
         memory: Plan,
         constants: dict[str, Tensor],
     ) -> tuple[tuple[Tensor, ...], Plan]:
-        """Returns the planned commands of the present time, replanned where that is due.
+        """Returns the planned commands of the current time, after replanning if necessary.
 
         Raises:
             ModelError: The loop is being compiled; torch's own error quotes it.
@@ -171,16 +172,16 @@ class MPPI(Policy):
 
     def _step(self, plan: Plan, time: float) -> int:
         """Returns the step of the plan that is being executed."""
-        # Times are products of steps and rounded, so that a step may begin a little early.
+        # Times are rounded products of steps, so that a step may begin a little early.
         return math.floor((time - plan.time) / self.time_step + 1e-3)
 
     def _replan(self, plan: Plan, states: Tensor, step: int, constants: dict[str, Tensor]) -> Plan:
-        """Returns the next plan, which begins at a step of the former.
+        """Returns the next plan, which begins at a step of the previous one.
 
         Args:
-            plan: The former plan.
-            states: Present readings of the state, ``(N, states)``.
-            step: Steps since the former plan began.
+            plan: The previous plan.
+            states: Current measurements of the state, ``(N, states)``.
+            step: Number of steps since the previous plan began.
             constants: What :meth:`constants` returned.
         """
         held = plan.commands[:, -1:].expand(-1, step, -1)
@@ -195,9 +196,9 @@ class MPPI(Policy):
         return Plan(commands, time, past, plan.num_replans + 1)
 
     def _candidates(self, former: Tensor, number: int) -> Tensor:
-        """Returns sequences around the former plan, ``(N, K, H, A)``, within the limits."""
+        """Returns sequences around the previous plan, ``(N, K, H, A)``, within the limits."""
         generator = torch.Generator().manual_seed(derived_seed(self.seed, "mppi", number))
-        # Drawn alike for all floating types and devices.
+        # Drawn in the same way for all floating types and devices.
         shape = self.num_samples, self.blend.shape[-1], len(self.actions)
         knots = torch.randn(*shape, generator=generator, dtype=torch.float64)
         noise = self.noise * torch.einsum("hj,kja->kha", self.blend, knots)
@@ -227,7 +228,7 @@ class MPPI(Policy):
             rollout=torch.zeros(count, dtype=torch.long, device=states.device),
             start=torch.zeros(count, dtype=torch.long, device=states.device),
         )
-        # Draws are on an axis in front of the episodes'.
+        # The axis of draws precedes that of episodes.
         domains = {name: x.to(**like)[..., None] for name, x in self.domains.items()}
         domains |= {name: x.to(**like) for name, x in constants.items()}
         trajectories = self.simulator.simulate(domains, inputs).to(**like)
@@ -249,9 +250,9 @@ class MPPI(Policy):
 
 
 def _blend(horizon: int, num_knots: int) -> Tensor:
-    """Returns what each step of the horizon takes from each knot, ``(horizon, num_knots)``.
+    """Returns the weight of each knot at each step of the horizon, ``(horizon, num_knots)``.
 
-    Rows have unit norm, so that independent knots of unit variance make steps of unit variance.
+    Rows have unit norm, so that independent knots of unit variance give steps of unit variance.
     """
     if num_knots == horizon:
         return torch.eye(horizon, dtype=torch.float64)

@@ -18,23 +18,24 @@ __all__ = ["Neural"]
 class Neural(Policy):
     """A multilayer perceptron: h₀ = φ(o)/s, h_l = tanh(W_l h_{l−1} + b_l), u = m + r tanh(…).
 
-    The last layer is squashed between the actions' limits of centre m and half-width r.
+    The last tanh keeps the commands within the actions' limits of centre m and half-width r.
 
-    Every weight is a tensor of its own in the loop (see :data:`~npdr_ppl.policies.linear.Units`),
-    so that each policy of a batch has its own network. The work per step is one operation per
-    weight: meant for tens to a few hundred weights, as evolutionary policy search is.
+    Every weight is a separate tensor in the loop (see :data:`~npdr_ppl.policies.linear.Units`), so
+    that each policy of a batch has its own network. A step takes one operation per weight. The
+    network is therefore meant for tens to a few hundred weights, as evolutionary policy search is.
 
     Args:
         observations: Names of the sensor channels o.
         actions: Names of the A action channels.
         limits: Least and greatest command of each action.
-        hidden: Units of each hidden layer; none gives a squashed linear policy.
+        hidden: Number of units of each hidden layer; without any it is a linear policy behind a
+            tanh.
         features: φ; ``None`` for the observations themselves.
         scales: Typical magnitude s of each feature in its unit; 1 by default.
         seed: Seed of the default weights, normal with variance 1/inputs; biases are zero.
-        max_weight: Bound of the magnitude of weights and biases.
-        parameters: Layer by layer and unit by unit, the weights, then the bias, ``(..., P)``;
-            named ``<unit>.<input>`` and ``<unit>.bias`` with hidden units ``h<layer>_<unit>``.
+        max_weight: Maximum magnitude of weights and biases.
+        parameters: The weights and then the bias of each unit, layer by layer, ``(..., P)``; named
+            ``<unit>.<input>`` and ``<unit>.bias`` with hidden units ``h<layer>_<unit>``.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class Neural(Policy):
         scales = (1.0,) * len(inputs) if scales is None else tuple(scales)
         if len(limits) != len(actions) or len(scales) != len(inputs):
             raise ShapeError(
-                f"{len(actions)} actions and {len(inputs)} features have so many limits and "
+                f"{len(actions)} actions and {len(inputs)} features need as many limits and "
                 f"scales, but got {len(limits)} limits and {len(scales)} scales."
             )
         self.observations = observations

@@ -12,12 +12,12 @@ from npdr_ppl.policies.base import Policy, PolicyParameter
 
 __all__ = ["Chirp", "Playback", "Sinusoid", "Strike"]
 
-# Durations below are taken as this many seconds, so that search may wander to zero and beyond.
+# In s. Shorter durations are raised to this value, because a search may propose zero or less.
 _SHORTEST = 1e-3
 
 
 class Playback(Policy):
-    """Commands a recorded sequence, whatever it observes.
+    """Commands a recorded sequence, independent of the observations.
 
     Args:
         commands: Sequence, shape ``(K, A)``; the last command is held afterwards.
@@ -41,10 +41,10 @@ class Playback(Policy):
     def act(
         self, observation: tuple[Tensor, ...], time: Tensor | float, memory: Any, constants: Any
     ) -> tuple[tuple[Tensor, ...], Any]:
-        """Returns the command of the present step."""
+        """Returns the command of the current step."""
         time = torch.as_tensor(time, device=self.commands.device)
         step = torch.round(time / self.time_step).long().clamp(max=len(self.commands) - 1)
-        # Not by brackets: a compiled loop would ask for the number.
+        # Not indexed by brackets: a compiled loop would need the number.
         row = self.commands.index_select(0, step.reshape(1))
         return row[0].unbind(-1), memory
 
@@ -76,14 +76,14 @@ class Sinusoid(Policy):
         memory: Any,
         constants: dict[str, Tensor],
     ) -> tuple[tuple[Tensor, ...], Any]:
-        """Returns the command of the present time."""
+        """Returns the command of the current time."""
         k = constants
         angle = 2.0 * math.pi * k["frequency"] * time + k["phase"]
         return (k["amplitude"] * torch.sin(angle),), memory
 
 
 class Chirp(Policy):
-    """A sine whose frequency runs linearly from f₀ to f₁ in a given time, then stays.
+    """A sine whose frequency changes linearly from f₀ to f₁ in a given time, then stays constant.
 
     A sin(2π (f₀ t + (f₁ − f₀) t²/(2 T))) + c with amplitude A, duration T and offset c.
 
@@ -112,7 +112,7 @@ class Chirp(Policy):
         memory: Any,
         constants: dict[str, Tensor],
     ) -> tuple[tuple[Tensor, ...], Any]:
-        """Returns the command of the present time."""
+        """Returns the command of the current time."""
         k = constants
         first, last = k["first_frequency"], k["last_frequency"]
         duration = k["duration"].clamp_min(_SHORTEST)
@@ -130,9 +130,9 @@ class StrikeConstants(NamedTuple):
 
 
 class Strike(Policy):
-    """A point-to-point motion: position commands from a start to an end, then held.
+    """A point-to-point motion: position commands from a start to an end, where they are held.
 
-    q(t) = q₀ + s(t/T) (q₁ − q₀) with s(x) = x, or with the profile of least jerk, which starts and
+    q(t) = q₀ + s(t/T) (q₁ − q₀) with s(x) = x, or with the minimum-jerk profile, which starts and
     ends at rest,
 
         s(x) = 10 x³ − 15 x⁴ + 6 x⁵,   x ≤ 1.
@@ -142,12 +142,12 @@ class Strike(Policy):
         start: Positions q₀ at the start in the channels' units, A numbers.
         end: Default of the positions q₁ at the end, A numbers.
         duration: Default of the duration T, in s.
-        profile: How the way is covered.
+        profile: Profile s of the motion.
         limits: Least and greatest end of each channel.
         parameters: T in s, then q₁, shape ``(..., 1 + A)``.
 
     Reference: Flash and Hogan, The coordination of arm movements, J. Neurosci. 1985, equation 4
-    (least jerk).
+    (minimum jerk).
     """
 
     observations = ()
@@ -195,7 +195,7 @@ class Strike(Policy):
         memory: Any,
         constants: StrikeConstants,
     ) -> tuple[tuple[Tensor, ...], Any]:
-        """Returns the positions of the present time."""
+        """Returns the positions of the current time."""
         x = (time / constants.duration).clamp(0.0, 1.0)
         if self.profile == "minimum-jerk":
             x = x * x * x * (10.0 + x * (6.0 * x - 15.0))

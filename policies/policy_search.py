@@ -1,7 +1,7 @@
-"""The protocol of a policy search: ask for candidates, tell it their returns, read off a policy.
+"""The protocol of a policy search: ask for candidates, tell it their returns, get a policy.
 
-A search sees parameter vectors and their returns, and never a simulator, so the caller owns the
-domains, the initial states and checkpoints.
+A search uses parameter vectors and their returns, never a simulator. The caller is responsible for
+the domains, the initial states and checkpoints.
 """
 
 from abc import ABC, abstractmethod
@@ -20,7 +20,7 @@ __all__ = ["PolicySearch", "SearchSpace", "SearchState", "checked", "counted", "
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """Where a search may look.
+    """The search space.
 
     Attributes:
         names: Names of the P parameters.
@@ -51,13 +51,13 @@ class SearchSpace:
 
 @dataclass(frozen=True)
 class SearchState:
-    """What the next iteration needs; each search extends it, by tensors only.
+    """The data that the next iteration needs; each search extends it, by tensors only.
 
     Attributes:
         space: Names and bounds of the parameters.
-        iteration: How many times the search was told returns.
-        best: Best candidate so far, ``(P,)``; where the search began, before any.
-        best_return: Its return, as it was told then; −∞ before any.
+        iteration: Number of calls of :meth:`PolicySearch.tell` so far.
+        best: Best candidate so far, ``(P,)``; before any, the initial parameters.
+        best_return: Its return, as given to :meth:`PolicySearch.tell`; −∞ before any.
     """
 
     space: SearchSpace
@@ -72,7 +72,7 @@ S = TypeVar("S", bound=SearchState)
 class PolicySearch(ABC, Generic[S]):
     """A way to improve a policy's parameters, POLOPT of Algorithm 1 (Muratore et al. 2021).
 
-    A search is immutable: its options are constructor arguments, everything that changes is in
+    A search is immutable: its options are constructor arguments, and everything that changes is in
     the state. Parameters, returns and states are float64 tensors on the CPU.
 
     Attributes:
@@ -99,7 +99,7 @@ class PolicySearch(ABC, Generic[S]):
                 f"A search begins at one policy, parameters of shape ({len(space.names)},); got "
                 f"{tuple(start.shape)}."
             )
-        # Compared in the bounds' own precision: a default in float64 may lie within rounding of
+        # Compared in the bounds' own precision: a float64 default may differ by rounding from
         # its bound.
         lower, upper = policy.bounds
         outside = ~((start.to(lower) >= lower) & (start.to(upper) <= upper) & start.isfinite())
@@ -114,8 +114,8 @@ class PolicySearch(ABC, Generic[S]):
     def forget(self, state: S) -> S:
         """Returns a new search that begins at :meth:`parameters`, for other domains.
 
-        Exploration is as wide as at first, and no return told so far counts any more: it would
-        not be comparable.
+        Exploration is as wide as at the beginning. The earlier returns are dropped, because
+        returns in other domains are not comparable.
         """
         return self.begin(state.space, self.parameters(state))
 
@@ -133,7 +133,7 @@ class PolicySearch(ABC, Generic[S]):
         """Proposes parameters to try, ``(population, P)``, within the bounds.
 
         Args:
-            state: The present state.
+            state: The current state.
             generator: Source of all randomness, on the CPU.
         """
 
@@ -156,8 +156,8 @@ class PolicySearch(ABC, Generic[S]):
     def parameters(self, state: S) -> Tensor:
         """Returns the parameters to deploy, ``(P,)``.
 
-        They may never have been tried, such as a mean: where a simulation is cheap, try them and
-        ``state.best`` once more on the same domains, and deploy the better ones.
+        They may never have been tried, for example if they are a mean. If simulations are cheap,
+        try them and ``state.best`` again on the same domains, and deploy the better ones.
         """
 
     def tensors(self, state: S) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -190,8 +190,8 @@ class PolicySearch(ABC, Generic[S]):
             or not torch.equal(tensors["upper"], space.upper)
         ):
             raise ModelError(
-                f"This state is of a search over {', '.join(values['names'])} with their bounds "
-                f"then, which are not those of {type(policy).__name__} now; begin anew."
+                f"This state is of a search over {', '.join(values['names'])}. Their names or "
+                f"bounds differ from those of {type(policy).__name__}; begin a new search."
             )
         own = {name: tensors[name] for name in self._tensor_names()}
         return self.state_class(space=space, iteration=int(values["iteration"]), **own)
@@ -205,10 +205,10 @@ class PolicySearch(ABC, Generic[S]):
 def checked(
     state: SearchState, candidates: Tensor, returns: Tensor, num_candidates: int | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Checks what a search is told.
+    """Checks the arguments of :meth:`PolicySearch.tell`.
 
     Args:
-        state: The present state.
+        state: The current state.
         candidates: Parameters tried, ``(population, P)``.
         returns: Their returns, ``(population,)``.
         num_candidates: The population; ``None`` if any number will do.
@@ -232,12 +232,12 @@ def checked(
 
 
 def counted(state: S, candidates: Tensor, returns: Tensor) -> S:
-    """Returns the state one iteration on, the best candidate so far brought up to date.
+    """Returns the state of the next iteration, with the best candidate updated.
 
     Args:
-        state: The state before.
+        state: The previous state.
         candidates: Parameters tried, ``(population, P)``.
-        returns: What :func:`checked` made of their returns, ``(population,)``.
+        returns: Their returns as :func:`checked` returned them, ``(population,)``.
     """
     state = replace(state, iteration=state.iteration + 1)
     index = returns.argmax()
@@ -247,7 +247,7 @@ def counted(state: S, candidates: Tensor, returns: Tensor) -> S:
 
 
 def per_parameter(option: str, value: float | Sequence[float], space: SearchSpace) -> Tensor:
-    """Returns an option that is one number, or one per parameter, as ``(P,)``.
+    """Returns an option, given as one number or one per parameter, as ``(P,)``.
 
     Args:
         option: Its name.

@@ -1,18 +1,19 @@
-"""PoWER: policy search by exploration that is weighted with the returns.
+"""PoWER: policy search by exploration weighted with the returns.
 
-Perturb the mean θ of the parameters, and move it to where the returns were good (Kober & Peters
-2011, *Policy search for motor primitives in robotics*, Machine Learning 84; exploration is
-constant during an episode, and covariance matters between parameters). With the candidates θᵢ of
-this iteration and of the memory, their returns Rᵢ and the elite E, the best of them,
+The mean θ of the parameters is perturbed, and moves towards candidates with high returns (Kober &
+Peters 2011, *Policy search for motor primitives in robotics*, Machine Learning 84; exploration is
+constant during an episode, with covariance between parameters). With the candidates θᵢ of this
+iteration and of the memory, their returns Rᵢ and the elite E, the best of them,
 
     wᵢ = Rᵢ − min_j R_j,
     θ ← θ + Σ_{i∈E} wᵢ (θᵢ − θ) / Σ_{i∈E} wᵢ,
     Σ ← Σ_i wᵢ (θᵢ − θ)(θᵢ − θ)ᵀ / Σ_i wᵢ,        Σ ≽ diag(σ_min²),
 
-both with the θ before. Taking the elite instead of all candidates is the paper's importance
-sampling. Where the paper uses the returns themselves, the worst is subtracted here: returns may
-be negative, and a constant added to all of them, or another unit, makes no difference. Higher
-baselines (their median, say) shrink Σ faster and stop farther from the optimum of noisy returns.
+both with the previous θ. Taking the elite instead of all candidates is the paper's importance
+sampling. The paper uses the returns themselves; here the worst return is subtracted. Returns may
+therefore be negative, and adding a constant to all of them, or changing their unit, has no effect.
+With higher baselines, for example the median, Σ shrinks faster and the search stops farther from
+the optimum of noisy returns.
 """
 
 from collections.abc import Sequence
@@ -37,14 +38,14 @@ __all__ = ["PoWER", "PoWERState"]
 
 @dataclass(frozen=True)
 class PoWERState(SearchState):
-    """What the next iteration needs.
+    """The data that the next iteration needs.
 
     Attributes:
-        mean: Present parameters θ, ``(P,)``.
+        mean: Current parameters θ, ``(P,)``.
         covariance: Exploration Σ, ``(P, P)``.
-        floor: Least standard deviations σ_min, ``(P,)``.
+        floor: Minimum standard deviations σ_min, ``(P,)``.
         memory: Best candidates so far, ``(m, P)``, the best first.
-        memory_returns: Their returns, ``(m,)``, as they were told then.
+        memory_returns: Their returns, ``(m,)``, as given to :meth:`PoWER.tell`.
     """
 
     mean: Tensor
@@ -58,14 +59,15 @@ class PoWERState(SearchState):
 class PoWER(PolicySearch[PoWERState]):
     """PoWER; see the module's text for the method. It deploys the mean.
 
-    Candidates in the memory keep the returns that they were told with. If domains change, call
-    :meth:`forget`, or candidates that were lucky with the domains before hold the search back.
+    Candidates in the memory keep their returns. If the domains change, call :meth:`forget`.
+    Otherwise candidates with high returns in the previous domains slow the search down.
 
     Args:
-        population: Perturbed candidates per iteration; the mean comes first, on top of them.
-        memory: Best candidates that are remembered, the elite.
-        exploration: Standard deviations at first, one number or one per parameter.
-        floor: Least standard deviations, one number or one per parameter.
+        population: Number of perturbed candidates per iteration; the mean comes first, in
+            addition.
+        memory: Number of best candidates that are kept, the elite.
+        exploration: Initial standard deviations, one number or one per parameter.
+        floor: Minimum standard deviations, one number or one per parameter.
     """
 
     name: ClassVar[str] = "power"
@@ -116,8 +118,8 @@ class PoWER(PolicySearch[PoWERState]):
     def tell(self, state: PoWERState, candidates: Tensor, returns: Tensor) -> PoWERState:
         """Moves mean and covariance; see :meth:`PolicySearch.tell`.
 
-        Any number of candidates will do, also such as were not asked for. Failed ones are left
-        out, and if no return differs from another, nothing is learnt but what to remember.
+        Accepts any number of candidates, also ones that :meth:`ask` did not propose. Failed ones
+        are left out. If all returns are equal, only the memory changes.
         """
         candidates, returns = checked(state, candidates, returns)
         state = counted(state, candidates, returns)
@@ -135,7 +137,7 @@ class PoWER(PolicySearch[PoWERState]):
             covariance = offset.T @ (weight[:, None] * offset) / weight.sum()
             covariance = _raised(covariance, state.floor)
             step = weight[elite] @ offset[elite] / weight[elite].sum()
-            mean = state.space.clamp(mean + step)  # against rounding: bounds are convex
+            mean = state.space.clamp(mean + step)  # only against rounding: bounds are convex
         return replace(
             state,
             mean=mean,
@@ -150,7 +152,7 @@ class PoWER(PolicySearch[PoWERState]):
 
 
 def _raised(covariance: Tensor, floor: Tensor) -> Tensor:
-    """Returns a covariance C with C ≽ diag(floor²): no direction is explored less than that.
+    """Returns a covariance C with C ≽ diag(floor²), the minimum exploration in every direction.
 
     Args:
         covariance: Positive semidefinite, ``(P, P)``.

@@ -21,8 +21,8 @@ class RadialBasis(Policy):
 
         u = Σ_m w_m g_m(o) / Σ_m g_m(o),   g_m(o) = exp(−½ Σ_j ((o_j − c_mj)/σ_j)²)
 
-    Far from all centres the nearest one decides. As a mean, a command lies between the least and
-    the greatest w, so that values within an action's limits keep it there.
+    Far from all centres the value at the nearest centre dominates. A command is a mean and lies
+    between the least and the greatest w. It stays within an action's limits if all values do.
 
     Args:
         observations: Names of the O sensor channels.
@@ -55,10 +55,10 @@ class RadialBasis(Policy):
                 f"{tuple(widths)}."
             )
         if len(limits) != len(actions):
-            raise ShapeError(f"{len(actions)} actions have so many limits, got {len(limits)}.")
+            raise ShapeError(f"{len(actions)} actions need as many limits, got {len(limits)}.")
         self.observations = observations
         self.actions = actions
-        # Numbers instead of tensors: they follow any floating type and device.
+        # Numbers instead of tensors: they work with any floating type and device.
         self.centres: tuple[tuple[float, ...], ...] = tuple(map(tuple, centres.tolist()))
         self.widths = tuple(widths)
         self.parameter_info = tuple(
@@ -85,7 +85,7 @@ class RadialBasis(Policy):
             observations: Names of the O sensor channels.
             actions: Names of the action channels.
             ranges: First and last centre along each observation.
-            counts: Centres along each observation, at least 2 each.
+            counts: Number of centres along each observation, at least 2 each.
             limits: Least and greatest command of each action.
             parameters: The values.
         """
@@ -114,10 +114,10 @@ class RadialBasis(Policy):
         seed: int = 0,
         parameters: Tensor | None = None,
     ) -> Self:
-        """Returns centres drawn uniformly, as wide as the spacing of a grid of so many centres.
+        """Returns uniformly drawn centres, as wide as the spacing of a grid with as many centres.
 
-        A grid's number of centres grows with the power of the number of observations; this one
-        is free.
+        The number of centres of a grid grows exponentially with the number of observations. Here
+        it can be chosen freely.
 
         Args:
             observations: Names of the O sensor channels.
@@ -148,7 +148,7 @@ class RadialBasis(Policy):
         constants: tuple[tuple[Tensor, ...], ...],
     ) -> tuple[tuple[Tensor, ...], Any]:
         """Returns the commands."""
-        # One operation per number, which compiled loops fuse; a stack and a softmax they do not.
+        # Compiled loops fuse one operation per number, but not a stack and a softmax.
         logarithms = []
         for centre in self.centres:
             # log g without −½ Σ (o/σ)², which all centres share and which cancels in the mean.

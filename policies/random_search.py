@@ -1,4 +1,4 @@
-"""Random search, the floor for every other: perturb the first parameters, keep the best."""
+"""Random search, the baseline: perturb the initial parameters and keep the best candidate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,10 +22,10 @@ __all__ = ["RandomSearch", "RandomSearchState"]
 
 @dataclass(frozen=True)
 class RandomSearchState(SearchState):
-    """What the next iteration needs.
+    """The data that the next iteration needs.
 
     Attributes:
-        start: Parameters at which the search began, ``(P,)``.
+        start: Initial parameters, ``(P,)``.
         exploration: Standard deviations around them, ``(P,)``.
     """
 
@@ -35,10 +35,11 @@ class RandomSearchState(SearchState):
 
 @dataclass(frozen=True)
 class RandomSearch(PolicySearch[RandomSearchState]):
-    """Independent normal perturbations of where it began; it deploys the best candidate so far.
+    """Independent normal perturbations of the initial parameters; deploys the best candidate.
 
     Args:
-        population: Candidates per iteration; where the search began comes first, on top of them.
+        population: Number of candidates per iteration; the initial parameters come first, in
+            addition.
         exploration: Standard deviations, one number or one per parameter.
     """
 
@@ -70,7 +71,7 @@ class RandomSearch(PolicySearch[RandomSearchState]):
         )
 
     def ask(self, state: RandomSearchState, generator: torch.Generator) -> Tensor:
-        """Perturbs the first parameters, which are the first row; see :meth:`PolicySearch.ask`."""
+        """Perturbs the initial parameters, the first row; see :meth:`PolicySearch.ask`."""
         noise = torch.randn(
             self.population, len(state.start), generator=generator, dtype=torch.float64
         )
@@ -82,7 +83,7 @@ class RandomSearch(PolicySearch[RandomSearchState]):
     ) -> RandomSearchState:
         """Remembers the best candidate; see :meth:`PolicySearch.tell`.
 
-        Any number of candidates will do, also such as were not asked for.
+        Accepts any number of candidates, also ones that :meth:`ask` did not propose.
         """
         candidates, returns = checked(state, candidates, returns)
         return counted(state, candidates, returns)

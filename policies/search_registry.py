@@ -20,7 +20,7 @@ BUILT_IN = {
     "power": "npdr_ppl.policies.power:PoWER",
     "random": "npdr_ppl.policies.random_search:RandomSearch",
 }
-"""Searches of this package by name; each is imported when it is asked for."""
+"""Searches of this package by name; each is imported on first use."""
 
 
 def _locations() -> dict[str, str]:

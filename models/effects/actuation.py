@@ -1,4 +1,4 @@
-"""What happens to a command on its way to the dynamics."""
+"""Effects that change a command before it reaches the dynamics."""
 
 import math
 from collections.abc import Mapping
@@ -27,8 +27,8 @@ __all__ = ["ActuatorGain", "ActuatorLag", "DeadZone", "InputDelay", "Saturation"
 class InputDelay(ActionEffect):
     """u(t − d) with a delay d that need not be a whole number of steps.
 
-    Commands are held for a step, so with d = (n + f) h a step of length h sees u_{k−n−1} for the
-    fraction f and u_{k−n} for the rest.
+    Commands are held for a step. With d = (n + f) h, step k of length h therefore uses u_{k−n−1}
+    for the fraction f of the step and u_{k−n} for the rest.
     """
 
     id = "input_delay"
@@ -44,7 +44,7 @@ class InputDelay(ActionEffect):
         return {"delay": dist.Uniform(0.0, 0.03)}
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
-        """Returns the steps that the longest delay reaches back."""
+        """Returns the number of steps in the longest delay."""
         return math.floor(float(parameters["delay"].detach().max()) / time_step) + 1
 
     def initial_memory(self, command: Tensor, start: Start) -> tuple[Tensor, Tensor]:
@@ -78,9 +78,10 @@ class ActuatorLag(ActionEffect):
         return {"time_constant": dist.Uniform(0.0, 0.05)}
 
     def initial_memory(self, command: Tensor, start: Start) -> Any:
-        """Returns the settled output, and what is missing of the command in the next step.
+        """Returns the settled output, and its relative errors in the next step.
 
-        As shares of what is missing at its start: at its end, in its mean, in its moment.
+        These are the output's deviation from the command at the step's end, its mean and its
+        moment, relative to the deviation at the step's start.
         """
         time_constant, half = start.parameters["time_constant"], 0.5 * start.time_step
         decay = remaining(time_constant, start.time_step)
@@ -91,7 +92,7 @@ class ActuatorLag(ActionEffect):
     def act(
         self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
     ) -> tuple[Uneven, Any]:
-        """Returns the output during the step, and that at its end."""
+        """Returns the output during the step, and the output at its end."""
         output, shares = memory
         command = commands.now()
         missing = output - command
@@ -144,7 +145,7 @@ class SupplySag(ActionEffect):
 
 
 class Saturation(ActionEffect):
-    """clip(u, ±u_max): a limit below the one that the channel declares."""
+    """clip(u, ±u_max): a limit below the limit that the channel declares."""
 
     id = "saturation"
     parameters = (Parameter("limit", "{port}", math.inf, "greatest command u_max"),)
@@ -187,6 +188,6 @@ class DeadZone(ActionEffect):
     def act(
         self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
     ) -> tuple[Tensor, Any]:
-        """Returns u − clip(u, ±δ), which is the same."""
+        """Returns u − clip(u, ±δ), an equal expression."""
         command, width = commands.now(), parameters["width"]
         return command - command.clamp(-width, width), memory

@@ -1,4 +1,4 @@
-"""Every effect at every port of a simulator where it makes sense."""
+"""All effects at all ports of a simulator to which they can attach."""
 
 from collections.abc import Iterator
 
@@ -11,20 +11,20 @@ from npdr_ppl.models.effects.registry import effects
 
 __all__ = ["candidate_effects", "sensor_groups"]
 
-# Lengths, masses and inertias stay what they are during a rollout.
+# Lengths, masses and inertias do not change during a rollout.
 _LASTING_UNITS = ("m", "kg", "kg m²")
 
 
 def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
-    """Returns each effect of the catalogue at each port where it makes sense.
+    """Returns each effect of the catalogue at each port to which it can attach.
 
-    A sensor effect attaches to the channels that one device may have it on; see
-    :class:`~npdr_ppl.language.effects.SensorEffect`. Parameters drift that neither last nor are
-    nominally zero. Effects that the simulator has already, or
-    that its engine cannot apply, are left out.
+    A sensor effect attaches to the channels that one device may affect; see
+    :class:`~npdr_ppl.language.effects.SensorEffect`. Drift applies to parameters that can change
+    during a rollout and are not nominally zero. Effects that the simulator already has, or that
+    its engine cannot apply, are left out.
 
     Args:
-        simulator: The simulator, whose ports say what passes through them.
+        simulator: The simulator, whose ports declare their quantities.
 
     Example:
         >>> from npdr_ppl.models.pendulum import Pendulum
@@ -47,11 +47,11 @@ def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
 
 
 def sensor_groups(simulator: Simulator, span: SensorSpan) -> tuple[tuple[str, ...], ...]:
-    """Returns the sensor channels that one device may read, by name.
+    """Returns the sensor channels that one device may measure, by name.
 
     Args:
         simulator: The simulator.
-        span: What a device reads.
+        span: The channels that a device measures.
     """
     ports = {port.name for port in simulator.ports if port.kind == "sensor"}
     channels = [channel for channel in simulator.sensors if channel.name in ports]
@@ -84,7 +84,7 @@ def _ports(simulator: Simulator, effect: type[Effect]) -> Iterator[str]:
 
 
 def _is_accepted(simulator: Simulator, effect: Effect) -> bool:
-    """Returns whether a simulator takes an effect; not every engine can apply each."""
+    """Returns whether a simulator accepts an effect; some engines cannot apply some effects."""
     try:
         simulator.with_effects(effect)
     except ModelError:
@@ -93,7 +93,7 @@ def _is_accepted(simulator: Simulator, effect: Effect) -> bool:
 
 
 def _by_unit(simulator: Simulator, group: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Returns a group cut into groups of one unit each."""
+    """Returns a group divided into groups of one unit each."""
     ports: list[Port] = [simulator.port(name) for name in group]
     units = dict.fromkeys(port.unit for port in ports)
     return [tuple(port.name for port in ports if port.unit == unit) for unit in units]

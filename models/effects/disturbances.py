@@ -1,4 +1,4 @@
-"""Forces and changes that come from elsewhere: ripple, wind, vibration, drift."""
+"""External forces and changes: ripple, wind, vibration, drift."""
 
 import math
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ class Cogging(LinearForceEffect):
 
     Args:
         port: Name of the port to attach to.
-        order: Periods per turn N, known from the motor's poles and slots.
+        order: Number of periods per turn N, known from the motor's poles and slots.
         priors: Priors that replace the effect's own, by parameter name.
     """
 
@@ -107,10 +107,10 @@ class PeriodicDisturbance(TimedForceEffect):
 
 
 class Wind(ForceEffect):
-    """A u|u|/w² with u = w cos(q − ψ) − q̇: drag relative to air that moves at a steady w.
+    """A u|u|/w² with u = w cos(q − ψ) − q̇: drag relative to air that moves at a constant w.
 
-    What turns with the joint sees the wind head-on at the angle ψ; there, at rest, the wind's
-    force is A.
+    At the joint angle ψ the body that turns with the joint faces the wind. At rest at this angle,
+    the wind's force is A.
     """
 
     id = "wind"
@@ -133,7 +133,7 @@ class Wind(ForceEffect):
         }
 
     def suits(self, port: Port) -> bool:
-        """Returns whether the joint turns; on one that slides, wind is a bias and drag."""
+        """Returns whether the joint turns; on a sliding joint, wind is a bias and drag."""
         return port.coordinate == "rad"
 
     def force(
@@ -148,8 +148,8 @@ class Wind(ForceEffect):
 class ParameterDrift(ParameterEffect):
     """θ (1 + ρ t): a domain parameter that drifts with the time t since the rollout began.
 
-    The trend of a random walk. It is evaluated at each segment's middle and constant within it,
-    so rollouts have to be cut into segments to show it.
+    It models the trend of a random walk. It is evaluated at each segment's middle and constant
+    within it, so it has an effect only if rollouts are divided into segments.
     """
 
     id = "parameter_drift"

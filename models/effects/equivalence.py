@@ -1,4 +1,4 @@
-"""Causes that recordings may not be able to tell apart, to be reported together."""
+"""Causes that recordings may not be able to distinguish, and that are reported together."""
 
 from npdr_ppl.language.effect_context import EquivalenceClass
 

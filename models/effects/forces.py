@@ -46,7 +46,7 @@ class Bias(LinearForceEffect):
 
 
 class Spring(LinearForceEffect):
-    """−k (q − q₀): a spring, or a cable that is dragged along."""
+    """−k (q − q₀): a spring, or a cable that moves with the joint."""
 
     id = "spring"
     parameters = (

@@ -23,7 +23,7 @@ __all__ = [
 
 
 class ViscousFriction(LinearForceEffect):
-    """−b v with damping b; not to be told from a motor's back-EMF."""
+    """−b v with damping b; not distinguishable from a motor's back-EMF."""
 
     id = "viscous_friction"
     parameters = (Parameter("damping", "{port} s/{coordinate}", 0.0, "force per speed b"),)
@@ -48,7 +48,7 @@ class ViscousFriction(LinearForceEffect):
 
 
 class CoulombFriction(LinearForceEffect):
-    """−F sign v in motion, and at rest just what keeps the joint at rest, up to F."""
+    """−F sign v in motion; at rest the force that keeps the joint at rest, up to F."""
 
     id = "coulomb_friction"
     parameters = (Parameter("magnitude", "{port}", 0.0, "dry friction F"),)
@@ -73,7 +73,7 @@ class CoulombFriction(LinearForceEffect):
 
 
 class AsymmetricCoulombFriction(LinearForceEffect):
-    """−F₊ in forward and +F₋ in backward motion; not to be told from Coulomb plus a bias."""
+    """−F₊ in forward and +F₋ in backward motion; not distinguishable from Coulomb plus a bias."""
 
     id = "asymmetric_coulomb_friction"
     parameters = (
@@ -93,7 +93,7 @@ class AsymmetricCoulombFriction(LinearForceEffect):
     def dry_friction(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
     ) -> Tensor:
-        """Returns the bound in the present direction; at rest the smaller one holds."""
+        """Returns the bound in the current direction; at rest the smaller one."""
         forward, backward = parameters["forward"], parameters["backward"]
         smaller = torch.minimum(forward, backward)
         moving = torch.where(velocity > 0.0, forward, backward)
@@ -105,9 +105,9 @@ class AsymmetricCoulombFriction(LinearForceEffect):
 
 
 class StribeckFriction(ForceEffect):
-    """Dry friction that is ΔF exp(−|v/v_s|) greater near rest: −ΔF exp(−|v/v_s|) sign v.
+    """Additional dry friction near rest: −ΔF exp(−|v/v_s|) sign v.
 
-    Attaches next to Coulomb friction, of which ΔF is the excess of static over sliding friction.
+    Attach it together with Coulomb friction. ΔF is static minus sliding friction.
     """
 
     id = "stribeck_friction"

@@ -1,4 +1,4 @@
-"""Friction that remembers, or depends on what the joint transmits."""
+"""Friction with a state, or that depends on the load of the joint."""
 
 import math
 from collections.abc import Mapping
@@ -20,13 +20,13 @@ __all__ = ["FrictionDrift", "LoadDependentFriction", "PreslidingFriction"]
 class PreslidingFriction(ForceEffect):
     """−F (x + τ ẋ) with ẋ = (v − |v| x)/z_s: bristles that bend by z_s before they slide.
 
-    The LuGre model with g(v) = F, bristle stiffness σ₀ = F/z_s, damping σ₁ = τ σ₀ and x = z/z_s
-    within ±1; with τ = 0 Dahl's. In steady sliding it is Coulomb friction of magnitude F, in whose
-    place it stands.
+    This is the LuGre model with g(v) = F, bristle stiffness σ₀ = F/z_s, damping σ₁ = τ σ₀ and x =
+    z/z_s within ±1. With τ = 0 it is Dahl's model. In steady sliding it is Coulomb friction of
+    magnitude F, which it replaces.
 
-    Bristles are stiff, so a step is solved implicitly: with the displacement D z_s during a step
-    of length h, x' = (x + D)/(1 + |D|), and D follows from the force that x' gives. A joint in
-    motion starts a segment with its bristles bent all the way.
+    Bristles are stiff, so a step is solved implicitly. With the displacement D z_s during a step
+    of length h, x' = (x + D)/(1 + |D|), and D follows from the force at x'. If the joint moves at
+    the start of a segment, its bristles start fully bent.
     """
 
     id = "presliding_friction"
@@ -53,7 +53,7 @@ class PreslidingFriction(ForceEffect):
     def initial_memory(
         self, position: Tensor, velocity: Tensor, start: Start
     ) -> tuple[Tensor, Tensor]:
-        """Returns bristles that follow the motion, and no force yet."""
+        """Returns bristles bent by the motion, and zero force."""
         return velocity.sign(), torch.zeros_like(velocity)
 
     def begin_step(
@@ -75,13 +75,13 @@ class PreslidingFriction(ForceEffect):
         free = time_step * (joint.velocity + time_step * joint.acceleration) / deflection
         free = free + stiffness * memory_share * bristles
         stiffness = stiffness * (1.0 + memory_share)
-        # At D = 0 the equation is off by this, so D has its sign; mirror to D ≥ 0.
+        # The residual of the equation at D = 0. D has its sign; mirror to D ≥ 0.
         excess = free - stiffness * bristles
         side = torch.where(excess < 0.0, -1.0, 1.0).to(excess)
         linear = 1.0 - side * free + stiffness
         root = torch.sqrt(linear * linear + 4.0 * excess.abs())
-        # Of the two forms of the root the one that does not cancel; the other's divisor is kept
-        # away from zero for its gradient.
+        # Of the two forms of the root, take the one without cancellation. The other's divisor
+        # is kept away from zero, because its gradient must be finite.
         is_positive = linear > 0.0
         divisor = torch.where(is_positive, linear + root, torch.ones_like(root))
         size = torch.where(is_positive, 2.0 * excess.abs() / divisor, 0.5 * (root - linear))
@@ -103,7 +103,7 @@ class PreslidingFriction(ForceEffect):
 class LoadDependentFriction(ForceEffect):
     """−μ |τ| sign v: dry friction in proportion to the drive's force τ, as in a loaded gear.
 
-    τ is the generalised force of the actions at the joint, as it is at the step's start.
+    τ is the generalised force of the actions at the joint, at the step's start.
     """
 
     id = "load_dependent_friction"
@@ -118,11 +118,11 @@ class LoadDependentFriction(ForceEffect):
         return {"coefficient": dist.HalfNormal(0.08)}
 
     def suits(self, port: Port) -> bool:
-        """Returns whether a drive loads the joint."""
+        """Returns whether a drive acts on the joint."""
         return port.is_driven
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:
-        """Returns no load yet."""
+        """Returns a load of zero."""
         return torch.zeros_like(position)
 
     def begin_step(
@@ -139,10 +139,11 @@ class LoadDependentFriction(ForceEffect):
 
 
 class FrictionDrift(TimedForceEffect):
-    """−(F sign v + b v) exp(−t/T): friction of a cold device that is gone once it is warm.
+    """−(F sign v + b v) exp(−t/T): friction of a cold device that vanishes as it warms up.
 
-    Attaches next to the friction that remains. A rollout begins cold: what happened before it is
-    not on record, and neither is the heat, of which time t since its beginning takes the place.
+    Attach it together with the friction that remains. A rollout is assumed to begin cold, because
+    earlier motion is not recorded. Temperature is not recorded either; the time t since the
+    rollout began takes its place.
     """
 
     id = "friction_drift"

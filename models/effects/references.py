@@ -1,4 +1,4 @@
-"""Where the catalogue's laws are from."""
+"""References for the catalogue's laws."""
 
 __all__ = [
     "ARMSTRONG_1994",

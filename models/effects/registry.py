@@ -1,4 +1,4 @@
-"""The registry of effects: the catalogue, and what other packages add to it.
+"""The registry of effects: the catalogue, and effects that other packages add.
 
 Other packages add theirs by an entry point of group ``npdr_ppl.effects``: its name is the effect's
 id, its value a subclass of :class:`~npdr_ppl.language.effects.Effect`.
@@ -71,7 +71,7 @@ def effect_class(name: str) -> type[Effect]:
         name: Its id, e.g. ``"coulomb_friction"``.
 
     Raises:
-        ModelError: There is no such effect, it cannot be loaded, or its id is another.
+        ModelError: There is no such effect, it cannot be loaded, or its id differs from the name.
     """
     return _found(_REGISTRY, name)
 

@@ -1,4 +1,4 @@
-"""What happens between a true value and its reading."""
+"""Effects between a true value and its measurement."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,13 +19,12 @@ __all__ = ["EncoderBias", "EncoderScale", "Quantisation", "SensorLowPass"]
 
 
 class SensorLowPass(SensorEffect):
-    """ẏ = (x − y)/T: a filtered reading, e.g. a velocity derived from an encoder.
+    """ẏ = (x − y)/T: a filtered measurement, e.g. a velocity derived from an encoder.
 
-    Exact for velocities that change along a line between samples and for positions that do along a
-    parabola, so that the reading trails by T at any sampling rate, as that of a driver does which
-    filters the encoder's differences. The filter's output at a segment's start is what was read
-    there. Attach it to a group of channels, ``"arm_velocity,pole_velocity"``, where one driver
-    filters them all.
+    Exact for velocities that are linear between samples and for positions that are parabolic. The
+    measurement therefore lags by T at any sampling rate, as that of a driver that filters the
+    encoder's differences. At a segment's start the filter's output is the measurement there. If
+    one driver filters several channels, attach it to the group, ``"arm_velocity,pole_velocity"``.
     """
 
     id = "sensor_low_pass"
@@ -41,11 +40,11 @@ class SensorLowPass(SensorEffect):
         return {"time_constant": dist.Uniform(0.0, 0.03)}
 
     def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> Any:
-        """Returns the shares of what the next reading is made of, the filter's output and value.
+        """Returns the weights in the next measurement, and the filter's output and past values.
 
-        Those of the true value, of the one before it and of the output. For a position there are
-        the share of the curvature in the next reading, none as the value before is not known, that
-        in later ones, and the value before.
+        There are weights for the true value, for the previous one and for the output. A position
+        has two more for the curvature: that in the next measurement is zero, because the value
+        before is unknown; the other one holds from then on.
         """
         time_constant = start.parameters["time_constant"]
         decay = remaining(time_constant, start.time_step)
@@ -61,7 +60,7 @@ class SensorLowPass(SensorEffect):
     def read(
         self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
     ) -> tuple[Tensor, Any]:
-        """Returns the filter's output, and with the true value its memory."""
+        """Returns the filter's output, and the memory with the true value."""
         shares, bends, (output, last, previous) = memory
         reading = torch.addcmul(shares[0] * value, shares[1], last)
         reading = torch.addcmul(reading, shares[2], output)
@@ -76,7 +75,7 @@ class EncoderBias(SensorEffect):
     """q + β."""
 
     id = "encoder_bias"
-    parameters = (Parameter("offset", "{port}", 0.0, "offset β of the reading"),)
+    parameters = (Parameter("offset", "{port}", 0.0, "offset β of the measurement"),)
     spans = ("position",)
     law = "q + β"
     equivalence = (ANGLE_OFFSET,)
@@ -88,11 +87,11 @@ class EncoderBias(SensorEffect):
         return {"offset": dist.Normal(0.0, 0.01 * port.rated)}
 
     def suits(self, port: Port) -> bool:
-        """Returns whether a position is read, and no rate."""
+        """Returns whether the channel is a position and not a rate."""
         return not port.unit.endswith("/s")
 
     def initial_value(self, reading: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Takes the offset out."""
+        """Removes the offset."""
         return reading - parameters["offset"]
 
     def read(
@@ -118,15 +117,15 @@ class EncoderScale(SensorEffect):
         return {"error": dist.Normal(0.0, 0.01)}
 
     def suits(self, port: Port) -> bool:
-        """Returns whether a position is read, and no rate."""
+        """Returns whether the channel is a position and not a rate."""
         return not port.unit.endswith("/s")
 
     def initial_value(self, reading: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Takes the scale error out."""
+        """Removes the scale error."""
         return reading / (1.0 + parameters["error"])
 
     def initial_rate(self, rate: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Takes the scale error out."""
+        """Removes the scale error."""
         return rate / (1.0 + parameters["error"])
 
     def read(
@@ -137,10 +136,10 @@ class EncoderScale(SensorEffect):
 
 
 class Quantisation(SensorEffect):
-    """round(x/Δ) Δ: a reading in whole counts of Δ, usually known from the device."""
+    """round(x/Δ) Δ: a measurement with resolution Δ, usually known from the device."""
 
     id = "quantisation"
-    parameters = (Parameter("count", "{port}", 0.0, "size of a count Δ"),)
+    parameters = (Parameter("count", "{port}", 0.0, "resolution Δ"),)
     is_smooth = False
     is_noise = True
     law = "round(x/Δ) Δ"
@@ -158,5 +157,5 @@ class Quantisation(SensorEffect):
         count = parameters["count"]
         is_coarse = count > 0.0
         divisor = torch.where(is_coarse, count, torch.ones_like(count))
-        # The number of counts has no gradient; that of the reading in Δ is this number.
+        # Rounding has no gradient; the gradient with respect to Δ is this integer.
         return torch.where(is_coarse, torch.round(value / divisor).detach() * count, value), memory

@@ -59,7 +59,7 @@ class Tilt(EnvironmentEffect):
 
 
 class Payload(EnvironmentEffect):
-    """An extra mass Δm where the port says, with all of its inertia and weight."""
+    """An extra mass Δm at the place of the port, with its inertia and weight."""
 
     id = "payload"
     parameters = (Parameter("mass", "{port}", 0.0, "extra mass Δm"),)
@@ -69,7 +69,7 @@ class Payload(EnvironmentEffect):
     reference = JANOT_2019
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
-        """Half-normal; 20 % of the mass that the port is rated at."""
+        """Half-normal; 20 % of the port's rated mass."""
         return {"mass": dist.HalfNormal(0.2 * port.rated)}
 
     def suits(self, port: Port) -> bool:
@@ -77,15 +77,15 @@ class Payload(EnvironmentEffect):
         return port.unit == "kg"
 
     def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
-        """Returns the mass on board, more by Δm."""
+        """Returns the port's mass plus Δm."""
         return value + parameters["mass"]
 
 
 class Contact(EnvironmentEffect):
     """Contact coefficients c exp(ε): friction, restitution, compliance, rolling resistance.
 
-    The port's quantity is a mapping of the coefficients that the engine has, by these names; the
-    others have no effect. A relative change keeps every coefficient positive.
+    The port's quantity maps these names to the coefficients that the engine has; coefficients that
+    the engine lacks have no effect. A relative change keeps every coefficient positive.
     """
 
     id = "contact"

@@ -14,7 +14,7 @@ __all__ = ["TimedForceEffect"]
 class TimedForceEffect(ForceEffect):
     """A force effect whose memory is the time in s since the rollout began.
 
-    It is that of the middle of the step for which the force is constant.
+    The time is that of the middle of the step, for which the force is constant.
     """
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:

@@ -1,4 +1,4 @@
-"""Readings that are late, or stamped by a clock that is off."""
+"""Measurements that are late, or whose time stamps come from a wrong clock."""
 
 import math
 from collections.abc import Mapping
@@ -18,12 +18,12 @@ __all__ = ["ClockSkew", "SensorDelay"]
 
 
 def _on_line(age: Tensor) -> Tensor:
-    """Returns the share that a value has in that of so many steps before it, on a line."""
+    """Returns the weight of a value in the value ``age`` steps before it, on a line."""
     return (1.0 - age.abs()).clamp_min(0.0)
 
 
 def _on_parabola(age: Tensor) -> Tensor:
-    """Returns the same on the parabola through the two values around and the one before them."""
+    """Returns the same on the parabola through the two adjacent values and the one before them."""
     share = torch.where(age >= 0.0, (1.0 - age) * (1.0 - 0.5 * age), (1.0 + age) * (1.0 - age))
     share = torch.where(age >= -1.0, share, 0.5 * (2.0 + age) * (1.0 + age))
     return torch.where((age > -2.0) & (age < 1.0), share, 0.0)
@@ -32,13 +32,13 @@ def _on_parabola(age: Tensor) -> Tensor:
 class SensorDelay(SensorEffect):
     """y(t) = x(t − d) with a delay d that need not be a whole number of steps.
 
-    Between steps of length h, a velocity, which is kinked where commands change, is on the line
-    through its neighbours, and a position on the parabola through two of them and the one before.
-    Attach it to the channels that are late together.
+    Between steps of length h a velocity is interpolated linearly, because it has kinks where
+    commands change. A position is interpolated by the parabola through the two adjacent values and
+    the one before. Attach it to all channels that share the delay.
 
-    What was read at a segment's start is the state d earlier, so the segment starts from where the
-    simulator without its effects gets from there under the commands of that time. What the sensor
-    reports until d has passed is found the same way, backwards.
+    The measurement at a segment's start is the state d earlier. The segment's initial state is
+    computed from it by the simulator without its effects, under the commands of that time. The
+    measurements until d has passed are computed in the same way, backwards.
     """
 
     id = "sensor_delay"
@@ -56,7 +56,7 @@ class SensorDelay(SensorEffect):
         return {"delay": dist.Uniform(0.0, 0.03)}
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
-        """Returns the steps that the longest delay reaches back, and one for the curvature."""
+        """Returns the number of steps in the longest delay, and one for the curvature."""
         return math.floor(float(parameters["delay"].detach().max()) / time_step) + 2
 
     def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor:
@@ -79,7 +79,7 @@ class SensorDelay(SensorEffect):
         memory: tuple[tuple[Tensor, ...], tuple[Tensor, ...]],
         time_step: float,
     ) -> tuple[Tensor, tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]:
-        """Returns the value d ago."""
+        """Returns the value a time d earlier."""
         weights, past = memory
         reading = weights[0] * value
         for weight, earlier in zip(weights[1:], past, strict=True):
@@ -88,11 +88,11 @@ class SensorDelay(SensorEffect):
 
 
 class ClockSkew(SensorEffect):
-    """y(t) = x(t (1 + κ)): readings stamped by a clock that runs apart from that of the commands.
+    """y(t) = x(t (1 + κ)): measurements timed by a clock with another rate than the commands'.
 
-    κ t is small, so that a position follows from the parabola through its last three values, and a
-    velocity, which is kinked where commands change, from the line through two. Both clocks agree
-    when a rollout begins; readings at a segment's start are κ t ahead.
+    κ t is small. A position therefore follows from the parabola through its last three values. A
+    velocity follows from the line through two, because it has kinks where commands change. Both
+    clocks agree when a rollout begins; measurements at a segment's start are κ t ahead.
     """
 
     id = "clock_skew"
@@ -116,11 +116,11 @@ class ClockSkew(SensorEffect):
         return parameters["skew"] * time
 
     def initial_rate(self, rate: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Takes the time's scale out."""
+        """Removes the time's scale."""
         return rate / (1.0 + parameters["skew"])
 
     def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> tuple[Tensor, ...]:
-        """Returns the time, the share of curvature, the present value and the one before it."""
+        """Returns the time, the curvature's weight, the current value and the one before it."""
         smooth = torch.full_like(value, 0.0 if start.is_rate else 1.0)
         return start.time, smooth, value, start.past(value)[0]
 

@@ -1,13 +1,13 @@
-"""What lies between a motor and the joint that it drives: elasticity and backlash.
+"""Effects between a motor and the joint that it drives: elasticity and backlash.
 
-Both split the joint's inertia. Of the inertia J = 1/W that a force at the joint sees, the share ρ
-turns with the motor and the rest with the link; δ is how far the motor is ahead of the link. The
-joint's own coordinate is the link's. With the drive's force τ, and the acceleration a that the
-joint would have if it were rigid, the two masses obey, apart from the force s that joins them,
+Both split the joint's inertia. Of the inertia J = 1/W at the joint, the share ρ turns with the
+motor and the rest with the link. δ is the motor's advance relative to the link, and the joint's
+own coordinate is the link's. Let τ be the drive's force, s the force between the two masses, and a
+the acceleration of a rigid joint. The two masses obey
 
     ρ J (q̈ + δ̈) = τ − s,    q̈ = a + W f,    f = −ρ J δ̈,
 
-where f is what the link feels more than in a rigid joint. Eliminating q̈ leaves
+where f is the additional force on the link compared with a rigid joint. Eliminating q̈ leaves
 
     δ̈ = (τ W/ρ − a − s W/ρ)/(1 − ρ),
 
@@ -29,25 +29,25 @@ from npdr_ppl.models.effects.references import SPONG_1987, TAO_1996
 __all__ = ["Backlash", "JointElasticity"]
 
 _Memory = tuple[Tensor, Tensor, Tensor, Tensor]
-"""How far the motor is ahead (NaN before it is known), the rate of that, the mean force and the
-force's moment within the step."""
+"""The motor's advance (NaN before it is known), its rate, the mean force and the force's moment
+within the step."""
 
 _SHARE = Parameter("motor_share", "1", 0.3, "share ρ of the inertia on the motor's side")
 
-# A resonance at a thousand times the rate of the steps is rigid in any precision.
+# A resonance at a thousand times the step rate is rigid in any precision.
 _STEPS_PER_LEAST_TIME_CONSTANT = 1000.0
 
-# Beyond this damping ratio a joint hardly swings, and ω_d would vanish.
+# Above this damping ratio a joint hardly oscillates, and ω_d would vanish.
 _GREATEST_DAMPING_RATIO = 0.999
 
 
 def _pull(joint: Joint, share: Tensor) -> Tensor:
-    """Returns δ̈ of a motor that nothing joins to its link."""
+    """Returns δ̈ of a motor that is not connected to its link."""
     return (joint.drive * joint.inverse_inertia / share - joint.acceleration) / (1.0 - share)
 
 
 class _Transmission(ForceEffect):
-    """What joins a motor to its link; how far the motor is ahead is found in the first step."""
+    """A connection of motor and link; the motor's advance is computed in the first step."""
 
     needs_joint = True
 
@@ -56,7 +56,7 @@ class _Transmission(ForceEffect):
         return port.is_driven
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> _Memory:
-        """Returns an advance that is not known yet."""
+        """Returns an unknown advance, NaN."""
         zero = torch.zeros_like(position)
         return torch.full_like(position, torch.nan), zero, zero, zero
 
@@ -67,7 +67,7 @@ class _Transmission(ForceEffect):
         return memory[2]
 
     def moment(self, parameters: Mapping[str, Tensor], memory: _Memory) -> Tensor:
-        """Returns the moment of the force: motors may turn or hit several times within a step."""
+        """Returns the moment of the force: motors may reverse or hit often within a step."""
         return memory[3]
 
 
@@ -78,19 +78,19 @@ def _felt(
     after: tuple[Tensor, Tensor],
     time_step: float,
 ) -> tuple[Tensor, Tensor]:
-    """Returns mean and moment of the force that the link feels while the motor gets ahead.
+    """Returns mean and moment of the force on the link while the motor's advance changes.
 
     Args:
         joint: The joint.
         share: Motor's share of the inertia.
-        before: How far the motor is ahead, and the rate of that, at the step's start.
+        before: The motor's advance and its rate at the step's start.
         after: The same at its end.
         time_step: Seconds per step.
     """
     motor_inertia = share / joint.inverse_inertia
     (advance, rate), (next_advance, next_rate) = before, after
     mean = -motor_inertia * (next_rate - rate) / time_step
-    # With the moment the link is where the motor's advance has left it.
+    # The moment makes the link's position agree with the motor's advance.
     ahead = 0.5 * time_step * (rate + next_rate) - (next_advance - advance)
     return mean, -motor_inertia * ahead
 
@@ -98,8 +98,8 @@ def _felt(
 class JointElasticity(_Transmission):
     """s = k δ + d δ̇: a spring and a damper between motor and link.
 
-    In terms of the free resonance ω = 1/T: δ̈ = p − ω² δ − 2 ζ ω δ̇ with the pull p of the drive,
-    solved exactly over a step in which p is constant. A segment starts with the spring settled.
+    In terms of the free resonance ω = 1/T: δ̈ = p − ω² δ − 2 ζ ω δ̇ with the drive's term p. It is
+    solved exactly over a step, in which p is constant. A segment starts with the spring settled.
     """
 
     id = "joint_elasticity"
@@ -115,7 +115,7 @@ class JointElasticity(_Transmission):
     reference = SPONG_1987
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
-        """Resonance mostly above 10 Hz; damping ratio up to 0.3; any share but the extremes."""
+        """Resonance mostly above 10 Hz; damping ratio up to 0.3; any share except the extremes."""
         return {
             "time_constant": dist.HalfNormal(0.01),
             "damping_ratio": dist.Uniform(0.005, 0.3),
@@ -153,10 +153,10 @@ class JointElasticity(_Transmission):
 
 
 class Backlash(_Transmission):
-    """|δ| ≤ g: play of half width g between motor and link, which meet without a bounce.
+    """|δ| ≤ g: play of half width g between motor and link, with inelastic impacts.
 
-    While the gap is open no drive reaches the link, and the link moves without the motor's
-    inertia. A segment starts with the gap closed on the side to which the drive pushes.
+    While the gap is open, the drive does not act on the link, and the link moves without the
+    motor's inertia. A segment starts with the gap closed on the side to which the drive pushes.
     """
 
     id = "backlash"
@@ -169,7 +169,7 @@ class Backlash(_Transmission):
     reference = TAO_1996
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
-        """Play half-normal, 0.2 % of the rated position (7'); any share but the extremes."""
+        """Play half-normal, 0.2 % of the rated position (7'); any share except the extremes."""
         return {
             "play": dist.HalfNormal(0.002 * port.rated_position),
             "motor_share": dist.Uniform(0.05, 0.9),
@@ -192,8 +192,8 @@ class Backlash(_Transmission):
             after = _flown(advance, rate, pull, play, time_step)
             return *after, *_felt(joint, share, before, after, time_step)
         reached = (advance + time_step * (rate + time_step * pull)).clamp(-play, play)
-        # The rate that arrives at the end of the gap when the step ends, and zero once there: the
-        # mean force alone then leaves the link where it belongs.
+        # The rate with which the motor reaches the gap's end when the step ends, and zero once
+        # there. The mean force alone then moves the link to the right position.
         after = reached, (reached - advance) / time_step
         mean, _ = _felt(joint, share, before, after, time_step)
         return *after, mean, torch.zeros_like(mean)
@@ -202,12 +202,12 @@ class Backlash(_Transmission):
 def _flown(
     advance: Tensor, rate: Tensor, pull: Tensor, play: Tensor, time_step: float
 ) -> tuple[Tensor, Tensor]:
-    """Returns the motor's advance and its rate after a flight that may end at a flank."""
+    """Returns the motor's advance and its rate after a free motion that may end at a flank."""
     sides = [_time_to_flank(play, s * advance, s * rate, s * pull) for s in (-1.0, 1.0)]
     flight = torch.minimum(*sides).clamp_max(time_step)
     flank = torch.where(sides[0] < sides[1], -play, play)
     has_hit = torch.minimum(*sides) < time_step
-    # Without a bounce: from where it hits it leaves only if the drive pulls it off.
+    # Inelastic impact: after a hit the motor leaves the flank only if the drive pulls it off.
     left = time_step - flight
     off = torch.where(pull * flank < 0.0, pull, 0.0)
     reached = torch.where(
@@ -221,13 +221,13 @@ def _flown(
 
 
 def _time_to_flank(play: Tensor, advance: Tensor, rate: Tensor, pull: Tensor) -> Tensor:
-    """Returns the seconds to the flank at +g; infinitely many where the flight does not end there.
+    """Returns the time in s to the flank at +g; infinite if the free motion does not end there.
 
     The least root of g = δ + δ̇ t + p t²/2 that is not negative.
     """
     distance = (play - advance).clamp_min(0.0)
     discriminant = rate * rate + 2.0 * pull * distance
-    # What no flight needs must not make its derivatives infinite.
+    # Branches that are not used must not make the derivatives infinite.
     is_real = discriminant > 0.0
     closing = rate + torch.where(is_real, discriminant, 1.0).sqrt()
     is_flight = is_real & (closing > 0.0)

@@ -1,8 +1,8 @@
-"""What strikes the ball: the club head alone, or the whole arm that holds it.
+"""The strikers of the ball: the club head alone, or the whole arm that holds it.
 
-Both follow the joints' recorded angles and have, at every contact, the velocity that goes with
-them; a body that was merely put from place to place would have none and pass on no momentum. The
-head alone launches the ball as the whole arm does, at a fraction of the cost.
+Both follow the joints' recorded angles and have the corresponding velocity at every contact. A
+body that is only moved from pose to pose would have no velocity and transfer no momentum. The head
+alone launches the ball as the whole arm does, in a fraction of the computing time.
 """
 
 from abc import ABC, abstractmethod
@@ -24,23 +24,24 @@ Array = NDArray[np.float64]
 ClubKind = Literal["head", "arm"]
 
 ASIDE = (0.0, 0.0, 100.0), (0.0, 0.0, 0.0, 1.0)
-"""Where the head is when it is out of reach: it falls there, which is no one's business."""
+"""Position in m and quaternion of the head while it is out of reach. It falls there without any
+effect."""
 
 MOTOR_FORCE = 1e5
-"""Greatest torque of a joint's motor in N m; no more than a way to say that the joint obeys."""
+"""Maximum torque of a joint's motor in N m, large enough for the joint to follow its commands."""
 
 LINK_RADIUS = 0.05
-"""Radius of the ball of matter that stands for a link in m; its inertia matters as little as its
-mass where joints obey."""
+"""Radius in m of the sphere that represents a link. Its inertia and mass have no influence,
+because the joints follow their commands."""
 
 
 class Club(ABC):
     """A striker that is moved along a recorded swing.
 
     Args:
-        angles: Joint angles in rad at the M + 1 bounds of sub-steps, ``(M + 1, 7)``.
+        angles: Joint angles in rad at the M + 1 boundaries of sub-steps, ``(M + 1, 7)``.
         sub_step: Seconds per sub-step.
-        sub_steps: Sub-steps per step.
+        sub_steps: Number of sub-steps per step.
         gravity: Acceleration of gravity in m/s².
     """
 
@@ -58,15 +59,15 @@ class Club(ABC):
 
     @abstractmethod
     def follower(self, client: Any, body: int) -> Callable[[int], None]:
-        """Returns what gives the club its pose and velocity of a sub-step, just before that."""
+        """Returns a function that sets the club's pose and velocity just before a sub-step."""
 
     @abstractmethod
     def put_aside(self, client: Any, body: int) -> None:
-        """Takes care of a club that is out of the ball's reach."""
+        """Prepares the club for the steps in which it is out of the ball's reach."""
 
     @cached_property
     def poses(self) -> Pose:
-        """Poses of the head's centre at the bounds of sub-steps."""
+        """Poses of the head's centre at the boundaries of sub-steps."""
         return head_path(self.angles)
 
     @cached_property
@@ -76,7 +77,7 @@ class Club(ABC):
 
 
 class ClubHead(Club):
-    """The head alone, along the arm's forward kinematics; see :class:`Club`."""
+    """The head alone, moved by the arm's forward kinematics; see :class:`Club`."""
 
     def build(self, client: Any, restitution: float) -> tuple[int, int]:
         """Adds the head; see :meth:`Club.build`."""
@@ -89,8 +90,8 @@ class ClubHead(Club):
         return body, -1
 
     def follower(self, client: Any, body: int) -> Callable[[int], None]:
-        """Returns what moves the head; see :meth:`Club.follower`."""
-        # Looked up once: the client wraps a function anew each time it is asked for it.
+        """Returns the function that moves the head; see :meth:`Club.follower`."""
+        # Looked up once, because the client wraps a function anew at each access.
         place, push = client.resetBasePositionAndOrientation, client.resetBaseVelocity
         positions, quaternions = self._positions, self._quaternions
         velocities, rates = self.velocities, self.rates
@@ -102,10 +103,10 @@ class ClubHead(Club):
         return follow
 
     def put_aside(self, client: Any, body: int) -> None:
-        """Puts the head where nothing is."""
+        """Moves the head away from all bodies."""
         client.resetBasePositionAndOrientation(body, *ASIDE)
 
-    # Plain lists, because one swing serves thousands of strikes and Bullet takes numbers.
+    # Lists, because one swing is used for thousands of strikes and Bullet takes numbers.
 
     @cached_property
     def _positions(self) -> list[list[float]]:
@@ -117,7 +118,7 @@ class ClubHead(Club):
 
     @cached_property
     def velocities(self) -> list[list[float]]:
-        """Mean velocities in sub-steps in m/s, plus what gravity takes: the head is held up."""
+        """Mean velocities in sub-steps in m/s, plus a compensation of gravity."""
         velocities = np.diff(self.poses.position, axis=0) / self.sub_step
         velocities[:, 2] += self.gravity * self.sub_step
         return velocities.tolist()
@@ -133,8 +134,8 @@ class ClubHead(Club):
 class WholeArm(Club):
     """Seven links, the club and its head as one multi-body; see :class:`Club`.
 
-    Every joint is put to its angle and given its velocity, which its motor holds against gravity
-    and the blow.
+    Every joint is set to its angle and velocity. Its motor holds the velocity against gravity and
+    the impact.
     """
 
     def build(self, client: Any, restitution: float) -> tuple[int, int]:
@@ -165,7 +166,7 @@ class WholeArm(Club):
         return body, len(JOINTS)
 
     def follower(self, client: Any, body: int) -> Callable[[int], None]:
-        """Returns what moves the joints; see :meth:`Club.follower`."""
+        """Returns the function that moves the joints; see :meth:`Club.follower`."""
         place, control = client.resetJointState, client.setJointMotorControlArray
 
         def follow(k: int) -> None:

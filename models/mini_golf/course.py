@@ -1,4 +1,4 @@
-"""The mini-golf course: what stands where, how large it is, and what of it is unknown."""
+"""The mini-golf course: positions and sizes of its bodies, and the unknown parameters."""
 
 import math
 from dataclasses import dataclass
@@ -40,21 +40,21 @@ OBSTACLES = (
 """The left obstacle (1) and the right one (2)."""
 
 MEASURED_OBSTACLES = ((0.852088, 1.48181, -7.7), (0.576446, 1.21897, 29.3))
-"""Both obstacles on the rig by motion capture: x and y of the centre in m, angle in degrees."""
+"""Both obstacles of the rig, by motion capture: x and y of the centre in m, angle in degrees."""
 
 HOLE = (1.18977, 1.37017)
 HOLE_DEPTH = 0.002
 HOLE_RISE = 1e-4
-"""The disc's top in m above the ground: the ball stops once its point of contact is on the disc.
-One that stood out by a millimetre would stop it half a centimetre earlier, at the rim; one of ten
-micrometres lets fast balls pass, because the ground still bears them."""
+"""Height of the disc's top above the ground in m. The ball stops once its point of contact is on
+the disc. A disc 1 mm high would stop it 0.5 cm earlier, at the rim. A disc 10 µm high lets fast
+balls pass, because the ground still supports them."""
 
 HOLE_FRICTION = 10.0
-"""Friction and, in m, rolling friction of the disc that stands for the hole."""
+"""Friction and, in m, rolling friction of the disc that represents the hole."""
 
 CLUB_HEAD_SIZE = (0.017, 0.07, 0.01)
 CLUB_MASS = 0.9
-"""The head's mass in kg: enough for a ball of some grams not to change the path it is given."""
+"""The head's mass in kg, large enough that a ball of a few grams does not change its path."""
 
 DEFAULT_FRICTION = 0.8
 """Friction of rails, obstacles and club head."""

@@ -1,4 +1,4 @@
-"""Forward kinematics of the arm that holds the club: seven angles in, the club head's pose out.
+"""Forward kinematics of the arm that holds the club: from seven angles to the head's pose.
 
 A transform is a translation followed by intrinsic rotations about x, y and z; a joint is its
 transform followed by a rotation about its own z axis.
@@ -36,7 +36,7 @@ class Pose:
         return cls(np.array((x, y, z), dtype=float), turn.as_matrix())
 
     def __matmul__(self, other: "Pose") -> "Pose":
-        """Returns the transform that first goes from here to ``other``'s frame."""
+        """Returns this transform followed by ``other``, which is given in this one's frame."""
         position = self.position + np.einsum("...ij,...j->...i", self.rotation, other.position)
         return Pose(position, self.rotation @ other.rotation)
 
@@ -50,9 +50,9 @@ class Joint:
     """A revolute joint and the link behind it.
 
     Attributes:
-        frame: From the frame before to the joint's own.
-        lower: Least angle in rad.
-        upper: Greatest angle in rad.
+        frame: Transform from the previous frame to the joint's own.
+        lower: Minimum angle in rad.
+        upper: Maximum angle in rad.
         mass: Mass of the link in kg.
     """
 
@@ -89,7 +89,7 @@ JOINTS = (
 """The seven joints, base to tip."""
 
 CLUB = Pose.of(0.164, -0.02, -0.01, 0, 90, -165)
-"""From the last joint to the club, whose shaft points along its −y."""
+"""From the last joint to the club, whose shaft points along the club's −y axis."""
 
 HEAD = Pose.of(0.01, -0.945, 0, 0, 0, 57)
 """From the club to the centre of its head."""

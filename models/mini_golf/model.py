@@ -1,4 +1,4 @@
-"""Pyro models of the strike: the paper's ten parameters, and with two restitutions."""
+"""Pyro models of the strike: with the paper's ten parameters, and with two restitutions."""
 
 import math
 
@@ -15,11 +15,11 @@ __all__ = ["mini_golf", "mini_golf_two_restitutions"]
 
 
 def mini_golf(inputs: Inputs, *, noise: Noise | None = None) -> Tensor:
-    """A ball of unknown make between two obstacles of unknown place: the paper's ten parameters.
+    """An unknown ball between two obstacles at unknown positions: the paper's ten parameters.
 
     Args:
         inputs: Whole strikes with the channels ``ball_x`` and ``ball_y`` and the joints' commands.
-        noise: Noise of the readings.
+        noise: Measurement noise.
     """
     restitution = pyro.sample("ball_restitution", dist.Uniform(0.0, 1.0))
     parameters = _ball() | {"ball_restitution": restitution} | _obstacles()
@@ -27,13 +27,13 @@ def mini_golf(inputs: Inputs, *, noise: Noise | None = None) -> Tensor:
 
 
 def mini_golf_two_restitutions(inputs: Inputs, *, noise: Noise | None = None) -> Tensor:
-    """As :func:`mini_golf`, with the rebound off the club apart from that off obstacles.
+    """As :func:`mini_golf`, with separate rebounds off the club and off obstacles.
 
     The club's restitution may exceed 1: the recorded head is slower than the ball it launches.
 
     Args:
         inputs: Whole strikes with the channels ``ball_x`` and ``ball_y`` and the joints' commands.
-        noise: Noise of the readings.
+        noise: Measurement noise.
     """
     parameters = _ball() | {
         "club_restitution": pyro.sample("club_restitution", dist.Uniform(0.0, 2.0)),

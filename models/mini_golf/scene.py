@@ -6,16 +6,16 @@ How contacts are solved is part of the model, so it is fixed here:
 * Bullet combines restitutions, frictions and rolling frictions of two bodies as it does by
   default: the products of restitutions and of frictions, and for rolling the sum of each body's
   rolling friction (m) times the other's friction;
-* the head pushes the ball alone, the rest of the world the ball alone;
-* a contact exists from 10 µm on and overlaps are not pushed apart by springs (contact ERP 0). By
-  Bullet's default of 2 cm, contacts are foreseen one ball radius ahead and swallow the rebound.
-  The threshold belongs to the process and outlives a reset, so every strike sets it;
+* the head collides only with the ball, and all other bodies collide only with the ball;
+* a contact exists below a distance of 10 µm, and overlaps are not pushed apart by springs (contact
+  ERP 0). With Bullet's default of 2 cm, contacts are predicted one ball radius ahead and suppress
+  the rebound. The threshold belongs to the process and survives a reset, so every strike sets it;
 * no damping in the air, and the bodies never sleep.
 
-What the time goes to decides how it is done: what stands is kept in maximal coordinates, because
-Bullet moves every body in reduced ones at every sub-step, standing or not; and while the club is
-out of reach, one call of Bullet makes all sub-steps of a step. Neither changes the physics; the
-first changes rounding, which contacts amplify.
+Two choices save computing time. Fixed bodies are kept in maximal coordinates, because Bullet
+updates every body in reduced coordinates at every sub-step, even fixed ones. While the club is out
+of reach, one call of Bullet makes all sub-steps of a step. Neither changes the physics; the first
+changes rounding, which contacts amplify.
 """
 
 from typing import Any
@@ -54,18 +54,18 @@ SUB_STEPS = SETTINGS.substeps
 GRAVITY = -SETTINGS.gravity[2]
 
 REACH = 0.1
-"""Distance in m of ball and club head beyond which the head is not moved: the ball has a radius
-of 2.6 cm at most, the head a half-diagonal of 3.7 cm, and neither goes much faster than 2 m/s, or
-2 cm per step."""
+"""Distance in m of ball and club head beyond which the head is not moved. The ball has a radius of
+at most 2.6 cm and the head a half-diagonal of 3.7 cm. Neither moves much faster than 2 m/s, or 2
+cm per step."""
 
 REST_SPEED = 1e-4
-"""Speed in m/s, and speed of the surface, below which a ball that nothing will push lies still:
-rolling friction stops it within a micrometre."""
+"""Speed in m/s, also of the surface, below which a ball counts as at rest if nothing will push it.
+Rolling friction then stops it within a micrometre."""
 
 STEPS_PER_REST_CHECK = 10
 
 _BALL, _WORLD, _HEAD = 1, 2, 4
-"""Collision groups; the ball meets both others, which do not meet each other."""
+"""Collision groups; the ball collides with both others, which do not collide with each other."""
 
 
 class Scene:
@@ -88,8 +88,8 @@ class Scene:
 
         Args:
             parameters: The course and the ball.
-            ball: Where the ball lies at the start in m, ``(2,)``.
-            club: What strikes it, on its way through K steps.
+            ball: Initial position of the ball in m, ``(2,)``.
+            club: The striker, with its path over K steps.
             time_step: Seconds per step.
 
         Returns:
@@ -136,7 +136,7 @@ class Scene:
         return max(*map(abs, linear), radius * max(map(abs, angular))) < REST_SPEED
 
     def _set_step(self, time_step: float, sub_steps: int, *, is_one_call: bool) -> None:
-        """Sets the sub-steps' length, and whether a call makes all sub-steps of a step or one."""
+        """Sets the sub-steps' length, and whether a call makes one sub-step or all of a step."""
         client = self._client
         # Survives a reset, so every strike sets it.
         client.setPhysicsEngineParameter(numSubSteps=sub_steps if is_one_call else 0)

@@ -1,4 +1,4 @@
-"""The simulator of one strike: joint angles replayed, the ball's course out."""
+"""The simulator of one strike: it replays joint angles and returns the ball's path."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -31,7 +31,7 @@ _COMMANDS = tuple(
 
 
 class Workspace:
-    """A scene, and the club on its way along the joint angles last seen.
+    """A scene, and the club with the path of the latest joint angles.
 
     Attributes:
         scene: The connection to Bullet.
@@ -43,10 +43,10 @@ class Workspace:
         self._club: Club | None = None
 
     def club(self, kind: ClubKind, angles: Array, time_step: float) -> Club:
-        """Returns the club for joint angles at the bounds of steps, ``(K + 1, 7)`` in rad.
+        """Returns the club for joint angles at the boundaries of steps, ``(K + 1, 7)`` in rad.
 
-        Between the bounds the angles are linear in time. Thousands of draws share one swing,
-        whose kinematics take as long as a strike.
+        Between the boundaries the angles are linear in time. The club is kept, because thousands
+        of draws share one swing and its kinematics take as long as a strike.
         """
         key = (angles.tobytes(), time_step)
         if self._club is None or key != self._key:
@@ -61,20 +61,21 @@ class Workspace:
 class MiniGolf(PooledSimulator):
     """A robot arm strikes a golf ball, which rolls past two obstacles towards a hole.
 
-    The arm is where it is told to be: a command is the joints' position at its own time, between
-    two commands they move linearly, and the club head's pose and velocity follow by forward
+    The arm follows its commands exactly. A command is the joints' position at its own time, and
+    between two commands they move linearly. The club head's pose and velocity follow by forward
     kinematics. Rigid-body contacts with the ball are PyBullet's; see
     :mod:`npdr_ppl.models.mini_golf.scene` for how they are solved.
 
-    Bullet multiplies restitutions. The ball's is a factor of all rebounds; the club's and the
-    obstacles' are 1 unless told otherwise, so that ball restitution alone decides. The club's may
-    exceed 1: a flexible shaft gives back more than the head's own motion.
+    Bullet multiplies restitutions. The ball's is a factor of all rebounds. The club's and the
+    obstacles' are 1 by default, so that only the ball's has an effect. The club's may exceed 1,
+    because a flexible shaft returns more than the head's own motion.
 
     A strike is simulated from its first sample, at which the ball is at rest.
 
     Args:
-        club: What strikes: ``"head"``, the club head alone, or ``"arm"``, the whole arm as one
-            multi-body, which launches the ball the same and takes several times as long.
+        club: The striker: ``"head"``, the club head alone, or ``"arm"``, the whole arm as one
+            multi-body. The arm launches the ball in the same way and takes several times as long
+            to simulate.
     """
 
     states = (*_BALL, *_ANGLES)
@@ -117,7 +118,7 @@ class MiniGolf(PooledSimulator):
         """Simulates all strikes; see :meth:`Simulator.simulate`.
 
         Raises:
-            DataError: A segment does not begin where its rollout does.
+            DataError: A segment does not begin at the start of its rollout.
         """
         if bool(inputs.start.any()):
             raise DataError(
@@ -127,7 +128,7 @@ class MiniGolf(PooledSimulator):
         return super().simulate(parameters, inputs)
 
     def set_up(self) -> Workspace:
-        """Returns what strikes of one process share."""
+        """Returns the data that all strikes of one process share."""
         return Workspace()
 
     def simulate_one(
@@ -138,13 +139,13 @@ class MiniGolf(PooledSimulator):
         Args:
             workspace: What :meth:`set_up` returned.
             parameters: All parameters, in the declared units.
-            segment: The commands, and where the ball lies.
+            segment: The commands, and the initial position of the ball.
             seed: Has no effect.
 
         Returns:
             Ball and joints after each step, ``(steps, 9)`` in m and rad.
         """
-        # What the joints were told after the last step is not on record: they hold still.
+        # The command after the last step is not recorded, so the joints keep their position.
         angles = np.concatenate([segment.actions, segment.actions[-1:]])
         ball = workspace.scene.strike(
             _strike_parameters(parameters),

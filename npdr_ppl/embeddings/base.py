@@ -1,4 +1,4 @@
-"""The protocol of an embedding: trajectories in, what a backend conditions on out."""
+"""The protocol of an embedding: it maps trajectories to the features given to a backend."""
 
 from abc import ABC, abstractmethod
 
@@ -14,9 +14,9 @@ __all__ = ["Embedding", "check_trajectory", "states_of"]
 class Embedding(ABC):
     """Maps trajectories to features x, f_ψ of Muratore et al. (2021).
 
-    Callers hand over simulations chunk by chunk and keep only the features, so that memory does
-    not grow with simulations × steps. Embeddings are immutable; a trained one offers a network
-    that the backend learns jointly with its density estimator.
+    Callers pass simulations chunk by chunk and keep only the features, so that memory does not
+    grow with simulations × steps. Embeddings are immutable. A trained embedding provides a network
+    that the backend trains jointly with its density estimator.
 
     Attributes:
         is_trained: Whether :meth:`network` has to be trained on the features.
@@ -29,9 +29,9 @@ class Embedding(ABC):
         """Maps trajectories to features.
 
         Args:
-            trajectory: Readings after each step, ``(B, S, K, C)``, whose channels are those of
-                the inputs, in their order.
-            inputs: What was simulated: S segments of K steps.
+            trajectory: Measurements after each step, ``(B, S, K, C)``; the channels are those of
+                the inputs, in the same order.
+            inputs: The simulated segments: S segments of K steps.
 
         Returns:
             ``(B, F)``, or an array per simulation for a network. Padded steps have no influence.
@@ -41,11 +41,11 @@ class Embedding(ABC):
         """
 
     def network(self, feature_shape: torch.Size) -> nn.Module | None:
-        """Returns an untrained network for features, ``None`` if they are final.
+        """Returns an untrained network for features; ``None`` if no network is needed.
 
         Args:
-            feature_shape: Shape of one simulation's features; the network is given batches of
-                them, standardised.
+            feature_shape: Shape of one simulation's features; the network gets batches of them,
+                standardised.
         """
         return None
 
@@ -61,7 +61,7 @@ def check_trajectory(trajectory: Tensor, inputs: Inputs) -> None:
 
 
 def states_of(trajectory: Tensor, inputs: Inputs) -> Tensor:
-    """Returns each segment's readings including the one it started with, ``(B, S, K + 1, C)``."""
+    """Returns each segment's measurements including the initial one, ``(B, S, K + 1, C)``."""
     check_trajectory(trajectory, inputs)
     start = inputs.initial_readings.to(trajectory)[..., None, :]
     return torch.cat([start.expand(len(trajectory), -1, -1, -1), trajectory], dim=2)

@@ -13,12 +13,12 @@ __all__ = ["Convolutional", "Linear", "Recurrent"]
 
 
 class _Trained(Embedding):
-    """A raw trajectory as features, for a network to read."""
+    """A raw trajectory as features, the input of a network."""
 
     is_trained = True
 
     def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
-        """Returns the readings, ``(B, S, K, C)``, zero where a step does not exist."""
+        """Returns the measurements, ``(B, S, K, C)``, zero where a step does not exist."""
         check_trajectory(trajectory, inputs)
         mask = inputs.mask.to(trajectory.device)
         return torch.where(mask[..., None], trajectory, 0.0)
@@ -26,14 +26,14 @@ class _Trained(Embedding):
 
 @dataclass(frozen=True)
 class Linear(_Trained):
-    """One trained linear layer over all readings of all segments.
+    """One trained linear layer over all measurements of all segments.
 
-    Where every reading of a trajectory means something of its own, as on the way of a ball, this
-    learns the combinations that matter. Of a stride of 2, ``linear/2``, it is the embedding of
-    Muratore et al. (2021) for mini golf.
+    It suits trajectories in which every measurement has its own meaning, such as the path of a
+    ball, and learns the relevant combinations. With a stride of 2, ``linear/2``, it is the
+    embedding of Muratore et al. (2021) for mini golf.
 
     Attributes:
-        output: Features F handed to the density estimator.
+        output: Number of features F for the density estimator.
     """
 
     output: int = 100
@@ -52,7 +52,7 @@ class Recurrent(_Trained):
 
     Attributes:
         hidden: Units of the recurrent layer.
-        output: Features F handed to the density estimator.
+        output: Number of features F for the density estimator.
 
     References:
         K. Cho et al., Learning phrase representations using RNN encoder–decoder, 2014.
@@ -75,7 +75,7 @@ class Convolutional(_Trained):
 
     Attributes:
         hidden: Feature maps of the widest layer.
-        output: Features F handed to the density estimator.
+        output: Number of features F for the density estimator.
     """
 
     hidden: int = 48
@@ -96,16 +96,16 @@ def _checked(feature_shape: torch.Size) -> tuple[int, int, int]:
 
 
 class _Pooled(nn.Module):
-    """Encodes each segment by itself and averages what a small network makes of the codes.
+    """Encodes each segment separately, passes the codes through a small network and averages.
 
-    Segments start in different states and are driven by different actions, which are the same in
-    every simulation. A learnt code per segment tells the network which one it reads, so that
-    averaging does not mix them up.
+    Segments differ in their initial states and actions, which are the same in every simulation. A
+    learnt code per segment identifies the segment to the network, so that averaging does not mix
+    segments up.
     """
 
     def __init__(self, encoder: nn.Module, segments: int, hidden: int, output: int) -> None:
         super().__init__()
-        # Codes of unit scale, whatever the encoder: beside them the segments' own codes count.
+        # Any encoder's output has unit scale, so that the segments' codes are not negligible.
         self.encoder = nn.Sequential(encoder, nn.LayerNorm(hidden))
         self.segment_code = nn.Parameter(torch.randn(segments, hidden))
         self.mix = nn.Sequential(

@@ -38,7 +38,7 @@ def embedding_by_name(word: str) -> Embedding:
 
     Args:
         word: A name of :func:`embedding_names`, optionally with the channels to embed, and a
-            stride in steps behind ``/`` or the length of blocks to average behind ``~``, e.g.
+            stride in steps after ``/`` or the length of blocks to average after ``~``, e.g.
             ``"bayessim"``, ``"all/10"``, ``"all~10"`` or ``"all[ball_x,ball_y]/2"``.
 
     Raises:

@@ -1,4 +1,4 @@
-"""An embedding that keeps what a recording says about the parameters near its closest fit."""
+"""An embedding that keeps the information on the parameters near the best fit."""
 
 from dataclasses import dataclass
 
@@ -13,13 +13,13 @@ __all__ = ["Score"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Score(Embedding):
-    """The gradient of a Gaussian log likelihood by the parameters, at one point.
+    """The gradient of a Gaussian log likelihood with respect to the parameters, at one point.
 
-    With the simulation μ, its derivative J and the covariance C of what it leaves, all at the
-    point of expansion, the features of a trajectory x are the d numbers t(x) = Jᵀ C⁻¹ (x − μ): no
-    d numbers hold more Fisher information about the parameters there. Far from that point
-    trajectories are unlike a linear model's, so each is divided by its standard deviation
-    √(Jᵀ C⁻¹ J) and compressed by asinh, which loses nothing.
+    Let μ be the simulation, J its derivative and C the covariance of the residuals, all at the
+    point of expansion. The features of a trajectory x are the d numbers t(x) = Jᵀ C⁻¹ (x − μ). No
+    d numbers hold more Fisher information about the parameters at this point. Far from it the
+    linear model does not hold. Each number is therefore divided by its standard deviation √(Jᵀ C⁻¹
+    J) and compressed by asinh, which loses no information.
 
     Attributes:
         mean: μ, ``(S, K, C)``.

@@ -1,4 +1,4 @@
-"""Embeddings that are final: summary statistics and the readings themselves."""
+"""Embeddings without a trained network: summary statistics and the measurements themselves."""
 
 from dataclasses import dataclass
 
@@ -16,15 +16,15 @@ __all__ = ["AllSteps", "BayesSimStatistic", "Differences", "LastStep"]
 class BayesSimStatistic(Embedding):
     """Correlations of actions with state differences, and the differences' mean and variance.
 
-    With S the readings before each step, D their differences to the next reading and A the
+    With S the measurements before each step, D their differences to the next measurement and A the
     actions of the same steps, the features of a rollout are ``AᵀD`` (a plain sum over its steps,
     actions by channels), the mean of D and the biased variance of D. The steps of all segments of
-    a rollout are pooled; no difference reaches from one segment into the next. The features of
-    several rollouts are concatenated, so F = R (A·C + 2·C).
+    a rollout are pooled; no difference is taken between two segments. The features of several
+    rollouts are concatenated, so F = R (A·C + 2·C).
 
     References:
         F. Ramos et al., BayesSim: adaptive domain randomization via probabilistic inference for
-        robotics simulators, 2019, section IV; the pooling over segments is ours.
+        robotics simulators, 2019, section IV; the pooling over segments is our addition.
     """
 
     def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
@@ -51,32 +51,32 @@ class BayesSimStatistic(Embedding):
 
 @dataclass(frozen=True)
 class LastStep(Embedding):
-    """The last reading of every segment, F = S·C."""
+    """The last measurement of every segment, F = S·C."""
 
     def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
-        """Returns the last readings, ``(B, S·C)``."""
+        """Returns the last measurements, ``(B, S·C)``."""
         check_trajectory(trajectory, inputs)
         steps = torch.arange(1, inputs.num_steps + 1) * inputs.mask.cpu()
         last = (steps.amax(-1) - 1).to(trajectory.device)
         if bool((last < 0).any()):
-            raise ShapeError("a segment has no step left, so it has no last reading.")
+            raise ShapeError("a segment has no step left, so it has no last measurement.")
         index = last[None, :, None, None].expand(len(trajectory), -1, 1, trajectory.shape[-1])
         return trajectory.gather(2, index).flatten(1)
 
 
 @dataclass(frozen=True)
 class AllSteps(Embedding):
-    """Every reading, segment after segment; with a stride for long rollouts, e.g. ``all/10``."""
+    """All measurements, one segment after another; use a stride for long rollouts: ``all/10``."""
 
     def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
-        """Returns the readings of the steps that exist, ``(B, (valid steps)·C)``."""
+        """Returns the measurements of the steps that exist, ``(B, (valid steps)·C)``."""
         check_trajectory(trajectory, inputs)
         return trajectory[:, inputs.mask.to(trajectory.device)].flatten(1)
 
 
 @dataclass(frozen=True)
 class Differences(Embedding):
-    """Every difference between consecutive readings of a segment, its start included."""
+    """All differences between consecutive measurements of a segment, from the initial one on."""
 
     def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
         """Returns the differences of the steps that exist, ``(B, (valid steps)·C)``."""

@@ -1,4 +1,4 @@
-"""Embeddings of a thinner trajectory: every k-th step, block means, chosen channels or steps."""
+"""Embeddings of a reduced trajectory: every k-th step, block means, selected channels or steps."""
 
 from dataclasses import dataclass, replace
 
@@ -14,10 +14,10 @@ __all__ = ["Averaged", "Masked", "Strided"]
 
 @dataclass(frozen=True)
 class Strided(Embedding):
-    """Hands every k-th reading to another embedding.
+    """Passes every k-th measurement to another embedding.
 
-    Readings after steps k, 2k, … of a segment are kept, each with the action of the first of its
-    k steps; the rest of a segment that k does not divide is dropped.
+    Measurements after steps k, 2k, … of a segment are kept, each with the action of the first of
+    its k steps. If k does not divide the number of steps, the remaining steps are dropped.
 
     Attributes:
         inner: The embedding that gets the thinned trajectory.
@@ -62,12 +62,12 @@ class Strided(Embedding):
 
 @dataclass(frozen=True)
 class Averaged(Embedding):
-    """Hands the means of blocks of k readings to another embedding.
+    """Passes the means of blocks of k measurements to another embedding.
 
-    Where readings are noisy and the motion is slow against k steps, the means keep what every
-    single reading tells at a k-th of the size, which :class:`Strided` throws away. Readings after
-    steps 1 … k, k + 1 … 2k, … of a segment are averaged, as are the actions of these steps; a
-    block that is padded in part counts the steps that exist.
+    If the measurements are noisy and the motion hardly changes within k steps, the means use every
+    measurement, whereas :class:`Strided` discards most of them. The size is reduced by the same
+    factor k. Measurements after steps 1 … k, k + 1 … 2k, … of a segment are averaged, and so are
+    the actions of these steps. In a partly padded block only the steps that exist are averaged.
 
     Attributes:
         inner: The embedding that gets the averaged trajectory.
@@ -118,13 +118,14 @@ class Averaged(Embedding):
 
 @dataclass(frozen=True)
 class Masked(Embedding):
-    """Hands chosen channels and steps to another embedding.
+    """Passes selected channels and steps to another embedding.
 
     Attributes:
-        inner: The embedding that gets the rest.
+        inner: The embedding that gets the selection.
         channels: Names and order of the channels kept, ``None`` for all.
-        first_step: First step of each segment that counts, from 0.
-        last_step: Step before which counting ends, ``None`` for the segment's end.
+        first_step: First step of each segment that is used, from 0.
+        last_step: First step that is not used any more; ``None`` to use all up to the segment's
+            end.
     """
 
     inner: Embedding
@@ -150,7 +151,7 @@ class Masked(Embedding):
         return self.inner.is_trained
 
     def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
-        """Returns the inner embedding's features of what is kept."""
+        """Returns the inner embedding's features of the selection."""
         check_trajectory(trajectory, inputs)
         if self.channels is not None:
             missing = [name for name in self.channels if name not in inputs.channel_names]

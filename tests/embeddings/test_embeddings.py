@@ -220,7 +220,7 @@ def test_what_does_not_fit_is_refused(trajectory, inputs):
         embedding_by_name("all[w]").features(trajectory, inputs)
     with pytest.raises(ShapeError, match="a stride of 5 leaves nothing"):
         embedding_by_name("all/5").features(trajectory, inputs)
-    with pytest.raises(ShapeError, match="no last reading"):
+    with pytest.raises(ShapeError, match="no last measurement"):
         embedding_by_name("last/4").features(trajectory, inputs)
     with pytest.raises(ShapeError, match="no segment has steps from 4"):
         Masked(AllSteps(), first_step=4).features(trajectory, inputs)

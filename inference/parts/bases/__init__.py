@@ -1,4 +1,4 @@
-"""Base classes that several methods share: training in rounds, on which proposals, of what.
+"""Base classes that several methods share: training in rounds, proposals, kinds of estimators.
 
 May import: the other parts. Start reading at ``neural_backend.py``.
 """

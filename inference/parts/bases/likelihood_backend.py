@@ -1,9 +1,9 @@
-"""What backends share that learn a likelihood, or its ratio, instead of a posterior.
+"""Base class of backends that learn a likelihood, or a likelihood ratio, instead of a posterior.
 
 They estimate log L(z; x) = log p(x | z) + c(x) with any c. The posterior at an observation is p(z)
-L(z; x_o) / Z, sampled by tempering (:mod:`npdr_ppl.inference.parts.samplers.tempering`). Which
-proposal the parameters came from does not matter, so that sequential rounds need no correction;
-and a learned likelihood serves any other prior, hierarchical ones included.
+L(z; x_o) / Z, sampled by tempering (:mod:`npdr_ppl.inference.parts.samplers.tempering`). The
+proposal of the parameters does not matter, so sequential rounds need no correction. A learned
+likelihood can be used with any other prior, hierarchical ones included.
 """
 
 from abc import abstractmethod
@@ -59,7 +59,7 @@ class LikelihoodBackend(NeuralBackend):
         ]
 
     def _check_fixed_features(self, problem: Problem) -> None:
-        """Refuses an embedding that is learnt jointly.
+        """Raises an error if the embedding is trained jointly.
 
         Raises:
             BackendError: The problem's features come from a network to be trained.

@@ -1,18 +1,18 @@
-"""What the methods with mixture density networks share: proposals and their correction.
+"""Base class of methods with mixture density networks: proposals and their correction.
 
 The first round's simulations come from the prior N(0, I), those of a later round r from a
-proposal, the present posterior or the Gaussian with its moments. The mixture q(z | x) is fitted to
-all simulations so far, each through the proposal posterior of its own round r(n),
+proposal. This is the current posterior or the Gaussian with its moments. The mixture q(z | x) is
+fitted to all simulations so far, each by the proposal posterior of its own round r(n),
 
     max sum_n log [q(z_n | x_n) t_r(n)(z_n) / Z_r(n)(x_n)],        t_r = p~_r / p,
 
 which is known in closed form, see :mod:`npdr_ppl.inference.parts.mixtures.proposal_correction`. We
-depart from Papamakarios & Murray (2016, Algorithm 2) in two points. They fit what stands in the
-brackets as a free mixture and divide it by t_r once it is fitted; the quotient of two Gaussians
-need not be one, and then there is no posterior. Fitting q through its product with t_r is the same
-likelihood, restricted to those mixtures whose quotient by t_r is a density: there always is a
-posterior. And they fit the last round only; the earlier rounds tie down q where the last proposal
-does not go, most of all between the modes of a mixture.
+depart from Papamakarios & Murray (2016, Algorithm 2) in two points. First, they fit the term in
+brackets as a free mixture and divide it by t_r afterwards. The quotient of two Gaussians need not
+be a Gaussian, and then there is no posterior. We fit q by its product with t_r. This is the same
+likelihood, restricted to mixtures whose quotient by t_r is a density, so there always is a
+posterior. Second, they fit the last round only. We also use the earlier rounds, which determine q
+where the last proposal has no draws, above all between the modes of a mixture.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -55,7 +55,7 @@ PROPOSAL_FIELDS = ("log_weights", "means", "precision_factors")
 
 @dataclass(frozen=True)
 class ProposedSimulations(Simulations):
-    """Simulations that know what they were drawn from.
+    """Simulations with the proposals from which they were drawn.
 
     Attributes:
         proposals: The proposals of all rounds but the first, which used the prior.
@@ -67,7 +67,7 @@ class ProposedSimulations(Simulations):
         return replace(self, z=self.z[rows], x=self.x[rows], rounds=self.rounds[rows])
 
     def followed_by(self, z: Tensor, x: Tensor, number: int) -> "ProposedSimulations":
-        """Returns these and a round's."""
+        """Returns these simulations and those of a round."""
         return _proposed(super().followed_by(z, x, number), self.proposals)
 
 
@@ -76,10 +76,10 @@ class MixtureBackend(NeuralBackend):
     """A backend whose posterior is a mixture of Gaussians.
 
     Args:
-        components: Components of every member's mixture.
+        components: Number of components of every member's mixture.
         hidden: Widths of the hidden layers.
-        proposals: What later rounds draw from: ``"gaussian"``, with the posterior's moments, or
-            the posterior itself, ``"mixture"``.
+        proposals: Distribution from which later rounds draw: ``"gaussian"``, with the posterior's
+            moments, or ``"mixture"``, the posterior itself.
 
     The other options are those of
     :class:`~npdr_ppl.inference.parts.bases.neural_backend.NeuralBackend`.
@@ -93,7 +93,7 @@ class MixtureBackend(NeuralBackend):
     proposals: Literal["gaussian", "mixture"] = "gaussian"
 
     def __post_init__(self) -> None:
-        """Validates the options that all have; a method adds its own."""
+        """Validates the common options; a method adds its own."""
         super().__post_init__()
         self._check_ranges(components=(1, float("inf")))
         self._check_widths("hidden")
@@ -189,7 +189,7 @@ class MixtureBackend(NeuralBackend):
         self, problem: Problem, state: NeuralState
     ) -> list[MixtureDensityNetwork]:
         """Returns the ensemble with a state's weights."""
-        with seeded(0, "untrained networks"):  # the caller's stream must not notice
+        with seeded(0, "untrained networks"):  # leaves the caller's random stream unchanged
             networks = self._networks(problem)
         for k, network in enumerate(networks):
             network.load_state_dict({name: value[k] for name, value in state.weights.items()})
@@ -218,7 +218,7 @@ class MixtureBackend(NeuralBackend):
     def _precondition(self, problem: Problem, simulations: Simulations) -> Preconditioner:
         """Fits the regression to the last round and corrects it for that round's proposal."""
         preconditioner = super()._precondition(problem, simulations)
-        # A round of which nearly all simulations failed is too small for a regression.
+        # If nearly all simulations of a round failed, it is too small for a regression.
         sizes = torch.bincount(simulations.rounds).tolist()
         last = max(number for number, size in enumerate(sizes) if size >= MIN_SIMULATIONS)
         if last == 0 or problem.build_network is not None:
@@ -230,7 +230,7 @@ class MixtureBackend(NeuralBackend):
     def _loss(
         self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
     ) -> Loss:
-        """Returns the objective of the present round on the training device."""
+        """Returns the objective of the current round on the training device."""
         f = preconditioner.features(simulations.x.to(problem.device))
         z = simulations.z.to(problem.device)
         points = preconditioner.whiten(z, f)
@@ -241,9 +241,9 @@ class MixtureBackend(NeuralBackend):
     def _tilts(
         self, preconditioner: Preconditioner, simulations: Simulations, f: Tensor
     ) -> Tensor:
-        """Returns the forms of every row's tilt in whitened parameters, ``(n, J (d + 1)^2)``."""
+        """Returns every row's quadratic forms in whitened parameters, ``(n, J (d + 1)^2)``."""
         forms = torch.stack([tilt_forms(proposal) for proposal in _proposals(simulations)])
-        none = torch.zeros_like(forms[:1])  # of the prior: J equal shares of one
+        none = torch.zeros_like(forms[:1])  # for the prior: J terms of 1 / J each
         none[..., -1, -1] = 2 * torch.tensor(float(forms.shape[1])).log()
         by_row = torch.cat((none, forms)).to(f.device)[simulations.rounds.to(f.device)]
         shift = preconditioner.shift(f)
@@ -251,7 +251,7 @@ class MixtureBackend(NeuralBackend):
 
 
 def _proposals(simulations: Simulations) -> tuple[GaussianMixture, ...]:
-    """Returns the proposals that simulations came from."""
+    """Returns the proposals of the simulations."""
     return simulations.proposals if isinstance(simulations, ProposedSimulations) else ()
 
 

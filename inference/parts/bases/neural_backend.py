@@ -1,7 +1,7 @@
-"""What all backends that train an ensemble of networks share: data, training, state on disk.
+"""Base class of backends that train an ensemble of networks: data, training, state on disk.
 
-A method says which networks, which loss and which of the simulations; :class:`NeuralBackend` does
-the rest. Every round trains anew on the simulations so far.
+A method defines the networks, the loss and the simulations to use; :class:`NeuralBackend` does the
+rest. Every round trains anew on the simulations so far.
 """
 
 import logging
@@ -36,7 +36,7 @@ __all__ = ["NeuralBackend", "NeuralState", "Simulations"]
 logger = logging.getLogger(__name__)
 
 MIN_SIMULATIONS = 10
-"""Simulations below which there is nothing to hold out and no covariance to estimate."""
+"""Minimum number of simulations: fewer allow no held-out set and no estimate of a covariance."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Simulations:
         return Simulations(self.z[rows], self.x[rows], self.rounds[rows])
 
     def followed_by(self, z: Tensor, x: Tensor, number: int) -> "Simulations":
-        """Returns these and a round's."""
+        """Returns these simulations and those of a round."""
         rounds = torch.full((len(z),), number, dtype=torch.long)
         return Simulations(
             torch.cat((self.z, z)), torch.cat((self.x, x)), torch.cat((self.rounds, rounds))
@@ -69,13 +69,13 @@ class Simulations:
 
 @dataclass(frozen=True)
 class NeuralState(State):
-    """What the next round needs.
+    """The data that the next round needs.
 
     Attributes:
         simulations: All successful simulations.
         weights: The networks' parameters and buffers by name, each ``(members, ...)``; empty
             before the first round.
-        preconditioner: What the networks' data are preconditioned with.
+        preconditioner: The preconditioner of the networks' data.
     """
 
     simulations: Simulations
@@ -88,24 +88,24 @@ class NeuralBackend(Backend):
     """A backend that trains an ensemble of networks on preconditioned simulations.
 
     Args:
-        members: Independently trained networks; the posterior is the mixture of theirs.
-        epochs: Passes through the simulations at most.
-        batch_size: Rows of a mini-batch at most; fewer with few simulations.
+        members: Number of independently trained networks; the posterior is the mixture of theirs.
+        epochs: Maximum number of passes through the simulations.
+        batch_size: Maximum number of rows of a mini-batch; fewer with few simulations.
         learning_rate: Peak of the one-cycle schedule.
         weight_decay: Decoupled weight decay.
         averaging: Decay of the running average of the weights.
         validation_fraction: Fraction of the simulations each member holds out.
-        patience: Epochs without improvement after which training stops.
+        patience: Number of epochs without improvement after which training stops.
     """
 
     objective: ClassVar[str] = "validation_log_prob"
     """Name of the figure that training maximises."""
 
     preconditioner_type: ClassVar[type[Preconditioner]] = Preconditioner
-    """What :meth:`_precondition` returns."""
+    """Type of the result of :meth:`_precondition`."""
 
     shares_held_out: ClassVar[bool] = False
-    """Whether all members hold out the same simulations rather than each its own."""
+    """Whether all members hold out the same simulations; otherwise each holds out its own."""
 
     members: int = 2
     epochs: int = 30
@@ -117,7 +117,7 @@ class NeuralBackend(Backend):
     patience: int = 20
 
     def __post_init__(self) -> None:
-        """Validates the options that all have; a method adds its own."""
+        """Validates the common options; a method adds its own."""
         self._check_ranges(
             members=(1, float("inf")),
             epochs=(1, float("inf")),
@@ -143,7 +143,7 @@ class NeuralBackend(Backend):
                 )
 
     def _check_choice(self, option: str, allowed: Sequence[str]) -> None:
-        """Checks that an option is one of some words.
+        """Checks that an option is one of the allowed words.
 
         Raises:
             BackendError: It is not.
@@ -155,7 +155,7 @@ class NeuralBackend(Backend):
             )
 
     def _check_widths(self, option: str) -> None:
-        """Makes an option a tuple and checks that it names widths of hidden layers.
+        """Makes an option a tuple and checks that it holds widths of hidden layers.
 
         Raises:
             BackendError: It does not.
@@ -181,25 +181,25 @@ class NeuralBackend(Backend):
         Args:
             problem: The problem.
             state: The state before the round.
-            preconditioner: That of the round.
-            simulations: What the round trains on.
+            preconditioner: The preconditioner of the round.
+            simulations: Simulations on which the round trains.
         """
         return self._networks(problem)
 
     def _evaluator(self, problem: Problem) -> Evaluator:
-        """Returns how all networks are evaluated at once; embedding networks are in turn."""
+        """Returns the joint evaluation of all networks; embedding networks run one by one."""
         return vectorised if problem.build_network is None else in_turn
 
     @abstractmethod
     def _loss(
         self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
     ) -> Loss:
-        """Returns the objective of the present round on the problem's device."""
+        """Returns the objective of the current round on the problem's device."""
 
     def _validation_loss(
         self, problem: Problem, preconditioner: Preconditioner, simulations: Simulations
     ) -> Loss | None:
-        """Returns the objective at held-out rows where :meth:`_loss` is random, else ``None``."""
+        """Returns the objective at held-out rows if :meth:`_loss` is random, else ``None``."""
         return None
 
     def _calibration(
@@ -210,14 +210,14 @@ class NeuralBackend(Backend):
         weights: Mapping[str, Tensor],
         held_out: Tensor,
     ) -> dict[str, Tensor]:
-        """Returns what is fitted after training and kept with the weights: nothing.
+        """Returns values fitted after training and stored with the weights; none by default.
 
         Args:
             problem: The problem.
-            preconditioner: That of the round.
-            simulations: What the round trained on.
+            preconditioner: The preconditioner of the round.
+            simulations: Simulations on which the round trained.
             weights: The trained networks' parameters and buffers.
-            held_out: Numbers of the simulations each member held out, ``(members, n)``.
+            held_out: Indices of the simulations that each member held out, ``(members, n)``.
         """
         return {}
 
@@ -226,7 +226,7 @@ class NeuralBackend(Backend):
         return torch.ones(len(state.simulations), dtype=torch.bool)
 
     def _precondition(self, problem: Problem, simulations: Simulations) -> Preconditioner:
-        """Returns the preconditioner of the present round's networks."""
+        """Returns the preconditioner of the current round's networks."""
         is_raw = problem.build_network is not None
         return fit_preconditioner(simulations.z, simulations.x, is_raw)
 
@@ -306,7 +306,7 @@ class NeuralBackend(Backend):
         return validation + preconditioner.log_det
 
     def _clipped_features(self, problem: Problem, preconditioner: Preconditioner) -> int:
-        """Counts the observation's features outside the simulated range, with a warning."""
+        """Counts the observation's features outside the simulated range and logs a warning."""
         clipped = self._outside(problem, preconditioner)
         if clipped.any():
             logger.warning(
@@ -366,10 +366,10 @@ class NeuralBackend(Backend):
         return state
 
     def _trained(self, state: State) -> tuple[NeuralState, Preconditioner]:
-        """Returns a state that has seen simulations, and its preconditioner.
+        """Returns a state with simulations, and its preconditioner.
 
         Raises:
-            BackendError: It has not.
+            BackendError: The state has no simulations.
         """
         state = self._own(state)
         if state.preconditioner is None:

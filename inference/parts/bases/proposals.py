@@ -1,4 +1,4 @@
-"""Truncated proposals: the prior restricted to where the present posterior has its mass.
+"""Truncated proposals: the prior restricted to the region of the current posterior's mass.
 
 Deistler, Goncalves & Macke (2022), *Truncated proposals for scalable and hassle-free
 simulation-based inference*, https://arxiv.org/abs/2210.04815.
@@ -16,17 +16,17 @@ __all__ = ["log_density_bound", "sample_truncated_prior"]
 logger = logging.getLogger(__name__)
 
 NUM_BOUND_SAMPLES = 10_000
-"""Posterior samples from which the region's bound is read."""
+"""Number of posterior samples from which the region's bound is computed."""
 
 CHUNK = 16_384
-"""Prior draws tested at once."""
+"""Number of prior draws tested in one batch."""
 
 MIN_ACCEPTANCE = 5e-3
-"""Share of accepted prior draws below which importance resampling takes over from rejection."""
+"""If a smaller share of prior draws is accepted, importance resampling replaces rejection."""
 
 OVERSAMPLING = 32
-"""Posterior draws per resampled one. Deistler et al. (2022, Appendix 6.4) use 1024 and draw one of
-each group; resampling one weighted set without replacement needs fewer."""
+"""Number of posterior draws per resampled draw. Deistler et al. (2022, Appendix 6.4) use 1024 and
+draw one of each group; resampling one weighted set without replacement needs fewer."""
 
 
 def sample_truncated_prior(
@@ -35,13 +35,13 @@ def sample_truncated_prior(
     """Draws from p(z) restricted to a region {z: log q(z | x_o) > tau} (their Eq. 2).
 
     The bound tau leaves a fraction epsilon of the posterior's mass outside. Prior draws are
-    rejected outside the region; where it is too small a part of the prior for that, draws of q
-    inside it are resampled with weights p / q (their §3.2 and Appendix 6.4).
+    rejected outside the region. If the region is too small a part of the prior, draws of q inside
+    it are resampled with weights p / q (their §3.2 and Appendix 6.4).
 
     Args:
         problem: Gives the prior.
         num_samples: Number of draws n.
-        posterior: The present posterior q.
+        posterior: The current posterior q.
         outside: Fraction epsilon.
 
     Returns:

@@ -1,14 +1,15 @@
-"""What backends share that train in rounds on truncated proposals.
+"""Base class of backends that train in rounds on truncated proposals.
 
 Deistler, Goncalves & Macke (2022), *Truncated proposals for scalable and hassle-free
-simulation-based inference*, https://arxiv.org/abs/2210.04815: from the second round on, parameters
-come from the prior restricted to the region that holds all but a fraction epsilon of the present
-posterior's mass. Wherever the posterior has mass the proposal is proportional to the prior, so
-that a conditional density estimator is trained as in the first round, without any correction.
+simulation-based inference*, https://arxiv.org/abs/2210.04815. From the second round on, parameters
+come from the prior restricted to a region. It holds all but a fraction epsilon of the current
+posterior's mass. In this region the proposal is proportional to the prior. A conditional density
+estimator is therefore trained as in the first round, without any correction.
 
-We depart from the paper in training on the simulations near that region only, those of earlier
-rounds included: the rest says nothing about the posterior, and without it an estimator and a
-regression need to describe a small neighbourhood only, in which the simulator is nearly linear.
+Unlike the paper, we train only on the simulations near that region, those of earlier rounds
+included. The other simulations have no information on the posterior. Without them, an estimator
+and a regression need to describe only a small neighbourhood, in which the simulator is nearly
+linear.
 """
 
 from dataclasses import dataclass
@@ -24,13 +25,13 @@ from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 __all__ = ["TruncatedBackend"]
 
 OUTSIDE_EARLIER = 1e-3
-"""Mass of an earlier posterior outside the region it is a proposal for: less than within one
-inference, because other data may move the posterior."""
+"""Mass of an earlier posterior outside the region for which it is a proposal. It is less than
+within one inference, because other data may move the posterior."""
 
 
 @dataclass(frozen=True)
 class TruncatedBackend(NeuralBackend):
-    """A backend whose later rounds simulate the prior near the present posterior.
+    """A backend whose later rounds draw from the prior near the current posterior.
 
     Args:
         outside: Posterior mass epsilon outside the region of truncated proposals.
@@ -67,7 +68,7 @@ class TruncatedBackend(NeuralBackend):
             return super()._training_rows(problem, state)
         with torch.no_grad():
             posterior = Mixture(self.densities(problem, state))
-            # As wide as the posterior's draws reach: the margin around the region of the
-            # proposals shows an estimator what lies beyond that region's edge.
+            # The neighbourhood covers all of the posterior's draws. Its margin around the region
+            # of the proposals gives the estimator data beyond that region's edge.
             bound = log_density_bound(posterior, 0.0)
             return posterior.log_prob(state.simulations.z) > bound

@@ -1,9 +1,9 @@
 """An autoregressive flow at one context, for many points.
 
-A posterior is one context – the features of the observation, perhaps a thousand – and very many
-parameter vectors of perhaps ten entries. What the context adds to a conditioner's first layer is
-the same for all of them and worked out once, and inverting the flow, which takes a pass per
-parameter, evaluates in each pass the outputs of that parameter only.
+A posterior has one context, the features of the observation, perhaps a thousand, and very many
+parameter vectors of perhaps ten entries. The context's contribution to a conditioner's first layer
+is the same for all of them and computed once. Inverting the flow takes a pass per parameter; each
+pass evaluates the outputs of that parameter only.
 """
 
 from typing import Any
@@ -31,7 +31,7 @@ def conditioned(flow: LazyComposedTransform, context: Tensor) -> ComposedTransfo
         *(
             _ConditionedTransform(transform, context)
             if isinstance(transform, MaskedAutoregressiveTransform)
-            else transform(context)  # of a single parameter: its outputs are the context's
+            else transform(context)  # with one parameter: the outputs depend on the context only
             for transform in flow.transforms
         )
     )

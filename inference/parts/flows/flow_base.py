@@ -1,14 +1,14 @@
-"""The base density of a trained flow, widened to what held-out simulations show.
+"""The base density of a trained flow, widened according to held-out simulations.
 
-A flow T is trained with a standard normal base, and knows the simulations it was trained on better
-than others: its posteriors are too narrow. Two numbers, common to an ensemble's members, correct
-for that, a scale s and the degrees of freedom nu of a multivariate t distribution,
+A flow T is trained with a standard normal base. It fits the simulations of its training better
+than others, so its posteriors are too narrow. Two numbers, common to an ensemble's members,
+correct this: a scale s and the degrees of freedom nu of a multivariate t distribution,
 
     q_m(u | f) = t_nu(T_m(u; f) / s) s^-d |det dT_m / du|,
 
-whose limit nu to infinity is a normal distribution. They are those of largest likelihood of the
-members' mixture at simulations that no member was trained on. With as few parameters nothing can
-be fitted too closely, and where the flows are right they stay at one and infinity.
+whose limit nu to infinity is a normal distribution. They maximise the likelihood of the members'
+mixture at simulations on which no member was trained. So few parameters cannot overfit. If the
+flows are right, they stay at one and infinity.
 """
 
 import math
@@ -26,8 +26,8 @@ FREEDOMS = (math.inf, 100.0, 50.0, 30.0, 20.0, 15.0, 10.0, 7.0, 5.0, 4.0, 3.0)
 """Degrees of freedom tried."""
 
 MIN_GAIN = 1.0
-"""Log likelihood of all held-out rows together by which a base must beat the standard normal for
-each of its two parameters (Akaike 1974): less is chance."""
+"""Minimum gain in total log likelihood of the held-out rows over the standard normal, for each of
+the two parameters (Akaike 1974). A smaller gain may be chance."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Conditional normalising flows from zuko, and the posterior density they give.
+"""Conditional normalising flows from zuko, and the posterior density that they define.
 
-A member of an ensemble is a :class:`FlowNetwork`; several of them are kept and trained as one
-stack of weights, and read off one by one as a :class:`FlowDensity`.
+A member of an ensemble is a :class:`FlowNetwork`. Several of them are stored and trained as one
+stack of weights; each gives a :class:`FlowDensity`.
 """
 
 import math
@@ -40,30 +40,30 @@ FLOWS = ("nsf", "maf", "affine-nsf")
 Network = TypeVar("Network", bound=nn.Module)
 
 INITIAL_SCALE = 0.01
-"""Factor on the last layer's initial weights: a flow starts near the identity, that is, at the
-preconditioner's linear-Gaussian posterior, and is never trained to a worse place than that."""
+"""Factor on the last layer's initial weights. A flow therefore starts near the identity, that is,
+at the preconditioner's linear-Gaussian posterior, and training never ends at a worse one."""
 
 STANDARD_NORMAL = FlowBase()
 
 CHUNK = 4_096
-"""Rows sampled or evaluated at once. Intermediate values of many more leave the cache, which costs
-three times the arithmetic."""
+"""Rows sampled or evaluated in one batch. With many more, intermediate values do not fit into the
+cache, which takes three times as long as the arithmetic."""
 
 MAX_REDRAWS = 100
-"""Attempts to replace samples that are not finite before a flow is declared broken."""
+"""Maximum number of attempts to replace samples that are not finite; then an error is raised."""
 
 
 class Spline(MonotonicRQSTransform):
-    """zuko's monotonic rational-quadratic spline on [-5, 5] with its knots computed faster.
+    """zuko's monotonic rational-quadratic spline on [-5, 5], with faster computation of knots.
 
-    The knots are those of the parent class, which normalises bin widths and heights by a softmax
-    over a last dimension of a few bins; on a CPU that takes longer than all the rest of the
-    spline together. The parameters are bounded before, so that plain exponentials cannot overflow.
+    The knots are those of the parent class. It normalises bin widths and heights by a softmax over
+    a last dimension of a few bins. On a CPU that takes longer than all the rest of the spline. The
+    parameters are bounded before, so that plain exponentials cannot overflow.
 
     Args:
         bins: Unconstrained bin widths and heights, ``(*, 2, K)``.
         derivatives: Unconstrained derivatives at the inner knots, ``(*, K - 1)``.
-        bound: Edge of the interval, beyond which the map is the identity.
+        bound: Edge of the interval; beyond it the map is the identity.
         slope: Smallest slope of the spline.
     """
 
@@ -89,20 +89,20 @@ class FlowNetwork(nn.Module):
 
         log q(u | f) = log N(T(u; h(f)); 0, I) + log |det dT/du|.
 
-    Every transform is fully autoregressive, u_i given u_<i, so that already one of them can
-    represent any density; the order alternates between transforms and between members.
+    Every transform is fully autoregressive, u_i given u_<i, so that a single transform can
+    represent any density. The order alternates between transforms and between members.
 
     Args:
         num_parameters: Dimension d of u.
         num_features: Length of h(f).
         embedding: Network h, or ``None`` for the identity.
         flow: ``"nsf"``, monotonic rational-quadratic splines (Durkan et al. 2019); ``"maf"``,
-            affine maps (Papamakarios et al. 2017); or ``"affine-nsf"``, splines behind one affine
-            map, which takes over where the conditional scale varies by orders of magnitude.
+            affine maps (Papamakarios et al. 2017); or ``"affine-nsf"``, splines after one affine
+            map, which represents conditional scales that vary by orders of magnitude.
         transforms: Number of autoregressive transforms.
         hidden: Widths of the conditioners' hidden layers.
-        bins: Bins of a spline.
-        is_reversed: Whether the first transform runs through the parameters backwards.
+        bins: Number of bins of a spline.
+        is_reversed: Whether the first transform has the parameters in reverse order.
     """
 
     def __init__(
@@ -187,11 +187,11 @@ def build_networks(
         members: Number of networks.
         num_parameters: Dimension d.
         observation: An observation, ``(F,)`` or of the shape the embedding network takes.
-        build: Makes an untrained embedding network, or ``None``.
+        build: Function that makes an untrained embedding network, or ``None``.
         flow: See :class:`FlowNetwork`, as for the rest.
         transforms: Number of transforms.
         hidden: Widths of hidden layers.
-        bins: Bins of a spline.
+        bins: Number of bins of a spline.
 
     Raises:
         BackendError: The embedding network does not map a batch to ``(n, features)``.
@@ -220,11 +220,11 @@ def load_member(
     """Builds a network and loads one member of a stack of weights, ready for evaluation.
 
     Args:
-        build: Makes a list of untrained networks, of which the member's is used.
+        build: Function that makes a list of untrained networks; the member's is used.
         weights: Parameters and buffers by name, each ``(members, ...)``.
-        member: Which one.
+        member: Index of the member.
     """
-    with seeded(0, "untrained networks"):  # the caller's stream must not notice
+    with seeded(0, "untrained networks"):  # leaves the caller's random stream unchanged
         network = build()[member]
     network.load_state_dict({name: value[member] for name, value in weights.items()})
     return network.requires_grad_(False).eval()
@@ -233,12 +233,12 @@ def load_member(
 class FlowDensity(Density):
     """The posterior of one ensemble member given the observation.
 
-    Wherever the network lives, samples are returned on the CPU and log densities where their
-    argument is.
+    Samples are returned on the CPU, log densities on their argument's device, for any device of
+    the network.
 
     Args:
         network: A trained network, on the CPU or a GPU.
-        preconditioner: What was fitted before training, on the same device.
+        preconditioner: The preconditioner fitted before training, on the same device.
         observation: Observation x_o, ``(F,)`` or a raw array, on the same device.
         base: The flow's base density.
     """

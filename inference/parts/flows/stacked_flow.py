@@ -1,9 +1,9 @@
 """Log densities of all members of an ensemble of flows in one pass, for training.
 
 The members' weights are stacked, ``(members, out, in)``, and a layer of all members is one batched
-matrix product. Rows lie along the last dimension throughout, ``(members, units, n)``, so that what
-is elementwise over a spline's few bins runs over rows. Values are those of the networks: only the
-order of the arithmetic differs.
+matrix product. Rows are always the last dimension, ``(members, units, n)``, so that elementwise
+operations on a spline's few bins run over rows. Values are those of the networks; only the order
+of the arithmetic differs.
 """
 
 import math
@@ -20,7 +20,7 @@ from npdr_ppl.inference.parts.training.ensemble_training import LogProb
 __all__ = ["stacked_log_prob"]
 
 BOUND, SLOPE = 5.0, 1e-3
-"""Edge of a spline's interval and smallest slope, as in
+"""Edge of a spline's interval and minimum slope, as in
 :class:`~npdr_ppl.inference.parts.flows.flows.Spline` and zuko's affine map."""
 
 LIMIT = -math.log(SLOPE)
@@ -32,8 +32,7 @@ def stacked_log_prob(
     """Returns the log densities of all members as one call.
 
     Args:
-        network: One of the members, a flow without an embedding network; its values are not
-            read.
+        network: One of the members, a flow without an embedding network; its weights are not used.
         parameters: All members' parameters by name, each ``(members, ...)``.
         buffers: Their buffers.
     """
@@ -53,7 +52,7 @@ def stacked_log_prob(
 
     def log_prob(u: Tensor, f: Tensor) -> Tensor:
         shape = u.shape[:-1]
-        # Atoms of a row share its context, which is worked out once.
+        # The atoms of a row share its context, which is computed once.
         atoms = u.shape[2] if u.ndim == 4 else 1
         x = u.flatten(1, -2).transpose(1, 2)
         context = f.flatten(2).transpose(1, 2)
@@ -88,7 +87,7 @@ def _conditioner(
         buffers: Buffers by name.
         x: The transform's input, ``(members, d, n * atoms)``.
         context: Features, ``(members, F, n)``.
-        atoms: Columns of x that share a context.
+        atoms: Number of columns of x that share a context.
     """
     hidden = x
     for number, name in enumerate(names):
@@ -140,7 +139,7 @@ def spline(outputs: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     left, width, low, height, index = _SelectedBin.apply(
         sizes.unflatten(2, (2, bins)), argument.detach()
     )
-    # Of the derivatives only those at the bin's ends are made positive; the outer two are one.
+    # Only the derivatives at the bin's ends are made positive; the outermost two are one.
     before = derivatives.gather(2, (index - 1).clamp(min=0)[:, :, None])[:, :, 0]
     after = derivatives.gather(2, index.clamp(max=bins - 2)[:, :, None])[:, :, 0]
     before, after = before.where(index > 0, 0.0), after.where(index < bins - 1, 0.0)
@@ -158,14 +157,14 @@ def spline(outputs: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _SelectedBin(torch.autograd.Function):
-    """The bin that an argument lies in, with derivatives of what depends on all bins."""
+    """The bin of an argument, with the derivatives of the values that depend on all bins."""
 
     @staticmethod
     def forward(ctx: Any, raw: Tensor, x: Tensor) -> tuple[Tensor, ...]:
-        """Returns the bin's left edge, width, lower edge, height and number, as x.
+        """Returns the bin's left edge, width, lower edge, height and index, in x's shape.
 
         Args:
-            ctx: What the gradient needs is kept here.
+            ctx: Stores the values that the gradient needs.
             raw: Unconstrained widths and heights, ``(members, d, 2, K, n)``.
             x: Arguments inside the interval, ``(members, d, n)``.
         """
@@ -173,7 +172,7 @@ class _SelectedBin(torch.autograd.Function):
         sizes = (raw / denominator).exp_()
         ends = sizes.cumsum(3)
         total = ends[:, :, :, -1]
-        # Compared with unscaled knots, which spares scaling them.
+        # Compared with unscaled knots, so that they need not be scaled.
         position = ((x + BOUND) * (1 / (2 * BOUND))) * total[:, :, 0]
         index = (ends[:, :, 0, :-1] < position[:, :, None]).sum(2)
         chosen = index[:, :, None, None].expand(-1, -1, 2, 1, -1)

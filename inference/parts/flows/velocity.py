@@ -1,4 +1,4 @@
-"""Velocity networks, and the posterior density that an equation with such a velocity gives."""
+"""Velocity networks, and the posterior density defined by an equation with such a velocity."""
 
 import math
 from collections.abc import Callable
@@ -17,13 +17,13 @@ INITIAL_SCALE = 0.01
 the preconditioner's linear-Gaussian posterior."""
 
 CHUNK = 4096
-"""Rows integrated at once: keeps the working set within the processor's cache."""
+"""Rows integrated in one batch; keeps the working set within the processor's cache."""
 
 NOISE_SPACING = 0.3
-"""How much the solver's steps concentrate at the end of the path."""
+"""Factor kappa of the spacing of the solver's steps; larger values give more steps at the end."""
 
 MAX_REDRAWS = 100
-"""Attempts to replace samples that are not finite before a flow is declared broken."""
+"""Maximum number of attempts to replace samples that are not finite; then an error is raised."""
 
 NUM_TIME_FEATURES = 7
 
@@ -36,8 +36,8 @@ def end_angle(sigma: float) -> float:
 def time_features(angle: Tensor) -> Tensor:
     """Returns smooth functions of the angle, ``(..., 7)``.
 
-    Besides waves there is asinh(tan(phi)), which near the end of the path is the logarithm of the
-    ratio of signal to noise: the velocity then changes on the scale of the noise that is left.
+    Besides waves there is asinh(tan(phi)). Near the end of the path it is the logarithm of the
+    signal-to-noise ratio. There the velocity changes on the scale of the remaining noise.
     """
     waves = [wave(k * angle) for k in (1, 2, 4) for wave in (torch.cos, torch.sin)]
     return torch.stack((angle.tan().asinh() / 3, *waves), dim=-1)
@@ -51,17 +51,17 @@ class VelocityNetwork(nn.Module):
         h_k = h_{k-1} + O_k silu((1 + S_k s) * (I_k h_{k-1} + i_k) + T_k s) + o_k,      k = 1, 2,
         v   = L h_2 + l,
 
-    after feature-wise modulation (Perez et al. 2018, https://arxiv.org/abs/1709.07871). Whatever
-    does not depend on y is computed once for all points of the same time and features, so that
-    only the narrow residual blocks are evaluated at every point. With two blocks the exact
-    divergence costs no more than the velocity, see :meth:`velocity_and_divergence`.
+    after feature-wise modulation (Perez et al. 2018, https://arxiv.org/abs/1709.07871). All terms
+    that do not depend on y are computed once for all points of the same time and features. Only
+    the narrow residual blocks are evaluated at every point. With two blocks the exact divergence
+    costs no more than the velocity, see :meth:`velocity_and_divergence`.
 
     Args:
         num_parameters: Dimension d of y.
         num_features: Length of h(f).
         embedding: Network h, or ``None`` for the identity.
         hidden: Width of the residual blocks.
-        context: Width of the network that makes s.
+        context: Width of the network that computes s.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class VelocityNetwork(nn.Module):
         return self.velocity(points[..., :-1], self.modulate(points[..., -1], context))
 
     def embed(self, f: Tensor) -> Tensor:
-        """Returns what the features contribute, ``(n, context)``."""
+        """Returns the features' contribution, ``(n, context)``."""
         return self.features(f if self.embedding is None else self.embedding(f))
 
     def modulate(self, angle: Tensor, context: Tensor) -> Tensor:
@@ -164,10 +164,10 @@ class VelocityDensity(Density):
 
     Args:
         network: A trained network, on the CPU or a GPU.
-        preconditioner: What was fitted before training, on the same device.
+        preconditioner: The preconditioner fitted before training, on the same device.
         observation: Observation x_o, ``(F,)`` or a raw array, on the same device.
-        sigma: Noise left at the end of the path.
-        steps: Steps of the solver.
+        sigma: Remaining noise at the end of the path.
+        steps: Number of steps of the solver.
     """
 
     def __init__(
@@ -248,8 +248,8 @@ class VelocityDensity(Density):
 def _grid(sigma: float, steps: int) -> Tensor:
     """Returns the angles between the solver's steps, ``(steps + 1,)``, in float64.
 
-    They are evenly spaced in g(phi) = phi + kappa asinh(tan(phi)): in the angle at first and in
-    the logarithm of the remaining noise, -log(cos(phi)), in the end.
+    They are evenly spaced in g(phi) = phi + kappa asinh(tan(phi)): at first in the angle, at the
+    end in the logarithm of the remaining noise, -log(cos(phi)).
     """
     end = end_angle(sigma)
     fine = torch.linspace(0.0, end, 4097, dtype=torch.float64)

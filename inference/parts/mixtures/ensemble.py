@@ -22,7 +22,7 @@ class Mixture(Density):
         self._members = list(members)
 
     def sample(self, num_samples: int) -> Tensor:
-        """Draws ``(num_samples, d)``, as equally many of every member as possible, shuffled."""
+        """Draws ``(num_samples, d)``, as equally from all members as possible, in random order."""
         share, rest = divmod(num_samples, len(self._members))
         draws = [q.sample(share + (k < rest)) for k, q in enumerate(self._members)]
         return torch.cat(draws)[torch.randperm(num_samples)]

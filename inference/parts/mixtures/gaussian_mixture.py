@@ -17,8 +17,8 @@ ROUNDING = 1e-12
 class GaussianMixture(Density):
     """The mixture q(z) = sum_k w_k N(z; m_k, (T_k^T T_k)^-1).
 
-    Computes in float64, in which the triangular factors of very narrow components keep their
-    meaning where covariance matrices would lose it.
+    Computes in float64. There the triangular factors of very narrow components remain accurate,
+    whereas covariance matrices would not.
 
     Args:
         log_weights: Logarithms of the weights w_k up to a common constant, ``(K,)``.
@@ -30,7 +30,7 @@ class GaussianMixture(Density):
     def __init__(self, log_weights: Tensor, means: Tensor, precision_factors: Tensor) -> None:
         log_weights = log_weights.double()
         total = log_weights.logsumexp(0)
-        # Weights that are normalised keep their bits: a mixture read from a file is the one that
+        # Normalised weights stay bitwise the same: a mixture read from a file equals the one that
         # was written.
         self.log_weights = log_weights - torch.where(total.abs() < ROUNDING, 0.0, total)
         self.means = means.double()
@@ -90,8 +90,8 @@ class GaussianMixture(Density):
 def triangular_factors(roots: Tensor) -> Tensor:
     """Returns upper triangular T with T^T T = W^T W and positive diagonal.
 
-    By orthogonal triangularisation, which, other than a Cholesky factorisation of W^T W, cannot
-    fail.
+    It uses orthogonal triangularisation, which cannot fail, unlike a Cholesky factorisation of W^T
+    W.
 
     Args:
         roots: Square roots W of precisions, ``(..., d, d)``.

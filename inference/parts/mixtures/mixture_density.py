@@ -16,19 +16,19 @@ from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
 __all__ = ["MixtureDensityNetwork", "mixture_at", "perceptron"]
 
 INITIAL_SCALE = 0.01
-"""Factor on the head's initial weights, so that features hardly matter before training."""
+"""Factor on the head's initial weights, so that features have little effect before training."""
 
 INITIAL_SPREAD = 0.3
-"""Standard deviation of the components' initial means, in standard deviations of the whole: equal
-components would receive equal gradients and stay equal."""
+"""Standard deviation of the components' initial means, in standard deviations of the whole
+mixture. Equal components would receive equal gradients and stay equal."""
 
 LOG_SCALE_LIMIT = 7.0
-"""Largest logarithm of a precision factor's diagonal element, either way: components between a
-thousandth and a thousand of the linear regression's residuals wide."""
+"""Maximum absolute logarithm of a precision factor's diagonal elements: the widths of components
+lie between 0.001 and 1000 times the linear regression's residuals."""
 
 
 class MixtureParameters(NamedTuple):
-    """Mixtures of n rows, which the last dimension numbers.
+    """Mixtures of n rows; the rows are the last dimension.
 
     The many small operations on matrices then run along contiguous memory.
 
@@ -84,7 +84,7 @@ class MixtureDensityNetwork(nn.Module):
             self.head.bias.zero_()
             if components > 1:
                 _, log_scales, shifts, _ = self.head.bias.split(self.sizes)
-                # Narrower components make up for the spread of their means.
+                # Narrower components compensate for the spread of their means.
                 log_scales.fill_(-0.5 * math.log(1 - INITIAL_SPREAD**2))
                 shifts.copy_(INITIAL_SPREAD * torch.randn_like(shifts))
 
@@ -140,8 +140,9 @@ def _factor_rows(scales: Tensor, mixtures: MixtureParameters) -> list[Tensor]:
 def _log_integral(forms: Tensor, rows: list[Tensor]) -> Tensor:
     """Integrates Gaussians times exponentials of quadratic forms by Gaussian elimination.
 
-    Eliminates one parameter after another from the sum of a form and [U, -v]^T [U, -v]; row i of
-    the latter is added just before parameter i is eliminated, because it has no entries before.
+    Eliminates one parameter after another from the sum of a form and [U, -v]^T [U, -v]. Row i of
+    the latter is added just before parameter i is eliminated, because its earlier entries are
+    zero.
 
     Args:
         forms: Quadratic forms, ``(d + 1, d + 1, J, 1, n)``.
@@ -155,7 +156,7 @@ def _log_integral(forms: Tensor, rows: list[Tensor]) -> Tensor:
     left = forms
     for row in rows:
         first = left[0] + (row[0] * row)[:, None]
-        # Not smaller than the square of U's diagonal but for rounding: the form is nonnegative.
+        # Not below the square of U's diagonal except for rounding: the form is nonnegative.
         pivot = torch.maximum(first[0], (row[0] ** 2)[None])
         column = first[1:]
         fresh = (row[1:, None] * row[None, 1:])[:, :, None]
@@ -180,7 +181,7 @@ def mixture_at(
 
     Args:
         network: The network.
-        preconditioner: What was fitted before training, on the same device.
+        preconditioner: The preconditioner fitted before training, on the same device.
         observation: Observation x_o, ``(F,)`` or a raw array, on the same device.
     """
     d = network.num_parameters

@@ -1,4 +1,4 @@
-"""What a Gaussian proposal does to a posterior, and how to undo it, in closed form.
+"""The effect of a Gaussian proposal on a posterior, and its correction, in closed form.
 
 Parameters drawn from a proposal p~(z) instead of the prior p(z) = N(0, I) change the posterior to
 the *proposal posterior*
@@ -11,9 +11,9 @@ tilt t is a sum of exponentials of quadratic forms,
     t(z) = sum_j exp(-1/2 (z, 1)^T T_j (z, 1)),
     T_j = [[S_j^-1 - I, -S_j^-1 m_j], [., m_j^T S_j^-1 m_j + log det S_j - 2 log b_j]],
 
-so that a mixture of Gaussians stays one when multiplied by it, and Z is known. With proposals no
-wider than the prior in any direction, S_j <= I, the upper left block is positive semidefinite:
-every Gaussian times t is integrable, whatever its covariance.
+so that the product of t and a mixture of Gaussians is a mixture of Gaussians, and Z is known. With
+proposals no wider than the prior in any direction, S_j <= I, the upper left block is positive
+semidefinite. The product of t and a Gaussian is then integrable for any covariance.
 """
 
 from collections.abc import Sequence
@@ -43,11 +43,11 @@ def proposal_of(
 ) -> GaussianMixture:
     """Returns the next round's proposal: the posterior, no wider than the prior.
 
-    Eigenvalues of covariances above one, the prior's, become one.
+    Eigenvalues of covariances above one, that of the prior, are set to one.
 
     Args:
         posteriors: The posteriors of an ensemble's members.
-        kind: ``"mixture"``, their equal mixture, or ``"gaussian"``, the one with its moments.
+        kind: ``"mixture"``, their equal mixture, or ``"gaussian"``, the Gaussian with its moments.
     """
     proposal = GaussianMixture(
         torch.cat([q.log_weights for q in posteriors]),
@@ -82,9 +82,9 @@ def tilted(density: GaussianMixture, forms: Tensor) -> GaussianMixture:
 
     Args:
         density: The mixture q of K components.
-        forms: Quadratic forms of t, ``(J, d + 1, d + 1)``; those of :func:`tilt_forms` give the
-            proposal posterior of a posterior, and the negative of a single one gives back the
-            posterior of a proposal posterior, provided that there is one.
+        forms: Quadratic forms of t, ``(J, d + 1, d + 1)``. Those of :func:`tilt_forms` turn a
+            posterior into the proposal posterior. The negative of a single one turns a proposal
+            posterior back into the posterior, if that exists.
     """
     d = density.means.shape[1]
     factors = density.precision_factors
@@ -100,7 +100,7 @@ def tilted(density: GaussianMixture, forms: Tensor) -> GaussianMixture:
 
 
 def whiten_forms(forms: Tensor, factor: Tensor, shift: Tensor) -> Tensor:
-    """Rewrites quadratic forms of z as ones of u, z = L u + s.
+    """Rewrites quadratic forms of z as quadratic forms of u, where z = L u + s.
 
     Args:
         forms: Quadratic forms, ``(n, J, d + 1, d + 1)`` in float64.
@@ -123,13 +123,13 @@ def correct_regression(
 ) -> Preconditioner:
     """Divides a regression's Gaussian, N(z; A f + b, L L^T), by a proposal's tilt.
 
-    The regression was made on draws from the proposal. What is left of its precision after that
-    of the proposal is taken away is the likelihood's; in directions where this difference is
-    negative, as it can only be by chance, the simulations are taken to say nothing.
+    The regression was made on draws from the proposal. Its precision minus that of the proposal is
+    the likelihood's. This difference can be negative only by chance; in such directions the
+    simulations are assumed to have no information.
 
     Args:
         preconditioner: A regression of z on f.
-        proposal: The proposal; a mixture counts as the Gaussian with its moments.
+        proposal: The proposal; a mixture is replaced by the Gaussian with its moments.
 
     Returns:
         The preconditioner of the posterior; for linear-Gaussian models it is exact up to

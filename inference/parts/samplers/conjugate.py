@@ -4,8 +4,8 @@ r"""Bayesian linear regression with the conjugate normal–inverse-gamma prior.
 
 Then β | t is a multivariate Student-t with N degrees of freedom about m_n with scale matrix
 (b_n/a_n) Λ_n⁻¹, where Λ_n = V₀⁻¹ + AᵀA, m_n = Λ_n⁻¹ (V₀⁻¹ m₀ + Aᵀt), a_n = N/2 and
-2 b_n = ‖t − A m_n‖² + (m_n − m₀)ᵀ V₀⁻¹ (m_n − m₀). With known noise, where the prior is
-β ~ N(m₀, V₀), it is normal.
+2 b_n = ‖t − A m_n‖² + (m_n − m₀)ᵀ V₀⁻¹ (m_n − m₀). With known noise the prior is β ~ N(m₀, V₀),
+and the posterior is normal.
 
 Reference: C. M. Bishop, Pattern Recognition and Machine Learning, 2006, §3.3 and exercise 3.12;
 A. Gelman et al., Bayesian Data Analysis, 3rd ed., 2013, §14.8.
@@ -23,10 +23,10 @@ from npdr_ppl.errors import BackendError, ShapeError
 __all__ = ["StudentT", "linear_posterior", "row_noise"]
 
 REWEIGHTINGS = 10
-"""Iterations between the fit and the noise of each kind of row."""
+"""Number of iterations between the fit and the noise of each kind of row."""
 
 RELATIVE_NOISE = 1e-9
-"""Least noise of a kind of row, relative to the size of its terms."""
+"""Minimum noise of a kind of row, relative to the size of its terms."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def linear_posterior(
         targets: t, ``(N,)``.
         prior_mean: m₀, ``(k,)``.
         prior_covariance: V₀, ``(k, k)``, positive definite.
-        noise: σ where it is known.
+        noise: σ if it is known.
 
     Raises:
         ShapeError: The shapes do not fit each other.
@@ -111,14 +111,14 @@ def linear_posterior(
         )
     if not all(x.isfinite().all() for x in (regressors, targets, prior_mean, prior_covariance)):
         raise BackendError("The regression's matrices contain NaN or infinity.")
-    # In units of the prior, β = m₀ + S u with u ~ N(0, σ² I), so that scales do not matter.
+    # In units of the prior, β = m₀ + S u with u ~ N(0, σ² I), so that scales have no effect.
     scale, info = torch.linalg.cholesky_ex(prior_covariance)
     if int(info):
         raise BackendError("The prior covariance of the base parameters is not positive definite.")
     sigma = 1.0 if noise is None else noise
     rows = regressors @ scale / sigma
     rest = (targets - regressors @ prior_mean) / sigma
-    # Least squares of the rows under the prior's own; QR squares no condition number.
+    # Least squares of the prior's rows and the data's; QR does not square the condition number.
     stacked = torch.cat((rows, torch.eye(k, dtype=rows.dtype)))
     q, r = torch.linalg.qr(stacked)
     u = torch.linalg.solve_triangular(
@@ -130,7 +130,7 @@ def linear_posterior(
     else:
         degrees = torch.tensor(float(len(targets)), dtype=r.dtype)
         square = (rest - rows @ u).square().sum() + u.square().sum()
-        # A fit without any residual would have a density without any width.
+        # Without any residual the density would have zero width.
         floor = torch.finfo(r.dtype).eps ** 2 * rest.square().sum().clamp_min(1e-300)
         variance = torch.maximum(square, floor) / degrees
     # Any square root of the scale matrix; the lower triangular one comes from its QR.
@@ -144,10 +144,10 @@ def row_noise(
 ) -> Tensor:
     """Returns the noise of rows of J kinds, ``(J,)``, by iteratively reweighted fits.
 
-    Rows of one joint have one unit and one noise, and joints differ. The noise of a kind is what
-    the fit leaves, in units of the kind's largest term under the fit, times that term under the
-    prior's mean. The detour matters where the right-hand side is zero: taken as it is, the rest
-    would vanish along with β, and ever greater weights would drive β there.
+    Rows of one joint have the same unit and noise; joints differ. The noise of a kind is the
+    residual in units of the kind's largest term under the fit, times that term under the prior's
+    mean. This scaling is needed where the right-hand side is zero. Without it the residual would
+    vanish as β goes to zero, and growing weights would drive β to zero.
 
     Args:
         rows: Regressors, ``(N, J, k)``.

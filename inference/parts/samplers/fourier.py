@@ -13,7 +13,7 @@ KERNELS = {"rbf": math.inf, "matern-3/2": 1.5, "matern-5/2": 2.5}
 """Smoothness nu of the kernels by name."""
 
 NUM_DISTANCES = 10_000
-"""Pairs of rows from which the median distance is read."""
+"""Number of pairs of rows from which the median distance is computed."""
 
 
 class FourierFeatures(nn.Module):
@@ -41,7 +41,7 @@ class FourierFeatures(nn.Module):
         super().__init__()
         seed = int(torch.randint(2**31, ()))
         engine = SobolEngine(num_features + 1, scramble=True, seed=seed)
-        # The middle of a cell of the sequence's resolution is neither zero nor one.
+        # The middle of a cell of the sequence's resolution is never zero or one.
         uniform = engine.draw(num_frequencies, dtype=torch.float64).clamp(2**-31, 1 - 2**-31)
         frequencies = torch.special.ndtri(uniform[:, 1:])
         nu = KERNELS[kernel]
@@ -59,7 +59,7 @@ class FourierFeatures(nn.Module):
 def median_distance(f: Tensor) -> float:
     """Returns the median distance between two rows of ``(n, F)``, drawn from the global stream.
 
-    It is one if most rows are alike.
+    It is one if most rows are equal.
     """
     first, second = torch.randint(len(f), (2, NUM_DISTANCES))
     distance = (f[first] - f[second])[first != second].norm(dim=-1).median().item()

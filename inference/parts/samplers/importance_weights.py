@@ -1,4 +1,4 @@
-"""Weights of draws: how far they can be tempered, and draws of equal weight made of them."""
+"""Weights of draws: the longest tempering step, and resampling to equal weights."""
 
 import torch
 from torch import Tensor
@@ -12,10 +12,10 @@ def longest_step(log_weight: Tensor, longest: float, effective_share: float) -> 
     """Returns the longest step of the exponent that keeps an effective share of draws.
 
     Args:
-        log_weight: Logarithms of the weights at an exponent of one, ``(n,)``; draws where they are
-            not finite have no weight, and are no part of the share.
-        longest: Longest step that is wanted.
-        effective_share: Effective sample size to keep, as a share of the others.
+        log_weight: Logarithms of the weights at an exponent of one, ``(n,)``; draws with values
+            that are not finite have no weight, and are not part of the share.
+        longest: Upper limit of the step.
+        effective_share: Effective sample size to keep, as a share of the draws with finite values.
     """
 
     def share(step: float) -> float:

@@ -5,11 +5,11 @@ A cloud of particles moves from the prior p(z) to the posterior, proportional to
     pi_b(z) proportional to p(z) L(z)^b,        0 = b_0 < b_1 < ... < 1
 
 (Neal 2001; Del Moral, Doucet & Jasra 2006). Each exponent is chosen so that the effective sample
-size of the incremental weights L^(b_k - b_(k-1)) is a set share of the particles; these are then
-resampled, and moved by elliptical slice sampling generalised to any target (Murray, Adams & MacKay
-2010; Nishihara, Murray & Adams 2014, https://arxiv.org/abs/1210.7477), which has no step size to
-tune. All particles move in one batch. Modes keep their weights, because particles never have to
-cross between them, and the weights' means multiply up to the evidence
+size of the incremental weights L^(b_k - b_(k-1)) is a fixed share of the particles. The particles
+are then resampled. They move by elliptical slice sampling generalised to any target (Murray, Adams
+& MacKay 2010; Nishihara, Murray & Adams 2014, https://arxiv.org/abs/1210.7477), which has no step
+size to tune. All particles move in one batch. Modes keep their weights, because particles need not
+cross between them. The product of the weights' means is the evidence
 
     Z = integral p(z) L(z) dz.
 """
@@ -36,27 +36,29 @@ EFFECTIVE_SHARE = 0.5
 """Effective sample size of the incremental weights, as a share of the particles."""
 
 MAX_SWEEPS, MAX_FINAL_SWEEPS = 5, 24
-"""Slice updates of each particle after a resampling, and at the end, at most. Particles in modes
-that they never leave stay correlated with their start however long they move."""
+"""Maximum number of slice updates of each particle after a resampling, and at the end. Particles
+that never leave their mode stay correlated with their initial positions for any number of
+updates."""
 
 DECORRELATED = 0.1
-"""Correlation with their start, the greatest over all coordinates, at which particles have moved
-far enough."""
+"""Particles have moved far enough once their correlation with their initial positions, the maximum
+over all coordinates, is this small."""
 
 MAX_SHRINKS = 40
-"""Shrinkings of a slice before a particle stays where it is; each shortens it about by half."""
+"""Maximum number of shrinkings of a slice; each roughly halves it. Then the particle stays where
+it is."""
 
 MAX_STAGES = 200
-"""Exponents before a likelihood is declared unfit for sampling."""
+"""Maximum number of exponents; then an error reports that the likelihood is too peaked."""
 
 MIN_PARTICLES = 1_000
-"""Particles at least: fewer lose modes and know their covariance badly."""
+"""Minimum number of particles: fewer lose modes and give a poor estimate of the covariance."""
 
 CHUNK = 16_384
-"""Points evaluated at once."""
+"""Points evaluated in one batch."""
 
 NUM_KERNELS, NUM_EVIDENCE_POINTS = 200, 20_000
-"""Gaussians of the proposal that estimates the evidence, and points drawn from it."""
+"""Number of Gaussians of the proposal that estimates the evidence, and of points drawn from it."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ def tempered_particles(
 
     Args:
         problem: Gives the prior.
-        log_likelihood: log L; where it is not finite the particle has no weight.
+        log_likelihood: log L; a particle at which it is not finite has no weight.
         num_particles: Number of particles n.
 
     Raises:
@@ -121,7 +123,7 @@ def tempered_particles(
 
 
 def _correlation(start: Tensor, end: Tensor) -> float:
-    """Returns the greatest correlation over all coordinates of ``(n, d)`` points."""
+    """Returns the maximum correlation over all coordinates of ``(n, d)`` points."""
     a, b = start - start.mean(0), end - end.mean(0)
     scale = (a.square().mean(0) * b.square().mean(0)).sqrt().clamp_min(1e-30)
     return float(((a * b).mean(0) / scale).max())
@@ -137,8 +139,8 @@ def _slice_sweep(
     """Moves every particle by one elliptical slice update that leaves pi_b invariant.
 
     The ellipse passes through a particle and a draw of the Gaussian N(m, C) that fits the cloud;
-    the slice is that of pi_b(z) / N(z; m, C). Which particles share an ellipse's Gaussian is the
-    only way in which they see each other.
+    the slice is that of pi_b(z) / N(z; m, C). Particles influence each other only by sharing this
+    Gaussian.
     """
     n, d = z.shape
     mean = z.mean(0)
@@ -177,8 +179,8 @@ def _slice_sweep(
 class UnnormalisedDensity(Density):
     """A posterior p(z) L(z) / Z given by its likelihood.
 
-    The first call that needs Z estimates it once, from a stream of its own; its error is about
-    one per cent.
+    The first call that needs Z estimates it once, from a separate random stream; its error is
+    about 1 %.
 
     Args:
         problem: Gives the prior.
@@ -198,7 +200,7 @@ class UnnormalisedDensity(Density):
     def sample(self, num_samples: int) -> Tensor:
         """Draws ``(num_samples, d)`` from torch's global stream.
 
-        Of given draws, as few as possible are repeated.
+        If draws were given, as few of them as possible are repeated.
         """
         if self._draws is not None:
             n = len(self._draws)
@@ -235,11 +237,11 @@ class UnnormalisedDensity(Density):
 
 
 def kernel_mixture(z: Tensor, num_kernels: int) -> MixtureSameFamily:
-    """Returns an equal mixture of Gaussians at draws, as wide as Silverman's rule says.
+    """Returns an equal mixture of Gaussians at draws, with widths from Silverman's rule.
 
     Args:
         z: Draws of a density, ``(n, d)``.
-        num_kernels: Number of Gaussians at most.
+        num_kernels: Maximum number of Gaussians.
     """
     centres = z[torch.randperm(len(z))[:num_kernels]]
     n, d = centres.shape

@@ -1,4 +1,4 @@
-"""Embedding networks learnt jointly with a density estimator."""
+"""Embedding networks trained jointly with a density estimator."""
 
 from collections.abc import Callable
 
@@ -16,11 +16,12 @@ def build_embedding(
     """Builds an untrained embedding network, if there is one.
 
     Args:
-        build: Makes it, or ``None``.
+        build: Function that makes it, or ``None``.
         observation: An observation, ``(F,)`` or of the shape the network takes.
 
     Returns:
-        The network, and the number of features it returns; without one that of the observation's.
+        The network, and the number of features that it returns; without a network, the number of
+        features of the observation.
 
     Raises:
         BackendError: The network does not map a batch to ``(n, features)``.

@@ -1,8 +1,8 @@
 """Training of an ensemble of density estimators, all members in one pass.
 
 The members' weights are stacked, and one vectorised call evaluates all of them on their own
-mini-batches: on small networks the cost of a step is mostly that of starting kernels, which is
-then paid once.
+mini-batches. With small networks most of a step's time goes into starting kernels, which is then
+done once for all members.
 """
 
 import math
@@ -27,20 +27,22 @@ __all__ = [
 ]
 
 LogProb = Callable[[Tensor, Tensor], Tensor]
-"""Log densities of all members, of u's leading shape: takes whitened parameters u,
-``(members, n, d)`` or, several for each context, ``(members, n, atoms, d)``, and features f,
-``(members, n, ...)``."""
+"""Function for the log densities of all members, with u's leading shape. It takes whitened
+parameters u, ``(members, n, d)``, or several for each context, ``(members, n, atoms, d)``, and
+features f, ``(members, n, ...)``."""
 
 Evaluator = Callable[[nn.Module, dict[str, Tensor], dict[str, Tensor]], LogProb]
-"""Makes the log densities of all members from one of their networks and their stacked parameters
-and buffers by name, each ``(members, ...)``."""
+"""Function that makes the log densities of all members. It takes one of their networks and their
+stacked parameters and buffers by name, each ``(members, ...)``."""
 
 Loss = Callable[[LogProb, Tensor], Tensor]
-"""Losses of the rows numbered by the second argument, ``(members, n)`` to ``(members, n)``. Rows
-come in random order, so that a row's neighbours are a random sample of the others."""
+"""Function for the losses of the rows whose indices are the second argument, ``(members, n)`` to
+``(members, n)``. Rows come in random order, so that a row's neighbours are a random sample of the
+others."""
 
 GRADIENT_NORM = 5.0
-"""Largest norm of a member's gradient: rows in a flow's tail can have losses of any size."""
+"""Maximum norm of a member's gradient, because rows in a flow's tail can have very large
+losses."""
 
 
 @dataclass(frozen=True)
@@ -48,17 +50,19 @@ class TrainingOptions:
     """How to train.
 
     Attributes:
-        epochs: Passes through the data at most.
-        batch_size: Rows of a mini-batch at most; fewer with few rows, see :data:`MIN_BATCHES`.
+        epochs: Maximum number of passes through the data.
+        batch_size: Maximum number of rows of a mini-batch; fewer with few rows, see
+            :data:`MIN_BATCHES`.
         learning_rate: Peak of the one-cycle schedule (Smith & Topin 2019).
         weight_decay: Decoupled weight decay (Loshchilov & Hutter 2019).
-        averaging: Decay of the running average of the weights, which is what is validated and
-            kept; 0 keeps the last weights instead.
+        averaging: Decay of the running average of the weights. The average is validated and kept;
+            with 0 the last weights are kept instead.
         validation_fraction: Fraction of the rows held out.
-        shares_held_out: Whether all members hold out the same rows rather than each its own.
-        patience: Epochs without improvement after which training stops; fewer, but at least
-            :data:`MIN_PATIENCE`, while the best epoch is an early one, so that little is spent
-            where the preconditioner has left nothing to learn.
+        shares_held_out: Whether all members hold out the same rows; otherwise each holds out its
+            own.
+        patience: Number of epochs without improvement after which training stops. While the best
+            epoch is an early one, the number is smaller, but at least :data:`MIN_PATIENCE`. This
+            saves time where nothing is left to learn after preconditioning.
     """
 
     epochs: int
@@ -78,9 +82,9 @@ class Fit:
     Attributes:
         weights: Parameters and buffers by name, each ``(members, ...)``.
         validation: Best mean validation objective of every member, ``(members,)``.
-        best_epochs: Epoch it was reached at, ``(members,)``; 0 is before the first step.
-        epochs: Epochs trained.
-        held_out: Numbers of the rows that each member held out, ``(members, n)``.
+        best_epochs: Epoch in which it was reached, ``(members,)``; 0 is before the first step.
+        epochs: Number of epochs trained.
+        held_out: Indices of the rows that each member held out, ``(members, n)``.
     """
 
     weights: dict[str, Tensor]
@@ -92,13 +96,14 @@ class Fit:
 
 MIN_BATCHES, MIN_BATCH_SIZE = 16, 32
 """An epoch has at least 16 steps, unless batches would become smaller than 32 rows. With 2000
-simulations of slcp this is worth 0.5 nats of held-out log density over batches of 512."""
+simulations of slcp this increases the held-out log density by 0.5 nats compared with batches of
+512."""
 
 MIN_PATIENCE = 3
-"""Epochs trained at least; nonlinear problems improve in the first one."""
+"""Minimum number of epochs; nonlinear problems improve in the first one."""
 
 VALIDATION_CHUNK = 4096
-"""Held-out rows evaluated at once."""
+"""Number of held-out rows evaluated in one batch."""
 
 WARM_UP = 0.2
 """Fraction of the steps in which the learning rate rises."""
@@ -131,18 +136,18 @@ def train(
 ) -> Fit:
     """Trains an ensemble; every member has its own mini-batches.
 
-    Draws from torch's global stream on the CPU, whatever the device.
+    Draws from torch's global stream on the CPU, for any device.
 
     Args:
-        networks: Untrained members of equal structure, maps (u, f) to log densities.
+        networks: Untrained members of equal structure; each maps (u, f) to log densities.
         loss: The objective.
         num_rows: Rows of the data.
         options: How to train.
         device: Where the data are.
-        evaluator: How all members are evaluated at once; :func:`vectorised` if ``None``.
+        evaluator: Joint evaluation of all members; :func:`vectorised` if ``None``.
         progress: Called after every epoch with the fraction done and a short status.
-        validation_loss: The objective at held-out rows, where it is another one: the best epoch
-            is found by it, and it must not be random.
+        validation_loss: The objective at held-out rows if it differs from ``loss``. It selects the
+            best epoch and must not be random.
     """
     members = len(networks)
     networks = [network.to(device).train() for network in networks]
@@ -182,7 +187,7 @@ def train(
                 _clip_gradients(weights)
                 optimizer.step()
                 step += 1
-                # Early on the average forgets faster, so that it leaves the initial weights.
+                # At first the average decays faster, so that it leaves the initial weights.
                 decay = min(options.averaging, (1 + step) / (10 + step))
                 with torch.no_grad():
                     for mean, new in zip(average, weights, strict=True):

@@ -1,12 +1,13 @@
 """Preconditioning of features given parameters, for backends that learn a likelihood.
 
-Parameters are noise-free, so that what x depends on smoothly can be regressed away,
+Parameters are noise-free. The smooth dependence of x on them can therefore be removed by
+regression,
 
     u = L^-1 (V^T s - m(z)),        L L^T = Cov[V^T s - m(z)],        s_j = Phi^-1(F_j(x_j)),
 
 with a polynomial m in the parameters, scaled to [-1, 1], and combinations V of the features'
-normal scores s. The scores keep what a few parameters do - a light pendulum that spins - from
-deciding the regression; a density of s is one of x up to a function of x.
+normal scores s. With scores, a few extreme simulations, such as a light pendulum that spins, do
+not dominate the regression. A density of s is a density of x up to a function of x.
 """
 
 from dataclasses import dataclass
@@ -27,15 +28,15 @@ from npdr_ppl.inference.parts.training.preconditioning import (
 __all__ = ["LikelihoodPreconditioner", "fit_likelihood_preconditioner"]
 
 MAX_DEGREE = 12
-"""Degree of the polynomial at most."""
+"""Maximum degree of the polynomial."""
 
 MAX_TERMS, SIMULATIONS_PER_TERM = 300, 20
-"""Terms of the polynomial at most: the regression costs their square times the simulations, and
-fewer simulations determine fewer terms."""
+"""Maximum number of terms of the polynomial. The time of the regression is proportional to their
+square times the number of simulations. Fewer simulations determine fewer terms."""
 
 MIN_SCATTER = 1e-5
-"""Scatter of a feature at given parameters, relative to its spread, that is taken to be at least
-there: what has none would tell parameters apart infinitely well."""
+"""Minimum scatter of a feature at given parameters, relative to its spread. A feature without
+scatter would distinguish parameters infinitely well."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,11 @@ class LikelihoodPreconditioner(Preconditioner):
 
     Attributes:
         degrees: Degrees of m's terms in each parameter, ``(M, d)``.
-        edges: Least and greatest standardised value of each parameter, ``(2, d)``; beyond them
+        edges: Minimum and maximum standardised value of each parameter, ``(2, d)``; beyond them
             the polynomial is constant.
         directions: Combinations V of the scores, ``(F, k)``; ``(F, 0)`` for all of them.
-        feature_knots: Quantiles of each feature, ``(F, K)``; beyond the outer ones, where a
-            density would extrapolate, features are clipped.
+        feature_knots: Quantiles of each feature, ``(F, K)``. Features are clipped to the outer
+            ones, because a density would extrapolate beyond them.
         feature_scores: Normal scores of the quantiles, ``(K,)``.
         is_bounded: Whether m and the density are functions of Phi(z) instead of z, a scalar.
     """
@@ -84,7 +85,7 @@ def fit_likelihood_preconditioner(
     Args:
         z: Parameters, ``(n, d)``.
         x: Features, ``(n, F)``.
-        max_features: Combinations k at most.
+        max_features: Maximum number of combinations k.
         is_bounded: Whether m and the density are functions of Phi(z) instead of z.
     """
     limit = min(MAX_TERMS, max(z.shape[1], len(z) // SIMULATIONS_PER_TERM))
@@ -130,8 +131,8 @@ def fit_likelihood_preconditioner(
 def bounded(z: Tensor) -> Tensor:
     """Returns Phi(z) scaled to unit variance under a standard normal; linear in a uniform prior.
 
-    A parameter with a uniform prior hardly changes where z is large, so that what it does is
-    smooth in Phi(z) up to the prior's ends, and not in z.
+    A parameter with a uniform prior hardly changes where z is large. Its effect is therefore
+    smooth in Phi(z) up to the prior's ends, but not in z.
     """
     return torch.special.ndtr(z) * 12.0**0.5
 
@@ -150,7 +151,7 @@ def polynomials(f: Tensor, edges: Tensor, degrees: Tensor) -> Tensor:
 
     Args:
         f: Standardised parameters, ``(n, d)``.
-        edges: What is scaled to -1 and 1, ``(2, d)``; points beyond are moved there.
+        edges: Values that are scaled to -1 and 1, ``(2, d)``; points beyond are clipped to them.
         degrees: Degrees of the terms, ``(M, d)``.
     """
     inside = f.clamp(edges[0], edges[1])
@@ -166,7 +167,7 @@ def polynomials(f: Tensor, edges: Tensor, degrees: Tensor) -> Tensor:
 
 
 def discriminants(x: Tensor, basis: Tensor, num_directions: int) -> Tensor:
-    """Returns the combinations of features that tell most about the parameters.
+    """Returns the combinations of features with the most information on the parameters.
 
     Features are regressed on functions of the parameters. With the covariance B of the fitted
     values and the covariance W of the residuals, the directions v maximise v^T B v / v^T W v one

@@ -1,7 +1,7 @@
-"""Preconditioning: what is solved in closed form before a density estimator is trained.
+"""Preconditioning: the part solved in closed form before a density estimator is trained.
 
-A density estimator of parameters z given features x is asked to learn only what is neither
-marginal nor linear. Features pass through their empirical quantiles to normal scores; parameters
+A density estimator of parameters z given features x should learn only the part that is neither
+marginal nor linear. Features are mapped by their empirical quantiles to normal scores. Parameters
 are replaced by their standardised residuals of a ridge regression on these scores,
 
     f_j = Phi^-1(F_j(x_j)),        u = L^-1 (z - A f - b),        L L^T = Cov[z - A f - b],
@@ -29,29 +29,31 @@ __all__ = [
 ]
 
 MAX_KNOTS = 65
-"""Knots of a quantile map: a step of about 0.12 standard deviations with 10 000 simulations."""
+"""Number of knots of a quantile map: steps of about 0.12 standard deviations with 10 000
+simulations."""
 
 SIMULATIONS_PER_KNOT = 10
-"""Fewer simulations get fewer knots, so that the map does not follow the noise of the sample."""
+"""With fewer simulations there are fewer knots, so that the map does not follow sampling noise."""
 
 RAW_LIMIT = 10.0
-"""Robust standard deviations at which the elements of raw arrays are clipped."""
+"""The elements of raw arrays are clipped at this number of robust standard deviations."""
 
 RIDGES = tuple(10.0**k for k in range(-6, 3))
-"""Penalties tried, as a fraction of the number of simulations; leave-one-out error decides."""
+"""Penalties tried, as a fraction of the number of simulations; the least leave-one-out error
+selects one."""
 
 MIN_SCALE = 1e-5
-"""Smallest standard deviation of a residual, relative to its parameter's: z given x may be exact,
-and a density in float32 cannot be narrower than the resolution of its argument."""
+"""Minimum standard deviation of a residual, relative to its parameter's. x may determine z
+exactly, but a density in float32 cannot be narrower than the resolution of its argument."""
 
 
 @dataclass(frozen=True)
 class Preconditioner:
-    """A fitted preconditioner; every field is a tensor, so that it is written to disk as it is.
+    """A fitted preconditioner; every field is a tensor and can be written to disk directly.
 
     Attributes:
-        knots: Quantiles of each feature, ``(F, K)``; of raw arrays, their centre and scale per
-            element, ``(2,) + observation.shape``.
+        knots: Quantiles of each feature, ``(F, K)``; for raw arrays, centre and scale per element,
+            ``(2,) + observation.shape``.
         scores: Normal scores of the knots, ``(K,)``; empty for raw arrays.
         gain: Regression matrix A, ``(d, F)``; zero for raw arrays.
         offset: Intercept b, ``(d,)``.
@@ -116,7 +118,7 @@ class Preconditioner:
         return type(self)(**{k: v.to(device) for k, v in self.tensors().items()})
 
     def tensors(self) -> dict[str, Tensor]:
-        """Returns the fields by name, contiguous, as files want them."""
+        """Returns the fields by name, contiguous for files."""
         return {field.name: getattr(self, field.name).contiguous() for field in fields(self)}
 
     @classmethod
@@ -131,8 +133,8 @@ def fit_preconditioner(z: Tensor, x: Tensor, is_raw: bool = False) -> Preconditi
     Args:
         z: Parameters, ``(n, d)``.
         x: Features, ``(n, F)``, or raw arrays, ``(n,) + observation.shape``.
-        is_raw: Whether x goes to a trained network; arrays are then only standardised, robustly,
-            and z is standardised without regression.
+        is_raw: Whether x is the input of a trained network. Arrays are then only standardised,
+            robustly, and z is standardised without regression.
     """
     if is_raw:
         knots, scores = _centre_and_scale(x), z.new_zeros(0)
@@ -184,7 +186,7 @@ def normal_scores(x: Tensor, knots: Tensor, scores: Tensor) -> Tensor:
     low, high = knots.gather(1, above - 1), knots.gather(1, above)
     weight = ((columns - low) / (high - low).clamp(min=torch.finfo(x.dtype).tiny)).clamp(0, 1)
     found = torch.lerp(scores[above - 1], scores[above], weight)
-    # A feature that never varied says nothing, whatever value it has in the observation.
+    # A feature that never varied has no information, whatever its value in the observation.
     return torch.where((knots[:, -1] > knots[:, 0])[:, None], found, 0.0).T.contiguous()
 
 
@@ -202,14 +204,14 @@ def refit_regression(preconditioner: Preconditioner, z: Tensor, x: Tensor) -> Pr
 
 
 def whiten_unseen(preconditioner: Preconditioner, z: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Whitens the simulations a preconditioner was fitted to as if it had not seen them.
+    """Whitens the simulations of a preconditioner's fit as if each had been left out of the fit.
 
-    A regression's residuals are smaller at the simulations it was fitted to, by the more the fewer
-    simulations there are for each feature; an estimator trained on those would be too narrow
-    everywhere else. These are the leave-one-out residuals.
+    A regression's residuals are too small at the simulations of its fit. The fewer simulations
+    there are for each feature, the smaller they are. An estimator trained on them would be too
+    narrow everywhere else, so the leave-one-out residuals are used.
 
     Args:
-        preconditioner: What :func:`fit_preconditioner` made of these simulations.
+        preconditioner: Result of :func:`fit_preconditioner` for these simulations.
         z: Parameters, ``(n, d)``.
         x: Features, ``(n, F)``, or raw arrays.
 
@@ -229,7 +231,7 @@ def _centre_and_scale(x: Tensor) -> Tensor:
     n = len(x)
     low, centre, high = ordered[n // 4], ordered[n // 2], ordered[(3 * n) // 4]
     scale = (high - low) / 1.349
-    # An element that is mostly constant has no interquartile range but may still vary.
+    # A mostly constant element has an interquartile range of zero, but may still vary.
     scale = torch.where(scale > 0, scale, x.std(0))
     return torch.stack((centre, torch.where(scale > 0, scale, 1.0)))
 
@@ -280,5 +282,5 @@ def residual_factor(residuals: Tensor, z: Tensor) -> Tensor:
     correlation = weight * covariance / scale[:, None] / scale
     correlation.fill_diagonal_(1.0)
     factor = scale[:, None] * torch.linalg.cholesky(correlation)
-    # One memory layout, so that a factor read from disk gives the same bits.
+    # A fixed memory layout, so that a factor read from disk gives bitwise the same results.
     return factor.to(z.dtype).contiguous()

@@ -1,4 +1,4 @@
-"""What every backend checks of the simulations it is told."""
+"""Checks of simulations that all backends use."""
 
 import logging
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 
 
 def check_problem(problem: Problem) -> None:
-    """Checks what a backend is told before any simulation.
+    """Checks the problem before any simulation.
 
     Raises:
         ShapeError: There are no parameters, or the features are not a vector.
@@ -64,7 +64,7 @@ def finite_rows(
         raise ShapeError(f"Features must have shape {expected}, got {tuple(x.shape)}.")
     if not z.isfinite().all():
         raise BackendError("Simulated parameters must be finite; some are NaN or infinite.")
-    x = x.to(torch.float32)  # before the test: what overflows float32 is of no use either
+    x = x.to(torch.float32)  # before the test: values that overflow float32 are not usable either
     finite = x.flatten(1).isfinite().all(1)
     num_failed = len(z) - int(finite.sum())
     if num_failed:
@@ -80,7 +80,7 @@ def finite_rows(
 def check_restored(
     name: str, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
 ) -> None:
-    """Checks that a state read from disk is a backend's own and of the problem at hand.
+    """Checks that a state read from disk belongs to the backend and to the current problem.
 
     Args:
         name: The backend's name.
