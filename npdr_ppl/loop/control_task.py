@@ -1,4 +1,4 @@
-"""What a policy is to do on a device: the policy's form, the reward, where episodes start."""
+"""A task on a device: the policy's form, the reward and the initial states of episodes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ class ControlTask:
     """A task for a policy.
 
     Attributes:
-        name: Word that selects it.
-        policy: The policy with the parameters that search starts from.
+        name: Name that selects it.
+        policy: The policy with the initial parameters of a policy search.
         reward: Reward of a step.
         initial_states: Draws n true states at the start of an episode, ``(n, states)``.
         num_steps: Steps of an episode.
-        success: Return above which an episode counts as a success; ``None`` if there is none.
-        excitation: What a device is run with where data say too little; ``None`` for the policy
-            of the day.
+        success: Return above which an episode is a success; ``None`` if there is none.
+        excitation: Policy that runs the device if the data do not determine the parameters;
+            ``None`` for the current policy.
     """
 
     name: str
@@ -42,8 +42,9 @@ def _furuta_swing_up() -> ControlTask:
     from npdr_ppl.models.furuta import SwingUpReward, initial_states
     from npdr_ppl.policies.furuta_swing_up import FurutaSwingUp
 
-    # The paper counts a policy with a return above about 1400 as a success. Untrained, it swings
-    # whole episodes long, where one trained on a wide prior throws the arm against its stop.
+    # In the paper, a policy with a return above about 1400 is a success. The excitation is the
+    # untrained policy, because it swings for whole episodes; a policy trained on a wide prior
+    # drives the arm against its stop.
     return ControlTask(
         "furuta-swing-up",
         FurutaSwingUp(),
@@ -59,12 +60,12 @@ _TASKS: dict[str, Callable[[], ControlTask]] = {"furuta-swing-up": _furuta_swing
 
 
 def control_tasks() -> tuple[str, ...]:
-    """Returns the names of the tasks that come with the zoo."""
+    """Returns the names of the tasks in the model zoo."""
     return tuple(_TASKS)
 
 
 def control_task(name: str) -> ControlTask:
-    """Returns a task of the zoo.
+    """Returns a task of the model zoo.
 
     Raises:
         ModelError: There is no such task.

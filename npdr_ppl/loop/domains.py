@@ -1,4 +1,4 @@
-"""Domains: the simulators that a policy is trained in, drawn from a prior or a posterior."""
+"""Domains: the simulators for training a policy, drawn from a prior or a posterior."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ __all__ = ["Domains", "domains_at", "most_likely_domain", "prior_of", "simulator
 
 @dataclass(frozen=True)
 class Domains:
-    """Simulators of one kind with D parameter sets.
+    """One simulator with D parameter sets.
 
     Attributes:
         simulator: The simulator with its effects.
@@ -40,7 +40,7 @@ class Domains:
     def spread(self, share: float, generator: torch.Generator) -> "Domains":
         """Multiplies every parameter of every domain by a number uniform in 1 ± ``share``.
 
-        Policies trained on a point estimate are brittle even where it is the truth.
+        A policy trained on a point estimate is not robust, even if the estimate is exact.
         """
         return Domains(
             self.simulator,
@@ -52,7 +52,7 @@ class Domains:
         )
 
     def followed_by(self, others: "Domains") -> "Domains":
-        """Returns these domains and others of the same kind."""
+        """Returns these domains together with others of the same simulator."""
         return Domains(
             self.simulator,
             {k: torch.cat((v, others.parameters[k])) for k, v in self.parameters.items()},
@@ -65,14 +65,14 @@ def prior_of(
     actions: tuple[Channel, ...],
     time_step: float,
 ) -> Prior:
-    """Returns the prior of a model before anything has been measured.
+    """Returns the prior of a model when there is no measurement yet.
 
-    A model wants inputs, so it gets those of a device at rest for one step.
+    A model needs inputs, so it gets those of a device at rest for one step.
 
     Args:
         model: The Pyro model.
-        sensors: What the device reports.
-        actions: What it is commanded.
+        sensors: Channels of the device's measurements.
+        actions: Channels of its commands.
         time_step: Seconds per step.
     """
     at_rest = Rollouts.from_arrays(
@@ -86,7 +86,7 @@ def prior_of(
 
 
 def simulator_of(prior: Prior) -> ClosedLoopSimulator:
-    """Returns the simulator of a model's only black-box site, its effects attached.
+    """Returns the simulator of a model's only black-box site, with its effects attached.
 
     Raises:
         ModelError: There are several sites, or the simulator cannot run policies in batches.
@@ -108,7 +108,7 @@ def simulator_of(prior: Prior) -> ClosedLoopSimulator:
 
 
 def domains_at(prior: Prior, z: Tensor) -> Domains:
-    """Returns the domains that a model makes of points in reference coordinates.
+    """Converts points in reference coordinates to domains of a model.
 
     Args:
         prior: The model's prior.

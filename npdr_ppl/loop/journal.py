@@ -1,8 +1,8 @@
-"""A journal of an episode on a device: every step is on disk before the next one is made.
+"""A journal of an episode on a device: every step is on disk before the next one begins.
 
-A line per step, JSON: what the controller saw and what it commanded; a last line with the readings
-at the end marks the episode as complete. A process killed in mid-episode leaves what was recorded
-until then; one killed right after it leaves a whole episode.
+Each step is one JSON line with the controller's measurements and commands. A last line with the
+final measurements marks the episode as complete. If the process is killed during the episode, the
+steps so far remain; if it is killed right after the episode, the whole episode remains.
 """
 
 import json
@@ -18,10 +18,10 @@ __all__ = ["Journal", "read_journal"]
 
 
 class Journal:
-    """A controller that notes every step of its episode before the command leaves.
+    """A controller that writes down every step before the command is sent.
 
     Args:
-        controller: What decides on the commands.
+        controller: The controller that computes the commands.
         path: The file; ``None`` keeps the commands in memory only.
 
     Attributes:
@@ -35,14 +35,14 @@ class Journal:
         self._file = None if path is None else path.open("w", buffering=1)
 
     def __call__(self, readings: Array, time: float) -> Array:
-        """Returns the commands, ``(actions,)``, for readings ``(sensors,)`` at a time in s."""
+        """Returns the commands, ``(actions,)``, for measurements ``(sensors,)`` at a time in s."""
         commands = np.array(self._controller(readings, time), dtype=np.float64, ndmin=1)
         self.commands.append(commands)
         self._write({"readings": readings.tolist(), "commands": commands.tolist()})
         return commands
 
     def end(self, readings: Array) -> None:
-        """Notes that the episode is complete, with its last readings ``(sensors,)``, once."""
+        """Marks the episode as complete, once, with its last measurements ``(sensors,)``."""
         if not self._is_complete:
             self._write({"end": readings.tolist()})
         self._is_complete = True
@@ -54,16 +54,16 @@ class Journal:
 
     def _write(self, line: dict[str, list[float]]) -> None:
         if self._file is not None:
-            # Line-buffered, so the operating system has it even if the process is killed.
+            # Line-buffered, so the operating system has the line even if the process is killed.
             self._file.write(json.dumps(line) + "\n")
 
 
 def read_journal(path: Path, target: TargetDomain) -> tuple[Rollouts | None, Array, bool]:
-    """Returns what a journal holds.
+    """Reads a journal.
 
     Args:
         path: The file.
-        target: The device it was written for.
+        target: The device for which it was written.
 
     Returns:
         The rollout with the limits of the target applied, ``None`` if there is not one whole step;
@@ -80,7 +80,7 @@ def read_journal(path: Path, target: TargetDomain) -> tuple[Rollouts | None, Arr
         try:
             line = json.loads(text)
         except ValueError:
-            if number == len(lines) - 1:  # the kill came while it was written
+            if number == len(lines) - 1:  # the process was killed while writing it
                 break
             raise DataError(f"{path}: line {number + 1} is not JSON.") from None
         if "end" in line:

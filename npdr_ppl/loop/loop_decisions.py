@@ -1,4 +1,4 @@
-"""What the NPDR loop does about a diagnosis, and how it notes that down."""
+"""The NPDR loop's actions after a diagnosis, and their records."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ __all__ = [
 ]
 
 FROM_CHECK = "from_check"
-"""Key of decisions that a check of the new policy in simulation led to."""
+"""Key of decisions that a check of the new policy in simulation caused."""
 
 
 @dataclass(frozen=True)
 class Settled:
-    """A posterior, and what was decided about it."""
+    """A posterior, and the decisions and the action that followed from it."""
 
     posterior: Posterior
     data: "Data"
@@ -39,12 +39,12 @@ class Settled:
 def action_for(
     decision: Decision, options: LoopOptions, *, may_revise: bool, real_return: float
 ) -> Action:
-    """Returns what the loop does about a decision.
+    """Returns the loop's action after a decision.
 
     Args:
-        decision: What the diagnosis came to.
+        decision: The decision of the diagnosis.
         options: Options of the loop.
-        may_revise: Whether a missing effect can be looked for; it may turn out that there is none.
+        may_revise: Whether a search for missing effects is possible; it may find none.
         real_return: The iteration's mean return on the target.
     """
     if not options.follows_decisions:
@@ -71,13 +71,13 @@ def decision_record(
     *,
     is_from_check: bool = False,
 ) -> dict[str, Any]:
-    """Returns a decision as ``train.json`` has it.
+    """Returns a decision in the form of ``train.json``.
 
     Args:
-        decision: What is to be done.
-        reason: Why, in a sentence.
-        action: What the loop did about it.
-        diagnosis: The figures; what discovery or a check asks for has none.
+        decision: The decision.
+        reason: Its reason, in a sentence.
+        action: The loop's action after it.
+        diagnosis: The figures; decisions of discovery or of a check have none.
         is_from_check: Whether a check of the new policy in simulation asked for it.
     """
     origin = {FROM_CHECK: True} if is_from_check else {}
@@ -91,8 +91,8 @@ def decision_record(
 
 
 def enough(real_return: float) -> str:
-    """Returns the reason to end the loop at a return on the target."""
-    return f"The return on the target, {real_return:.0f}, is what was asked for."
+    """Returns the sentence that gives the reached return as the reason to end the loop."""
+    return f"The return on the target, {real_return:.0f}, reaches the requested return."
 
 
 def kept_record(
@@ -102,9 +102,9 @@ def kept_record(
 
     Args:
         real_return: The iteration's mean return on the target.
-        num_rollouts: Real rollouts so far.
-        effects: Names of the effects that the model has been given.
-        internal_model: Parameters of the policy's own model.
+        num_rollouts: Number of real rollouts so far.
+        effects: Names of the effects that were added to the model.
+        internal_model: Parameters of the policy's internal model.
     """
     decision = decision_record(Decision.STOP, enough(real_return), Action.KEPT)
     return {
@@ -120,15 +120,18 @@ def kept_record(
 
 
 def count_actions(decisions: Sequence[Mapping[str, Any]], *actions: Action) -> int:
-    """Returns how many decisions led to one of these actions."""
+    """Returns the number of decisions that led to one of these actions."""
     return sum(decision["action"] in actions for decision in decisions)
 
 
 def count_checks(decisions: Sequence[Mapping[str, Any]]) -> int:
-    """Returns how many rollouts checks before deploying asked for: how often all began anew."""
+    """Returns how many rollouts the checks before deploying asked for.
+
+    After each of them, inference and training are repeated.
+    """
     return sum(FROM_CHECK in decision for decision in decisions)
 
 
 def is_final(record: Mapping[str, Any]) -> bool:
-    """Returns whether the loop ends with an iteration."""
+    """Returns whether the loop ends after this iteration."""
     return record["decisions"][-1]["action"] == Action.KEPT

@@ -1,8 +1,8 @@
-"""Discovery inside the NPDR loop: the model gets what the real rollouts so far say it lacks.
+"""Discovery inside the NPDR loop: adds the effects that the model lacks on the real rollouts.
 
-Discovery always begins at the model that the loop was given, never at an earlier revision: an
-effect that was named from one short rollout has to prove itself again once there are more. What it
-comes to is on disk before the loop goes on, and a resumed run reads it instead of searching again.
+Discovery always begins with the loop's original model, never with an earlier revision. An effect
+that was found on one short rollout must be found again when there are more rollouts. The result is
+saved before the loop continues, and a resumed run reads it instead of searching again.
 """
 
 import logging
@@ -28,19 +28,19 @@ __all__ = ["LoopDiscovery", "Revision", "effect_names"]
 _LOGGER = logging.getLogger(__name__)
 
 USUAL_REPORTS = 60
-"""Sentences of a search of usual length, by which its progress is measured."""
+"""Number of messages that a typical search reports; the progress bar is scaled by it."""
 
 
 @dataclass(frozen=True)
 class Revision:
-    """What looking for a missing effect came to.
+    """The result of a search for missing effects.
 
     Attributes:
-        model: The revised model; ``None`` where nothing is to be revised.
+        model: The revised model; ``None`` if nothing is to be revised.
         reason: The finding in a sentence.
-        parameters: Where the revised model fits best, by latent site.
-        experiment: What to record next where causes could not be told apart, as
-            ``discovery.json`` has it.
+        parameters: The revised model's closest fit, by latent site.
+        experiment: The next experiment, if causes could not be distinguished, in the form of
+            ``discovery.json``.
     """
 
     model: Model | None
@@ -50,12 +50,12 @@ class Revision:
 
 
 class LoopDiscovery:
-    """Looks for what a model lacks in the real rollouts of a run.
+    """Searches the real rollouts of a run for effects that a model lacks.
 
     Args:
-        model: The model that the loop was given.
-        options: How to search.
-        seed: Seed of everything random.
+        model: The loop's original model.
+        options: Options of the search.
+        seed: Seed of all random numbers.
     """
 
     def __init__(self, model: Model, options: DiscoveryOptions, seed: int) -> None:
@@ -63,11 +63,11 @@ class LoopDiscovery:
         self.options = replace(options, seed=seed)
 
     def look(self, rollouts: Rollouts, folder: Path, progress: Step | None = None) -> Revision:
-        """Returns the model with what was found, from disk if it has been looked for already.
+        """Returns the model with the effects found, from disk if they were searched already.
 
         Args:
             rollouts: All real rollouts so far.
-            folder: Where ``discovery.json`` and ``revised_model.py`` go.
+            folder: Folder for ``discovery.json`` and ``revised_model.py``.
             progress: Called with the fraction done and a short status.
         """
         file = folder / "discovery.json"
@@ -80,14 +80,14 @@ class LoopDiscovery:
                     report=_reports(progress),
                 )
             except NpdrError as error:
-                # A rollout that ended early may be too short to tell anything by.
+                # A rollout that ended early may be too short for a search.
                 _LOGGER.warning("Discovery: %s", error)
                 return Revision(None, str(error))
             found.save(folder)
         return self._read(read_json(file))
 
     def _read(self, result: Mapping[str, Any]) -> Revision:
-        """Returns the revision that a saved discovery stands for."""
+        """Returns the revision that a saved discovery describes."""
         own = {effect.name: effect for effect in self.options.effects or ()}
         model = self.model
         for _ in range(result.get("finer_steps", 0)):
@@ -112,7 +112,10 @@ def _sentence(result: Mapping[str, Any]) -> str:
 
 
 def _reports(progress: Step | None) -> Callable[[str], None]:
-    """Returns what turns discovery's sentences into progress; how many come, nobody knows."""
+    """Returns a function that turns discovery's messages into progress.
+
+    The number of messages is not known in advance, so progress approaches 1 step by step.
+    """
     count = 0
 
     def report(sentence: str) -> None:

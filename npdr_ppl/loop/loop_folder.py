@@ -2,18 +2,18 @@
 
     loop.json                         what is run: model, target, task, options, seed, versions
     rollouts/rollout_<n>.nc           real rollouts, each with its journal ``.jsonl``
-    policy_<k>.safetensors, .json     the policy that POLOPT number k came to, 0 being the prior's
+    policy_<k>.safetensors, .json     the result of POLOPT number k; 0 is trained on the prior
     inference_<i>_<attempt>/          runs of inference, see :mod:`npdr_ppl.posterior.run_folder`
-    policy_<k>_<d>.safetensors, .json tries of policy k: before another rollout, for the mean or
-                                      for the tail; policy k is the last or the better one
-    revision_<i>/, revision_<i>_<l>/  what discovery found: revised_model.py, then discovery.json;
-                                      look l of an iteration comes after a rollout that a check
-                                      of the new policy asked for
+    policy_<k>_<d>.safetensors, .json drafts of policy k: before another rollout, for the mean or
+                                      for the tail; the last or the better one becomes policy k
+    revision_<i>/, revision_<i>_<l>/  result of discovery: revised_model.py, then discovery.json;
+                                      search l of an iteration follows a rollout that a check of
+                                      the new policy asked for
     iteration_<i>.json                the record of a finished iteration
     train.json                        the result so far
 
-Every file replaces its predecessor in one step, so a run killed at any moment leaves a folder that
-:func:`npdr_ppl.train` continues from.
+Each file is replaced in one atomic step. If a run is killed at any moment, :func:`npdr_ppl.train`
+can continue from the folder.
 """
 
 import dataclasses
@@ -67,10 +67,10 @@ class LoopFolder:
         *,
         seed: int,
     ) -> None:
-        """Describes the run, or checks that the folder holds this very run already.
+        """Writes the run's description, or checks that the folder contains this same run.
 
         Raises:
-            DataError: The folder holds a run with another model, target or options.
+            DataError: The folder contains a run with another model, target or options.
         """
         make_folder(self.path)
         description = plain(
@@ -84,7 +84,7 @@ class LoopFolder:
                 "seed": seed,
             }
         )
-        # More iterations of the same run are welcome.
+        # A run may be continued with more iterations.
         iterations = description["options"].pop("iterations")
         file = self.path / "loop.json"
         if not holds_this_run(file, description):
@@ -100,7 +100,7 @@ class LoopFolder:
         return self.path / f"inference_{index}_{attempt}"
 
     def revision(self, index: int, look: int = 0) -> Path:
-        """Returns the folder of what was looked for in an iteration."""
+        """Returns the folder of a search for missing effects in an iteration."""
         return self.path / f"revision_{_numbered(index, look or None)}"
 
     def save_policy(
@@ -111,7 +111,7 @@ class LoopFolder:
         *,
         draft: int | None = None,
     ) -> None:
-        """Saves a trained policy, or a draft; the JSON goes last and makes it count."""
+        """Saves a trained policy, or a draft; it counts as saved once the JSON exists."""
         file = self.path / f"policy_{_numbered(number, draft)}.json"
         save_tensors(file.with_suffix(".safetensors"), {"parameters": parameters})
         write_json(file, figures)
@@ -119,7 +119,7 @@ class LoopFolder:
     def policy(
         self, number: int, draft: int | None = None
     ) -> tuple[Tensor, dict[str, Any]] | None:
-        """Returns parameters and figures of a trained policy, ``None`` before it is."""
+        """Returns parameters and figures of a policy, ``None`` if it is not trained yet."""
         file = self.path / f"policy_{_numbered(number, draft)}.json"
         if not file.exists():
             return None
@@ -144,7 +144,7 @@ def _numbered(number: int, part: int | None) -> str:
 
 
 def _words(options: "LoopOptions") -> dict[str, Any]:
-    """Returns the options as what JSON has; objects of one's own by their text."""
+    """Returns the options as JSON-serialisable values; other objects as their ``repr``."""
     result = {}
     for item in dataclasses.fields(options):
         value = getattr(options, item.name)

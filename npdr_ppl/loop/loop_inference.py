@@ -35,15 +35,15 @@ def infer_posterior(
 
     Args:
         model: The model.
-        rollouts: What to infer from.
+        rollouts: The observed rollouts.
         options: Options of the loop.
         backend: The inference backend.
         rounds: Rounds of inference.
         prior: The model's prior.
-        last: Posterior of the last iteration, if there was one; of no use where the model has
-            other parameters since.
+        last: Posterior of the last iteration, if there was one; ignored if the model's parameters
+            differ from those of ``prior``.
         near: Parameters near which the model is known to fit best; empty if nothing is known.
-        seed: Seed of everything random.
+        seed: Seed of all random numbers.
         checkpoint: Folder of the run.
         report: Where to report progress.
     """
@@ -57,7 +57,7 @@ def infer_posterior(
     )
     start = last if options.start == "posterior" and backend.continues else None
     if start is not None and _sites(start.prior) != _sites(prior):
-        start = None  # the model was revised: the same place is something else
+        start = None  # the model was revised, so the coordinates have another meaning
     wants_fit = options.start == "closest fit" and backend.continues
     near_fit = prepared.neighbourhood() if wants_fit else None
     return infer(
@@ -75,5 +75,5 @@ def infer_posterior(
 
 
 def _sites(prior: Prior) -> list[tuple[str, int]]:
-    """Returns names and sizes of the latent sites, which is what reference coordinates mean."""
+    """Returns names and sizes of the latent sites, which define the reference coordinates."""
     return [(site.name, site.shape.numel()) for site in prior.sites]

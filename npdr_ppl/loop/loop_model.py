@@ -1,4 +1,4 @@
-"""The model of one run of the loop, and what it has been given since the run began."""
+"""The model of one run of the loop, and the effects that the run has added to it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,23 +18,23 @@ __all__ = ["LoopModel"]
 
 
 class LoopModel:
-    """A model that missing effects are added to.
+    """A model to which missing effects are added.
 
-    All attributes change together, where something is found; a resumed run, which repeats such
-    looks only, has the same.
+    All attributes change together when an effect is found. A resumed run repeats the successful
+    searches only, and so reaches the same attributes.
 
     Args:
         model: The Pyro model that the run begins with.
         target: The target domain.
-        discovery: Looks for missing effects.
-        revise: What does so in its place, if the caller has such a way of their own.
+        discovery: Searches for missing effects.
+        revise: The caller's own function that replaces discovery, if there is one.
 
     Attributes:
-        model: The model now.
+        model: The current model.
         prior: Its prior.
         near: Parameters near which it is known to fit best; empty if nothing is known.
-        proposal: What to run the device with so that the causes can be separated, if discovery
-            proposes something.
+        proposal: Commands for the device that separate the possible causes, if discovery proposes
+            any.
     """
 
     def __init__(
@@ -49,15 +49,15 @@ class LoopModel:
         self.proposal: Playback | None = None
 
     def look(self, rollouts: Rollouts, folder: Path, report: Reporter) -> tuple[bool, str]:
-        """Looks for effects that the model lacks, and gives it what is found.
+        """Searches for effects that the model lacks, and adds those that are found.
 
         Args:
             rollouts: All real rollouts so far.
-            folder: Where what is found goes, or is read from if it has been looked for already.
+            folder: Folder for the result; an earlier result there is used instead of a new search.
             report: Where to report progress.
 
         Returns:
-            Whether the model has effects now that were found, and what was found in a sentence.
+            Whether the model was revised, and a sentence that says what was found.
         """
         target = self.target
         near: Mapping[str, Tensor] = {}

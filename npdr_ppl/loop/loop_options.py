@@ -1,4 +1,4 @@
-"""Options of the NPDR loop, and what it can do about a decision."""
+"""Options of the NPDR loop, and the actions that can follow a decision."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,13 +20,13 @@ __all__ = ["NEW_ATTEMPTS", "SPREAD_WIDER", "Action", "LoopOptions", "Model", "Re
 Model = Callable[..., Any]
 
 Revise = Callable[[Model, Rollouts, Path | None], Model | None]
-"""Looks for what a model lacks: takes the model, all real rollouts and a folder of its own, and
-returns the revised model, or ``None`` if it found nothing. Called again with the same folder, as
-when a run is resumed, it must return the same."""
+"""Searches for effects that a model lacks. It takes the model, all real rollouts and a folder of
+its own, and returns the revised model, or ``None`` if it found nothing. A resumed run calls it
+again with the same folder; it must then return the same result."""
 
 
 class Action(StrEnum):
-    """What the loop did about a decision."""
+    """The action of the loop after a decision."""
 
     TRAINED = "trained the policy on the posterior"
     MIXED = "trained the policy on the posterior mixed with the prior"
@@ -39,9 +39,9 @@ class Action(StrEnum):
     LOGGED = "none, decisions are only logged"
 
 
-# After these the posterior is inferred anew, in a folder of its own.
+# After these actions the posterior is inferred again, in a folder of its own.
 NEW_ATTEMPTS = (Action.ANOTHER_ROLLOUT, Action.REVISED)
-# After these the policy is trained in domains spread wider: the model is wrong.
+# After these actions the domains are spread wider for training, because the model is wrong.
 SPREAD_WIDER = (Action.SPREAD, Action.NOTHING_FOUND)
 
 
@@ -51,62 +51,66 @@ class LoopOptions:
 
     Attributes:
         iterations: Iterations of the loop.
-        rollouts: Real rollouts H of each iteration.
-        extra_rollouts: Real rollouts that diagnoses, and checks before deploying, may ask for in
-            the whole run.
-        rollouts_used: Whether inference sees all rollouts so far or the latest iteration's.
-        backend: The inference backend; one with options of its own if it is no name.
-        rounds: Rounds R of inference in each iteration; one for backends that are not sequential.
-        extra_rounds: Rounds that a diagnosis may ask for in each iteration.
-        num_simulations: Simulations of each round.
+        rollouts: Number H of real rollouts in each iteration.
+        extra_rollouts: Further real rollouts that diagnoses and checks before deploying may ask
+            for in the whole run.
+        rollouts_used: Whether inference uses all rollouts so far or those of the latest iteration.
+        backend: The inference backend, by name or as an object with its own options.
+        rounds: Number R of inference rounds in each iteration; one for backends that are not
+            sequential.
+        extra_rounds: Further rounds that a diagnosis may ask for in each iteration.
+        num_simulations: Simulations in each round.
         binding: How rollouts are prepared for inference.
         start: Where inference starts: from the prior; in the neighbourhood of the closest fit,
-            where initial states are uncertain; or in later iterations, as in the paper, from the
+            if initial states are uncertain; or in later iterations, as in the paper, from the
             last posterior. Backends that cannot start elsewhere start from the prior.
-        search: The policy search; one with options of its own if it is no name.
-        search_iterations: Iterations of the policy search, each time.
-        search_restarts: Times that the search begins anew where its policy fails in nearly all
-            draws of the posterior. The cause is then a local optimum of the search, and not that
-            parameters are uncertain. Two sufficed on eight hidden rigs with a delay that were
-            used for tuning.
+        search: The policy search, by name or as an object with its own options.
+        search_iterations: Iterations of each policy search.
+        search_restarts: Greatest number of restarts of the search if its policy fails in nearly
+            all draws of the posterior. The cause is then a local optimum of the search, and not
+            the uncertainty of parameters. Two restarts were enough on eight hidden rigs with a
+            delay that were used for tuning.
         domains: Whether the policy is trained in draws of the posterior or at its most likely
             sample.
-        num_domains: Domains that the policy is trained in.
-        num_initial_states: Initial states in each.
-        risk: What the policy search maximises over the domains at first: their mean return, or the
-            mean of the worst.
+        num_domains: Number of domains for training the policy.
+        num_initial_states: Number of initial states in each domain.
+        risk: The policy search's first objective over the domains: their mean return, or the mean
+            return of the worst domains.
         least_success: Share of the posterior's draws, in simulation, in which a new policy must
-            succeed before it runs on the target; 0 checks nothing. Where it does not, another
-            rollout is recorded if one is left to ask for, otherwise the policy is trained for the
-            worst domains. The default is the share of successes that one would ask of the target,
-            which is one draw of the posterior if the model is right. It takes a task with a
-            threshold of success.
-        num_checked: Draws of the posterior in which a new policy is tried. With 200 the standard
+            succeed before it runs on the target; 0 checks nothing. If it fails the check, another
+            rollout is recorded. If no extra rollout is left, the policy is trained for the worst
+            domains. The default is the success rate that one would expect of the target, which is
+            one draw of the posterior if the model is right. The check needs a task with a
+            success threshold.
+        num_checked: Draws of the posterior in which a new policy is checked. With 200 the standard
             error of a share of 0.9 is 0.02.
-        tail_share: Share of the domains, the worst ones, whose mean return is then maximised, in
-            (0, 1]. EPOpt (Rajeswaran et al. 2017) takes a tenth of 240; a fifth of the default 50
-            domains is as many as can be averaged.
-        is_warm_start: Whether the search goes on from the last policy or begins anew.
-        starts_from_prior: Whether the first policy is trained on the prior or taken as it comes.
-        spread: Parameters of the domains are multiplied by numbers uniform in 1 ± ``spread``.
-        prior_share: Share of the domains drawn from the prior where the posterior is widened.
-        internal_model: Parameters of the policy's own model on the target: the most likely
+        tail_share: Share of the domains, in (0, 1], that are the worst domains. Training for them
+            maximises their mean return. EPOpt (Rajeswaran et al. 2017) takes a tenth of 240
+            domains; a fifth of the default 50 domains leaves ten for the mean.
+        is_warm_start: Whether the search continues from the last policy or starts again.
+        starts_from_prior: Whether the first policy is trained on the prior or used as the task
+            provides it.
+        spread: Parameters of the domains are multiplied by random numbers, uniform in
+            1 ± ``spread``.
+        prior_share: Share of the domains that is drawn from the prior if a diagnosis asks for a
+            wider posterior.
+        internal_model: Parameters of the policy's internal model on the target: the most likely
             sample's, or nominal.
-        deploys: Which policy the run ends with: the one with the best measured return, or the
-            last, which no real rollout has tried yet. Where no measured return reached the
-            task's threshold it is the last.
-        follows_decisions: Whether diagnoses change what the loop does, or are logged only.
+        deploys: Which policy the run returns: the one with the best measured return, or the
+            last one, which has not run on the target yet. It is also the last one if no measured
+            return reached the task's threshold.
+        follows_decisions: Whether diagnoses change the course of the loop, or are only logged.
         stop_return: Mean real return of an iteration that ends the loop; ``None`` to use all
             iterations.
-        stops: What it takes besides that return: an accepted posterior, which is then at hand, or
-            nothing, which spares inference and training on a device that already does its task.
-        thresholds: Limits behind the decisions.
-        discovers: When discovery looks in all real rollouts so far for effects that the model
-            lacks: in each iteration before anything is inferred, or after the posterior of the
-            model as it is has been diagnosed, whatever the diagnosis. The noise that a model gets
-            from its closest fit can make up for an effect in every diagnosis, so discovery's own
-            alarm has the last word.
-        discovery: How it searches; its seed comes from that of the run.
+        stops: Further condition for ending the loop at that return: an accepted posterior, which
+            is then available, or none. The latter saves inference and training on a device
+            that already does its task.
+        thresholds: Thresholds of the diagnosis.
+        discovers: When discovery searches all real rollouts so far for effects that the model
+            lacks: in each iteration before inference, or after the posterior of the present model
+            has been diagnosed, whatever the diagnosis. Discovery's own alarm decides, because a
+            model's noise, estimated at its closest fit, can hide an effect from every diagnosis.
+        discovery: Options of discovery; its seed is derived from the seed of the run.
     """
 
     iterations: int = 5
@@ -167,5 +171,5 @@ class LoopOptions:
 
     @property
     def tail(self) -> TailMean:
-        """What the policy search maximises where too few of the posterior's draws succeed."""
+        """Objective of the policy search if too few of the posterior's draws succeed."""
         return TailMean(self.tail_share)

@@ -1,4 +1,4 @@
-"""What a training run came to, and which of its policies to deploy."""
+"""The result of a training run, and which of its policies to deploy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,17 +14,17 @@ __all__ = ["Training", "Tried", "best_measured"]
 
 @dataclass(frozen=True)
 class Training:
-    """What a training run came to.
+    """The result of a training run.
 
     Attributes:
         policy: The policy to deploy.
         domain: Parameters of its internal model.
-        deployed: Number of the iteration whose rollouts measured it; ``None`` for the last
-            policy, which none has.
+        deployed: Number of the iteration whose rollouts measured the policy's return; ``None``
+            for the last policy, which has not run on the target.
         iterations: The records of the iterations, as in ``train.json``.
         rollouts: All real rollouts.
         posterior: The last posterior; ``None`` if no iteration was computed in this process.
-        model: The model, with what was added to it.
+        model: The model with the effects that were added.
     """
 
     policy: Policy
@@ -48,7 +48,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Tried:
-    """A policy that ran on the target, its internal model, and what it reached there."""
+    """A policy that ran on the target, its internal model, and its return there."""
 
     policy: Policy
     domain: dict[str, float]
@@ -61,10 +61,10 @@ def best_measured(
     """Returns the iteration of the policy to deploy, ``None`` for the last policy.
 
     Args:
-        tried: What was measured, by iteration.
+        tried: Policies with their measured returns, by iteration.
         deploys: The loop's option.
-        threshold: Return above which the task counts as done; where none was measured, the last
-            policy, which nobody has tried, is the better bet.
+        threshold: Return above which an episode is a success. If no policy reached it, the last
+            policy, which has not been tried, is more promising.
     """
     if deploys == "last" or not tried:
         return None

@@ -1,4 +1,4 @@
-"""What a device is run with where its data say too little."""
+"""Excitations for a device whose data do not determine the parameters."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,11 +17,11 @@ from npdr_ppl.posterior.posterior import Posterior
 __all__ = ["chosen_excitation", "proposed_excitation"]
 
 NUM_TRIED = 20
-"""Draws of the posterior in which a proposed excitation is tried: enough for a median."""
+"""Number of posterior draws in which a proposed excitation is simulated: enough for a median."""
 
 LEAST_LASTING = 0.5
-"""Share of a proposed excitation that the device must last in most draws: one that drives it
-against a stop at once tells little, and may break it."""
+"""Smallest share of a proposed excitation that the simulated episode must last in most draws. An
+excitation that drives the device against a stop at once tells little, and may damage it."""
 
 
 def proposed_excitation(
@@ -30,7 +30,7 @@ def proposed_excitation(
     """Returns the commands of the experiment that discovery proposes, ``None`` if there is none.
 
     Args:
-        experiment: ``next_experiment`` as ``discovery.json`` has it.
+        experiment: ``next_experiment`` in ``discovery.json``.
         actions: The device's actions.
         time_step: Seconds per command.
     """
@@ -39,7 +39,7 @@ def proposed_excitation(
     shape = excitation_commands(time_step)[experiment["excitation"]]
     names = tuple(action.name for action in actions)
     amplitudes = np.array([experiment["amplitude"].get(name, 0.0) for name in names])
-    # Afterwards nothing is commanded; the last command would be held.
+    # The last command is held after the end, so a zero command is appended.
     commands = np.concatenate((np.outer(shape, amplitudes), np.zeros((1, len(names)))))
     return Playback(torch.tensor(commands, dtype=torch.float32), names, time_step)
 
@@ -52,18 +52,18 @@ def chosen_excitation(
     *,
     seed: int,
 ) -> Policy:
-    """Returns what to record another rollout with.
+    """Returns the excitation for another rollout.
 
-    The experiment that discovery proposes, because it separates what is doubtful; the task's
-    excitation where there is no such experiment, or the device would not last through it; the
-    present policy where the task has none.
+    The first choice is the experiment that discovery proposes, because it separates the possible
+    causes. If there is none, or the device would not run through it, the task's excitation is
+    used, and if the task has none, the current policy.
 
     Args:
         task: Its excitation is the usual choice.
-        policy: The present policy.
-        proposal: What discovery proposes.
-        posterior: The posterior that it is tried in; ``None`` before there is one, in which case
-            the proposal is not taken.
+        policy: The current policy.
+        proposal: The experiment that discovery proposes.
+        posterior: The posterior in which the proposal is simulated; if it is ``None``, because
+            nothing has been inferred, the proposal is not used.
         seed: Seed of the draws and initial states.
     """
     if proposal is not None and posterior is not None and _lasts(task, proposal, posterior, seed):
@@ -72,7 +72,7 @@ def chosen_excitation(
 
 
 def _lasts(task: ControlTask, proposal: Playback, posterior: Posterior, seed: int) -> bool:
-    """Returns whether the device lasts in most draws of the posterior."""
+    """Returns whether the device runs through the proposal in most draws of the posterior."""
     num_steps = min(len(proposal.commands) - 1, task.num_steps)
     generator = torch.Generator().manual_seed(seed)
     domains = domains_at(posterior.prior, posterior.sample_mixture(NUM_TRIED, seed=seed))

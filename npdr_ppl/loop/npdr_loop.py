@@ -1,22 +1,22 @@
 """The NPDR loop, Algorithm 1 of Muratore et al. (2021), driven by diagnostics.
 
-An iteration runs the policy on the target domain, infers the domain parameters from what was
-recorded, lets the diagnosis of that posterior decide what to do about it, and trains the policy in
-domains drawn from it::
+An iteration runs the policy on the target domain and infers the domain parameters from the
+rollouts. The diagnosis of this posterior decides the next step. Then the policy is trained in
+domains drawn from the posterior::
 
     policy ← POLOPT(prior)
     repeat
-        rollouts ← run the policy on the target, its internal model being the most likely sample
-        model ← discover(model, rollouts), if the options say so
+        rollouts ← run the policy on the target, with the most likely sample as internal model
+        model ← discover(model, rollouts), if the options ask for it
         posterior ← INFER(model, rollouts), in rounds
         decision ← diagnose(posterior): accept, more rounds, another rollout, revise the model,
                    widen, stop
         policy ← POLOPT(posterior)
-        check the policy over the posterior: where it fails too often, record another rollout and
-            begin anew at INFER, or train it for the worst domains
+        check the policy over the posterior: if it fails too often, record another rollout and
+            return to INFER, or train it for the worst domains
 
-With a folder, every rollout, round and policy is on disk before the next step, and a run that was
-killed continues to the same result; see :mod:`npdr_ppl.loop.loop_folder`.
+If a folder is given, every rollout, round and policy is saved before the next step. A run that was
+killed then continues and reaches the same result; see :mod:`npdr_ppl.loop.loop_folder`.
 """
 
 import logging
@@ -75,11 +75,11 @@ __all__ = ["Training", "train"]
 _LOGGER = logging.getLogger(__name__)
 
 PREDICTIVE_DRAWS = 500
-"""Draws per ensemble member that a diagnosis reads."""
+"""Number of posterior draws per ensemble member that a diagnosis uses."""
 
 LEAST_SHARE = 0.5
-"""Share of an episode's steps that discovery wants: effects that show in few segments of a rollout
-that ended early are told from chance, but not from each other."""
+"""Share of an episode's steps that discovery needs. If a rollout ended early and an effect is
+visible in few segments, it can be distinguished from chance, but not from other effects."""
 
 
 def train(
@@ -93,21 +93,21 @@ def train(
     seed: int = 0,
     progress: bool | Reporter | None = None,
 ) -> Training:
-    """Trains a policy for a target domain that differs from its simulator.
+    """Trains a policy for a target domain that differs from the simulator.
 
     Args:
         model: A Pyro model of the target with one black-box site.
         target: The target domain; its parameters stay unknown.
-        task: What the policy is to do.
+        task: The task of the policy.
         options: Options of the loop.
-        out: Folder for the run, ``train.json`` included; a run killed there continues.
-        revise: What looks for a missing effect where a diagnosis asks for it.
-        seed: Seed of everything random.
+        out: Folder for the run and its ``train.json``. If a run was killed there, it continues.
+        revise: Function that searches for a missing effect if a diagnosis asks for it.
+        seed: Seed of all random numbers.
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Raises:
-        DataError: The target's channels do not fit, or the folder holds another run.
-        ModelError: The model cannot be trained on; see
+        DataError: The target's channels do not match, or the folder contains another run.
+        ModelError: Policies cannot be trained on the model; see
             :func:`npdr_ppl.loop.domains.simulator_of`.
     """
     options = options or LoopOptions()
@@ -115,7 +115,7 @@ def train(
         path = out or stack.enter_context(TemporaryDirectory(prefix="npdr-"))
         folder = LoopFolder(Path(path))
         loop = _Loop(model, target, task, options, folder, revise, seed, report)
-        # Only now: a model or target that does not fit leaves no folder of a run.
+        # Made after the checks, so that a model or target that does not match leaves no folder.
         folder.begin(model, target, task, options, seed=seed)
         return loop.run()
 
@@ -138,7 +138,7 @@ class _Loop:
         self.task = task
         self.options = options
         self.folder = folder
-        # A way of one's own to look for effects takes the place of discovery.
+        # A function given by the caller replaces discovery.
         may_discover = options.follows_decisions and revise is None
         self.discovers = options.discovers if may_discover else "never"
         discovery = LoopDiscovery(
@@ -163,7 +163,7 @@ class _Loop:
         self.tried: list[Tried] = []
 
     def run(self) -> Training:
-        """Runs all iterations, or those that are left."""
+        """Runs all iterations that are not finished yet."""
         if not self.rollouts.can_collect(self.options.rollouts):
             raise DataError(
                 f"{self.target.name} has {self.target.num_episodes} episodes; an iteration takes "
@@ -203,7 +203,7 @@ class _Loop:
         )
 
     def _iterate(self, index: int, report: Reporter) -> dict[str, Any]:
-        """Runs one iteration, or takes over what an earlier process made of it."""
+        """Runs one iteration, or restores it if an earlier process finished it."""
         number = self.options.rollouts
         new = [self.rollouts.collect(self.policy, self.domain) for _ in range(number)]
         returns = [float(rollout.rewards[0].sum()) for rollout in new if rollout.rewards]
@@ -225,7 +225,7 @@ class _Loop:
         return record
 
     def _is_good_enough(self, real_return: float) -> bool:
-        """Returns whether a measured return alone ends the loop."""
+        """Returns whether the measured return is enough to end the loop."""
         options = self.options
         wanted = options.stop_return if options.stops == "measured return" else None
         return options.follows_decisions and wanted is not None and real_return >= wanted
@@ -264,16 +264,16 @@ class _Loop:
         return record
 
     def _take_over(self, index: int, saved: dict[str, Any], report: Reporter) -> None:
-        """Repeats the steps of a finished iteration that change more than its record."""
+        """Repeats the steps of a finished iteration that change the loop's own state."""
         decisions = saved["decisions"]
         for number, decision in enumerate(decisions):
             if decision["action"] == Action.ANOTHER_ROLLOUT:
-                self._collect_excitation(None)  # it is on disk
+                self._collect_excitation(None)  # read from disk
             if decision["action"] == Action.REVISED:
                 self._revised(index, decisions[:number], report)
         following = self.folder.iteration(index + 1)
         if saved["parameters"] and (following is None or not following["parameters"]):
-            # The last one that has a posterior: it is read from disk.
+            # This is the last iteration with a posterior, which is read from disk.
             self.posterior = self._infer(index, decisions, report)
         self.domain = saved["internal_model"]
         if not is_final(saved):
@@ -285,12 +285,12 @@ class _Loop:
     def _infer_and_decide(
         self, index: int, real_return: float, decisions: list[dict[str, Any]], report: Reporter
     ) -> Settled:
-        """Infers the posterior and does what its diagnosis asks for until that settles it.
+        """Infers the posterior and follows its diagnosis until no new inference is needed.
 
         Args:
             index: Number of the iteration.
             real_return: Its mean return on the target.
-            decisions: Those of the iteration so far; more are appended.
+            decisions: The iteration's decisions so far; more are appended.
             report: Where to report progress.
         """
         options = self.options
@@ -311,7 +311,7 @@ class _Loop:
             if action is Action.ANOTHER_ROLLOUT:
                 self._collect_excitation(posterior)
             elif action is Action.MORE_ROUNDS:
-                pass  # inference goes on, with what is counted below
+                pass  # inference continues; the number of rounds follows from the decisions
             elif may_revise and (action is Action.REVISED or self.discovers != "never"):
                 may_revise = False
                 is_found, finding = self._revised(index, decisions, report)
@@ -330,7 +330,7 @@ class _Loop:
     def _discover_first(
         self, index: int, decisions: list[dict[str, Any]], report: Reporter
     ) -> None:
-        """Does what discovery wants before anything is inferred, and notes what was decided."""
+        """Takes discovery's steps before inference, and appends their decisions."""
         steps, wanted = self.rollouts.num_steps, self.task.num_steps
         is_short = steps < LEAST_SHARE * wanted
         if self.discovers != "never" and is_short and self.rollouts.extra_left(index) > 0:
@@ -343,7 +343,7 @@ class _Loop:
                 decisions.append(decision_record(Decision.REVISE_MODEL, reason, Action.REVISED))
 
     def _collect_excitation(self, posterior: Posterior | None) -> None:
-        """Records what tells more than the policy does."""
+        """Records a rollout with a more informative excitation than the policy."""
         seed = derived_seed(self.seed, "excitation", len(self.rollouts))
         excitation = chosen_excitation(
             self.task, self.policy, self.model.proposal, posterior, seed=seed
@@ -353,14 +353,14 @@ class _Loop:
     def _revised(
         self, index: int, decisions: Sequence[Mapping[str, Any]], report: Reporter
     ) -> tuple[bool, str]:
-        """Looks for missing effects; after a rollout that a check asked for, in a new folder."""
+        """Searches for missing effects; uses a new folder after a check asked for a rollout."""
         folder = self.folder.revision(index, count_checks(decisions))
         return self.model.look(self.rollouts.joined(), folder, report)
 
     def _infer(
         self, index: int, decisions: Sequence[Mapping[str, Any]], report: Reporter
     ) -> Posterior:
-        """Infers the posterior after decisions; rounds that are on disk are not repeated."""
+        """Infers the posterior after the decisions; saved rounds are not repeated."""
         options = self.options
         attempt = count_actions(decisions, *NEW_ATTEMPTS)
         rounds = options.rounds if self.backend.is_sequential else 1
@@ -384,17 +384,17 @@ class _Loop:
 
     @property
     def _start(self) -> Tensor:
-        """Where a policy search begins."""
+        """Policy parameters from which a search begins."""
         return (self.policy if self.options.is_warm_start else self.task.policy).parameters
 
     def _use(self, parameters: Tensor) -> None:
-        """Makes the policy with these parameters the present one."""
+        """Makes the policy with these parameters the current one."""
         self.policy = self.task.policy.with_parameters(parameters.to(self.task.policy.parameters))
 
     def _train(
         self, index: int, settled: Settled, checks: list[dict[str, Any]], report: Reporter
     ) -> dict[str, Any] | None:
-        """Trains the next policy and returns its figures, or none if a rollout is wanted first."""
+        """Trains the next policy; returns its figures, ``None`` if a rollout is needed first."""
         trained = self.training.train(
             index,
             settled,
@@ -417,7 +417,7 @@ class _Loop:
         risk: Risk,
         number: tuple[int, ...],
     ) -> tuple[Tensor, dict[str, Any]]:
-        """Searches for a policy and returns its parameters and figures."""
+        """Searches for a policy and returns its parameters and figures of the search."""
         options = self.options
         found = optimise_policy(
             self.task,

@@ -1,7 +1,8 @@
-"""The check before deploying: does a new policy work in the simulators that the data leave?
+"""The check before deploying: does a new policy work in simulators drawn from the posterior?
 
-A policy that fails in many draws of the posterior fails on the target just as likely, if the model
-is right. To find that out in simulation costs seconds, on a device a rollout or a part.
+If the model is right, the share of posterior draws in which a policy fails is its probability of
+failure on the target. A check in simulation costs seconds; on a device, a failure costs a rollout
+or a broken part.
 """
 
 import math
@@ -23,7 +24,7 @@ __all__ = ["Check", "NextStep", "check_policy", "decide"]
 
 
 class NextStep(StrEnum):
-    """What to do with a new policy."""
+    """The next step for a new policy."""
 
     DEPLOY = "deploy"
     SEARCH_AGAIN = "search again"
@@ -33,13 +34,13 @@ class NextStep(StrEnum):
 
 @dataclass(frozen=True)
 class Check:
-    """What a policy reached over the posterior, run as it would be on the target.
+    """A policy's returns over the posterior, when it runs as it would on the target.
 
     Attributes:
         success: Share of the draws in which its mean return is above the task's threshold; NaN
-            without one.
+            if the task has no threshold.
         mean_return: Mean of the returns in all draws.
-        tail_return: Mean of the returns in the worst share of them.
+        tail_return: Mean of the returns in the worst share of the draws.
         num_draws: Number of draws.
     """
 
@@ -50,7 +51,7 @@ class Check:
 
     @classmethod
     def of(cls, saved: Mapping[str, Any]) -> "Check":
-        """Returns a check as JSON has it, where numbers that are not finite are ``None``."""
+        """Reads a check from JSON, in which numbers that are not finite are ``None``."""
         success = math.nan if saved["success"] is None else saved["success"]
         mean, tail = (
             -math.inf if saved[name] is None else saved[name]
@@ -59,11 +60,11 @@ class Check:
         return cls(success, mean, tail, saved["num_draws"])
 
     def is_better_than(self, other: "Check") -> bool:
-        """Returns whether more draws succeed, or as many and the worst of them are better."""
+        """Returns whether more draws succeed, or as many and the worst draws are better."""
         return (self.success, self.tail_return) > (other.success, other.tail_return)
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the keys that ``train.json`` has."""
+        """Returns the check with the keys of ``train.json``."""
         return {
             "simulated_success": self.success,
             "simulated_return": {"mean": self.mean_return, "cvar": self.tail_return},
@@ -81,15 +82,16 @@ def check_policy(
 ) -> Check:
     """Runs a policy in many draws of the posterior at once.
 
-    The draws are not spread: this asks what the data say, while training guards against more. The
-    policy's own model is that which it would have on the target, the same in all draws.
+    The draws are not spread, because the check tests the posterior itself; training protects
+    against more. The policy's internal model is the one it would have on the target, the same in
+    all draws.
 
     Args:
-        task: What the policy is to do.
+        task: The task of the policy.
         policy: The policy.
         posterior: The posterior.
-        internal_model: Parameters of the policy's own model on the target.
-        options: Number of draws and of initial states in each, share of the worst draws.
+        internal_model: Parameters of the policy's internal model on the target.
+        options: Number of draws, number of initial states in each, and share of the worst draws.
         seed: Seed of the draws and of the initial states.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -114,17 +116,17 @@ def decide(
     rollouts_left: int,
     is_for_tail: bool,
 ) -> tuple[NextStep, str]:
-    """Returns what to do with a policy, and why in a sentence.
+    """Returns the next step for a policy, and the reason in a sentence.
 
     Args:
-        check: What it reached in simulation.
-        options: The share of successes that is asked for.
-        searches_left: Searches for a policy that can still be begun anew.
-        rollouts_left: Rollouts that can still be recorded.
+        check: Its results in simulation.
+        options: The required share of successes.
+        searches_left: Number of times that the policy search can still be restarted.
+        rollouts_left: Number of rollouts that can still be recorded.
         is_for_tail: Whether it has been trained for the worst domains.
     """
     if math.isnan(check.success):
-        return NextStep.DEPLOY, "The task has no threshold of success to check the policy by."
+        return NextStep.DEPLOY, "The policy is not checked: the task has no success threshold."
     shown = f"The policy succeeds in {check.success:.0%} of {check.num_draws} draws"
     least = f"the {options.least_success:.0%} asked for"
     if check.success >= options.least_success:
@@ -133,19 +135,20 @@ def decide(
         return NextStep.DEPLOY, f"{shown}, fewer than {least}; decisions are only logged."
     if is_for_tail:
         return NextStep.DEPLOY, (
-            f"{shown}, fewer than {least}, also after training for the worst "
-            f"{options.tail_share:.0%} of the domains, and no rollout is left to ask for."
+            f"{shown}, fewer than {least}, even after training for the worst "
+            f"{options.tail_share:.0%} of the domains, and no extra rollout is left."
         )
     if 1.0 - check.success >= options.least_success and searches_left > 0:
         return NextStep.SEARCH_AGAIN, (
-            f"{shown}: it fails whatever the parameters are within their uncertainty, so that a "
-            "better policy is searched for from another start."
+            f"{shown}: it fails for nearly all likely parameters, so uncertain parameters are not "
+            "the cause. The search is restarted from the task's own policy."
         )
     if rollouts_left > 0:
         return NextStep.ANOTHER_ROLLOUT, (
-            f"{shown}, fewer than {least}: record a rollout that tells more about the parameters."
+            f"{shown}, fewer than {least}: record a rollout with more information about the "
+            "parameters."
         )
     return NextStep.TRAIN_FOR_THE_TAIL, (
-        f"{shown}, fewer than {least}, and no rollout is left to ask for: train for the worst "
+        f"{shown}, fewer than {least}, and no extra rollout is left: train for the worst "
         f"{options.tail_share:.0%} of the domains."
     )

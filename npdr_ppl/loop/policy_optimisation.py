@@ -1,4 +1,4 @@
-"""POLOPT of Algorithm 1: a policy search evaluated in many domains at once."""
+"""POLOPT of Algorithm 1: a policy search that evaluates policies in many domains at once."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -20,15 +20,15 @@ __all__ = ["OptimisedPolicy", "optimise_policy", "returns_of"]
 
 @dataclass(frozen=True)
 class OptimisedPolicy:
-    """What a policy search found.
+    """The result of a policy search.
 
     Attributes:
         parameters: Parameters of the policy to deploy, ``(P,)`` in float64.
         policy: The policy.
         best_returns: Best objective among the candidates of each iteration: by default the mean
             return over the domains.
-        mean_return: Mean return of ``policy`` over the domains it was trained in.
-        success_rate: Share of these episodes that succeeded; NaN without such a threshold.
+        mean_return: Mean return of ``policy`` over its training domains.
+        success_rate: Share of these episodes that succeeded; NaN if the task has no threshold.
     """
 
     parameters: Tensor
@@ -64,21 +64,21 @@ def optimise_policy(
 ) -> OptimisedPolicy:
     """Searches for the policy with the greatest return over domains and initial states.
 
-    All candidates meet the same domains and, within an iteration, the same initial states, so
-    that they are compared on equal terms.
+    To make the comparison fair, all candidates run in the same domains and, within an iteration,
+    from the same initial states.
 
     Args:
-        task: What the policy is to do.
+        task: The task of the policy.
         domains: The D domains.
         search: The search.
-        start: Policy parameters to begin at, ``(P,)``.
+        start: Initial policy parameters, ``(P,)``.
         iterations: Iterations of the search.
-        num_initial_states: Initial states S of each iteration.
-        seed: Seed of everything random.
-        risk: What makes one number of the returns in all domains; ``None`` for their mean.
-        internal_model: Parameters of the policies' own model in every domain, as on the target;
-            ``None`` for each domain's own.
-        expected_calls: How many iterations of this size are to come, if more than ``iterations``.
+        num_initial_states: Number S of initial states in each iteration.
+        seed: Seed of all random numbers.
+        risk: Reduces the returns in all domains to one number; ``None`` for their mean.
+        internal_model: Parameters of the policies' internal model, the same in every domain, as
+            on the target; ``None`` for each domain's own parameters.
+        expected_calls: Expected number of iterations of this size, if more than ``iterations``.
         progress: Called with the fraction done and a short status.
     """
     objective = risk or MeanReturn()
@@ -101,7 +101,7 @@ def optimise_policy(
         best.append(float(values.max()))
         if progress is not None:
             progress((iteration + 1) / iterations, f"return {best[-1]:.0f}")
-    # A search's own estimate, such as PoWER's mean, may never have been tried.
+    # The search's own estimate, such as PoWER's mean, may never have been evaluated.
     finalists = torch.stack((search.parameters(state), state.best))
     stream = torch.Generator().manual_seed(derived_seed(seed, "policy evaluation"))
     starts = task.initial_states(num_initial_states, stream)
@@ -132,13 +132,13 @@ def returns_of(
     """Returns the return of every candidate in every domain, ``(P, D, S)``, in float32.
 
     Args:
-        task: What the policy is to do.
+        task: The task of the policy.
         domains: The D domains.
         candidates: Policy parameters, ``(P, parameters)``.
         initial_states: True states at the start, ``(S, states)``.
-        internal_model: Parameters of the policies' own model in every domain; ``None`` for each
-            domain's own.
-        expected_calls: How many calls of this size are to come.
+        internal_model: Parameters of the policies' internal model, the same in every domain;
+            ``None`` for each domain's own parameters.
+        expected_calls: Expected number of calls of this size.
     """
     policy = task.policy.with_parameters(candidates.float()[:, None, None])
     parameters = {name: value.float()[:, None] for name, value in domains.parameters.items()}

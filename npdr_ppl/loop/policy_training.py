@@ -22,13 +22,13 @@ __all__ = ["LoopTraining", "Optimise", "Trained"]
 Figures = dict[str, Any]
 
 Optimise = Callable[[Domains, Tensor, Risk, tuple[int, ...]], tuple[Tensor, Figures]]
-"""Searches for a policy in domains from a start, for a risk; the numbers tell one search of a run
-from another. Returns parameters and figures."""
+"""Searches for a policy in given domains, from initial parameters, with a given objective. The
+numbers identify the search within the run. Returns parameters and figures."""
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A policy that the loop goes on with.
+    """The policy with which the loop continues.
 
     Attributes:
         parameters: Its parameters.
@@ -40,14 +40,14 @@ class Trained:
 
 
 class LoopTraining:
-    """Trains policies of a run; each is on disk before it is judged.
+    """Trains the policies of a run; each is saved before the next step is chosen.
 
     Args:
-        task: What the policy is to do.
+        task: The task of the policy.
         options: Options of the loop.
         folder: The run's folder.
         seed: Seed of the run.
-        from_prior: Draws so many domains from the prior.
+        from_prior: Draws a given number of domains from the prior.
     """
 
     def __init__(
@@ -80,15 +80,15 @@ class LoopTraining:
 
         Args:
             index: Number of the iteration.
-            settled: The posterior, and what was decided about it.
-            start: Policy parameters that the search begins at.
-            internal_model: Parameters of the policy's own model on the target.
+            settled: The posterior and the decisions about it.
+            start: Initial policy parameters of the search.
+            internal_model: Parameters of the policy's internal model on the target.
             checks: The iteration's checks so far; more are appended.
-            rollouts_left: Rollouts that can still be recorded.
+            rollouts_left: Number of rollouts that can still be recorded.
             optimise: Searches for a policy.
 
         Returns:
-            The policy, on disk; ``None`` if another rollout is wanted first.
+            The policy, already saved; ``None`` if another rollout is needed first.
         """
         options = self.options
         best: tuple[Check, Tensor, Figures] | None = None
@@ -118,7 +118,7 @@ class LoopTraining:
             if verdict is NextStep.DEPLOY:
                 break
             if verdict is NextStep.SEARCH_AGAIN:
-                # From the policy as it came: the search before ended in a local optimum.
+                # Restart from the task's policy, because the search ended in a local optimum.
                 start, searches_left = self.task.policy.parameters.double(), searches_left - 1
             else:
                 start, risk = best[1], options.tail
@@ -127,7 +127,7 @@ class LoopTraining:
         return Trained(parameters, {**figures, **check.to_dict()})
 
     def _domains(self, number: tuple[int, int], settled: Settled) -> Domains:
-        """Returns what a draft of a policy is trained in."""
+        """Returns the training domains of a draft of a policy."""
         policy, draft = number
         of_draft = (policy - 1, draft) if draft else (policy - 1,)
         return training_domains(
@@ -154,7 +154,7 @@ class LoopTraining:
             settled.posterior,
             internal_model,
             self.options,
-            # The same draws for all drafts of a posterior, so that they are compared alike.
+            # All drafts of a posterior are checked on the same draws, for a fair comparison.
             seed=derived_seed(self.seed, "check", index),
         )
         figures["check"] = plain(asdict(check))

@@ -1,4 +1,4 @@
-"""Rollouts of a policy on the target domain: each is on disk before anything learns from it."""
+"""Rollouts of a policy on the target domain: each is saved before it is used."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -24,11 +24,11 @@ class RealRollouts:
 
     Args:
         target: The target domain.
-        task: What the policy is to do; gives the reward, so that returns on the target and in
-            simulation can be compared. Rewards that a target gives count where they were recorded
-            earlier, or where no state is.
+        task: The task of the policy. Its reward is used, so that returns on the target and in
+            simulation can be compared. The target's own rewards are used if its episodes were
+            recorded earlier, or if the state is not recorded.
         simulator: Names the state's components, for the reward.
-        folder: Where rollouts are kept; ``None`` for memory only.
+        folder: Folder for the rollouts; ``None`` keeps them in memory only.
 
     Raises:
         DataError: The target lacks a channel that the policy reads or commands.
@@ -49,7 +49,7 @@ class RealRollouts:
         actions = [action.name for action in target.actions]
         policy = task.policy
         needed = [*policy.observations, *policy.actions]
-        if target.is_recorded:  # no policy is run, but rewards are computed
+        if target.is_recorded:  # no policy runs, but rewards are computed
             needed = [state.name for state in simulator.states]
             needed += [action.name for action in simulator.actions]
         missing = [name for name in needed if name not in sensors + actions]
@@ -59,7 +59,7 @@ class RealRollouts:
     def collect(
         self, episode: int, policy: Policy, domain: Mapping[str, float], *, seed: int
     ) -> Rollouts:
-        """Returns the rollout of an episode, from disk if it has been made already.
+        """Returns the rollout of an episode, from disk if it was recorded already.
 
         Args:
             episode: Number of the episode in the whole run, from 0.
@@ -114,7 +114,7 @@ class RealRollouts:
     def _recover(self, journal_file: Path) -> tuple[Rollouts, Array] | None:
         """Returns an episode that was complete when the process was killed.
 
-        An incomplete one is put aside, so that what was recorded is not lost.
+        The file of an incomplete episode is renamed, so that its measurements are not lost.
         """
         if not journal_file.exists():
             return None
@@ -128,7 +128,7 @@ class RealRollouts:
         return None
 
     def _controller(self, policy: Policy, domain: Mapping[str, float]) -> Controller:
-        """Returns the policy as a function of all readings of the target."""
+        """Returns the policy as a function of all measurements of the target."""
         sensors = [sensor.name for sensor in self.target.sensors]
         if self.target.is_recorded:
             return lambda readings, time: np.zeros(len(self.target.actions))
@@ -142,7 +142,7 @@ class RealRollouts:
         return controller
 
     def _with_rewards(self, rollout: Rollouts, commands: Array) -> Rollouts:
-        # A recorded episode has only its applied commands.
+        # For an episode recorded earlier, only the applied commands are known.
         issued = commands if len(commands) else rollout.actions[0]
         rewards = rewards_of(self.task, self.simulator, rollout, issued)
         return replace(rollout, rewards=(rewards,))
@@ -151,7 +151,7 @@ class RealRollouts:
 def rewards_of(
     task: ControlTask, simulator: ClosedLoopSimulator, rollout: Rollouts, commands: Array
 ) -> NDArray[np.float64]:
-    """Returns the reward of every step, ``(T,)``, from readings, as a device can know it.
+    """Returns the reward of every step, ``(T,)``, computed from measurements as on a device.
 
     Args:
         task: Gives the reward.
@@ -165,7 +165,7 @@ def rewards_of(
     columns = {name: i for i, name in enumerate(rollout.channel_names)}
     missing = missing_states(simulator, rollout)
     if missing:
-        raise DataError(f"The reward needs readings of {', '.join(missing)}.")
+        raise DataError(f"The reward needs measurements of {', '.join(missing)}.")
     readings = torch.tensor(rollout.readings[0][:-1])
     state = [readings[:, columns[component.name]] for component in simulator.states]
     half = len(state) // 2

@@ -1,6 +1,6 @@
-"""What a policy search maximises over domains: the mean return, or that of the worst domains.
+"""The objective of a policy search over domains: the mean return, or that of the worst domains.
 
-Returns of failed simulations count as −∞.
+Failed simulations have a return of −∞.
 """
 
 import math
@@ -32,7 +32,7 @@ class Risk(Protocol):
 
 @dataclass(frozen=True)
 class MeanReturn:
-    """The mean over all domains: domains in which a policy fails are made up for by others."""
+    """The mean over all domains: good domains can compensate for domains where a policy fails."""
 
     def __call__(self, returns: Tensor) -> Tensor:
         """Returns the mean; see :class:`Risk`."""
@@ -48,7 +48,7 @@ class TailMean:
         CVaR_α = (1/k) (R₁ + … + R_⌊k⌋ + (k − ⌊k⌋) R_⌊k⌋₊₁).
 
     Args:
-        share: α, above 0 and at most 1; 1 is the mean.
+        share: α, above 0 and at most 1; 1 gives the mean over all domains.
 
     References: Chow and Ghavamzadeh, Algorithms for CVaR Optimization in MDPs, NeurIPS 2014;
     Rajeswaran et al., EPOpt: Learning Robust Neural Network Policies Using Model Ensembles, ICLR
@@ -71,7 +71,7 @@ class TailMean:
         ordered = _worst_first(returns)
         number = self.share * ordered.shape[-1]
         whole = min(math.floor(number), ordered.shape[-1])
-        # Products with a weight of 0 would make NaN of −∞.
+        # A weight of 0 is skipped, because 0 times −∞ is NaN.
         total = ordered[..., :whole].sum(-1)
         if whole < ordered.shape[-1] and number > whole:
             total = total + (number - whole) * ordered[..., whole]
@@ -79,5 +79,5 @@ class TailMean:
 
 
 def _worst_first(returns: Tensor) -> Tensor:
-    """Returns float64 returns in ascending order, those that are not a number first."""
+    """Returns float64 returns in ascending order, with NaN first, as −∞."""
     return torch.nan_to_num(returns.double(), nan=-math.inf).sort(-1).values

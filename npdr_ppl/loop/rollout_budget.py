@@ -37,16 +37,16 @@ class LoopRollouts:
 
     @property
     def num_steps(self) -> int:
-        """Steps of all rollouts."""
+        """Total number of steps in all rollouts."""
         return sum(sum(rollout.lengths) for rollout in self._rollouts)
 
     def can_collect(self, number: int) -> bool:
-        """Returns whether the target has so many episodes left."""
+        """Returns whether the target has at least this number of episodes left."""
         limit = self.target.num_episodes
         return limit is None or len(self) + number <= limit
 
     def extra_left(self, index: int) -> int:
-        """Returns how many more episodes may be asked for in an iteration."""
+        """Returns how many extra episodes are left in an iteration."""
         used = len(self) - self.options.rollouts * (index + 1)
         left = self.options.extra_rollouts - used
         return left if self.can_collect(1) else 0
@@ -64,6 +64,6 @@ class LoopRollouts:
         return self._rollouts[-1]
 
     def joined(self, number: int | None = None) -> Rollouts:
-        """Returns the last rollouts as one set, all if no number is given."""
+        """Returns the last rollouts as one set; all of them if no number is given."""
         first, *others = self._rollouts[-(number or len(self)) :]
         return first.concatenate(*others) if others else first

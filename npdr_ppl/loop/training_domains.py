@@ -1,4 +1,4 @@
-"""The domains that the loop trains a policy in after an iteration."""
+"""The domains in which the loop trains a policy after an iteration."""
 
 from collections.abc import Callable
 
@@ -20,13 +20,13 @@ def training_domains(
     seed: int,
     most_likely_seed: int,
 ) -> Domains:
-    """Returns draws of the posterior, or its most likely sample, spread as the options say.
+    """Returns draws of the posterior, or its most likely sample, with the options' spread.
 
     Args:
         posterior: The posterior.
         options: Options of the loop.
-        action: What the diagnosis led to; it may ask for more spread, or for some of the prior.
-        from_prior: Draws so many domains from the prior.
+        action: The action after the diagnosis; it may need more spread, or draws of the prior.
+        from_prior: Draws a given number of domains from the prior.
         seed: Seed of the draws.
         most_likely_seed: Seed of the search for the most likely sample.
     """
@@ -41,7 +41,7 @@ def training_domains(
         z = posterior.prior.to_reference({k: v[None] for k, v in most_likely.items()})
         z = z.expand(number, -1)
     generator = torch.Generator().manual_seed(seed)
-    # Where the model is wrong its posterior is too narrow, by how much nobody knows.
+    # If the model is wrong, its posterior is too narrow, by an unknown factor.
     spread = options.spread * (2.0 if action in SPREAD_WIDER else 1.0)
     domains = domains_at(posterior.prior, z).spread(spread, generator)
     return domains.followed_by(from_prior(num_prior)) if num_prior else domains

@@ -205,7 +205,7 @@ def test_a_measured_return_may_be_enough_to_end_the_loop(tmp_path, monkeypatch):
     result = run(tmp_path / "other", options)
     assert [record["real_return"] > 20.0 for record in result.iterations] == [False, True]
     last = result.iterations[-1]
-    assert last["decision"] == Decision.STOP and "what was asked for" in last["reason"]
+    assert last["decision"] == Decision.STOP and "reaches the requested return" in last["reason"]
     assert actions(result, 1) == [Action.KEPT] and last["checks"] == []
     assert len(asked) == 1  # nothing was inferred from its rollout
     assert result.deployed == 1

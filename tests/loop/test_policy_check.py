@@ -129,7 +129,7 @@ def test_a_policy_that_fails_in_simulation_asks_for_a_rollout_then_trains_for_th
         "The policy succeeds in 0% of 20 draws, fewer than the 50% asked for: record a rollout"
     )
     assert "train for the worst 40% of the domains" in reasons[1]
-    assert "also after training for the worst 40%" in reasons[2]
+    assert "even after training for the worst 40%" in reasons[2]
 
 
 def test_a_policy_that_works_in_simulation_is_deployed_at_once(tmp_path, searches):

@@ -1,4 +1,4 @@
-"""The proof: how far the model was from recordings that were held out, and how far it is now."""
+"""The proof: distance to held-out recordings before and after the model was revised."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from npdr_ppl.rollouts import Rollouts, stitch
 __all__ = ["Gap", "prove"]
 
 NUM_DRAWS = 40
-"""Posterior predictive trajectories."""
+"""Number of posterior predictive trajectories."""
 
 LEVEL = 0.9
 """Probability of the predictive interval whose coverage is reported."""
@@ -28,11 +28,11 @@ class Gap:
     """A metric on held-out rollouts.
 
     Attributes:
-        before: With the model as it was, refitted.
-        after: With the revised model.
-        noise_floor: What the revised model would leave of a recording of its own, because
+        before: Its value for the original model, refitted.
+        after: Its value for the revised model.
+        noise_floor: Its value if the revised model itself made the recording, because
             measurements and initial states have errors; ``None`` for a metric that has no floor.
-            Another model may leave a little less by chance.
+            Another model may have a slightly smaller value by chance.
     """
 
     before: float
@@ -41,7 +41,7 @@ class Gap:
 
     @property
     def closed(self) -> float | None:
-        """Share of what could be closed that was closed; ``None`` where nothing could be."""
+        """Share of the gap above the noise floor that was closed; ``None`` without such a gap."""
         if self.noise_floor is None or self.before <= self.noise_floor:
             return None
         return (self.before - self.after) / (self.before - self.noise_floor)
@@ -69,11 +69,11 @@ def prove(
     """Compares two fitted models on rollouts that neither was fitted to.
 
     Args:
-        before: The model as it was.
+        before: The original model.
         after: The revised model.
-        rollouts: The held-out recording, of another excitation where there is one.
-        options: Its segments.
-        draws_before: Draws of the posterior of the model as it was.
+        rollouts: The held-out recording, of another excitation if there is one.
+        options: How it is cut into segments.
+        draws_before: Draws of the posterior of the original model.
         draws_after: Draws of the posterior of the revised model.
         seed: Seed of the predictive draws.
     """
@@ -115,10 +115,10 @@ class _Scores:
 def _floor(
     hypothesis: Hypothesis, drawn: Tensor, rollouts: Rollouts, options: DataOptions
 ) -> dict[str, float]:
-    """Returns the metrics of a recording that the model itself might have made.
+    """Returns the metrics of a recording that is simulated with the model itself.
 
-    From initial states as far off as they turn out to be along the recording, with measurements
-    off by their noise, scored against the prediction from the smoother's estimate.
+    Its initial states have errors as large as along the real recording, and its measurements have
+    noise. It is compared with the prediction from the smoother's estimate.
     """
     segments = SegmentModel(hypothesis.model, rollouts, options)
     z, unmoved = hypothesis.fit.z[None], _no_offsets(segments, 1)
@@ -143,9 +143,9 @@ def _floor(
 
 
 def reading_noise(rollouts: Rollouts, channels: tuple[str, ...]) -> Tensor:
-    """Returns the standard deviation of the readings' own errors, ``(C,)``.
+    """Returns the standard deviation of the measurements' noise, ``(C,)``.
 
-    From third differences, where any smooth motion is negligible.
+    It is computed from third differences, in which any smooth motion is negligible.
     """
     columns = [rollouts.channel_names.index(name) for name in channels]
     parts = []
@@ -161,7 +161,7 @@ def _no_offsets(segments: SegmentModel, num: int) -> Tensor:
 
 
 def _predictive(hypothesis: Hypothesis, drawn: Tensor, segments: SegmentModel) -> Tensor:
-    """Returns posterior predictive trajectories, readings' noise included."""
+    """Returns posterior predictive trajectories, measurement noise included."""
     offsets = torch.randn(_no_offsets(segments, len(drawn)).shape, dtype=torch.float64)
     trajectory = segments.simulate(drawn, offsets).double()
     return trajectory + hypothesis.fit.scale * torch.randn(trajectory.shape, dtype=torch.float64)

@@ -1,7 +1,7 @@
-"""The experiment that would tell the alternatives apart.
+"""The experiment that best distinguishes the alternatives.
 
-One alternative makes a recording under each excitation, the others are refitted to it: the
-experiment to do is the one whose smallest separation, over all pairs, is largest.
+Each alternative simulates a recording under each excitation, and the others are refitted to it.
+The best experiment is the one with the largest minimum separation over all pairs.
 """
 
 import math
@@ -28,19 +28,20 @@ __all__ = ["NextExperiment", "excitation_commands", "next_experiment"]
 SECONDS = 4.0
 
 SAFE_SHARE = 1.0
-"""Amplitude in the greatest command of the recording: never more than the device has seen."""
+"""Amplitude as a share of the recording's greatest command, so that no command is larger than one
+that the device has already had."""
 
 
 @dataclass(frozen=True)
 class NextExperiment:
-    """What to record next.
+    """The experiment to record next.
 
     Attributes:
-        excitation: The kind of excitation; ``None`` where none that was tried helps.
+        excitation: The kind of excitation; ``None`` if no tried excitation helps.
         separations: Smallest separation of any two alternatives, in standard deviations of the
-            readings, by excitation; NaN where the simulation failed.
-        amplitude: Greatest command, by action. separated_by: What would tell the alternatives
-        apart in words, where they are a known class.
+            measurements, by excitation; NaN if the simulation failed.
+        amplitude: Greatest command, by action.
+        separated_by: How to distinguish the alternatives, in words, if they are a known class.
     """
 
     excitation: Excitation | None
@@ -60,7 +61,7 @@ class NextExperiment:
 
 
 ENOUGH = 5.0
-"""Separation from which an experiment is worth doing."""
+"""Separation, in standard deviations of the measurements, from which an experiment is useful."""
 
 
 def next_experiment(
@@ -69,13 +70,13 @@ def next_experiment(
     options: DataOptions,
     classes: Sequence[EquivalenceClass],
 ) -> NextExperiment:
-    """Compares excitations by how far they would set the alternatives apart.
+    """Compares excitations by the separation of the alternatives.
 
     Args:
-        alternatives: Fitted hypotheses that the recording cannot tell apart.
+        alternatives: Fitted hypotheses that the recording cannot distinguish.
         rollouts: The recording; its greatest commands bound the excitations.
-        options: Its segments.
-        classes: Equivalence classes of the effects in question.
+        options: How it is cut into segments.
+        classes: Equivalence classes of the alternatives' effects.
     """
     largest = np.max([np.abs(actions).max(0) for actions in rollouts.actions], axis=0)
     shapes = excitation_commands(rollouts.time_step)
@@ -124,9 +125,9 @@ def excitation_commands(time_step: float) -> dict[str, NDArray[np.float64]]:
 def _made(
     hypothesis: Hypothesis, rollouts: Rollouts, commands: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Returns what a hypothesis would read under commands ``(E, T, A)``, from rest, ``(E, T, C)``.
+    """Simulates measurements of a hypothesis, ``(E, T, C)``, under commands ``(E, T, A)``.
 
-    NaN where it cannot be simulated.
+    The simulation starts at rest. Measurements are NaN if it fails.
     """
     segments = hypothesis.segments
     start = torch.tensor(rollouts.readings[0][0]).expand(len(commands), -1)
@@ -160,7 +161,7 @@ def _recorded(
     readings: NDArray[np.float64],
     commands: NDArray[np.float64],
 ) -> Rollouts:
-    """Returns a recording of readings ``(E, T, C)`` under commands ``(E, T, A)``."""
+    """Returns a recording of measurements ``(E, T, C)`` under commands ``(E, T, A)``."""
     names, channels = rollouts.channel_names, hypothesis.segments.channel_names
     start = rollouts.readings[0][0][[names.index(name) for name in channels]]
     return Rollouts.from_arrays(
@@ -175,9 +176,9 @@ def _recorded(
 def _separations(
     made: Hypothesis, refitted: Hypothesis, recorded: Rollouts, options: DataOptions
 ) -> NDArray[np.float64]:
-    """Returns how far each rollout that one hypothesis made is from the other, refitted to it.
+    """Returns the distance of each rollout of one hypothesis from the other, refitted to it.
 
-    NaN where the other cannot be simulated there.
+    The distance is NaN if the other hypothesis cannot be simulated there.
     """
     segments = SegmentModel(refitted.model, recorded, options)
     offsets: Tensor = torch.zeros(

@@ -1,4 +1,4 @@
-"""How sure the parameters of a hypothesis are: draws of its posterior, and their summaries."""
+"""The uncertainty of a hypothesis's parameters: draws of its posterior, and their summaries."""
 
 import math
 from collections.abc import Mapping
@@ -16,21 +16,22 @@ __all__ = ["Draws", "Estimate", "estimates", "posterior_draws"]
 
 COPIES = 16
 BANDWIDTH = 0.3
-"""Each draw is smeared over so many places, by so many standard deviations, before an interval is
-read off: the shortest one of bare draws lies where they happen to be dense."""
+"""Before an interval is computed, each draw is replaced by ``COPIES`` draws, spread by
+``BANDWIDTH`` posterior standard deviations. The shortest interval of unsmoothed draws would be
+where they happen to be dense."""
 
 MASS = 0.94
-"""Of the interval of highest density."""
+"""Probability of the interval of highest density."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A parameter's posterior in a few numbers.
+    """A summary of a parameter's posterior.
 
     Attributes:
         mean: Mean, in ``unit``.
         sd: Standard deviation.
-        hdi_94: The shortest interval that holds 94 %.
+        hdi_94: The shortest interval that contains 94 % of the probability.
         unit: Its unit.
     """
 
@@ -40,7 +41,7 @@ class Estimate:
     unit: str
 
     def to_dict(self) -> dict[str, object]:
-        """Returns JSON-serialisable values; what is not finite is null."""
+        """Returns JSON-serialisable values; numbers that are not finite become ``None``."""
         mean, sd, low, high = (
             value if math.isfinite(value) else None for value in (self.mean, self.sd, *self.hdi_94)
         )
@@ -53,7 +54,7 @@ class Draws:
 
     Attributes:
         z: Reference coordinates, ``(n, d)``.
-        weights: Their weights, ``(n,)``, one in all.
+        weights: Their weights, ``(n,)``, with a sum of one.
     """
 
     z: Tensor
@@ -74,27 +75,28 @@ class Draws:
 
 
 def posterior_draws(hypothesis: Hypothesis, *, seed: int) -> Draws:
-    """Returns draws of the posterior along the recording.
+    """Returns draws of the posterior, given the recording.
 
-    By adaptive importance sampling; see :mod:`npdr_ppl.preparation.importance_sampling`.
+    They come from adaptive importance sampling; see
+    :mod:`npdr_ppl.preparation.importance_sampling`.
 
     Args:
         hypothesis: The fitted model.
         seed: Seed of the draws.
 
     Raises:
-        DataError: Simulations fail beside the fit.
+        DataError: Simulations fail close to the fit.
     """
     own_seed = derived_seed(seed, "discovery", "posterior")
     found = sample_posterior(hypothesis.likelihood, seed=own_seed)
-    counts = found.weights > 0.0  # what could not be simulated may lie anywhere
+    counts = found.weights > 0.0  # without failed simulations, whose parameters can be anything
     return Draws(found.z[counts], found.weights[counts])
 
 
 def estimates(
     hypothesis: Hypothesis, draws: Draws, units: Mapping[str, str]
 ) -> dict[str, Estimate]:
-    """Returns every scalar parameter's estimate, by site.
+    """Returns the estimate of every scalar parameter, by site.
 
     Args:
         hypothesis: The fitted model.
@@ -115,9 +117,9 @@ def estimates(
 
 
 def _shortest(values: Tensor, weights: Tensor) -> tuple[float, float]:
-    """Returns the ends of the shortest interval of the mass."""
+    """Returns the ends of the shortest interval with the probability ``MASS``."""
     ordered, order = values.sort()
-    # Each draw stands for the mass on both sides of it.
+    # Half of a draw's weight is on each side of it.
     mass = weights[order].cumsum(0) - 0.5 * weights[order]
     end = torch.searchsorted(mass, mass + MASS)
     inside = end < len(ordered)

@@ -1,4 +1,4 @@
-"""Where simulation and data disagree: the windows that the fitted model misses most."""
+"""Where simulation and data disagree: the windows with the fitted model's largest residuals."""
 
 import math
 from dataclasses import dataclass
@@ -17,14 +17,14 @@ NUM_SPOTS = 10
 
 @dataclass(frozen=True)
 class Spot:
-    """A window that the model misses.
+    """A window with a large residual.
 
     Attributes:
         rollout: Index of the rollout.
-        time_span: Seconds from the rollout's beginning.
-        channel: The channel that is missed most.
-        region: What went on there, in words.
-        z: Root-mean-square residual there in standard deviations of the readings' noise.
+        time_span: Start and end, in seconds from the rollout's beginning.
+        channel: The channel with the largest residual.
+        region: Ranges of the states and commands in the window, in words.
+        z: Root-mean-square residual of the channel, in standard deviations of the noise.
     """
 
     rollout: int
@@ -45,9 +45,9 @@ class Spot:
 
 
 def standardised(hypothesis: Hypothesis, rollouts: Rollouts) -> Tensor:
-    """Returns residuals in standard deviations of the readings' noise, ``(S, K, C)``.
+    """Returns residuals in standard deviations of the measurement noise, ``(S, K, C)``.
 
-    Initial states are at their best, so that what is left is the model's.
+    The initial states are fitted, so that the residuals are errors of the model.
 
     Args:
         hypothesis: The fitted model.
@@ -60,7 +60,7 @@ def standardised(hypothesis: Hypothesis, rollouts: Rollouts) -> Tensor:
 
 
 def worst_windows(hypothesis: Hypothesis, rollouts: Rollouts) -> list[Spot]:
-    """Returns the windows of greatest residual, the worst first.
+    """Returns the windows with the largest residuals, the worst first.
 
     Args:
         hypothesis: The fitted model.
@@ -87,7 +87,7 @@ def worst_windows(hypothesis: Hypothesis, rollouts: Rollouts) -> list[Spot]:
 
 
 def _region(hypothesis: Hypothesis, row: int) -> str:
-    """Says between which values states and commands moved during a window."""
+    """Describes the ranges of states and commands in a window."""
     segments = hypothesis.segments
     inputs = segments.inputs
     mask = inputs.mask[row]

@@ -1,4 +1,4 @@
-"""Alternatives: what else could stand in the place of an effect, all others being there."""
+"""Alternatives: other effects that could replace one effect, given all the others."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -25,24 +25,24 @@ __all__ = [
 ]
 
 STRAIN = 0.02
-"""Share of what it explains by which a law that fits only in a limit of its shape must be ahead of
-one that needs none: there it is likely the other law, and what differs is how an engine solves it,
-as dry friction whose bristles hardly bend."""
+"""Advantage that a law needs if it fits only with a shape parameter at its bound, as a share of
+the misfit that it explains. There it is likely another law, and only the engine's solution
+differs: bristles that hardly bend are dry friction."""
 
 
 @dataclass(frozen=True)
 class Added:
-    """An effect that the search ended with.
+    """An effect in the search's result.
 
     Attributes:
         effect: The effect.
-        place: Name of the effect in whose place it stands, by which its trials are found.
-        share: Share of all that was explained which is lost without it.
-        alternatives: Probability of the effects that could stand in its place, itself included,
-            given all others, by name.
-        fitting: Names of those that fit as well. The simplest is the likeliest, but a law that
-            contains it, as bristles contain dry friction, is as good where its further
-            parameters do not show.
+        place: Name of the effect that it replaced, or its own; the key of its trials.
+        share: Share of the explained misfit that is lost without it.
+        alternatives: Probability of each alternative, itself included, given all other effects,
+            by name.
+        fitting: Names of the alternatives that fit as well. The simplest law is the likeliest.
+            But a law that contains it, as bristles contain dry friction, fits as well if its
+            further parameters have no visible influence.
     """
 
     effect: Effect
@@ -59,13 +59,12 @@ class Added:
 
 @dataclass(frozen=True)
 class Alternatives:
-    """What could stand in an effect's place.
+    """The alternatives of an effect.
 
     Attributes:
         without: The model without the effect.
-        with_it: The model with the effect, as it was when the others were tried: with the same
-            states to start from.
-        others: The model with each other that could stand there, by name.
+        with_it: The model with the effect, with the same initial states as the alternatives.
+        others: The model with each alternative in the effect's place, by name.
     """
 
     without: Hypothesis
@@ -79,13 +78,13 @@ def find_alternatives(
     trials: Trials,
     options: DiscoveryOptions,
 ) -> Alternatives | None:
-    """Fits the model with others in an effect's place.
+    """Fits the model with other effects in an effect's place.
 
     Args:
         current: The model with the effect.
         effect: The effect.
         trials: Fits the model.
-        options: How to search.
+        options: Options of the search.
 
     Returns:
         ``None`` if the model cannot be simulated without the effect.
@@ -108,12 +107,12 @@ def tried_before(
     effect: Effect,
     seen: Sequence[tuple[Hypothesis, Mapping[str, Hypothesis]]],
 ) -> Alternatives | None:
-    """Returns the alternatives of an effect if they were tried already, when it was added last.
+    """Returns the alternatives of the last added effect, if they were fitted when it was added.
 
     Args:
         current: The model with the effect.
         effect: The effect.
-        seen: Hypotheses that were looked at, and the same with each candidate tried, by name.
+        seen: Earlier hypotheses, each with its extensions by one candidate, by name.
     """
     rest = set(current.names) - {effect.name}
     for hypothesis, tried in seen:
@@ -126,16 +125,16 @@ def tried_before(
 def weigh_alternatives(
     base: Hypothesis, current: Hypothesis, effect: Effect, alternatives: Alternatives | None
 ) -> tuple[Hypothesis, Added]:
-    """Asks which of the alternatives it is.
+    """Computes the probabilities of the alternatives and chooses the likeliest.
 
     Args:
-        base: The model in question.
+        base: The original model.
         current: The model with the effect.
         effect: The effect.
-        alternatives: What could stand in its place.
+        alternatives: Its alternatives.
 
     Returns:
-        The model with the likeliest, and what that is.
+        The model with the likeliest effect, and this effect.
     """
     if alternatives is None:
         return current, Added(effect, effect.name, 1.0, {effect.name: 1.0})
@@ -161,13 +160,13 @@ def weigh_alternatives(
 
 
 def log_prior(hypothesis: Hypothesis) -> float:
-    """Returns what the search over frequencies costs, as so many hypotheses share one's prior."""
+    """Returns the penalty for searching frequencies: all of them share one hypothesis's prior."""
     waves = sum(bool(effect.wave) for effect in hypothesis.effects)
     return -waves * math.log(FREQUENCIES)
 
 
 def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
-    """Returns the names of those that fit hardly worse than the likeliest, if at all."""
+    """Returns the names of alternatives that do not fit clearly worse than the likeliest."""
     reference = closest(list(trials.values()))
     least = trials[best].losses(reference.fit.scale).sum()
     return tuple(
@@ -179,11 +178,11 @@ def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
 
 
 def _strains(trials: Mapping[str, Hypothesis], without: Hypothesis) -> list[float]:
-    """Returns by how much evidence each candidate must be ahead of laws that fit without strain.
+    """Returns the penalties of candidates that fit only with a shape parameter at its bound.
 
     Args:
         trials: The model with each candidate, by the candidate's name.
-        without: The model without any.
+        without: The model without the candidates.
     """
     best = closest(list(trials.values()))
     before = float(without.losses(best.fit.scale).sum())

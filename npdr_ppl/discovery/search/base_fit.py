@@ -1,8 +1,8 @@
-"""The model as it is, fitted to a recording: where fit, compare, train and discover all begin.
+"""The original model's fit to a recording: fit, compare, train and discover all begin with it.
 
-The closest parameters and initial states are searched for from two places, the initial states are
-estimated once more along the motion that was found, and the integration steps are refined where
-they are too coarse for the recording.
+The search for the closest parameters and initial states begins at two points. Then the initial
+states are estimated again along the fitted motion, and the integration steps are refined if they
+are too coarse for the recording.
 """
 
 import math
@@ -32,16 +32,16 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["CONFIDENCE", "BaseFit", "fit_base", "in_finer_steps", "off_the_ends"]
 
 NOTICEABLE = 5.0
-"""Distance by which steps of a higher order move all readings together, in standard deviations of
-what a fit leaves, from which they are taken unless the recording speaks against them: effects
-would be found that make up for it. Refitted parameters make up for four fifths of a distance."""
+"""Change of all simulated measurements together by steps of a higher order, in standard deviations
+of the residuals. Above it, these steps are used unless the recording contradicts them, because
+false effects would compensate for it. Refitted parameters compensate for four fifths of it."""
 
 CONFIDENCE = 0.9
-"""Probability above which a recording is taken to be made in coarse steps itself."""
+"""Probability above which the recording itself is taken to be simulated with coarse steps."""
 
 
 ATTEMPTS = 4
-"""Times that a fit is made once more from inside the priors, each time from where the last led."""
+"""Greatest number of refits from inside the priors, each from the result of the previous one."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class BaseFit:
     """A model fitted to a recording.
 
     Attributes:
-        model: The model, in finer steps where its own are too coarse.
+        model: The model, with finer steps if its own are too coarse.
         hypothesis: Its closest fit.
         are_steps_coarse: Whether its own steps are too coarse for the recording.
     """
@@ -68,19 +68,19 @@ def fit_base(
     seed: int = 0,
     progress: Step | None = None,
 ) -> Hypothesis:
-    """Fits a model as it is to a recording.
+    """Fits a model to a recording, without adding effects.
 
     Args:
         model: The model.
         rollouts: The recording.
-        binding: Its segments.
-        near: Parameters near which the fit is known to lie; searched for by default.
+        binding: How it is cut into segments.
+        near: Parameters near which the fit is known to be; by default they are searched for.
         seed: Seed of the search.
         progress: Called with the fraction of the search done and a short status.
 
     Raises:
-        DataError: No parameters can be simulated along the recording, simulations fail beside the
-            fit, or the data do not fit the model.
+        DataError: No parameters can be simulated along the recording, simulations fail close to
+            the fit, or the data do not match the model.
     """
     begun: list[Hypothesis] = []
     failure: DataError | None = None
@@ -98,24 +98,24 @@ def fit_base(
     )
     fitted = off_the_ends(fitted, model, rollouts, binding)
     found = Trials(model, rollouts, binding).with_own_starts(fitted)
-    _ = found.linearisation  # all that follows needs it
+    _ = found.linearisation  # computed now, because all later steps need it
     return found
 
 
 def off_the_ends(
     fitted: Hypothesis, model: Model, rollouts: Rollouts, binding: DataOptions
 ) -> Hypothesis:
-    """Returns a fit that has not slid to a prior's end along what the recording does not show.
+    """Refits a model if parameters that the recording does not determine are at a prior's end.
 
-    Steps along a flat direction lead anywhere, and at an end a parameter hardly moves in reference
-    coordinates. Such a fit is made once more from inside; the one of greater posterior density is
-    kept.
+    Along a flat direction, a fit can step anywhere. At a prior's end, a parameter hardly changes
+    with its reference coordinate. The refit begins inside the prior. The fit with the greater
+    posterior density is kept.
 
     Args:
         fitted: The fit.
         model: The model without the effects of the fit.
         rollouts: The recording.
-        binding: Its segments.
+        binding: How it is cut into segments.
     """
     for _ in range(ATTEMPTS):
         z = fitted.fit.z
@@ -143,7 +143,7 @@ def off_the_ends(
 
 
 def _loss(hypothesis: Hypothesis, scale: Tensor) -> float:
-    """Returns minus the log density of a fit, up to a constant, for noise of a scale ``(C,)``."""
+    """Returns minus the log density of a fit, up to a constant, for a noise scale ``(C,)``."""
     return float(hypothesis.losses(scale).sum() + 0.5 * hypothesis.fit.z.square().sum())
 
 
@@ -155,17 +155,17 @@ def in_finer_steps(
     *,
     report: Callable[[str], None] = lambda _: None,
 ) -> BaseFit:
-    """Returns a fit in finer steps, where its own err noticeably; else as it is.
+    """Returns a fit with finer steps if the error of its own is noticeable; else unchanged.
 
-    The error of coarse steps would be found as a delay. A recording that was itself made in coarse
-    steps is left to them.
+    The error of coarse steps would be reported as a delay. If the recording itself was simulated
+    with coarse steps, they are kept.
 
     Args:
         current: A fitted hypothesis of the model.
         model: The model without the effects of the hypothesis.
         rollouts: The recording.
-        binding: Its segments.
-        report: Called with a sentence where steps are refined.
+        binding: How it is cut into segments.
+        report: Called with a sentence when steps are refined.
     """
     is_coarse = False
     while current.simulator.with_finer_steps() is not None:
@@ -178,7 +178,7 @@ def in_finer_steps(
                 finer = off_the_ends(finer, finer_model, rollouts, binding)
         if finer is None or weigh([current, finer], [0.0, 0.0], seed=0)[0] > CONFIDENCE:
             break
-        report("the model's steps are too coarse for this recording: finer ones")
+        report("the model's integration steps are too coarse for this recording; refining them")
         is_coarse, model = True, finer_model
         current = trials.with_own_starts(finer)
     return BaseFit(model, current, is_coarse)
@@ -192,7 +192,7 @@ def _starts(
     seed: int,
     progress: Step | None,
 ) -> list[Mapping[str, Tensor]]:
-    """Returns where to begin: the prior's middle and the best of a search, or what is known."""
+    """Returns initial guesses: the prior's middle and a search's result, or known parameters."""
     if near:
         return [near]
     segments = SegmentModel(model, rollouts, binding)
@@ -204,7 +204,10 @@ def _starts(
 def _step_error(
     current: Hypothesis, model: Model, rollouts: Rollouts, binding: DataOptions
 ) -> float:
-    """Returns how far a model's simulation is from a hypothesis's, in what that leaves."""
+    """Returns the distance between two simulations, in units of the hypothesis's residuals.
+
+    The simulations are those of the hypothesis and of the model with its effects.
+    """
     fit = current.fit
     finer = SegmentModel(
         with_effects(model, current.effects), rollouts, binding, current.segments.starts

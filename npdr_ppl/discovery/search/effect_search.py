@@ -1,4 +1,4 @@
-"""The search: add the effect that explains most, look again, take back what became needless."""
+"""The search: add the effect that explains most, screen again, remove effects no longer needed."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -36,29 +36,29 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["Round", "Search", "Searcher", "explained"]
 
 LEAST_SHARE = 1e-4
-"""Stop when the unexplained misfit is below this fraction of the explained misfit: where a large
-effect was missing, integrators and the laws' own details differ by as much."""
+"""Stop when the unexplained misfit is below this fraction of the explained misfit. If a large
+effect was missing, differences between integrators and in details of the laws are this large."""
 
 LEADING = 10
-"""Candidates whose distances from each other are computed."""
+"""Number of best candidates whose pairwise distances are computed."""
 
 PRIOR_OF_ANY = 0.5
-"""Prior probability that anything of the catalogue is missing."""
+"""Prior probability that any effect of the catalogue is missing."""
 
 
 @dataclass(frozen=True)
 class Round:
-    """What was seen at one state of the model.
+    """The results for one set of effects.
 
     Attributes:
-        hypothesis: The model as it was, fitted.
-        averaged: The same, with averages of a very long recording's readings.
-        alarm: Whether something was missing then.
+        hypothesis: The fitted model with these effects.
+        averaged: The same, with averaged measurements if the recording is very long.
+        alarm: Result of the test whether another effect is missing.
         ranking: The candidates by linear gain.
-        separation: How far the leading ones are apart; see :mod:`separation`.
-        responses: What pulses of force at the joints would change.
-        weights: Probability of each candidate fitted in full, by name; ``""`` for none.
-        trials: The model with each of them, by name.
+        separation: Distances between the best candidates; see :mod:`separation`.
+        responses: Changes of the measurements by pulses of force at the joints.
+        weights: Probability of each candidate fitted in full, by name; ``""`` for no effect.
+        trials: The model with each of these candidates, by name.
     """
 
     hypothesis: Hypothesis
@@ -73,14 +73,15 @@ class Round:
 
 @dataclass(frozen=True)
 class Search:
-    """What the search came to.
+    """The result of the search.
 
     Attributes:
-        rounds: What was seen before each addition, and at last.
-        final: The model at last.
+        rounds: The results before each addition, and at the end.
+        final: The final model.
         added: Its effects.
-        removed: Names of effects that were added and taken back.
-        trials: Hypotheses of the last look at each effect, by the name of what stood in for what.
+        removed: Names of effects that were added and removed again.
+        trials: The final model with each alternative in an effect's place, by the names of the
+            effect and of the alternative.
     """
 
     rounds: list[Round]
@@ -94,16 +95,16 @@ class Searcher:
     """Searches a recording for missing effects.
 
     Args:
-        model: The model in question.
+        model: The original model.
         rollouts: The recording.
-        options: How to search.
+        options: Options of the search.
         report: Called with a sentence at each step.
-        binding: Its segments; those of the options by default.
+        binding: How the recording is cut into segments; as in the options by default.
 
     Attributes:
-        model: The model in question, in finer steps once its own have turned out too coarse.
-        are_steps_coarse: Whether they have.
-        are_priors_widened: Whether some of its priors ended too early and were widened.
+        model: The original model, with finer steps once its own were found to be too coarse.
+        are_steps_coarse: Whether its own integration steps are too coarse.
+        are_priors_widened: Whether some of its priors were too narrow and were widened.
     """
 
     def __init__(
@@ -126,18 +127,18 @@ class Searcher:
 
     @property
     def trials(self) -> Trials:
-        """Fits of the model in the steps that it has now."""
+        """Fits of the model with its current integration steps."""
         return Trials(self.model, self.rollouts, self.binding)
 
     def fit_base(self) -> Hypothesis:
-        """Fits the model as it is; see :func:`~npdr_ppl.discovery.search.base_fit.fit_base`."""
-        self._report("fitting the model as it is")
+        """Fits the original model; see :func:`~npdr_ppl.discovery.search.base_fit.fit_base`."""
+        self._report("fitting the original model")
         return fit_base(self.model, self.rollouts, self.binding, seed=self.options.seed)
 
     def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
-        """Returns a hypothesis in finer steps where its own are too coarse; else as it is.
+        """Returns a hypothesis with finer steps if its own are too coarse; else unchanged.
 
-        All later hypotheses are in the steps of what is returned.
+        All later hypotheses use the steps of the returned one.
 
         Args:
             current: A fitted hypothesis.
@@ -150,10 +151,10 @@ class Searcher:
         return found.hypothesis
 
     def with_wider_priors(self, current: Hypothesis) -> Hypothesis:
-        """Returns a hypothesis with wider priors where its own end too early; else as it is.
+        """Returns a hypothesis with wider priors if its own are too narrow; else unchanged.
 
-        No effect is to be named that a wider prior explains as well: all later hypotheses have the
-        priors of what is returned.
+        All later hypotheses use the priors of the returned one. So no effect is named if a wider
+        prior explains the same misfit.
 
         Args:
             current: A fitted hypothesis.
@@ -163,18 +164,18 @@ class Searcher:
             return current
         self._report(f"{found.ends[0]}")
         self.model, self.are_priors_widened = found.model, True
-        # What the narrow prior left had hidden how coarse the steps are.
+        # The misfit caused by the narrow prior can hide that the steps are too coarse.
         return self.with_finer_steps(found.hypothesis)
 
     def run(self, first: Round, *, max_effects: int) -> Search:
-        """Adds effects until no alarm fires, nothing helps, or there are enough.
+        """Adds effects until no alarm fires, no effect helps, or the greatest number is reached.
 
         Args:
-            first: What was seen at the model as it is.
-            max_effects: How many are enough.
+            first: The results for the original model.
+            max_effects: Greatest number of effects.
 
         Returns:
-            What came of it; its first round is in finer steps if those turned out to be needed.
+            The result; its first round has finer steps if they were needed.
         """
         current, now = first.hypothesis, first
         rounds = [first]
@@ -192,7 +193,7 @@ class Searcher:
             current = self.trials.with_own_starts(current)
             removed += needless
             if not self.are_steps_coarse and self.with_finer_steps(current) is not current:
-                # What was missing had hidden how coarse they are: begin anew.
+                # The missing effect had hidden that the steps are too coarse: restart the search.
                 current = self.fit_base()
                 first = now = self.look(current)
                 rounds, removed = [first], []
@@ -203,11 +204,11 @@ class Searcher:
             rounds.append(now)
         current, added, trials = self.with_rivals(current, rounds)
         if set(current.names) != set(rounds[-1].hypothesis.names):
-            rounds.append(self.look(current))  # something was swapped: what is left is another
+            rounds.append(self.look(current))  # an effect was replaced, so residuals differ
         return Search(rounds, current, added, removed, trials)
 
     def look(self, hypothesis: Hypothesis) -> Round:
-        """Screens all candidates at a fitted hypothesis; the last one asked for is kept."""
+        """Screens all candidates at a fitted hypothesis; the last result is cached."""
         if self._last is not None and self._last.hypothesis is hypothesis:
             return self._last
         release_freed_memory()
@@ -225,8 +226,8 @@ class Searcher:
         if width > 1:
             fastest = 0.5 / (width * hypothesis.segments.inputs.time_step)
             self._report(
-                f"a long recording: means of {width} steps were searched, in which nothing above "
-                f"{fastest:.3g} Hz shows"
+                f"long recording: averages of {width} steps were searched, so that effects above "
+                f"{fastest:.3g} Hz are not visible"
             )
         best = ", ".join(s.name for s in ranking[:3]) or "none"
         self._report(
@@ -238,10 +239,10 @@ class Searcher:
     def _extended(
         self, current: Hypothesis, now: Round
     ) -> tuple[str | None, dict[str, float], dict[str, Hypothesis]]:
-        """Returns the candidate that explains most, unless none does, with weights and trials.
+        """Returns the candidate that explains most, with all weights and trials.
 
-        A candidate explains something if chance does not, as the alarm counts, or if the evidence
-        against the model without it is strong.
+        The candidate must have a p-value below the alarm's false-alarm rate, or there must be
+        strong evidence against the model without it. Otherwise ``None`` is returned in its place.
         """
         ranking = now.ranking
         trials = self.trials.extended(current, ranking, self._report)
@@ -255,7 +256,7 @@ class Searcher:
         best = max(trials, key=lambda name: weights[name])
         trials = self.trials.apart_from_waves_in_step(trials)
         if best not in trials:
-            self._report(f"{best} keeps in step with the motion, so it is a law of the state")
+            self._report(f"{best} is synchronous with the motion, so it is a law of the state")
             if not trials:
                 return None, weights, trials
             wave, best = best, max(trials, key=lambda name: weights[name])
@@ -268,7 +269,7 @@ class Searcher:
         return best, weights, trials
 
     def _pruned(self, current: Hypothesis) -> tuple[Hypothesis, list[str]]:
-        """Takes back effects that the last addition made needless."""
+        """Removes effects that are no longer needed after the last addition."""
         removed: list[str] = []
         for effect in current.effects[:-1]:
             if loss_without(current, effect) > PLAINLY:
@@ -284,14 +285,14 @@ class Searcher:
     def with_rivals(
         self, current: Hypothesis, rounds: list[Round]
     ) -> tuple[Hypothesis, list[Added], dict[tuple[str, str], Hypothesis]]:
-        """Asks of each effect what else could stand in its place, and swaps what is likelier.
+        """Compares each effect with its alternatives, and replaces it if one is likelier.
 
         Args:
-            current: The model with all effects, fitted.
-            rounds: What was seen on the way to it.
+            current: The fitted model with all effects.
+            rounds: The results of the search so far.
 
         Returns:
-            The model at last, its effects, and the models with each alternative; see
+            The final model, its effects, and the models with each alternative; see
             :class:`Search`.
         """
         added: list[Added] = []
@@ -315,35 +316,35 @@ class Searcher:
                 trials |= {(effect.name, name): trial for name, trial in tried.items()}
                 if current is not asked:
                     current = self.trials.with_own_starts(current)
-                    break  # the other effects are compared beside the one that was swapped in
+                    break  # the other effects are compared together with the new one
         return current, added, trials
 
     def _alternatives(
         self, current: Hypothesis, effects: Sequence[Effect], rounds: list[Round]
     ) -> Iterator[Alternatives | None]:
-        """Yields the alternatives of each effect, in their order."""
+        """Yields the alternatives of each effect, in the order of the effects."""
         seen = [(r.hypothesis, r.trials) for r in rounds]
         known = {effect.name: tried_before(current, effect, seen) for effect in effects}
         new = [effect for effect in effects if known[effect.name] is None]
         function = partial(find_alternatives, current, trials=self.trials, options=self.options)
         number = num_processes(current.simulator)
-        # With fewer of them than processes, each search had better use all.
+        # With fewer effects than processes, it is faster if each search uses all processes.
         found = side_by_side(function, new, number if len(new) >= number else 1)
         for effect in effects:
             yield known[effect.name] or next(found)
 
 
 def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:
-    """Returns the probability of one of two hypotheses."""
+    """Returns the probability of the first of two hypotheses."""
     return weigh([one, other], [0.0, 0.0], seed=0)[0]
 
 
 def _is_negligible(first: Hypothesis, current: Hypothesis, extended: Hypothesis) -> bool:
-    """Returns whether the last effect explains next to nothing beside all that was explained."""
+    """Returns whether the last effect explains a negligible share of all that was explained."""
     return explained(current, extended) < LEAST_SHARE * explained(first, extended)
 
 
 def explained(first: Hypothesis, final: Hypothesis) -> float:
-    """Returns by how much the misfit was reduced, in units of the readings' variance."""
+    """Returns the reduction of the misfit, in units of the measurements' variance."""
     scale = closest([first, final]).fit.scale
     return max(0.0, 2.0 * float((first.losses(scale) - final.losses(scale)).sum()))

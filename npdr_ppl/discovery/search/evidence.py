@@ -1,11 +1,13 @@
-"""Which of several hypotheses a recording speaks for, and how sure that is.
+"""The probabilities of several hypotheses, given a recording.
 
-Each segment's log density under each fitted hypothesis is computed with one scale of the readings
-and one share of independent readings, those of the hypothesis that leaves least. Evidence is their
-sum, less what the priors and the number of parameters cost, plus the log of the prior
-probability. The weights are pseudo-BMA+ (Yao, Vehtari, Simpson & Gelman 2018): evidence is
-resampled over blocks of segments by the Bayesian bootstrap, so that two hypotheses which differ by
-a few lucky segments share the probability.
+Each segment's log density under each fitted hypothesis is computed with one scale of the
+measurements and one share of independent measurements. Both are those of the hypothesis with the
+smallest residuals. Evidence is the sum of the log densities, minus the penalty for the priors and
+the number of parameters, plus the log of the prior probability.
+
+The weights are pseudo-BMA+ (Yao, Vehtari, Simpson & Gelman 2018): the Bayesian bootstrap resamples
+the evidence over blocks of segments. If two hypotheses differ only in a few segments by chance,
+they share the probability.
 """
 
 import math
@@ -22,15 +24,15 @@ __all__ = ["INDISTINCT", "SURVIVES", "closest", "evidence", "weigh"]
 RESAMPLINGS = 1000
 
 SURVIVES = 0.05
-"""Probability from which an alternative has to be reckoned with."""
+"""Probability from which an alternative remains possible."""
 
 INDISTINCT = 2.0
-"""Loss of log density up to which a recording does not tell two laws, or a law from its limit: two
-standard deviations of a likelihood ratio of one parameter."""
+"""Loss of log density up to which a recording cannot distinguish two laws, or a law from its
+limit: two standard deviations of a likelihood ratio of one parameter."""
 
 
 def closest(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
-    """Returns the hypothesis that leaves least, by the geometric mean over the channels."""
+    """Returns the hypothesis with the least residuals, by their geometric mean over channels."""
     return min(hypotheses, key=lambda h: float(h.fit.scale.log().sum()))
 
 
@@ -42,7 +44,7 @@ def evidence(
     Args:
         hypotheses: H fitted hypotheses.
         log_prior: Log of each one's prior probability.
-        reference: The one whose residuals give scale and share.
+        reference: The hypothesis whose residuals give the scale and the share.
     """
     scale, share = reference.fit.scale, reference.share
     rows = []
@@ -55,7 +57,7 @@ def evidence(
 def weigh(
     hypotheses: Sequence[Hypothesis], log_prior: Sequence[float], *, seed: int
 ) -> list[float]:
-    """Returns the probability of each hypothesis, one of them being true.
+    """Returns the probability of each hypothesis, assuming that one of them is true.
 
     Args:
         hypotheses: H fitted hypotheses.

@@ -1,9 +1,9 @@
-"""Laws that are not more than a limit of their own, where another law may be.
+"""Finds laws whose shape parameter may be at its bound, where the law equals another law.
 
-Friction that fades is friction as long as it does not fade, a bristle that does not bend is dry
-friction, a wave that takes an hour is a bias. A recording that says nothing against such a limit
-does not say that it is this law; and where the catalogue has the law of the limit, which needs
-less, that one has been preferred.
+Friction that fades equals friction if it does not fade, a bristle that does not bend equals dry
+friction, and a wave with a period of an hour equals a bias. If a recording is compatible with such
+a bound, it does not show that this law is the cause. If the catalogue contains the law at the
+bound, which has fewer parameters, the search has preferred it already.
 """
 
 import math
@@ -20,17 +20,20 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["limits"]
 
 DISTINCT = 5.0
-"""Loss of evidence at the other end from which it says something about the parameter at all."""
+"""Loss of evidence at the other end above which the recording determines the parameter."""
 
 
 def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ...]:
-    """Returns the names of an effect's shapes that may as well be at one end of their priors.
+    """Returns the names of shape parameters that fit as well at one end of their priors.
 
-    All other parameters are refitted there (a profile likelihood). Shapes that may be anywhere
-    are only unknown; the law needs them nowhere. Those between two bounds have no limit: at its
-    bounds a share or a damping ratio is a device's as well. Incidental ones do not count: bristles
-    without damping are bristles. Of a wave's frequency the low end does: no other law is a fast
-    wave; and where no rollout lasts a period, something else may bend like the part that is seen.
+    All other parameters are refitted at each end (a profile likelihood).
+
+    A parameter that fits at both ends is only unknown, and is left out. So are parameters between
+    two bounds, such as a share or a damping ratio, because a device can have the value at a bound.
+    Incidental parameters are left out too: bristles without damping are still bristles.
+
+    For a wave's frequency only the low end is tested, because no other law is a fast wave. If no
+    rollout lasts a period, another cause may look like the visible part of the wave.
 
     Args:
         current: The model with the effect, fitted.
@@ -65,6 +68,6 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
 
 
 def _is_seen_through(current: Hypothesis, effect: Effect, rollouts: Rollouts) -> bool:
-    """Returns whether a rollout lasts for a period of a wave."""
+    """Returns whether a rollout lasts for at least one period of a wave."""
     frequency = float(current.parameters[f"{effect.name}.{effect.wave}"])
     return frequency * max(rollouts.lengths) * rollouts.time_step >= 1.0

@@ -1,8 +1,8 @@
-"""Priors that end before the recording's parameters: found by fitting with wider ones.
+"""Finds priors that do not contain the recording's parameters, by a fit with wider priors.
 
-A closest fit at an end of a prior may mean that the prior is too narrow, or that a parameter
-makes up for an effect that the model lacks. Both leave a misfit, so it is tried: the priors at
-whose ends the fit lies are widened and the model is fitted again.
+If the closest fit is at an end of a prior, the prior may be too narrow, or the parameter may
+compensate for an effect that the model lacks. Both leave a misfit. To distinguish them, the priors
+with the fit at their ends are widened and the model is fitted again.
 """
 
 from collections.abc import Mapping
@@ -23,28 +23,28 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["PriorEnd", "Widened", "beyond", "widen_where_it_helps"]
 
 NEAR_END = 1.64
-"""Reference coordinate from which a parameter lies near an end of its prior: in the outermost 5 %
-on either side. Only these are tried, which costs one fit."""
+"""Absolute reference coordinate above which a parameter is near an end of its prior: in the
+outermost 5 % on either side. Only the priors of these are widened, which costs one fit."""
 
 FALSE_ALARM_RATE = 1e-3
-"""Probability that a prior which holds the truth is called too narrow, of a likelihood ratio."""
+"""Probability that the likelihood-ratio test reports a prior with the true value as too narrow."""
 
 OUTSIDE = 1e-3
-"""Prior probability beyond a value at which it counts as outside the prior."""
+"""A value is outside its prior if the prior probability beyond it is at most this."""
 
 MOST_WIDENINGS = 3
-"""How often priors are widened, each time threefold."""
+"""Greatest number of times that priors are widened, each time threefold."""
 
 
 @dataclass(frozen=True)
 class PriorEnd:
-    """A parameter that would lie beyond the end of its prior.
+    """A parameter that fits better beyond the end of its prior.
 
     Attributes:
         name: Its latent site.
         end: ``"lower"`` or ``"upper"``.
-        prior: The prior as a person would write it.
-        closest: Where the wider prior's fit puts it, in the parameter's unit.
+        prior: The prior in readable form.
+        closest: The value of the fit with a wider prior, in the parameter's unit.
     """
 
     name: str
@@ -54,19 +54,19 @@ class PriorEnd:
 
     def __str__(self) -> str:
         return (
-            f"{self.name} is at the {self.end} end of its prior, {self.prior}; the recording asks "
-            f"for about {self.closest:.4g}: widen it"
+            f"{self.name} is at the {self.end} end of its prior, {self.prior}; the fit with a "
+            f"wider prior gives about {self.closest:.4g}: widen the prior"
         )
 
 
 @dataclass(frozen=True)
 class Widened:
-    """What wider priors gave.
+    """The result of widening priors.
 
     Attributes:
         model: The model with wider priors.
         hypothesis: Its closest fit.
-        ends: The parameters that lie beyond their priors.
+        ends: The parameters that are outside their original priors.
     """
 
     model: Model
@@ -77,16 +77,16 @@ class Widened:
 def widen_where_it_helps(
     model: Model, current: Hypothesis, rollouts: Rollouts, binding: DataOptions
 ) -> Widened | None:
-    """Widens the priors at whose ends a fit lies, if the recording then fits better.
+    """Widens the priors that have the fit at an end, if the model then fits better.
 
     Args:
         model: The model without the effects of the hypothesis.
         current: Its closest fit.
         rollouts: The recording.
-        binding: Its segments.
+        binding: How it is cut into segments.
 
     Returns:
-        ``None`` where no prior ends too early.
+        The result, or ``None`` if no prior is too narrow.
     """
     result: Widened | None = None
     priors = current.segments.prior.distributions
@@ -116,7 +116,7 @@ def widen_where_it_helps(
 
 
 def _at_end(hypothesis: Hypothesis) -> list[str]:
-    """Returns the scalar sites that lie near an end of their priors."""
+    """Returns the scalar sites that are near an end of their priors."""
     z = hypothesis.fit.z
     return [
         site.name
@@ -126,16 +126,16 @@ def _at_end(hypothesis: Hypothesis) -> list[str]:
 
 
 def _gain(before: Hypothesis, after: Hypothesis) -> float:
-    """Returns by how much the log likelihood grows, at the scale that the later fit leaves."""
+    """Returns the increase of the log likelihood, at the residual scale of the later fit."""
     scale = after.fit.scale
     return after.share * float((before.losses(scale) - after.losses(scale)).sum())
 
 
 def beyond(priors: Mapping[str, Any], found: Hypothesis) -> tuple[PriorEnd, ...]:
-    """Returns the parameters that a fit puts outside their priors."""
+    """Returns the parameters whose fitted values are outside their priors."""
     ends = []
     for name, value in found.parameters.items():
-        if name not in priors:  # an effect that was added
+        if name not in priors:  # a parameter of an added effect
             continue
         below = _probability_below(priors[name], value) if value.numel() == 1 else None
         if below is None or OUTSIDE < below < 1.0 - OUTSIDE:
@@ -146,9 +146,9 @@ def beyond(priors: Mapping[str, Any], found: Hypothesis) -> tuple[PriorEnd, ...]
 
 
 def _probability_below(prior: Any, value: Tensor) -> float | None:
-    """Returns the prior probability of a smaller value, ``None`` where it is not known."""
+    """Returns the prior probability of a smaller value, ``None`` if it is not known."""
     try:
-        # Values outside a range have no cumulative probability in torch's checks.
+        # Torch rejects values outside a range, so they are moved to its bounds.
         low, high = torch.as_tensor(prior.support.lower_bound), prior.support.upper_bound
         value = value.flatten()[:1].to(low).maximum(low).minimum(torch.as_tensor(high))
     except AttributeError:

@@ -1,4 +1,4 @@
-"""Trials: the model in question with one set of effects or another, fitted to the recording."""
+"""Trials: fits of the original model with different sets of effects to the recording."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,44 +22,46 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["PLAINLY", "SHORTLIST", "Trials"]
 
 SHORTLIST = 6
-"""Candidates fitted in full in each round."""
+"""Greatest number of candidates that are fitted in full in each round."""
 
 MAX_STEPS = 12
-"""Steps of a fit."""
+"""Greatest number of steps of a fit."""
 
 TRIAL_STEPS = 6
-"""Steps of a fit that shows whether a candidate is worth a longer one."""
+"""Greatest number of steps of a first fit, which shows whether a longer fit is worth it."""
 
 CONTENDERS = 3
-"""Candidates that are fitted to the end."""
+"""Greatest number of candidates that are fitted until convergence."""
 
 CONTENDS = 0.3
-"""A candidate contends whose loss is at most this much above the least, relatively …"""
+"""A candidate is fitted until convergence if its loss exceeds the least by at most this share of
+it …"""
 
 CONTENDS_ANYWAY = 20.0
-"""… or this much, absolutely."""
+"""… or by at most this much in log density."""
 
 TOGETHER = 2
-"""Candidates that are tried before it is asked whether others are worth it."""
+"""Number of candidates that are tried before each decision whether to try more."""
 
 GROWTH = 4.0
-"""How much more a candidate may explain than its linear gain says, beside that of the best: on
-rigs for tuning 3.4 at most where it explains a tenth or more."""
+"""Greatest factor by which a full fit may explain more than a candidate's linear gain predicts,
+relative to the best candidate. On the tuning rigs it is at most 3.4 for candidates that explain a
+tenth or more."""
 
 PLAINLY = 30.0
-"""Evidence that settles which of two it is."""
+"""Difference of log evidence above which one of two hypotheses is taken as certain."""
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """A fit to be made.
+    """The arguments of a fit.
 
     Attributes:
-        effects: The effects that the model is to have.
-        start: Parameters to begin with, by site.
-        offsets: Offsets of the initial states to begin with, ``(S, m)``.
-        starts: What the segments start from.
-        is_trial: Whether rough steps will do.
+        effects: The effects to add to the model.
+        start: Initial guess of the parameters, by site.
+        offsets: Initial guess of the offsets of the initial states, ``(S, m)``.
+        starts: The segments' initial states.
+        is_trial: Whether a short fit with rough steps is enough.
         held: Reference coordinates of sites that are not fitted.
     """
 
@@ -76,9 +78,9 @@ class Trials:
     """Fits a model with effects.
 
     Attributes:
-        model: The model in question.
+        model: The original model.
         rollouts: The recording.
-        binding: Its segments.
+        binding: How it is cut into segments.
     """
 
     model: Model
@@ -91,15 +93,15 @@ class Trials:
         ranking: Sequence[Screened],
         report: Callable[[str], None] = lambda _: None,
     ) -> dict[str, Hypothesis]:
-        """Returns a hypothesis with each of the shortlist, fitted from where its linear gain is.
+        """Fits the hypothesis with each candidate of the shortlist, from its linear estimate.
 
-        In turn, and not those that by their linear gain are too far behind what has been found.
-        Candidates that cannot be simulated are left out.
+        The best candidates come first. Those whose linear gain is too small to match the best fit
+        so far are skipped. Candidates that cannot be simulated are left out.
 
         Args:
             current: The hypothesis.
             ranking: The candidates, the best first.
-            report: Called with a sentence about each.
+            report: Called with a sentence about each candidate.
         """
         trials: dict[str, Hypothesis] = {}
         waiting = list(ranking[:SHORTLIST])
@@ -127,11 +129,11 @@ class Trials:
     def converged(
         self, trials: dict[str, Hypothesis], *, done: str | None = None
     ) -> dict[str, Hypothesis]:
-        """Fits the contenders to the end; the others are too far behind for that to matter.
+        """Fits the best trials until convergence; the others are too far behind.
 
         Args:
             trials: The model with each of several effects.
-            done: The one that is at its end already.
+            done: Name of the effect whose fit has converged already.
         """
         scale = closest(list(trials.values())).fit.scale
         losses = {name: float(trial.losses(scale).sum()) for name, trial in trials.items()}
@@ -154,11 +156,11 @@ class Trials:
     def refitted(
         self, current: Hypothesis, effects: tuple[Effect, ...] | None = None
     ) -> Hypothesis | None:
-        """Returns the model with effects, fitted from where a hypothesis is.
+        """Fits the model with effects, from the parameters of a hypothesis.
 
         Args:
             current: The hypothesis.
-            effects: The effects, its own by default.
+            effects: The effects; those of the hypothesis by default.
 
         Returns:
             ``None`` if the model cannot be simulated with them.
@@ -172,10 +174,10 @@ class Trials:
         return found
 
     def with_own_starts(self, current: Hypothesis) -> Hypothesis:
-        """Returns a hypothesis whose segments start from where it leads itself.
+        """Refits a hypothesis with initial states that are estimated along its own motion.
 
-        What its model leaves of the readings tells their states better than the readings alone,
-        and how large its offsets come out tells how well.
+        With the model's help, the initial states are known better than from the measurements
+        alone. The size of the fitted offsets shows how well.
 
         Args:
             current: The hypothesis.
@@ -187,13 +189,13 @@ class Trials:
         (found,) = self._fits(
             [_Fit(current.effects, current.parameters, unmoved, starts)], current.simulator
         )
-        # Initial states that are told badly may be such that simulations from beside them fail.
+        # If initial states are estimated badly, simulations close to them may fail.
         return current if found is None or not found.can_be_linearised else found
 
     def holding(
         self, current: Hypothesis, held: Sequence[Mapping[str, float]]
     ) -> list[Hypothesis | None]:
-        """Returns a hypothesis with some of its parameters held and all others fitted anew.
+        """Refits a hypothesis with some of its parameters held fixed.
 
         Args:
             current: The hypothesis.
@@ -208,7 +210,7 @@ class Trials:
         return list(self._fits(asked, current.simulator))
 
     def apart_from_waves_in_step(self, tried: Mapping[str, Hypothesis]) -> dict[str, Hypothesis]:
-        """Returns the models less those whose last effect is a wave in step with the motion."""
+        """Removes models whose last effect is a wave that is synchronous with the motion."""
         return {
             name: trial
             for name, trial in tried.items()
@@ -216,7 +218,7 @@ class Trials:
         }
 
     def without(self, current: Hypothesis, effect: Effect) -> Hypothesis | None:
-        """Returns a hypothesis without one of its effects, see :meth:`refitted`."""
+        """Refits a hypothesis without one of its effects; see :meth:`refitted`."""
         return self.refitted(current, tuple(e for e in current.effects if e.name != effect.name))
 
     def _fits(self, asked: Sequence[_Fit], simulator: Simulator) -> Iterator[Hypothesis | None]:
@@ -225,7 +227,7 @@ class Trials:
 
 
 def _fitted(trials: Trials, asked: _Fit) -> Hypothesis | None:
-    """Returns a fitted model; ``None`` if it cannot be simulated."""
+    """Fits a model; returns ``None`` if it cannot be simulated."""
     try:
         found = fit_hypothesis(
             trials.model,
@@ -241,12 +243,12 @@ def _fitted(trials: Trials, asked: _Fit) -> Hypothesis | None:
         )
     except NpdrError:
         return None
-    _ = found.difference  # travels with it, computed side by side
+    _ = found.difference  # computed in the parallel process, and sent back with the fit
     return found
 
 
 def _far_behind(current: Hypothesis, best: Hypothesis) -> float:
-    """Returns the share of what the best trial explains below which no other is a match for it."""
+    """Returns the share of the best trial's gain that another must reach to be an alternative."""
     scale = best.fit.scale
     explained = best.share * float((current.losses(scale) - best.losses(scale)).sum())
     return 1.0 - PLAINLY / max(explained, PLAINLY)
