@@ -127,8 +127,8 @@ def train(
         typer.Option(
             min=0,
             max=1,
-            help="Share of posterior draws in which a policy must succeed in simulation before "
-            "it runs on the target; else record another rollout, or train for the worst domains.",
+            help="Share of episodes in posterior draws that must succeed before a policy "
+            "runs on the target; else record another rollout, or train for the worst domains.",
         ),
     ] = 0.9,
     tail_share: Annotated[

@@ -66,24 +66,26 @@ class LoopOptions:
             last posterior. Backends that cannot start elsewhere start from the prior.
         search: The policy search, by name or as an object with its own options.
         search_iterations: Iterations of each policy search.
-        search_restarts: Greatest number of restarts of the search if its policy fails in nearly
-            all draws of the posterior. The cause is then a local optimum of the search, and not
-            the uncertainty of parameters. Two restarts were enough on eight hidden rigs with a
-            delay that were used for tuning.
+        search_restarts: Greatest number of restarts of the search if its policy is unreliable in
+            nearly all draws of the posterior. The cause is then a local optimum of the search or
+            too wide a spread of the domains, and not the uncertainty of parameters. Each restart
+            halves the spread.
         domains: Whether the policy is trained in draws of the posterior or at its most likely
             sample.
         num_domains: Number of domains for training the policy.
         num_initial_states: Number of initial states in each domain.
         risk: The policy search's first objective over the domains: their mean return, or the mean
             return of the worst domains.
-        least_success: Share of the posterior's draws, in simulation, in which a new policy must
-            succeed before it runs on the target; 0 checks nothing. If it fails the check, another
-            rollout is recorded. If no extra rollout is left, the policy is trained for the worst
-            domains. The default is the success rate that one would expect of the target, which is
-            one draw of the posterior if the model is right. The check needs a task with a
-            success threshold.
+        least_success: Share of its simulated episodes, over draws of the posterior and initial
+            states, that must succeed before a new policy runs on the target; 0 checks nothing.
+            If it fails the check, another rollout is recorded. If no extra rollout is left, the
+            policy is trained for the worst domains. The default is the success rate that one
+            would expect of the target, which is one draw of the posterior if the model is right.
+            The check needs a task with a success threshold.
         num_checked: Draws of the posterior in which a new policy is checked. With 200 the standard
             error of a share of 0.9 is 0.02.
+        num_checked_states: Initial states from which it is checked in every draw. Policies that
+            fail from one initial state in six passed a check with two.
         tail_share: Share of the domains, in (0, 1], that are the worst domains. Training for them
             maximises their mean return. EPOpt (Rajeswaran et al. 2017) takes a tenth of 240
             domains; a fifth of the default 50 domains leaves ten for the mean.
@@ -134,6 +136,7 @@ class LoopOptions:
     risk: Risk = MeanReturn()
     least_success: float = 0.9
     num_checked: int = 200
+    num_checked_states: int = 10
     tail_share: float = 0.2
     is_warm_start: bool = True
     starts_from_prior: bool = True
@@ -158,7 +161,7 @@ class LoopOptions:
             "iterations": 1, "rollouts": 1, "rounds": 1, "num_simulations": 10,
             "search_iterations": 1, "num_domains": 1, "num_initial_states": 1,
             "extra_rollouts": 0, "extra_rounds": 0, "spread": 0, "prior_share": 0,
-            "least_success": 0, "num_checked": 1,
+            "least_success": 0, "num_checked": 1, "num_checked_states": 1,
         }  # fmt: skip
         for name, low in least.items():
             if not getattr(self, name) >= low:
@@ -171,5 +174,5 @@ class LoopOptions:
 
     @property
     def tail(self) -> TailMean:
-        """Objective of the policy search if too few of the posterior's draws succeed."""
+        """Objective of the policy search if too few episodes succeed."""
         return TailMean(self.tail_share)

@@ -37,7 +37,9 @@ class Check:
     """A policy's returns over the posterior, when it runs as it would on the target.
 
     Attributes:
-        success: Share of the draws in which its mean return is above the task's threshold; NaN
+        success: Share of its episodes, over draws and initial states, whose return is above the
+            task's threshold; NaN if the task has no threshold.
+        reliable_share: Share of the draws in which the required share of episodes succeed; NaN
             if the task has no threshold.
         mean_return: Mean of the returns in all draws.
         tail_return: Mean of the returns in the worst share of the draws.
@@ -45,6 +47,7 @@ class Check:
     """
 
     success: float
+    reliable_share: float
     mean_return: float
     tail_return: float
     num_draws: int
@@ -52,21 +55,25 @@ class Check:
     @classmethod
     def of(cls, saved: Mapping[str, Any]) -> "Check":
         """Reads a check from JSON, in which numbers that are not finite are ``None``."""
-        success = math.nan if saved["success"] is None else saved["success"]
+        success, reliable_share = (
+            math.nan if saved[name] is None else saved[name]
+            for name in ("success", "reliable_share")
+        )
         mean, tail = (
             -math.inf if saved[name] is None else saved[name]
             for name in ("mean_return", "tail_return")
         )
-        return cls(success, mean, tail, saved["num_draws"])
+        return cls(success, reliable_share, mean, tail, saved["num_draws"])
 
     def is_better_than(self, other: "Check") -> bool:
-        """Returns whether more draws succeed, or as many and the worst draws are better."""
+        """Returns whether more episodes succeed, or as many and the worst draws are better."""
         return (self.success, self.tail_return) > (other.success, other.tail_return)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the check with the keys of ``train.json``."""
         return {
             "simulated_success": self.success,
+            "reliable_share": self.reliable_share,
             "simulated_return": {"mean": self.mean_return, "cvar": self.tail_return},
         }
 
@@ -91,21 +98,26 @@ def check_policy(
         policy: The policy.
         posterior: The posterior.
         internal_model: Parameters of the policy's internal model on the target.
-        options: Number of draws, number of initial states in each, and share of the worst draws.
+        options: Number of draws, number of initial states in each, required share of successes,
+            and share of the worst draws.
         seed: Seed of the draws and of the initial states.
     """
     generator = torch.Generator().manual_seed(seed)
-    starts = task.initial_states(options.num_initial_states, generator)
+    starts = task.initial_states(options.num_checked_states, generator)
     domains = domains_at(posterior.prior, posterior.sample_mixture(options.num_checked, seed=seed))
     returns = returns_of(
         task, domains, policy.parameters[None], starts, internal_model=internal_model
     )[0]
     # A simulation that diverged is a failure.
     by_draw = returns.double().mean(1).nan_to_num(nan=-math.inf)
-    success = math.nan
+    success, reliable_share = math.nan, math.nan
     if task.success is not None:
-        success = float((by_draw > task.success).double().mean())
-    return Check(success, float(by_draw.mean()), float(options.tail(by_draw)), len(by_draw))
+        shares = (returns > task.success).double().mean(1)
+        success = float(shares.mean())
+        reliable_share = float((shares >= options.least_success).double().mean())
+    return Check(
+        success, reliable_share, float(by_draw.mean()), float(options.tail(by_draw)), len(by_draw)
+    )
 
 
 def decide(
@@ -127,7 +139,7 @@ def decide(
     """
     if math.isnan(check.success):
         return NextStep.DEPLOY, "The policy is not checked: the task has no success threshold."
-    shown = f"The policy succeeds in {check.success:.0%} of {check.num_draws} draws"
+    shown = f"The policy succeeds in {check.success:.0%} of its episodes ({check.num_draws} draws)"
     least = f"the {options.least_success:.0%} asked for"
     if check.success >= options.least_success:
         return NextStep.DEPLOY, f"{shown}, at least {least}."
@@ -138,10 +150,11 @@ def decide(
             f"{shown}, fewer than {least}, even after training for the worst "
             f"{options.tail_share:.0%} of the domains, and no extra rollout is left."
         )
-    if 1.0 - check.success >= options.least_success and searches_left > 0:
+    if 1.0 - check.reliable_share >= options.least_success and searches_left > 0:
         return NextStep.SEARCH_AGAIN, (
-            f"{shown}: it fails for nearly all likely parameters, so uncertain parameters are not "
-            "the cause. The search is restarted from the task's own policy."
+            f"{shown}, and is reliable in {check.reliable_share:.0%} of the draws. It fails for "
+            "nearly all likely parameters, so uncertain parameters are not the cause. The search "
+            "is restarted from the task's own policy."
         )
     if rollouts_left > 0:
         return NextStep.ANOTHER_ROLLOUT, (

@@ -97,7 +97,7 @@ class LoopTraining:
             number = index + 1, len(checks)
             saved = self.folder.policy(*number)
             if saved is None:
-                domains = self._domains(number, settled)
+                domains = self._domains(number, settled, options.search_restarts - searches_left)
                 saved = optimise(domains, start, risk, number if number[1] else number[:1])
                 self._add_check(saved, settled, internal_model, index)
                 self.folder.save_policy(number[0], *saved, draft=number[1])
@@ -118,7 +118,8 @@ class LoopTraining:
             if verdict is NextStep.DEPLOY:
                 break
             if verdict is NextStep.SEARCH_AGAIN:
-                # Restart from the task's policy, because the search ended in a local optimum.
+                # Restart from the task's policy, because the search ended in a local optimum, and
+                # in a narrower spread, because the optimum is often a compromise between domains.
                 start, searches_left = self.task.policy.parameters.double(), searches_left - 1
             else:
                 start, risk = best[1], options.tail
@@ -126,7 +127,7 @@ class LoopTraining:
         self.folder.save_policy(index + 1, parameters, figures)
         return Trained(parameters, {**figures, **check.to_dict()})
 
-    def _domains(self, number: tuple[int, int], settled: Settled) -> Domains:
+    def _domains(self, number: tuple[int, int], settled: Settled, num_restarts: int) -> Domains:
         """Returns the training domains of a draft of a policy."""
         policy, draft = number
         of_draft = (policy - 1, draft) if draft else (policy - 1,)
@@ -137,6 +138,7 @@ class LoopTraining:
             from_prior=self.from_prior,
             seed=derived_seed(self.seed, "posterior domains", *of_draft),
             most_likely_seed=self.seed,
+            num_restarts=num_restarts,
         )
 
     def _add_check(

@@ -19,6 +19,7 @@ def training_domains(
     from_prior: Callable[[int], Domains],
     seed: int,
     most_likely_seed: int,
+    num_restarts: int = 0,
 ) -> Domains:
     """Returns draws of the posterior, or its most likely sample, with the options' spread.
 
@@ -29,6 +30,7 @@ def training_domains(
         from_prior: Draws a given number of domains from the prior.
         seed: Seed of the draws.
         most_likely_seed: Seed of the search for the most likely sample.
+        num_restarts: Restarts of the policy search before this one; each halves the spread.
     """
     num_prior = 0
     if action is Action.MIXED:
@@ -43,5 +45,8 @@ def training_domains(
     generator = torch.Generator().manual_seed(seed)
     # If the model is wrong, its posterior is too narrow, by an unknown factor.
     spread = options.spread * (2.0 if action in SPREAD_WIDER else 1.0)
+    # No policy may exist for all domains of a wide spread, and a compromise can fail in all draws
+    # of the posterior itself.
+    spread *= 0.5**num_restarts
     domains = domains_at(posterior.prior, z).spread(spread, generator)
     return domains.followed_by(from_prior(num_prior)) if num_prior else domains

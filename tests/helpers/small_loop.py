@@ -149,6 +149,7 @@ def small_options(**changed):
         "num_initial_states": 2,
         "least_success": 0.0,
         "num_checked": 20,
+        "num_checked_states": 2,
     }
     return LoopOptions(**{**settings, **changed})
 

@@ -101,6 +101,19 @@ def test_a_policy_that_fails_in_all_draws_is_searched_for_again_from_its_first_p
     assert result.iterations[0]["simulated_return"]["cvar"] == max(returns)
 
 
+def test_each_restart_of_the_search_halves_the_spread_of_the_domains(tmp_path, searches):
+    options = small_options(
+        iterations=1, search_restarts=2, least_success=0.9, spread=0.2, domains="most likely",
+        num_domains=200,
+    )  # fmt: skip
+    run(tmp_path / "run", options, hard_task())
+    masses = [domains.parameters["mass"] for domains, _ in searches[1:]]
+    ranges = [float((mass.max() - mass.min()) / (mass.max() + mass.min())) for mass in masses]
+    # The ends of 200 uniform numbers are within 3 % of the interval's own. The domains for the
+    # tail are as wide as those of the last restart.
+    assert ranges == pytest.approx([0.2, 0.1, 0.05, 0.05], rel=0.03)
+
+
 def test_a_policy_that_fails_in_simulation_asks_for_a_rollout_then_trains_for_the_tail(
     tmp_path, searches
 ):
@@ -126,7 +139,7 @@ def test_a_policy_that_fails_in_simulation_asks_for_a_rollout_then_trains_for_th
     assert written["simulated_return"]["cvar"] < written["simulated_return"]["mean"] < 40.0
     reasons = [check["reason"] for check in written["checks"]]
     assert reasons[0].startswith(
-        "The policy succeeds in 0% of 20 draws, fewer than the 50% asked for: record a rollout"
+        "The policy succeeds in 0% of its episodes (20 draws), fewer than the 50% asked for: "
     )
     assert "train for the worst 40% of the domains" in reasons[1]
     assert "even after training for the worst 40%" in reasons[2]
@@ -195,36 +208,38 @@ def test_discovery_looks_again_at_what_a_check_asked_for(tmp_path, accepted):
     assert again.to_dict() == result.to_dict()
 
 
-def test_the_check_counts_draws_in_which_a_policy_succeeds(tmp_path):
-    options = small_options(iterations=1, num_checked=15)
+def test_the_check_counts_episodes_and_the_draws_in_which_most_succeed(tmp_path):
+    options = small_options(
+        iterations=1, num_checked=15, num_checked_states=4, least_success=0.75, search_restarts=0
+    )
     trained = run(tmp_path / "run", options)
     task, policy, posterior = small_task(), trained.policy, trained.posterior
     seed = 5
-    states = task.initial_states(2, torch.Generator().manual_seed(seed))
+    states = task.initial_states(4, torch.Generator().manual_seed(seed))
     domains = domains_at(posterior.prior, posterior.sample_mixture(15, seed=seed))
-    each = []
+    each = np.empty((15, 4))
     for number in range(15):
-        parameters = {name: value[number] for name, value in domains.parameters.items()}
-        episodes = [
-            Pendulum(compile="never").roll_out(
-                {name: value.float() for name, value in parameters.items()},
-                policy, state, 40, reward=task.reward,
-            ).returns
-            for state in states
-        ]  # fmt: skip
-        each.append(float(torch.stack(episodes).mean()))
-    middle = 0.5 * sum(sorted(each)[6:8])
-    divided = dataclasses.replace(task, success=middle)
+        parameters = {name: value[number].float() for name, value in domains.parameters.items()}
+        for index, state in enumerate(states):
+            episodes = Pendulum(compile="never").roll_out(
+                parameters, policy, state, 40, reward=task.reward
+            )
+            each[number, index] = float(episodes.returns)
+    threshold = float(np.sort(each.ravel())[29:31].mean())
+    divided = dataclasses.replace(task, success=threshold)
     found = check_policy(divided, policy, posterior, trained.domain, options, seed=seed)
-    assert found.success == pytest.approx(8 / 15)
-    assert found.mean_return == pytest.approx(np.mean(each), rel=1e-4)
-    assert found.tail_return == pytest.approx(np.mean(sorted(each)[:3]), rel=1e-4)
+    assert found.success == pytest.approx(0.5)
+    reliable = (each > threshold).mean(1) >= 0.75
+    assert found.reliable_share == pytest.approx(reliable.mean())
+    by_draw = each.mean(1)
+    assert found.mean_return == pytest.approx(by_draw.mean(), rel=1e-4)
+    assert found.tail_return == pytest.approx(np.sort(by_draw)[:3].mean(), rel=1e-4)
     assert found.num_draws == 15
 
 
 def test_decisions_follow_the_share_of_successes():
     options = LoopOptions(least_success=0.9)
-    good, bad = Check(0.9, 30.0, 20.0, 200), Check(0.895, 30.0, 20.0, 200)
+    good, bad = Check(0.9, 0.6, 30.0, 20.0, 200), Check(0.895, 0.6, 30.0, 20.0, 200)
 
     def step(check, *, searches=1, rollouts=1, is_for_tail=False):
         left = {"searches_left": searches, "rollouts_left": rollouts}
@@ -234,13 +249,15 @@ def test_decisions_follow_the_share_of_successes():
     assert step(bad) is NextStep.ANOTHER_ROLLOUT
     assert step(bad, rollouts=0) is NextStep.TRAIN_FOR_THE_TAIL
     assert step(bad, rollouts=0, is_for_tail=True) is NextStep.DEPLOY
-    # A policy that fails in nearly all draws is not helped by knowing the parameters better.
-    hopeless = Check(0.1, 3.0, 2.0, 200)
-    assert step(hopeless) is NextStep.SEARCH_AGAIN
-    assert step(hopeless, searches=0) is NextStep.ANOTHER_ROLLOUT
-    assert step(Check(0.105, 3.0, 2.0, 200)) is NextStep.ANOTHER_ROLLOUT
+    # A policy that is unreliable in nearly all draws is not helped by knowing the parameters
+    # better, even if most of its episodes succeed.
+    for success in (0.1, 0.8):
+        unreliable = Check(success, 0.1, 3.0, 2.0, 200)
+        assert step(unreliable) is NextStep.SEARCH_AGAIN
+        assert step(unreliable, searches=0) is NextStep.ANOTHER_ROLLOUT
+        assert step(Check(success, 0.105, 3.0, 2.0, 200)) is NextStep.ANOTHER_ROLLOUT
     assert good.is_better_than(bad) and not bad.is_better_than(good)
-    assert Check(0.9, 30.0, 21.0, 200).is_better_than(good)
+    assert Check(0.9, 0.6, 30.0, 21.0, 200).is_better_than(good)
 
 
 def test_options_out_of_range_are_refused():

@@ -102,7 +102,7 @@ def _key_figures(records: Records) -> list[KeyFigure]:
         KeyFigure(
             "Last success in simulation",
             number(last.get("simulated_success"), ".0%"),
-            "of the posterior's draws",
+            "of episodes in the posterior's draws",
         ),
         KeyFigure("Real rollouts", str(last.get("num_rollouts", count))),
         *added,
