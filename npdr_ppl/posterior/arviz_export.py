@@ -11,8 +11,9 @@ from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.posterior.density_mixture import DensityMixture
 from npdr_ppl.posterior.exported_checks import ATTRIBUTE
 from npdr_ppl.posterior.parameter_units import parameter_units
-from npdr_ppl.preparation.draw_budget import BUDGET, affordable_draws, executed_in_parts
+from npdr_ppl.preparation.draw_budget import affordable_draws, executed_in_parts
 from npdr_ppl.preparation.effective_share import effective_share
+from npdr_ppl.preparation.settings import DRAW_BUDGET
 from npdr_ppl.randomness import seeded
 
 if TYPE_CHECKING:
@@ -63,7 +64,9 @@ def to_arviz(posterior: DensityMixture, num_samples: int = 1_000, *, seed: int =
 
     with seeded(seed, "prior"):
         prior_z = prior.sample(num_samples)
-        num_prior = affordable_draws(MAX_PRIOR_PREDICTIVE_DRAWS, num_readings, budget=BUDGET // 4)
+        num_prior = affordable_draws(
+            MAX_PRIOR_PREDICTIVE_DRAWS, num_readings, budget=DRAW_BUDGET.most_bytes // 4
+        )
         prior_predictive = prior.execute(prior_z[:num_prior])
     few = min(num_samples, MAX_PREDICTIVE_DRAWS)
     predictive_z = z[:, :few].flatten(0, 1)

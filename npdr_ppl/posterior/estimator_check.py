@@ -20,8 +20,6 @@ from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, systematic
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.preparation.importance_sampling import (
-    ENOUGH_EFFECTIVE,
-    RELIABLE_K,
     WeightedDraws,
     effective_size,
     sample_posterior,
@@ -29,6 +27,7 @@ from npdr_ppl.preparation.importance_sampling import (
 )
 from npdr_ppl.preparation.ridges import RidgeCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
+from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING
 from npdr_ppl.randomness import seeded
 
 __all__ = ["Correction", "EstimatorCheck", "check_estimator"]
@@ -178,7 +177,7 @@ def check_estimator(
         )
     smoothed, k = smoothed_weights(log_weights)
     share = effective_size(smoothed) / len(z)
-    if k <= RELIABLE_K and share >= RIGHT_SHARE:
+    if k <= IMPORTANCE_SAMPLING.reliable_k and share >= RIGHT_SHARE:
         return EstimatorCheck(k, share, False, k, share * len(z), True), None
     if not corrects:
         return EstimatorCheck(k, share, False, k, share * len(z), False), None
@@ -193,7 +192,7 @@ def _corrected(draws: WeightedDraws, seed: int) -> Correction:
     # Where hardly any draw has a weight the posterior is drawn wider instead, and the check says
     # that it is not reliable.
     finite = int(draws.log_weights.isfinite().sum())
-    wanted = min(1.0, 0.5 * ENOUGH_EFFECTIVE / max(1, finite))
+    wanted = min(1.0, 0.5 * IMPORTANCE_SAMPLING.enough_effective / max(1, finite))
     exponent = longest_step(draws.log_weights, 1.0, wanted)
     log_weights = torch.where(
         draws.log_weights.isfinite(), exponent * draws.log_weights, -torch.inf

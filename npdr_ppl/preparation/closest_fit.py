@@ -17,24 +17,12 @@ from torch import Tensor
 from npdr_ppl.errors import DataError
 from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK, DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["ClosestFit", "closest_fit", "search_prior"]
-
-ITERATIONS, POPULATION = 6, 200
-"""Of the cross-entropy search: enough to find the valley, not its bottom."""
-
-ITERATIONS_BEFORE_STEPS = 3
-"""Iterations where Gauss-Newton steps go on from there."""
-
-MOST_SEGMENTS_SEARCHED = 24
-"""Most segments that the search simulates. On the benchmark's tuning recordings fits end at the
-same parameters as with all segments."""
-
-NEGLIGIBLE = 1e-9
-"""Standard deviation that no unit makes large."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +70,16 @@ def closest_fit(
     unmoved = torch.zeros(segments.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
     found = segments.scale_of(z, unmoved).tolist()
     scale = dict(zip(segments.channel_names, found, strict=True))
-    noise = {name: scale.get(name, NEGLIGIBLE) for name in segments.sensor_names}
+    noise = {
+        name: scale.get(name, PRIOR_SEARCH.negligible_deviation) for name in segments.sensor_names
+    }
     return ClosestFit(segments.prior.to_parameters(z[None]), scale, noise)
 
 
 def search_prior(
     segments: SegmentModel,
     *,
-    iterations: int = ITERATIONS,
+    iterations: int = PRIOR_SEARCH.iterations,
     seed: int = 0,
     progress: Step | None = None,
 ) -> Tensor:
@@ -100,7 +90,7 @@ def search_prior(
 
     Args:
         segments: The model along the recording.
-        iterations: Iterations, of ``POPULATION`` simulations each.
+        iterations: Iterations, of ``PRIOR_SEARCH.population`` simulations each.
         seed: Seed of the search.
         progress: Called with the fraction done and a short status.
 
@@ -121,15 +111,15 @@ def search_prior(
     for iteration in range(iterations):
         with seeded(seed, "residual noise", iteration):
             if iteration == 0:
-                tried = segments.prior.sample(POPULATION)
+                tried = segments.prior.sample(PRIOR_SEARCH.population)
             else:
-                draws = torch.randn(POPULATION, num_parameters, dtype=torch.float64)
+                draws = torch.randn(PRIOR_SEARCH.population, num_parameters, dtype=torch.float64)
                 tried = centre + spread * draws
         error = torch.cat(
             [_errors(segments, part, starts, ranges) for part in tried.split(together)]
         )
         order = error.argsort()
-        elite = tried[order[: POPULATION // 10]]
+        elite = tried[order[: PRIOR_SEARCH.population // 10]]
         centre, spread = elite.mean(0), elite.std(0)
         if float(error[order[0]]) < least:
             least, z = float(error[order[0]]), tried[order[0]]
@@ -153,13 +143,13 @@ def search_prior(
 def _spread_out(segments: SegmentModel, seed: int) -> SegmentModel:
     """Returns the model along a segment of each of equal parts of the recording."""
     num = segments.inputs.num_segments
-    if num <= MOST_SEGMENTS_SEARCHED:
+    if num <= PRIOR_SEARCH.most_segments:
         return segments
     generator = torch.Generator().manual_seed(seed)
-    places = torch.arange(MOST_SEGMENTS_SEARCHED) + torch.rand(
-        MOST_SEGMENTS_SEARCHED, generator=generator
+    places = torch.arange(PRIOR_SEARCH.most_segments) + torch.rand(
+        PRIOR_SEARCH.most_segments, generator=generator
     )
-    return segments.along((places * (num / MOST_SEGMENTS_SEARCHED)).long())
+    return segments.along((places * (num / PRIOR_SEARCH.most_segments)).long())
 
 
 def _errors(segments: SegmentModel, z: Tensor, starts: Tensor, ranges: Tensor) -> Tensor:

@@ -6,24 +6,18 @@ from torch import Tensor
 
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.memory import release_freed_memory
+from npdr_ppl.preparation.settings import DRAW_BUDGET
 
-__all__ = ["BUDGET", "affordable_draws", "executed_in_parts"]
+__all__ = ["affordable_draws", "executed_in_parts"]
 
-BUDGET = 128 * 2**20
-"""Bytes of trajectories that are kept at once, at most. Statistics make several copies of them."""
-
-LEAST_DRAWS = 20
-"""Draws that are kept however long the recording is: fewer have no quantiles to speak of."""
-
-PER_PART = 4_000_000
-"""Readings that are simulated at once, 32 MB in double precision; engines and statistics make
-copies of them."""
 
 BYTES = 8
 """Bytes of a reading in double precision, in which most is computed."""
 
 
-def affordable_draws(wanted: int, num_readings: int, *, budget: int = BUDGET) -> int:
+def affordable_draws(
+    wanted: int, num_readings: int, *, budget: int = DRAW_BUDGET.most_bytes
+) -> int:
     """Returns how many draws of a trajectory are kept: all that are wanted, if memory allows it.
 
     Args:
@@ -31,7 +25,7 @@ def affordable_draws(wanted: int, num_readings: int, *, budget: int = BUDGET) ->
         num_readings: Readings of one draw.
         budget: Bytes that the draws may take.
     """
-    return min(wanted, max(LEAST_DRAWS, budget // (BYTES * max(1, num_readings))))
+    return min(wanted, max(DRAW_BUDGET.least_draws, budget // (BYTES * max(1, num_readings))))
 
 
 def executed_in_parts(
@@ -50,6 +44,6 @@ def executed_in_parts(
         Points and the sites' outputs at them.
     """
     release_freed_memory()
-    for part in z.split(max(1, PER_PART // max(1, num_readings))):
+    for part in z.split(max(1, DRAW_BUDGET.measurements_per_part // max(1, num_readings))):
         yield part, prior.execute(part)
     release_freed_memory()

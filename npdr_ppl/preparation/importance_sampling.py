@@ -19,43 +19,16 @@ from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, systematic
 from npdr_ppl.preparation.ridges import RidgeCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
+from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING
 from npdr_ppl.randomness import seeded
 
 __all__ = [
-    "ENOUGH_EFFECTIVE",
-    "RELIABLE_K",
     "WeightedDraws",
     "effective_size",
     "heavy_tailed",
     "sample_posterior",
     "smoothed_weights",
 ]
-
-DRAWS_PER_ITERATION = 512
-"""Draws of each iteration, every one a simulation of the recording."""
-
-MOST_ITERATIONS = 8
-"""Iterations after which sampling ends in any case."""
-
-RELIABLE_K = 0.7
-"""Shape of the weights' tail up to which estimates can be relied on (Vehtari et al. 2024)."""
-
-ENOUGH_EFFECTIVE = 200.0
-"""Effective sample size at which sampling ends: the ends of a 90 % interval are then known to a
-tenth of a standard deviation."""
-
-DRAWS_OF_LEARNT = 128
-"""Draws of each density that is given to begin with."""
-
-EFFECTIVE_PER_PARAMETER = 8.0
-"""Effective draws per parameter from which a proposal's covariance is estimated."""
-
-NUM_KERNELS = 64
-"""Components of a kernel density estimate that serves as a proposal."""
-
-TAILS = ((0.6, 1.0), (0.3, 3.0), (0.1, 10.0))
-"""Weights of a proposal's components and the factors of their covariances: a normal density whose
-tails are heavier than those of a posterior, so that no weight can be huge."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +40,7 @@ class WeightedDraws:
         w: The same in coordinates in which ridges are straight, ``(n, d)``.
         space: These coordinates.
         log_weights: Logarithms of their weights, one in all, ``(n,)``.
-        k_hat: Shape of the tail of the weights; reliable up to ``RELIABLE_K``.
+        k_hat: Shape of the tail of the weights; reliable up to ``IMPORTANCE_SAMPLING.reliable_k``.
         effective: Effective sample size.
         iterations: Iterations that were needed.
     """
@@ -88,7 +61,10 @@ class WeightedDraws:
     @property
     def is_reliable(self) -> bool:
         """Whether the draws represent the posterior."""
-        return self.k_hat <= RELIABLE_K and self.effective >= 0.5 * ENOUGH_EFFECTIVE
+        return (
+            self.k_hat <= IMPORTANCE_SAMPLING.reliable_k
+            and self.effective >= 0.5 * IMPORTANCE_SAMPLING.enough_effective
+        )
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Returns mean ``(d,)`` and covariance ``(d, d)``."""
@@ -98,14 +74,15 @@ class WeightedDraws:
 
 
 def heavy_tailed(mean: Tensor, covariance: Tensor) -> GaussianMixture:
-    """Returns a density around a point with tails heavier than normal; see ``TAILS``.
+    """Returns a density around a point with heavier tails than a normal density.
 
     Args:
         mean: The point, ``(d,)``.
         covariance: Covariance of the central component, ``(d, d)``.
     """
     weights, factors = (
-        torch.tensor(column, dtype=torch.float64) for column in zip(*TAILS, strict=True)
+        torch.tensor(column, dtype=torch.float64)
+        for column in zip(*IMPORTANCE_SAMPLING.tails, strict=True)
     )
     return GaussianMixture.from_moments(
         weights, mean.expand(len(weights), -1), factors[:, None, None] * covariance
@@ -133,12 +110,15 @@ def sample_posterior(
     learnt = list(proposals)
     z, w, target = (torch.empty(0) for _ in range(3))
     result: WeightedDraws | None = None
-    for iteration in range(MOST_ITERATIONS):
+    for iteration in range(IMPORTANCE_SAMPLING.most_iterations):
         with seeded(seed, "importance", iteration):
-            new_w = own[-1].sample(DRAWS_PER_ITERATION).double()
+            new_w = own[-1].sample(IMPORTANCE_SAMPLING.draws_per_iteration).double()
             new_z, inside = space.to_reference(new_w)
             if iteration == 0:
-                drawn = [density.sample(DRAWS_OF_LEARNT).double().cpu() for density in learnt]
+                drawn = [
+                    density.sample(IMPORTANCE_SAMPLING.draws_of_given).double().cpu()
+                    for density in learnt
+                ]
                 new_z = torch.cat((new_z, *drawn))
                 new_w = torch.cat((new_w, *(space.from_reference(part) for part in drawn)))
                 inside = torch.cat((inside, inside.new_ones(len(new_z) - len(inside))))
@@ -150,19 +130,25 @@ def sample_posterior(
         z = new_z if first else torch.cat((z, new_z))
         w = new_w if first else torch.cat((w, new_w))
         target = new if first else torch.cat((target, new))
-        shares.append(DRAWS_PER_ITERATION)
+        shares.append(IMPORTANCE_SAMPLING.draws_per_iteration)
         jacobian = space.log_jacobian(z)
         rows = [
             density.log_prob(w).double() + jacobian + math.log(share)
             for density, share in zip(own, shares, strict=True)
         ]
-        rows += [d.log_prob(z).double().cpu() + math.log(DRAWS_OF_LEARNT) for d in learnt]
+        rows += [
+            d.log_prob(z).double().cpu() + math.log(IMPORTANCE_SAMPLING.draws_of_given)
+            for d in learnt
+        ]
         log_mixture = torch.stack(rows).nan_to_num(-math.inf).logsumexp(0)
         log_weights = (target - log_mixture).nan_to_num(-math.inf, -math.inf, -math.inf)
         smoothed, k_hat = smoothed_weights(log_weights)
         size = effective_size(smoothed)
         result = WeightedDraws(z, w, space, smoothed, k_hat, size, iteration + 1)
-        if result.k_hat <= RELIABLE_K and result.effective >= ENOUGH_EFFECTIVE:
+        if (
+            result.k_hat <= IMPORTANCE_SAMPLING.reliable_k
+            and result.effective >= IMPORTANCE_SAMPLING.enough_effective
+        ):
             break
         own.append(_adapted(w, log_weights, seed, iteration))
     assert result is not None
@@ -195,7 +181,9 @@ def _adapted(y: Tensor, log_weights: Tensor, seed: int, iteration: int) -> Gauss
     posterior step by step.
     """
     d = y.shape[1]
-    exponent = longest_step(log_weights, 1.0, min(0.5, EFFECTIVE_PER_PARAMETER * d / len(y)))
+    exponent = longest_step(
+        log_weights, 1.0, min(0.5, IMPORTANCE_SAMPLING.effective_per_parameter * d / len(y))
+    )
     tempered = torch.where(log_weights.isfinite(), exponent * log_weights, -torch.inf)
     if not bool(tempered.isfinite().any()):
         tempered = torch.zeros_like(tempered)
@@ -205,21 +193,29 @@ def _adapted(y: Tensor, log_weights: Tensor, seed: int, iteration: int) -> Gauss
     covariance = (weights[:, None] * away).mT @ away
     covariance = covariance + 1e-10 * torch.diag(covariance.diagonal().clamp_min(1e-12))
     with seeded(seed, "kernels", iteration):
-        centres = y[systematic(weights.log(), NUM_KERNELS)]
-    width = (4.0 / (d + 2) / NUM_KERNELS) ** (1.0 / (d + 4))  # Silverman's rule
+        centres = y[systematic(weights.log(), IMPORTANCE_SAMPLING.num_kernels)]
+    width = (4.0 / (d + 2) / IMPORTANCE_SAMPLING.num_kernels) ** (
+        1.0 / (d + 4)
+    )  # Silverman's rule
     shrunk = mean + math.sqrt(max(0.0, 1.0 - min(1.0, width) ** 2)) * (centres - mean)
     return GaussianMixture.from_moments(
         torch.cat(
             (
-                torch.full((NUM_KERNELS,), TAILS[0][0] / NUM_KERNELS, dtype=torch.float64),
-                torch.tensor([weight for weight, _ in TAILS[1:]], dtype=torch.float64),
+                torch.full(
+                    (IMPORTANCE_SAMPLING.num_kernels,),
+                    IMPORTANCE_SAMPLING.tails[0][0] / IMPORTANCE_SAMPLING.num_kernels,
+                    dtype=torch.float64,
+                ),
+                torch.tensor(
+                    [weight for weight, _ in IMPORTANCE_SAMPLING.tails[1:]], dtype=torch.float64
+                ),
             )
         ),
-        torch.cat((shrunk, mean.expand(len(TAILS) - 1, -1))),
+        torch.cat((shrunk, mean.expand(len(IMPORTANCE_SAMPLING.tails) - 1, -1))),
         torch.cat(
             (
-                (width**2 * covariance).expand(NUM_KERNELS, d, d),
-                torch.stack([factor * covariance for _, factor in TAILS[1:]]),
+                (width**2 * covariance).expand(IMPORTANCE_SAMPLING.num_kernels, d, d),
+                torch.stack([factor * covariance for _, factor in IMPORTANCE_SAMPLING.tails[1:]]),
             )
         ),
     )

@@ -18,18 +18,13 @@ from npdr_ppl.language.effects import SensorEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.preparation.settings import INITIAL_STATES
 from npdr_ppl.preparation.solving import is_invertible
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import cut
 from npdr_ppl.rollouts.states import estimate_departures
 
 __all__ = ["InitialStates", "error_factors", "estimate_starts", "uncertain_components"]
-
-ROUNDS = 30
-"""Rounds of expectation maximisation; components that readings say little of hardly move."""
-
-FACTORS = 0.2, 10.0
-"""Least and greatest factor of the errors."""
 
 
 @dataclass(frozen=True)
@@ -253,13 +248,13 @@ def error_factors(residual: Tensor, by_starts: Tensor) -> Tensor:
     eye = torch.eye(by_starts.shape[-1], dtype=torch.float64)
     factors = torch.ones(by_starts.shape[-1], dtype=torch.float64)
     # At the largest factors, where the unit matrix keeps least apart.
-    is_known = is_invertible(eye / FACTORS[1] ** 2 + information)
+    is_known = is_invertible(eye / INITIAL_STATES.factor_limits[1] ** 2 + information)
     if not bool(is_known.any()):
         return factors
     information, score = information[is_known], score[is_known]
-    for _ in range(ROUNDS):
+    for _ in range(INITIAL_STATES.iterations):
         covariance = torch.linalg.inv(eye + factors[:, None] * information * factors)
         mean = (covariance @ (factors * score)[..., None])[..., 0]
         square = (mean.square() + covariance.diagonal(dim1=-2, dim2=-1)).mean(0)
-        factors = (factors * square.sqrt()).clamp(*FACTORS)
+        factors = (factors * square.sqrt()).clamp(*INITIAL_STATES.factor_limits)
     return factors

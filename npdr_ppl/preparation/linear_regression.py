@@ -16,6 +16,7 @@ from npdr_ppl.language.linear_dynamics import InverseDynamics, Motion
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.preparation.settings import LINEAR_REGRESSION
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.differentiation import (
@@ -27,12 +28,6 @@ from npdr_ppl.rollouts.differentiation import (
 )
 
 __all__ = ["LinearForm", "regression_of"]
-
-NUM_PRIOR_DRAWS = 4_096
-"""Prior draws that give the base parameters' moments and the directions they vary in."""
-
-RELATIVE_RANK = 1e-7
-"""Least relative singular value of a direction that counts; what is linear is so to 1e-12."""
 
 
 class LinearForm:
@@ -79,7 +74,10 @@ class LinearForm:
         for site in prior.sites:
             self.determined[site.coordinates] = site.name in self.determined_sites
         with seeded(0, "linear form"):
-            z, other = prior.sample(NUM_PRIOR_DRAWS), prior.sample(NUM_PRIOR_DRAWS)
+            z, other = (
+                prior.sample(LINEAR_REGRESSION.num_prior_draws),
+                prior.sample(LINEAR_REGRESSION.num_prior_draws),
+            )
         self._check_order(z, other)
         self._reduce(self.all_base(self.parameters(z)))
 
@@ -188,12 +186,12 @@ class LinearForm:
     def _reduce(self, draws: Tensor) -> None:
         """Finds base parameters that all others are affine functions of: β_all = G β + β₀."""
         mean, spread = draws.mean(0), draws.std(0)
-        varies = spread > RELATIVE_RANK * mean.abs()
+        varies = spread > LINEAR_REGRESSION.relative_rank * mean.abs()
         centred = (draws - mean) / torch.where(varies, spread, 1.0) * varies
         # QR with pivoting takes the columns in the order of what each adds to those before.
         decomposition: Any = linalg.qr(centred.numpy(), mode="r", pivoting=True)
         size, order = np.abs(np.diag(decomposition[0])), decomposition[1]
-        rank = int((size > RELATIVE_RANK * size[0]).sum()) if varies.any() else 0
+        rank = int((size > LINEAR_REGRESSION.relative_rank * size[0]).sum()) if varies.any() else 0
         if rank != len(self.determined_sites):
             raise BackendError(
                 f"The base parameters of {self.simulator.name} vary in {rank} directions under "

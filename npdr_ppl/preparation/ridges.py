@@ -24,49 +24,10 @@ from npdr_ppl.inference.parts.samplers.importance_weights import longest_step
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.preparation.sampling_coordinates import SamplingCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
+from npdr_ppl.preparation.settings import RIDGE
 from npdr_ppl.randomness import seeded
 
 __all__ = ["RidgeCoordinates"]
-
-FEWEST_POINTS, POINTS_PER_TERM = 96, 6
-"""Points at which a ridge is traced, and how many for each term of a quadratic in its weak
-coordinates; each costs a simulation of the recording per chord step."""
-
-CHORD_STEPS, MORE_STEPS = 5, 3
-"""Chord steps to each point, at first and where a polynomial already says about where it is."""
-
-TRIED = 20
-"""How many times as many points are drawn, of which those on the priors' support are kept."""
-
-FEWEST_FOUND = 0.3
-"""Share of the points that chord steps must find for the ridge to be followed any further."""
-
-ROUNDS = 8
-"""Times that a ridge is traced at most."""
-
-CLOSE = 1.0
-"""Log density that the median point may gain by chord steps from where the polynomial has it: the
-polynomial is then within the posterior's own width."""
-
-MOST_DEGREE, POINTS_PER_COEFFICIENT = 6, 3
-"""Greatest degree of the polynomial, and least number of points for each of its terms."""
-
-REACH = 2.0
-"""How far weak coordinates of these points are spread, in standard deviations."""
-
-GROWS = 1.3
-"""Ratio of variances from one tracing to the next from which a ridge may reach farther still."""
-
-EVEN_SHARE = 0.1
-"""Effective share of the traced points from which they are spread as the ridge is; with less the
-weights are tempered, and the next points go on from where these lead."""
-
-FARTHEST = 1.0
-"""Greatest chord step along a stiff direction, in prior standard deviations."""
-
-KEPT = 0.75
-"""Share of the points, those nearest to the recording, that the polynomial is fitted to; chord
-steps need not converge everywhere."""
 
 
 @dataclass(frozen=True)
@@ -186,27 +147,27 @@ class RidgeCoordinates:
     ) -> "RidgeCoordinates":
         """Returns the coordinates with the polynomial that the ridge follows."""
         k, d, found = self.num_weak, len(self.centre), self
-        number = max(FEWEST_POINTS, POINTS_PER_TERM * _num_terms(k, 2))
+        number = max(RIDGE.fewest_points, RIDGE.points_per_term * _num_terms(k, 2))
         points, values = torch.empty(0, d).double(), torch.empty(0).double()
-        for round_ in range(ROUNDS):
-            factor = REACH * torch.linalg.cholesky(found.weak_covariance)
+        for round_ in range(RIDGE.most_rounds):
+            factor = RIDGE.reach * torch.linalg.cholesky(found.weak_covariance)
             with seeded(seed, "ridge", round_):
-                drawn = torch.randn(TRIED * number, k, dtype=torch.float64)
+                drawn = torch.randn(RIDGE.draw_factor * number, k, dtype=torch.float64)
             weak = found.weak_mean + drawn @ factor.mT
             _, inside = found.to_reference(torch.cat((weak, weak.new_zeros(len(weak), d - k)), -1))
             drawn, weak = drawn[inside][:number], weak[inside][:number]
             if not len(weak):
                 break
-            steps = CHORD_STEPS if round_ == 0 else MORE_STEPS
+            steps = RIDGE.first_chord_steps if round_ == 0 else RIDGE.chord_steps
             w, predicted, log_density = found._followed(likelihood, weak, slope, steps)
             is_found = log_density.isfinite()
-            if float(is_found.double().mean()) < FEWEST_FOUND:
+            if float(is_found.double().mean()) < RIDGE.least_found_share:
                 break
             missed = (log_density - predicted)[is_found].median()
             points, values = torch.cat((points, w)), torch.cat((values, log_density))
             found = found._bent_through(points, values)
             log_weights = log_density + 0.5 * drawn.square().sum(-1)
-            exponent = longest_step(log_weights, 1.0, EVEN_SHARE)
+            exponent = longest_step(log_weights, 1.0, RIDGE.even_share)
             weights = (exponent * log_weights).nan_to_num(-torch.inf).softmax(0)
             mean = weights @ weak
             away = weak - mean
@@ -215,7 +176,11 @@ class RidgeCoordinates:
             grown = torch.linalg.eigvals(torch.linalg.solve(found.weak_covariance, covariance))
             found = replace(found, weak_mean=mean, weak_covariance=covariance)
             # Where it was expected and spread as before: there is no more to find.
-            if missed < CLOSE and exponent == 1.0 and float(grown.real.max()) < GROWS:
+            if (
+                missed < RIDGE.close_gain
+                and exponent == 1.0
+                and float(grown.real.max()) < RIDGE.growth
+            ):
                 break
         return found
 
@@ -253,7 +218,7 @@ class RidgeCoordinates:
             # The prior's own pull is that of a normal one of the same variance.
             change = ((score @ by_w)[:, k:] - w[:, k:]) / stiff
             w = w.clone()
-            w[:, k:] += change.nan_to_num(0.0).clamp(-FARTHEST, FARTHEST)
+            w[:, k:] += change.nan_to_num(0.0).clamp(-RIDGE.longest_step, RIDGE.longest_step)
         return best, predicted, value
 
     def _bent_through(self, w: Tensor, log_density: Tensor) -> "RidgeCoordinates":
@@ -262,15 +227,15 @@ class RidgeCoordinates:
         Its degree is that of least leave-one-out error in standard deviations of the posterior.
         """
         k = self.num_weak
-        near = log_density.argsort(descending=True)[: int(KEPT * len(w))]
+        near = log_density.argsort(descending=True)[: int(RIDGE.fitted_share * len(w))]
         near = near[log_density[near].isfinite()]
         # Points off the ridge by more than others say less of where it is.
         excess = log_density[near].max() - log_density[near]
         weight = (1.0 + excess / excess.median().clamp_min(0.5)).rsqrt()[:, None]
         wanted = weight * w[near, k:]
         least, found = torch.inf, self
-        for degree in range(1, MOST_DEGREE + 1):
-            if POINTS_PER_COEFFICIENT * _num_terms(k, degree) > len(near):
+        for degree in range(1, RIDGE.most_degree + 1):
+            if RIDGE.points_per_coefficient * _num_terms(k, degree) > len(near):
                 break
             q, r = torch.linalg.qr(weight * _monomials(w[near, :k], degree))
             leverage = q.square().sum(-1, keepdim=True).clamp(max=0.999)

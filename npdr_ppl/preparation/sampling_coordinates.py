@@ -12,18 +12,9 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.language.prior import Prior
+from npdr_ppl.preparation.settings import SAMPLING_COORDINATES
 
 __all__ = ["SamplingCoordinates"]
-
-TAIL = 2.326
-"""Reference coordinate of the 1 % quantile, without its sign."""
-
-WIDEST_RATIO = 50.0
-"""Ratio of a prior's 99 % to its 1 % quantile up to which a parameter's logarithm is taken: one
-whose prior reaches down to zero may well be zero, where the logarithm has no end."""
-
-PRIOR_DRAWS = 1024
-"""Draws by which the prior's variances are estimated, to 5 %."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +43,24 @@ class SamplingCoordinates:
         rest = cls(prior, False, none, torch.ones(d, dtype=torch.float64))
         if any(site.shape.numel() != 1 for site in prior.sites):
             return rest
-        ends = torch.stack([torch.full((d,), sign * TAIL) for sign in (-1.0, 0.0, 1.0)]).double()
+        ends = torch.stack(
+            [
+                torch.full((d,), sign * SAMPLING_COORDINATES.tail_coordinate)
+                for sign in (-1.0, 0.0, 1.0)
+            ]
+        ).double()
         low, _, high = _columns(prior, ends)
         generator = torch.Generator().manual_seed(0)
-        z = torch.randn(PRIOR_DRAWS, d, generator=generator, dtype=torch.float64)
+        z = torch.randn(
+            SAMPLING_COORDINATES.num_prior_draws, d, generator=generator, dtype=torch.float64
+        )
         # A site that depends on others does not take its own values when only they change.
-        alone = torch.where(torch.eye(d, dtype=torch.bool), TAIL, 0.0).double()
+        alone = torch.where(
+            torch.eye(d, dtype=torch.bool), SAMPLING_COORDINATES.tail_coordinate, 0.0
+        ).double()
         if not torch.allclose(_columns(prior, alone).diagonal(), high):
             return rest
-        is_logarithm = (low > 0.0) & (high < WIDEST_RATIO * low)
+        is_logarithm = (low > 0.0) & (high < SAMPLING_COORDINATES.widest_ratio * low)
         raw = cls(prior, True, is_logarithm, torch.ones(d, dtype=torch.float64))
         variance = raw.from_reference(z).var(0)
         return cls(prior, True, is_logarithm, variance)

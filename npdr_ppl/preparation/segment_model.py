@@ -1,10 +1,10 @@
-"""A model with one black-box site along a recording, from initial states that may be off.
+"""A model with one black-box site along a recording, with uncertain initial states.
 
 The recording is cut into segments. Each starts from a state that is only known within the
-smoother's error, so that a simulation depends on the parameters, which all segments share, and on
-the offset of each segment's own initial state. Derivatives by both are finite differences, one
-batch of simulations for all parameters, all segments and all components of their initial states:
-the simulator stays a black box.
+smoother's error. A simulation therefore depends on the parameters, which all segments share, and
+on the offset of each segment's own initial state. Derivatives by both are finite differences. They
+are computed in one batch of simulations for all parameters, segments and components of initial
+states. The simulator stays a black box.
 """
 
 import copy
@@ -30,38 +30,19 @@ from npdr_ppl.preparation.initial_states import (
     estimate_starts,
     uncertain_components,
 )
+from npdr_ppl.preparation.settings import LINEARISATION
 from npdr_ppl.preparation.solving import is_invertible, solve_or_zero
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Linearisation", "SegmentModel"]
 
-PARAMETER_STEP = 1e-2
-"""Half the width of finite differences, in standard deviations of the prior: more than what
-single precision and dry friction blur."""
-
-START_STEP = 0.1
-"""Half the width of finite differences of initial states, in standard deviations of the smoother's
-error."""
-
-START_LIMIT = 4.5
-"""How far from the prior's centre a fit may begin, in standard deviations: at the ends of a range
-a parameter hardly moves in reference coordinates."""
-
-LEAST_SCALE = 1e-6
-"""Least scale of a channel's residuals as a share of its largest measurement. Files and
-simulations in single precision hold no more digits, and with less noise than that the initial
-states of a simulated, noise-free recording could not be integrated out in double precision."""
-
-SMALLEST = 1e-9
-"""The same of a channel that is zero throughout, in its unit."""
-
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Residuals and their derivatives; S segments of N readings, d parameters, m offsets.
+    """Residuals and their derivatives; S segments of N measurements, d parameters, m offsets.
 
     Attributes:
-        residual: What was measured less what was simulated, ``(S, N)``.
+        residual: Measurement minus simulation, ``(S, N)``.
         by_parameters: Derivative of the simulation by parameters, ``(S, N, d)``.
         by_starts: Derivative by the offsets of each segment's own initial state, ``(S, N, m)``.
     """
@@ -74,8 +55,7 @@ class Linearisation:
     def is_finite(self) -> bool:
         """Whether the simulation succeeded at the point and everywhere beside it.
 
-        Squares, of which sums are made, are to be finite too: what diverges takes a few steps more
-        to be infinite itself.
+        Their squares, which are summed later, must be finite too.
         """
         parts = self.residual, self.by_parameters, self.by_starts
         return all(bool(part.square().sum().isfinite()) for part in parts)
@@ -133,7 +113,7 @@ class SegmentModel:
         rollouts: The recording.
         options: Segments, initial states and precision; where initial states are ``"uncertain"``
             they can be shifted, otherwise m is zero.
-        starts: What the segments start from, if better known than by the smoother.
+        starts: Initial states of the segments, if known better than by the smoother.
 
     Attributes:
         prior: The model's prior.
@@ -141,9 +121,9 @@ class SegmentModel:
         sensor_names: The channels that the simulator reports.
         measured: The C of them that were measured, as the simulator declares them.
         channel_names: Their names.
-        observed: What was measured, ``(S, K, C)``.
-        starts: What the segments start from, where that was given.
-        steps_per_average: Steps whose whitened readings are averaged; see :meth:`averaged`.
+        observed: The measurements, ``(S, K, C)``.
+        starts: Initial states of the segments, if they were given.
+        steps_per_average: Steps whose whitened residuals are averaged; see :meth:`averaged`.
     """
 
     steps_per_average = 1
@@ -179,7 +159,7 @@ class SegmentModel:
     def estimated_starts(
         self, z: Tensor, scale: Tensor, rollouts: Rollouts
     ) -> InitialStates | None:
-        """Estimates what the segments start from along a fitted motion, and how well.
+        """Estimates the initial states of the segments, with their errors, along a fitted motion.
 
         Args:
             z: Parameters, ``(d,)``.
@@ -187,8 +167,8 @@ class SegmentModel:
             rollouts: The recording.
 
         Returns:
-            ``None`` if what the segments start from is certain, or where simulations from what was
-            estimated fail.
+            The initial states; ``None`` if they are certain, or if simulations from the estimate
+            fail.
         """
         starts = estimate_starts(self.black_box(z[None]), self._smoothed, rollouts)
         if starts is None:
@@ -215,15 +195,15 @@ class SegmentModel:
         return part
 
     def averaged(self, most: int, fewest: int) -> "SegmentModel":
-        """Returns the model with fewer whitened readings, where a recording has very many.
+        """Returns the model with averages of residuals, if a recording has very many.
 
         Each average of w steps is multiplied by √w. White noise then keeps unit variance, and slow
-        changes stay as detectable as before; what is faster than the average is lost.
+        changes stay as detectable as before. Changes that are faster than the average are lost.
 
         Args:
-            most: Readings that are few enough; more are left where segments are short.
-            fewest: Averages that a segment keeps at least; those of less than twice as many steps
-                stay as they are.
+            most: Number of residuals that need no averaging. More are left if segments are short.
+            fewest: Least number of averages in a segment; a segment of fewer than twice as many
+                steps is not averaged.
         """
         readings = int(self.inputs.mask.sum()) * len(self.measured)
         part = copy.copy(self)
@@ -239,7 +219,9 @@ class SegmentModel:
     def least_scale(self) -> Tensor:
         """Least scale of each channel's residuals, in its unit, ``(C,)``."""
         largest = (self.observed * self.inputs.mask[..., None]).abs().amax((0, 1)).double()
-        return (LEAST_SCALE * largest).clamp_min(SMALLEST)
+        return (LINEARISATION.relative_scale_floor * largest).clamp_min(
+            LINEARISATION.absolute_scale_floor
+        )
 
     @property
     def num_offsets(self) -> int:
@@ -264,9 +246,9 @@ class SegmentModel:
         return box.simulator
 
     @property
-    def dented_coordinates(self) -> Tensor:
-        """Mask ``(d,)`` of coordinates along which the misfit has local minima."""
-        dented = torch.zeros(self.prior.num_parameters, dtype=torch.bool)
+    def coordinates_with_minima(self) -> Tensor:
+        """Mask ``(d,)`` of the coordinates along which the misfit has local minima."""
+        masked = torch.zeros(self.prior.num_parameters, dtype=torch.bool)
         names = {
             name
             for effect in self.simulator.effects
@@ -275,8 +257,8 @@ class SegmentModel:
         }
         for site in self.prior.sites:
             if site.name in names:
-                dented[site.coordinates] = True
-        return dented
+                masked[site.coordinates] = True
+        return masked
 
     def place_of(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Returns reference coordinates from which a fit may begin, ``(d,)``.
@@ -290,7 +272,7 @@ class SegmentModel:
         middle = self.prior.to_parameters(z[None])
         known = {name: torch.as_tensor(value)[None] for name, value in parameters.items()}
         z = self.prior.to_reference({name: known.get(name, v) for name, v in middle.items()})
-        return z[0].nan_to_num(0.0).clamp(-START_LIMIT, START_LIMIT)
+        return z[0].nan_to_num(0.0).clamp(-LINEARISATION.start_limit, LINEARISATION.start_limit)
 
     def black_box(self, z: Tensor) -> SimulatorBlackBox:
         """Returns the black-box site as the model makes it at n points, ``(n, d)``."""
@@ -358,8 +340,8 @@ class SegmentModel:
             is_rough: Whether one-sided differences will do, at half the price.
         """
         d, m = len(z), self.num_offsets
-        shifts = PARAMETER_STEP * torch.eye(d, dtype=torch.float64)
-        moves = START_STEP * torch.eye(m, dtype=torch.float64)[:, None]
+        shifts = LINEARISATION.parameter_step * torch.eye(d, dtype=torch.float64)
+        moves = LINEARISATION.initial_state_step * torch.eye(m, dtype=torch.float64)[:, None]
         signs = (1.0,) if is_rough else (1.0, -1.0)
         num = len(signs)
         points = torch.cat([sign * shifts for sign in signs])
@@ -377,8 +359,8 @@ class SegmentModel:
             up, down, left, right = by_z[:d], by_z[d:], by_start[:m], by_start[m:]
         return Linearisation(
             here[0],
-            ((down - up) / (num * PARAMETER_STEP)).permute(1, 2, 0),
-            ((right - left) / (num * START_STEP)).permute(1, 2, 0),
+            ((down - up) / (num * LINEARISATION.parameter_step)).permute(1, 2, 0),
+            ((right - left) / (num * LINEARISATION.initial_state_step)).permute(1, 2, 0),
         )
 
     def _shifted(self, offsets: Tensor) -> Inputs:

@@ -1,5 +1,7 @@
 """Each decision is reached by a real posterior of a real recording, for the right reason."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyro
 import pyro.distributions as dist
@@ -130,9 +132,11 @@ def test_a_fit_spends_the_rounds_that_it_has_left(clean, quick, monkeypatch):
     from npdr_ppl.preparation import importance_sampling as posterior_sampling
 
     # Neither is given the draws that it takes to agree with the simulator.
-    monkeypatch.setattr(posterior_sampling, "MOST_ITERATIONS", 1)
-    monkeypatch.setattr(posterior_sampling, "DRAWS_PER_ITERATION", 8)
-    monkeypatch.setattr(posterior_sampling, "DRAWS_OF_LEARNT", 8)
+    few = replace(
+        posterior_sampling.IMPORTANCE_SAMPLING,
+        most_iterations=1, draws_per_iteration=8, draws_of_given=8,
+    )  # fmt: skip
+    monkeypatch.setattr(posterior_sampling, "IMPORTANCE_SAMPLING", few)
     monkeypatch.setattr(estimator_check, "CHECKED_DRAWS", 16)
     posterior, result = fit(
         pendulum, clean, backend=quick, rounds=1, extra_rounds=1, num_simulations=100,

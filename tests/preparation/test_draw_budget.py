@@ -15,8 +15,9 @@ from npdr_ppl.posterior.comparison import predictive_scores
 from npdr_ppl.preparation import draw_budget
 from npdr_ppl.preparation.binding import bind
 from npdr_ppl.preparation.data_options import DataOptions
-from npdr_ppl.preparation.draw_budget import LEAST_DRAWS, affordable_draws
+from npdr_ppl.preparation.draw_budget import affordable_draws
 from npdr_ppl.preparation.effective_share import effective_share
+from npdr_ppl.preparation.settings import DRAW_BUDGET
 
 DRAWS = 30
 """Of each of two members."""
@@ -43,15 +44,16 @@ def test_short_recordings_keep_every_draw_that_is_wanted():
     assert affordable_draws(500, 1_000) == 500
     # 60 s at 1 kHz, 7 channels, in double precision.
     long = affordable_draws(500, 7 * 60_000)
-    assert LEAST_DRAWS < long < 500 and long * 7 * 60_000 * 8 <= draw_budget.BUDGET
-    assert affordable_draws(500, 10**9) == LEAST_DRAWS
+    assert DRAW_BUDGET.least_draws < long < 500 and long * 7 * 60_000 * 8 <= DRAW_BUDGET.most_bytes
+    assert affordable_draws(500, 10**9) == DRAW_BUDGET.least_draws
     assert affordable_draws(5, 10**9) == 5
 
 
 @pytest.mark.slow
 def test_parts_have_the_likelihood_of_the_whole(posterior, monkeypatch):
     """By the definition, from trajectories that are all in memory."""
-    monkeypatch.setattr(draw_budget, "PER_PART", 1)  # one draw at a time
+    one_at_a_time = dataclasses.replace(DRAW_BUDGET, measurements_per_part=1)
+    monkeypatch.setattr(draw_budget, "DRAW_BUDGET", one_at_a_time)
     found = exported(posterior)["log_likelihood"]["trajectory"]
     observation, prior = posterior.bound.observations["trajectory"], posterior.prior
     z = posterior.sample_reference(DRAWS, seed=0).flatten(0, 1)
@@ -95,7 +97,8 @@ def test_fewer_predictive_draws_score_alike(posterior, recording, noisy_pendulum
         return predictive_scores.predictive_scores(posterior, bound, {}, is_held_out=True)
 
     whole = scores()
-    monkeypatch.setattr(draw_budget, "PER_PART", 1)
+    one_at_a_time = dataclasses.replace(DRAW_BUDGET, measurements_per_part=1)
+    monkeypatch.setattr(draw_budget, "DRAW_BUDGET", one_at_a_time)
     parts = scores()
     np.testing.assert_array_equal(parts.elpd, whole.elpd)
     # Noise is drawn in another order; 200 draws of 400 readings leave a few per cent to chance.

@@ -16,8 +16,9 @@ from npdr_ppl.models.effects import Backlash, CoulombFriction, StribeckFriction
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.preparation import segment_fit
 from npdr_ppl.preparation.data_options import DataOptions
-from npdr_ppl.preparation.segment_fit import LEAST_GAIN, fit_segments
+from npdr_ppl.preparation.segment_fit import fit_segments
 from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
+from npdr_ppl.preparation.settings import SEGMENT_FIT
 from npdr_ppl.rollouts import Rollouts
 
 OPTIONS = DataOptions(None, 20, "uncertain", "float64")
@@ -49,7 +50,11 @@ def promised(segments, fit):
 def test_fine_steps_end_where_nothing_is_left_to_gain(segments):
     rough = fit_segments(segments, START, is_rough=True)
     fine = fit_segments(segments, START)
-    assert promised(segments, fine) < 2 * LEAST_GAIN < promised(segments, _at(segments, START))
+    assert (
+        promised(segments, fine)
+        < 2 * SEGMENT_FIT.least_gain
+        < promised(segments, _at(segments, START))
+    )
     least = objective(segments, fine.z, fine.offsets, fine.scale)
     assert least <= objective(segments, rough.z, rough.offsets, fine.scale)
     # Rough steps end within a thousandth of it: enough to rank hypotheses that differ plainly.
@@ -68,7 +73,7 @@ def test_parameters_known_a_thousand_times_better_hold_up_no_other():
         for name, value in hidden.parameters.items()
     }
     fit = fit_segments(segments, segments.place_of(typical))
-    assert promised(segments, fit) < 2 * LEAST_GAIN
+    assert promised(segments, fit) < 2 * SEGMENT_FIT.least_gain
 
 
 def test_a_segment_that_begins_far_off_is_reached_and_holds_up_no_other(segments):
@@ -81,7 +86,7 @@ def test_a_segment_that_begins_far_off_is_reached_and_holds_up_no_other(segments
     others = torch.arange(len(found.offsets)) != 3
     assert (found.offsets[others] - plain.offsets[others]).abs().max() < 0.5
     assert (found.z - plain.z).abs().max() < 0.2
-    assert promised(segments, found) < 2 * LEAST_GAIN
+    assert promised(segments, found) < 2 * SEGMENT_FIT.least_gain
 
 
 def test_a_segment_that_friction_holds_is_freed():
@@ -121,15 +126,17 @@ def test_most_fits_leap_out_of_the_dents_that_play_leaves_in_the_misfit(monkeypa
     def above(away):
         """Returns how far above the least misfit a fit ends that begins elsewhere."""
         begun = start.clone()
-        begun[segments.dented_coordinates] += torch.tensor(away, dtype=torch.float64)
+        begun[segments.coordinates_with_minima] += torch.tensor(away, dtype=torch.float64)
         fit = fit_segments(segments, begun)
         ends = [objective(segments, f.z, f.offsets, least.scale) for f in (fit, least)]
         return ends[0] - ends[1]
 
     starts = (-0.5, -0.1), (-0.3, 0.3), (0.3, -0.3), (-1.0, 0.0), (1.0, 0.0), (0.0, -0.5)
-    # Other dents are hundreds away; what a few more steps might gain is less than this.
+    # Other local minima are hundreds away; what a few more steps might gain is less than this.
     assert sum(above(away) < 10.0 for away in starts) >= 4
-    monkeypatch.setattr(segment_fit, "MOST_LEAPS", 0)
+    monkeypatch.setattr(
+        segment_fit, "SEGMENT_FIT", dataclasses.replace(SEGMENT_FIT, most_restarts=0)
+    )
     assert sum(above(away) < 10.0 for away in starts) <= 1
 
 
@@ -212,7 +219,7 @@ def test_a_fit_goes_on_where_derivatives_explode(segments, monkeypatch):
     assert (found.z - plain.z).abs().max() < 0.2
 
 
-def test_no_leap_is_taken_where_the_parameters_cannot_be_told(segments, monkeypatch):
+def test_nothing_is_restarted_where_the_parameters_cannot_be_told(segments, monkeypatch):
     linearise = segments.linearise
 
     def explodes(z, offsets, scale, *, is_rough=False):
@@ -226,8 +233,8 @@ def test_no_leap_is_taken_where_the_parameters_cannot_be_told(segments, monkeypa
     fit = fit_segments(segments, START)
     monkeypatch.setattr(segments, "linearise", explodes)
     every = torch.ones(2, dtype=torch.bool)
-    monkeypatch.setattr(SegmentModel, "dented_coordinates", every)
-    assert segment_fit._leap(segments, fit.z, fit.offsets, fit.scale, ~every) is None
+    monkeypatch.setattr(SegmentModel, "coordinates_with_minima", every)
+    assert segment_fit._restart(segments, fit.z, fit.offsets, fit.scale, ~every) is None
 
 
 def test_equal_fits_from_equal_starts(segments):

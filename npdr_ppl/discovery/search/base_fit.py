@@ -23,9 +23,10 @@ from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import with_finer_steps
-from npdr_ppl.preparation.closest_fit import ITERATIONS_BEFORE_STEPS, search_prior
+from npdr_ppl.preparation.closest_fit import search_prior
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
 from npdr_ppl.rollouts import Rollouts
 
@@ -196,7 +197,9 @@ def _starts(
     if near:
         return [near]
     segments = SegmentModel(model, rollouts, binding)
-    z = search_prior(segments, iterations=ITERATIONS_BEFORE_STEPS, seed=seed, progress=progress)
+    z = search_prior(
+        segments, iterations=PRIOR_SEARCH.iterations_before_steps, seed=seed, progress=progress
+    )
     found = segments.prior.to_parameters(z[None])
     return [{}, {name: value[0] for name, value in found.items()}]
 

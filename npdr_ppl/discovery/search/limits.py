@@ -14,7 +14,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.search.evidence import INDISTINCT
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.language.effects import Effect
-from npdr_ppl.preparation.segment_model import START_LIMIT
+from npdr_ppl.preparation.settings import LINEARISATION
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["limits"]
@@ -51,7 +51,11 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
         if parameter.name not in (*effect.strength, *effect.incidental)
         and not isinstance(priors[parameter.name].support, constraints.interval)
     }
-    ends = [{site: end} for site in shapes for end in (-START_LIMIT, START_LIMIT)]
+    ends = [
+        {site: end}
+        for site in shapes
+        for end in (-LINEARISATION.start_limit, LINEARISATION.start_limit)
+    ]
     best = current.losses(current.fit.scale).sum()
     lost = [
         math.inf

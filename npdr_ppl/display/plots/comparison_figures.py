@@ -18,8 +18,9 @@ from npdr_ppl.display.plots.marginals import Samples
 from npdr_ppl.drawing.theme import save_figure
 from npdr_ppl.posterior.comparison.comparison_result import Comparison
 from npdr_ppl.posterior.parameter_units import parameter_units
-from npdr_ppl.preparation.draw_budget import BUDGET, affordable_draws
+from npdr_ppl.preparation.draw_budget import affordable_draws
 from npdr_ppl.preparation.evaluation import replay
+from npdr_ppl.preparation.settings import DRAW_BUDGET
 from npdr_ppl.progress import Step
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
@@ -82,7 +83,7 @@ def write_comparison_figures(
     options = some.bound.options
     shown = rollouts[[0]]
     # The posteriors are simulated for one figure, so they share the memory budget.
-    budget = BUDGET // (4 * len(draws))
+    budget = DRAW_BUDGET.most_bytes // (4 * len(draws))
     num = affordable_draws(NUM_PREDICTIVE, shown.readings[0].size, budget=budget)
     replays = {
         label: replay(model, shown, {n: v[:num] for n, v in values.items()}, options)

@@ -12,8 +12,9 @@ from npdr_ppl.drawing.columns import scalar_columns
 from npdr_ppl.drawing.theme import save_figure
 from npdr_ppl.posterior.parameter_units import parameter_units
 from npdr_ppl.posterior.posterior import PosteriorBase
-from npdr_ppl.preparation.draw_budget import BUDGET, affordable_draws
+from npdr_ppl.preparation.draw_budget import affordable_draws
 from npdr_ppl.preparation.evaluation import replay
+from npdr_ppl.preparation.settings import DRAW_BUDGET
 from npdr_ppl.progress import Step
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
@@ -71,7 +72,9 @@ def write_fit_figures(
     step(0.7, "predictions")
     options = posterior.bound.options
     shown = rollouts[[0]]
-    num = affordable_draws(NUM_PREDICTIVE, shown.readings[0].size, budget=BUDGET // 4)
+    num = affordable_draws(
+        NUM_PREDICTIVE, shown.readings[0].size, budget=DRAW_BUDGET.most_bytes // 4
+    )
     few = {name: value[:num] for name, value in draws.items()}
     replayed = replay(model, shown, few, options)
     single = replay(model, shown, {n: v[None] for n, v in most_likely.items()}, options)

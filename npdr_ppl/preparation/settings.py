@@ -1,0 +1,341 @@
+"""The numbers that the preparation of a recording uses, one validated object per stage.
+
+They are no options for users: :class:`~npdr_ppl.preparation.data_options.DataOptions` has those.
+"""
+
+import math
+from dataclasses import dataclass
+
+from npdr_ppl.settings import check_range
+
+__all__ = [
+    "DRAW_BUDGET",
+    "IMPORTANCE_SAMPLING",
+    "INITIAL_STATES",
+    "LINEARISATION",
+    "LINEAR_REGRESSION",
+    "PRIOR_SEARCH",
+    "RIDGE",
+    "SAMPLING_COORDINATES",
+    "SEGMENT_FIT",
+    "DrawBudgetSettings",
+    "ImportanceSamplingSettings",
+    "InitialStateSettings",
+    "LinearRegressionSettings",
+    "LinearisationSettings",
+    "PriorSearchSettings",
+    "RidgeSettings",
+    "SamplingCoordinateSettings",
+    "SegmentFitSettings",
+]
+
+
+@dataclass(frozen=True)
+class LinearisationSettings:
+    """Finite differences of segments, and the least scale of their residuals.
+
+    Attributes:
+        parameter_step: Half the width of finite differences of parameters, in standard deviations
+            of the prior. It exceeds the changes that single precision and dry friction hide.
+        initial_state_step: Half the width of finite differences of initial states, in standard
+            deviations of the smoother's error.
+        start_limit: Greatest distance of a fit's first point from the prior's centre, in standard
+            deviations. At the ends of a prior's range a parameter hardly changes with its
+            reference coordinate.
+        relative_scale_floor: Least scale of a channel's residuals, as a share of its largest
+            measurement. Files and simulations in single precision hold no more digits. With less
+            noise, the initial states of a simulated recording without noise cannot be integrated
+            out in double precision.
+        absolute_scale_floor: Least scale of the residuals of a channel that is zero throughout,
+            in the channel's unit.
+    """
+
+    parameter_step: float = 1e-2
+    initial_state_step: float = 0.1
+    start_limit: float = 4.5
+    relative_scale_floor: float = 1e-6
+    absolute_scale_floor: float = 1e-9
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1e-6, 1.0, "parameter_step", "initial_state_step")
+        check_range(self, 1.0, 8.0, "start_limit")
+        check_range(self, 0.0, 1e-2, "relative_scale_floor", "absolute_scale_floor")
+
+
+@dataclass(frozen=True)
+class SegmentFitSettings:
+    """Damped Gauss-Newton steps, and restarts from other points.
+
+    Attributes:
+        first_damping: Damping of the first step, relative to the curvature of each parameter and
+            of each segment's initial state.
+        damping_limits: Smallest and greatest damping.
+        near_factors: Multiples of the last successful damping that are tried first.
+        far_factors: Multiples that are tried if the near ones gain too little; the steps end only
+            after these.
+        rough_gain: Reduction of the objective, as a share of it, below which rough steps end.
+        settled_scale: Rough steps end only if each channel's scale is at least this share of its
+            value before the step.
+        longest_step: Greatest change of a parameter's reference coordinate in one step, in
+            standard deviations of the prior. Initial states are not limited: on an unstable motion
+            they can be wrong by many standard deviations, and each segment has its own damping.
+        largest_coordinate: Greatest distance of a fit from the prior's centre, in standard
+            deviations. A strength that is much smaller than its half-normal prior expects lies at
+            −3 and beyond.
+        least_gain: Reduction of the objective, in variances of the measurement noise, below which
+            steps end. It is a quarter of a unit of log evidence, which is a tenth of what makes
+            one of two models ten times as likely.
+        outlier_misfit: Multiple of the median segment's misfit above which other initial states
+            are tried.
+        initial_state_restarts: Distances of these initial states, in standard deviations of the
+            smoother's error, along each component.
+        restart_distances: Distances of restarts from a fit where the misfit has local minima, in
+            standard deviations of the fit's normal approximation.
+        wide_restart_distances: The same in standard deviations of the prior. The curvature at a
+            local minimum says little about the misfit beyond it.
+        restart_directions: Number of random directions of restarts, per coordinate that has local
+            minima.
+        most_restarts: Greatest number of successive restarts.
+    """
+
+    first_damping: float = 1e-2
+    damping_limits: tuple[float, float] = (1e-8, 1e6)
+    near_factors: tuple[float, ...] = (0.1, 1.0, 10.0)
+    far_factors: tuple[float, ...] = (1e-4, 1e-2, 1.0, 1e2, 1e4)
+    rough_gain: float = 1e-3
+    settled_scale: float = 0.95
+    longest_step: float = 1.0
+    largest_coordinate: float = 5.0
+    least_gain: float = 0.5
+    outlier_misfit: float = 10.0
+    initial_state_restarts: tuple[float, ...] = (1.0, 4.0)
+    restart_distances: tuple[float, ...] = (1.0, 3.0, 10.0)
+    wide_restart_distances: tuple[float, ...] = (0.03, 0.1, 0.3)
+    restart_directions: int = 6
+    most_restarts: int = 4
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, *self.damping_limits, "first_damping")
+        check_range(self, 1e-8, 1e8, "near_factors", "far_factors")
+        check_range(self, 0.0, 1.0, "rough_gain", "settled_scale")
+        check_range(self, 1e-3, 8.0, "longest_step", "largest_coordinate")
+        check_range(self, 0.0, math.inf, "least_gain", "initial_state_restarts")
+        check_range(self, 0.0, math.inf, "restart_distances", "wide_restart_distances")
+        check_range(self, 1.0, math.inf, "outlier_misfit")
+        check_range(self, 0, 100, "restart_directions", "most_restarts")
+
+
+@dataclass(frozen=True)
+class PriorSearchSettings:
+    """The cross-entropy search for the closest fit, over the whole prior.
+
+    Attributes:
+        iterations: Number of iterations. Enough to find the basin of the closest fit, not its
+            lowest point.
+        population: Number of parameter sets in each iteration.
+        iterations_before_steps: Number of iterations if Gauss-Newton steps follow.
+        most_segments: Greatest number of segments that are simulated. On the tuning recordings of
+            ``benchmarks/clean_fits.py``, fits end at the same parameters as with all segments.
+        negligible_deviation: Standard deviation that is negligible in every unit.
+    """
+
+    iterations: int = 6
+    population: int = 200
+    iterations_before_steps: int = 3
+    most_segments: int = 24
+    negligible_deviation: float = 1e-9
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, math.inf, "iterations", "iterations_before_steps", "most_segments")
+        check_range(self, 10, math.inf, "population")
+        check_range(self, 0.0, 1e-3, "negligible_deviation")
+
+
+@dataclass(frozen=True)
+class InitialStateSettings:
+    """Estimation of the errors of the segments' initial states.
+
+    Attributes:
+        iterations: Number of iterations of expectation maximisation. Components about which the
+            measurements say little hardly change.
+        factor_limits: Smallest and greatest factor by which the smoother's errors are scaled.
+    """
+
+    iterations: int = 30
+    factor_limits: tuple[float, float] = (0.2, 10.0)
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, 10_000, "iterations")
+        check_range(self, 1e-3, 1e3, "factor_limits")
+
+
+@dataclass(frozen=True)
+class SamplingCoordinateSettings:
+    """Coordinates in which posteriors are sampled.
+
+    Attributes:
+        tail_coordinate: Absolute reference coordinate of the 1 % and 99 % quantiles.
+        widest_ratio: Ratio of a prior's 99 % to its 1 % quantile up to which the logarithm of a
+            parameter is taken. A parameter whose prior begins at zero may be zero, where the
+            logarithm is infinite.
+        num_prior_draws: Number of draws from which the prior's variances are estimated, with an
+            error of 5 %.
+    """
+
+    tail_coordinate: float = 2.326
+    widest_ratio: float = 50.0
+    num_prior_draws: int = 1024
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1.0, 5.0, "tail_coordinate")
+        check_range(self, 1.0, math.inf, "widest_ratio")
+        check_range(self, 100, math.inf, "num_prior_draws")
+
+
+@dataclass(frozen=True)
+class RidgeSettings:
+    """Tracing of a posterior's curved ridge.
+
+    Attributes:
+        fewest_points: Least number of points at which a ridge is traced. Each point costs one
+            simulation of the recording per chord step.
+        points_per_term: Number of points for each term of a quadratic in the weak coordinates.
+        first_chord_steps: Chord steps to each point in the first round.
+        chord_steps: Chord steps in later rounds, in which a polynomial predicts the points.
+        draw_factor: Number of draws for each point; those outside the prior's support are dropped.
+        least_found_share: Share of the points that chord steps must find; with fewer, tracing
+            ends.
+        most_rounds: Greatest number of rounds.
+        close_gain: Tracing can end when the median point gains less log density than this by its
+            chord steps. The polynomial is then within the posterior's own width.
+        most_degree: Greatest degree of the polynomial.
+        points_per_coefficient: Least number of points for each coefficient of the polynomial.
+        reach: Spread of the points along the weak coordinates, in standard deviations.
+        growth: Tracing continues if a variance grew by more than this factor in a round.
+        even_share: Effective share of the traced points that their weights must keep. With less,
+            the weights are tempered.
+        longest_step: Greatest chord step along a stiff direction, in standard deviations of the
+            prior.
+        fitted_share: Share of the points to which the polynomial is fitted, those closest to the
+            recording. Chord steps need not converge everywhere.
+    """
+
+    fewest_points: int = 96
+    points_per_term: int = 6
+    first_chord_steps: int = 5
+    chord_steps: int = 3
+    draw_factor: int = 20
+    least_found_share: float = 0.3
+    most_rounds: int = 8
+    close_gain: float = 1.0
+    most_degree: int = 6
+    points_per_coefficient: int = 3
+    reach: float = 2.0
+    growth: float = 1.3
+    even_share: float = 0.1
+    longest_step: float = 1.0
+    fitted_share: float = 0.75
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, 10_000, "fewest_points", "points_per_term", "draw_factor")
+        check_range(self, 1, 100, "first_chord_steps", "chord_steps", "most_rounds")
+        check_range(self, 1, 20, "most_degree", "points_per_coefficient")
+        check_range(self, 0.0, 1.0, "least_found_share", "even_share", "fitted_share")
+        check_range(self, 0.0, 100.0, "close_gain", "reach", "longest_step")
+        check_range(self, 1.0, 100.0, "growth")
+
+
+@dataclass(frozen=True)
+class ImportanceSamplingSettings:
+    """Adaptive importance sampling of a posterior.
+
+    Attributes:
+        draws_per_iteration: Number of draws in each iteration; each is one simulation of the
+            recording.
+        most_iterations: Greatest number of iterations.
+        reliable_k: Greatest Pareto shape k̂ of the weights with which estimates are reliable
+            (Vehtari et al. 2024).
+        enough_effective: Effective sample size at which sampling ends. The ends of a 90 % interval
+            are then known to a tenth of a standard deviation.
+        draws_of_given: Number of draws of each density that is given as a first proposal.
+        effective_per_parameter: Effective draws per parameter that are needed to estimate a
+            proposal's covariance.
+        num_kernels: Number of components of a kernel density estimate that serves as a proposal.
+        tails: Weights of a proposal's components, and factors of their covariances. The mixture
+            has heavier tails than a normal posterior, so that no weight becomes huge.
+    """
+
+    draws_per_iteration: int = 512
+    most_iterations: int = 8
+    reliable_k: float = 0.7
+    enough_effective: float = 200.0
+    draws_of_given: int = 128
+    effective_per_parameter: float = 8.0
+    num_kernels: int = 64
+    tails: tuple[tuple[float, float], ...] = ((0.6, 1.0), (0.3, 3.0), (0.1, 10.0))
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, math.inf, "draws_per_iteration", "most_iterations", "num_kernels")
+        check_range(self, 1, math.inf, "enough_effective", "draws_of_given")
+        check_range(self, 0.0, 1.0, "reliable_k")
+        check_range(self, 1.0, math.inf, "effective_per_parameter")
+        check_range(self, 0.0, math.inf, "tails")
+
+
+@dataclass(frozen=True)
+class DrawBudgetSettings:
+    """Memory for simulated trajectories.
+
+    Attributes:
+        most_bytes: Bytes of trajectories that are kept at once. Statistics make several copies.
+        least_draws: Number of draws that are kept of any recording, however long; fewer do not
+            have useful quantiles.
+        measurements_per_part: Measurements that are simulated at once, 32 MB in double precision.
+            Engines and statistics make copies.
+    """
+
+    most_bytes: int = 128 * 2**20
+    least_draws: int = 20
+    measurements_per_part: int = 4_000_000
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, math.inf, "most_bytes", "least_draws", "measurements_per_part")
+
+
+@dataclass(frozen=True)
+class LinearRegressionSettings:
+    """Linear regression on a model's base parameters.
+
+    Attributes:
+        num_prior_draws: Number of prior draws from which the moments of the base parameters are
+            computed.
+        relative_rank: Least singular value of a direction, relative to the largest. Linear
+            relations hold to 1e-12.
+    """
+
+    num_prior_draws: int = 4_096
+    relative_rank: float = 1e-7
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 100, math.inf, "num_prior_draws")
+        check_range(self, 1e-12, 1.0, "relative_rank")
+
+
+LINEARISATION = LinearisationSettings()
+SEGMENT_FIT = SegmentFitSettings()
+PRIOR_SEARCH = PriorSearchSettings()
+INITIAL_STATES = InitialStateSettings()
+SAMPLING_COORDINATES = SamplingCoordinateSettings()
+RIDGE = RidgeSettings()
+IMPORTANCE_SAMPLING = ImportanceSamplingSettings()
+DRAW_BUDGET = DrawBudgetSettings()
+LINEAR_REGRESSION = LinearRegressionSettings()

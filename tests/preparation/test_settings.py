@@ -1,0 +1,32 @@
+"""Settings are checked when they are made."""
+
+import dataclasses
+
+import pytest
+
+from npdr_ppl.preparation import settings
+from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING, SEGMENT_FIT
+
+STAGES = [getattr(settings, name) for name in settings.__all__ if name.isupper()]
+
+
+@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: type(stage).__name__)
+def test_every_setting_is_validated(stage):
+    for field in dataclasses.fields(stage):
+        value = getattr(stage, field.name)
+        wrong = (-1,) * len(value) if isinstance(value, tuple) else -1
+        with pytest.raises(ValueError, match="must lie in"):
+            dataclasses.replace(stage, **{field.name: wrong})
+
+
+def test_tuples_are_checked_element_by_element():
+    with pytest.raises(ValueError, match=r"SegmentFitSettings.restart_distances must lie in .*-3"):
+        dataclasses.replace(SEGMENT_FIT, restart_distances=(1.0, -3.0))
+    with pytest.raises(ValueError, match="tails must lie in"):
+        dataclasses.replace(IMPORTANCE_SAMPLING, tails=((0.5, 1.0), (0.5, -2.0)))
+
+
+def test_every_setting_is_documented():
+    for stage in STAGES:
+        for field in dataclasses.fields(stage):
+            assert f"        {field.name}: " in type(stage).__doc__
