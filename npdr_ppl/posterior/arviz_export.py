@@ -24,7 +24,7 @@ __all__ = ["to_arviz"]
 
 MAX_PREDICTIVE_DRAWS = 100
 """Posterior predictive draws of each member. All of them have log likelihoods; trajectories are
-kept of as many as :data:`~npdr_ppl.preparation.draw_budget.BUDGET` allows."""
+kept of as many as :data:`~npdr_ppl.preparation.settings.DRAW_BUDGET` allows."""
 
 MAX_PRIOR_PREDICTIVE_DRAWS = 50
 """Prior predictive draws, those of the first prior draws; enough to see what the prior allows."""

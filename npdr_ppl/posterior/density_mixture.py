@@ -17,7 +17,7 @@ from npdr_ppl.randomness import seeded
 __all__ = ["DensityMixture"]
 
 ROUNDING = 1e-9
-"""What a number of draws may exceed an integer by and still be that integer."""
+"""Rounding error that is allowed when a number of draws is compared with an integer."""
 
 
 class DensityMixture(ABC):

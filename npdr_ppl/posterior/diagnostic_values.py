@@ -20,7 +20,7 @@ __all__ = [
 ]
 
 FEWEST_SEGMENTS = 8
-"""Segments below which nothing is said of how many are influential: each of a few is."""
+"""Least number of segments with which influential ones count. Each of fewer is influential."""
 
 
 def conditional_contraction(groups: Mapping[str, "xr.Dataset"]) -> dict[str, float]:

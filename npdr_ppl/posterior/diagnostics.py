@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 __all__ = ["Decision", "Diagnosis", "Thresholds", "diagnose"]
 
 
-CONTRACTS = 0.5
-"""Contraction given all other parameters from which a parameter is determined in combination with
-them: half of what would be known of it if they were known."""
+CONDITIONAL_CONTRACTION = 0.5
+"""Least contraction of a parameter, given all others, with which the data determine it in
+combination with them. At 0.5 its conditional standard deviation is half that of its prior."""
 
 
 class Decision(StrEnum):
@@ -325,7 +325,11 @@ class _Reading:
                 "The data determine no parameter "
                 f"({_listed(unlearnt)}), and no more can be recorded.",
             )
-        alone = [n for n in unlearnt if self.figures.conditional_contraction[n] < CONTRACTS]
+        alone = [
+            n
+            for n in unlearnt
+            if self.figures.conditional_contraction[n] < CONDITIONAL_CONTRACTION
+        ]
         if alone:
             return (
                 Decision.NEW_ROLLOUT,

@@ -1,8 +1,8 @@
-"""Is a learnt posterior what the simulator itself says?
+"""Compares a learnt posterior with the simulator's own likelihood, and corrects it.
 
-A learnt density q(z | x) is an approximation. Where the recording has a likelihood, draws of q are
-weighted by p(x | z) p(z) / q(z): even weights mean that q is right. If they are uneven, q is
-replaced by draws of the posterior itself, which start from q and from the closest fit; see
+A learnt density q(z | x) is an approximation. If the recording has a likelihood, draws of q are
+weighted by p(x | z) p(z) / q(z). Equal weights mean that q is right. If they are unequal, q is
+replaced by draws of the posterior itself, whose first proposals are q and the closest fit; see
 :mod:`npdr_ppl.preparation.importance_sampling`.
 """
 
@@ -19,6 +19,7 @@ from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, systematic
 from npdr_ppl.language.prior import Prior
+from npdr_ppl.posterior.settings import ESTIMATOR_CHECK
 from npdr_ppl.preparation.importance_sampling import (
     WeightedDraws,
     effective_size,
@@ -32,30 +33,7 @@ from npdr_ppl.randomness import seeded
 
 __all__ = ["Correction", "EstimatorCheck", "check_estimator"]
 
-CHECKED_DRAWS = 256
-"""Draws of a learnt posterior that are weighted, each a simulation of the recording."""
-
-RIGHT_SHARE = 0.99
-"""Share of these draws that must be worth an independent one for the learnt posterior to be kept.
-Its tails may be heavier than the posterior's: at a share of 0.92 one draw in a thousand was eleven
-standard deviations away, which spoilt every segment's leave-one-out weights."""
-
-CHAINS = 2
-"""Disjoint sets of draws that a corrected posterior is made of, to compare with each other."""
-
-KERNELS = 256
-"""Components of a corrected posterior's density in each chain."""
-
-BANDWIDTH = 0.2
-"""Standard deviation of these components, in the posterior's (West 1993 shrinks them towards the
-mean, so that the variance stays)."""
-
-
 MIXTURE_PARTS = ("log_weights", "means", "precision_factors")
-
-POINTS_TOGETHER = 2_000
-"""Points at which a corrected density is computed at once: with all its components they take some
-ten megabytes per parameter."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +42,11 @@ class EstimatorCheck:
 
     Attributes:
         learnt_pareto_k: Tail index of the weights of its draws; reliable up to 0.7.
-        learnt_effective_share: Share of its draws that are worth an independent one.
+        learnt_effective_share: Effective sample size of its draws, as a share of their number.
         is_corrected: Whether it was replaced.
-        pareto_k: Tail index of the weights of the draws that the posterior is made of now.
+        pareto_k: Tail index of the weights of the present posterior's draws.
         effective: Their effective sample size.
-        is_reliable: Whether the posterior is what the simulator says.
+        is_reliable: Whether the present posterior agrees with the likelihood.
     """
 
     learnt_pareto_k: float
@@ -79,7 +57,7 @@ class EstimatorCheck:
     is_reliable: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns JSON-serialisable values; what is not finite is null."""
+        """Returns JSON-serialisable values; a value that is not finite is null."""
         return {
             name: None if isinstance(value, float) and not math.isfinite(value) else value
             for name, value in asdict(self).items()
@@ -109,18 +87,18 @@ class RidgeDensity(Density):
         return torch.cat(found)[:num_samples]
 
     def log_prob(self, z: Tensor) -> Tensor:
-        """Returns the log density at ``(n, d)``, shape ``(n,)``, but for what lies off support."""
+        """Returns the log density, ``(n,)``, at points of the support, ``(n, d)``."""
         values = [
             self.mixture.log_prob(self.space.from_reference(part.double()))
             + self.space.log_jacobian(part.double())
-            for part in z.split(POINTS_TOGETHER)
+            for part in z.split(ESTIMATOR_CHECK.points_per_part)
         ]
         return torch.cat(values).to(z)
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What takes the place of a learnt posterior.
+    """The posterior that replaces a learnt one.
 
     Attributes:
         densities: Its chains.
@@ -166,18 +144,18 @@ def check_estimator(
         corrects: Whether to correct it.
 
     Returns:
-        The comparison, and what takes the posterior's place, ``None`` if it stays.
+        The comparison, and the corrected posterior; ``None`` if the learnt one is kept.
     """
     learnt = Mixture(densities)
     prior = likelihood.segments.prior
     with seeded(seed, "check estimator"), torch.no_grad():
-        z = learnt.sample(CHECKED_DRAWS).double().cpu()
+        z = learnt.sample(ESTIMATOR_CHECK.num_draws).double().cpu()
         log_weights = (
             likelihood.log_prob(z) + prior.log_prob(z) - learnt.log_prob(z).double().cpu()
         )
     smoothed, k = smoothed_weights(log_weights)
     share = effective_size(smoothed) / len(z)
-    if k <= IMPORTANCE_SAMPLING.reliable_k and share >= RIGHT_SHARE:
+    if k <= IMPORTANCE_SAMPLING.reliable_k and share >= ESTIMATOR_CHECK.least_effective_share:
         return EstimatorCheck(k, share, False, k, share * len(z), True), None
     if not corrects:
         return EstimatorCheck(k, share, False, k, share * len(z), False), None
@@ -189,28 +167,30 @@ def check_estimator(
 
 def _corrected(draws: WeightedDraws, seed: int) -> Correction:
     """Returns kernel density estimates of disjoint parts of weighted draws."""
-    # Where hardly any draw has a weight the posterior is drawn wider instead, and the check says
-    # that it is not reliable.
+    # If only a few draws have a weight, tempered weights make the posterior wider; the check then
+    # reports that it is not reliable.
     finite = int(draws.log_weights.isfinite().sum())
     wanted = min(1.0, 0.5 * IMPORTANCE_SAMPLING.enough_effective / max(1, finite))
     exponent = longest_step(draws.log_weights, 1.0, wanted)
     log_weights = torch.where(
         draws.log_weights.isfinite(), exponent * draws.log_weights, -torch.inf
     )
+    chains, kernels = ESTIMATOR_CHECK.num_chains, ESTIMATOR_CHECK.num_kernels
+    bandwidth = ESTIMATOR_CHECK.bandwidth
     densities = []
-    for chain in range(CHAINS):
-        w, own = draws.w[chain::CHAINS], log_weights[chain::CHAINS].log_softmax(0)
+    for chain in range(chains):
+        w, own = draws.w[chain::chains], log_weights[chain::chains].log_softmax(0)
         weights = own.exp()
         mean = weights @ w
         away = w - mean
         covariance = (weights[:, None] * away).mT @ away
         covariance = covariance + torch.diag(1e-12 + 1e-9 * covariance.diagonal())
         with seeded(seed, "corrected posterior", chain):
-            centres = w[systematic(own, KERNELS)]
+            centres = w[systematic(own, kernels)]
         mixture = GaussianMixture.from_moments(
-            torch.full((KERNELS,), 1.0 / KERNELS, dtype=torch.float64),
-            mean + math.sqrt(1.0 - BANDWIDTH**2) * (centres - mean),
-            (BANDWIDTH**2 * covariance).expand(KERNELS, *covariance.shape),
+            torch.full((kernels,), 1.0 / kernels, dtype=torch.float64),
+            mean + math.sqrt(1.0 - bandwidth**2) * (centres - mean),
+            (bandwidth**2 * covariance).expand(kernels, *covariance.shape),
         )
         densities.append(RidgeDensity(draws.space, mixture))
     return Correction(tuple(densities))

@@ -1,8 +1,9 @@
-"""What every command does with a recording before it infers anything.
+"""The preparation of a recording, with which every command begins.
 
-Initial states are estimated, and taken to be uncertain; the model's closest fit is found; its
-integration steps are refined where they are too coarse; noise that the model does not declare is
-estimated; and features are chosen. ``fit``, ``compare``, ``train`` and ``discover`` share this.
+It estimates the initial states and their errors, finds the model's closest fit, refines
+integration steps that are too coarse, estimates noise that the model does not declare, and chooses
+features.
+``fit``, ``compare``, ``train`` and ``discover`` share it.
 """
 
 import math
@@ -40,10 +41,10 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["Preparation", "can_be_prepared", "held_out", "prepare", "score_embedding"]
 
 NEGLIGIBLE = 1e-9
-"""Standard deviation of a channel that was not measured: no unit makes it large."""
+"""Standard deviation of a channel that was not measured; it is negligible in every unit."""
 
 MARGIN = 0.1
-"""Least standard deviation of the neighbourhood of a fit, in the prior's."""
+"""Least standard deviation of the neighbourhood of a fit, in standard deviations of the prior."""
 
 
 @dataclass(frozen=True)
@@ -51,21 +52,22 @@ class Preparation:
     """A model and a recording, ready for inference.
 
     Attributes:
-        model: The model, with noise, in finer steps where its own are too coarse.
-        plain_model: The same without noise that was estimated.
+        model: The model with noise, and with finer steps if its own are too coarse.
+        plain_model: The same model without estimated noise.
         rollouts: The recording.
         options: The options, with features that can be applied.
         noise: Estimated standard deviation by channel, in its unit; ``None`` if the model keeps
             its own.
-        noise_of_sensors: The same for all sensors; next to none where nothing was measured.
+        noise_of_sensors: The same for all sensors; negligible for those that were not measured.
         are_steps_coarse: Whether the model's own integration steps are too coarse.
-        hypothesis: The closest fit, where initial states are uncertain and the simulator is
-            deterministic; ``None`` otherwise, and nothing below is known then.
+        hypothesis: The closest fit, if initial states are uncertain and the simulator is
+            deterministic; otherwise ``None``, as are the attributes below.
         likelihood: The recording's likelihood.
-        widest: The closest fit with wider priors where some end too early, else the same.
-        ends: The priors that end too early.
-        searcher: What discovery searches with.
-        closest: The parameters that leave least where initial states are taken as true.
+        widest: The closest fit with wider priors, if it lies at the end of a prior; otherwise the
+            same as ``hypothesis``.
+        ends: These ends of priors.
+        searcher: Discovery's search.
+        closest: The closest fit if initial states are taken as true.
     """
 
     model: Callable[..., Any]
@@ -89,10 +91,10 @@ class Preparation:
 
     @property
     def alarm(self) -> Alarm | None:
-        """Whether anything is missing that no parameters explain, as discovery tests it.
+        """Discovery's test of whether the recording shows anything that no parameters explain.
 
-        Where priors end too early, at the closest fit with wider ones. ``None`` where that cannot
-        be tested: of too few segments.
+        It is made at the closest fit with wider priors, if the fit lies at the end of a prior.
+        ``None`` if there are too few segments for the test.
         """
         if self.searcher is None or self.widest is None:
             return None
@@ -102,7 +104,7 @@ class Preparation:
 
     @property
     def misfit(self) -> float:
-        """Residuals at the closest fit in units of the declared noise; one without any."""
+        """Residuals at the closest fit relative to the declared noise; 1 if none is declared."""
         if self.likelihood is None or not self.likelihood.is_noise_declared:
             return 1.0
         return math.sqrt(self.likelihood.misfit)
@@ -116,8 +118,8 @@ class Preparation:
     def neighbourhood(self) -> GaussianMixture | None:
         """Returns a normal density around the closest fit, wider than the posterior should be.
 
-        Its covariance is that of Laplace's approximation, and ``MARGIN`` of the prior's standard
-        deviations more in every direction, for what is not linear and for what the model lacks.
+        Its covariance is that of Laplace's approximation, plus that of ``MARGIN`` in every
+        direction, because the model is not linear and may lack effects.
         """
         if self.likelihood is None:
             return None

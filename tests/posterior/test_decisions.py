@@ -137,7 +137,8 @@ def test_a_fit_spends_the_rounds_that_it_has_left(clean, quick, monkeypatch):
         most_iterations=1, draws_per_iteration=8, draws_of_given=8,
     )  # fmt: skip
     monkeypatch.setattr(posterior_sampling, "IMPORTANCE_SAMPLING", few)
-    monkeypatch.setattr(estimator_check, "CHECKED_DRAWS", 16)
+    fewer = replace(estimator_check.ESTIMATOR_CHECK, num_draws=16)
+    monkeypatch.setattr(estimator_check, "ESTIMATOR_CHECK", fewer)
     posterior, result = fit(
         pendulum, clean, backend=quick, rounds=1, extra_rounds=1, num_simulations=100,
         progress=False,

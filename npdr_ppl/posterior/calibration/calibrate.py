@@ -36,14 +36,15 @@ from npdr_ppl.randomness import derived_seed, seeded
 __all__ = ["calibrate"]
 
 NUM_DATASETS, NUM_REFITS = 300, 50
-"""Data sets by default. 300 tell a coverage of 80 % to ± 4.5 points with 95 % confidence; a refit
-costs as much as the whole inference."""
+"""Default numbers of data sets. With 300, a coverage of 80 % is known to ± 4.5 points with 95 %
+confidence. A refit costs as much as the whole inference, so their default is smaller."""
 
 MIN_DATASETS = 20
-"""Data sets below which no miscalibration could be told from chance."""
+"""Least number of data sets; with fewer, miscalibration cannot be distinguished from chance."""
 
 MAX_REFERENCE_FEATURES = 512
-"""Features that the reference points of TARP depend on; evenly spaced ones if there are more."""
+"""Greatest number of features on which the reference points of TARP depend; of more features,
+evenly spaced ones are used."""
 
 
 def calibrate(

@@ -27,12 +27,12 @@ from npdr_ppl.errors import ShapeError
 __all__ = ["Band", "simultaneous_band", "uniformity_p_value"]
 
 MAX_POINTS = 100
-"""Thresholds at which the distribution is tested: one per cent apart, as fine as N in the
-hundreds resolves."""
+"""Greatest number of thresholds at which the distribution is tested. They are one per cent apart,
+which is as fine as some hundred data sets can resolve."""
 
 SMALLEST_STATISTIC = 1e-10
-"""Below it the p-value is replaced by its upper bound, thresholds × statistic: the exact one would
-drown in rounding and cost N² per threshold."""
+"""Statistic below which the p-value is replaced by its upper bound, thresholds × statistic. The
+exact value would be lost in rounding errors and cost N² operations per threshold."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ __all__ = ["StackedPosterior", "Stacking", "mixture_elpd", "stack"]
 
 
 NUM_DRAWS = 100
-"""Equal draws that stand for a density without any; ArviZ's estimates need a few."""
+"""Number of equal draws that represent a density without draws; ArviZ's estimates need several."""
 
 
 class StackedPosterior(PosteriorBase):

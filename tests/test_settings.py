@@ -4,10 +4,16 @@ import dataclasses
 
 import pytest
 
-from npdr_ppl.preparation import settings
+from npdr_ppl.posterior import settings as posterior_settings
+from npdr_ppl.preparation import settings as preparation_settings
 from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING, SEGMENT_FIT
 
-STAGES = [getattr(settings, name) for name in settings.__all__ if name.isupper()]
+STAGES = [
+    getattr(module, name)
+    for module in (preparation_settings, posterior_settings)
+    for name in module.__all__
+    if name.isupper()
+]
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: type(stage).__name__)
