@@ -1,4 +1,4 @@
-"""A model bound to measured data: what every backend and every workflow starts from."""
+"""A model bound to measured data, the input of every backend."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -32,14 +32,14 @@ name."""
 
 @dataclass(frozen=True)
 class Observation:
-    """What was observed at one black-box site.
+    """The observation at one black-box site.
 
     Attributes:
         value: The observation in the shape of the site's value: plates, then the event. Channels
             that the data lack are zero.
         channels: Positions of the measured channels among the simulator's sensors, ``None`` for
             a plain function.
-        inputs: The segments' inputs with just these channels, ``None`` for a plain function.
+        inputs: The segments' inputs with these channels only, ``None`` for a plain function.
         embedding: Maps trajectories to features, ``None`` for the output itself.
     """
 
@@ -65,16 +65,16 @@ class Observation:
 
 @dataclass(frozen=True)
 class BoundModel:
-    """A model, its arguments and what was observed.
+    """A model, its arguments and the observations.
 
     Attributes:
         model: The Pyro model.
         args: Its positional arguments.
         prior: Its prior in reference coordinates.
-        observations: What was observed, by black-box site.
+        observations: The observations, by black-box site.
         data: The data as given, by black-box site.
         options: How the data were prepared.
-        starts: Initial states of the segments where they are better known than by the smoother.
+        starts: Initial states of the segments, if known better than by the smoother.
         likelihood: Likelihood of the recording with initial states integrated out, for models of
             one deterministic simulator; ``None`` for all others.
     """
@@ -100,7 +100,7 @@ class BoundModel:
         return self.features({n: o.value[None] for n, o in self.observations.items()})[0]
 
     def network_builder(self) -> Callable[[], torch.nn.Module] | None:
-        """Returns what makes an embedding network to be trained, if the embedding has one."""
+        """Returns the factory of the embedding's trainable network, if it has one."""
         embeddings = [o.embedding for o in self.observations.values()]
         trained = [e for e in embeddings if e is not None and e.is_trained]
         if not trained:
@@ -179,7 +179,7 @@ def bind(
     site_inputs = dict(
         zip([n for n, part in named.items() if isinstance(part, Rollouts)], layout, strict=True)
     )
-    # Where no preparation has found a closest fit, there is none to take a score at.
+    # Without a preparation there is no closest fit at which a score can be computed.
     embedding = PLAIN_FEATURES if options.embedding == "score" else options.embedding
     chosen = embedding_by_name(embedding) if isinstance(embedding, str) else embedding
     observations = {
@@ -190,7 +190,7 @@ def bind(
 
 
 def problem_of(bound: BoundModel, device: str | torch.device = "cpu") -> Problem:
-    """Returns what a backend may know of a bound model."""
+    """Returns the inference problem that a backend receives."""
     prior = bound.prior
     return Problem(
         num_parameters=prior.num_parameters,
@@ -206,7 +206,7 @@ def problem_of(bound: BoundModel, device: str | torch.device = "cpu") -> Problem
 
 
 def _log_likelihood(bound: BoundModel) -> Callable[[Tensor], Tensor] | None:
-    """Returns the log density of all that was measured, if the model has one with gradients."""
+    """Returns the log density of all measurements, if the model has one with gradients."""
     prior, marginal = bound.prior, bound.likelihood
     if marginal is not None and marginal.is_differentiable:
         return marginal.log_prob
@@ -227,7 +227,7 @@ def _log_likelihood(bound: BoundModel) -> Callable[[Tensor], Tensor] | None:
 
 
 def _regression(bound: BoundModel) -> Callable[[Smoothing], LinearRegression] | None:
-    """Returns what computes the model's linear regression, once for each choice of filters."""
+    """Returns a function that makes the model's linear regression, once per choice of filters."""
     if len(bound.data) != 1:
         return None
     (name, data), *_ = bound.data.items()
@@ -243,7 +243,7 @@ def _regression(bound: BoundModel) -> Callable[[Smoothing], LinearRegression] | 
 
 
 class _InputsBySite(dict[str, Inputs]):
-    """Inputs by site; a model that asks for a site without data is told so."""
+    """Inputs by site; raises an error if the model asks for a site without data."""
 
     def __missing__(self, name: str) -> Inputs:
         raise DataError(f"The data are for {', '.join(self)}, but the model asks for {name!r}.")

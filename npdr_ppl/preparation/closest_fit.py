@@ -1,9 +1,9 @@
-"""How near a model can come to a recording, and what inference takes from that.
+"""The closest fit of a model to a recording, and the noise that it implies.
 
-A simulator that lacks an effect never reproduces a recording exactly; without noise of the size of
-what is left, the recording is unlike every simulation and a likelihood-free posterior is
-extrapolation. The closest fit gives the size of that noise, and a point around which trajectories
-can be compressed into their score.
+A simulator that lacks an effect never reproduces a recording exactly. Without noise of the size of
+the remaining residuals, the recording differs from every simulation, and a likelihood-free
+posterior extrapolates. The closest fit gives the size of that noise. It is also the point around
+which trajectories are compressed into their score.
 """
 
 import math
@@ -27,12 +27,12 @@ __all__ = ["ClosestFit", "closest_fit", "search_prior"]
 
 @dataclass(frozen=True)
 class ClosestFit:
-    """How near a model can come to a recording, from initial states that are taken as true.
+    """The closest fit of a model to a recording, if initial states are taken as true.
 
     Attributes:
-        parameters: The parameters that leave least, ``(1,) + site.shape`` by latent site.
+        parameters: Those with the smallest residual, ``(1,) + site.shape`` by latent site.
         scale: Root-mean-square residual by measured channel, in the channel's unit.
-        noise: The same for all sensors; those that were not measured get next to none.
+        noise: The same for all sensors; negligible for those that were not measured.
     """
 
     parameters: dict[str, Tensor]
@@ -50,7 +50,7 @@ def closest_fit(
 ) -> ClosestFit:
     """Searches for the parameters of least residual along a recording; see :func:`search_prior`.
 
-    What errors of the initial states leave belongs to the noise.
+    Residuals that errors of the initial states cause count as noise.
 
     Args:
         model: The Pyro model.
@@ -63,7 +63,7 @@ def closest_fit(
         DataError: No parameters could be simulated along the recording.
     """
     segments = SegmentModel(model, rollouts, options)
-    # Wrong units are reported here; the search would only find that nothing fits.
+    # Check units first, because the search itself would only find that nothing fits.
     simulator = segments.simulator
     rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
     z = search_prior(segments, seed=seed, progress=progress)
@@ -83,10 +83,10 @@ def search_prior(
     seed: int = 0,
     progress: Step | None = None,
 ) -> Tensor:
-    """Returns the best place that a cross-entropy search finds, reference coordinates ``(d,)``.
+    """Returns the best point of a cross-entropy search, in reference coordinates ``(d,)``.
 
-    A short one (Rubinstein 1999), along segments from all over the recording: enough to find the
-    valley, not its bottom.
+    The search (Rubinstein 1999) is short and simulates segments from the whole recording. It
+    finds the basin of the closest fit, not its lowest point.
 
     Args:
         segments: The model along the recording.
@@ -126,7 +126,7 @@ def search_prior(
         if progress is not None:
             progress((iteration + 1) / iterations, f"error {least:.3g} of the range")
     if segments is not every:
-        # What can be simulated along some segments may fail along others.
+        # Parameters that can be simulated along some segments may fail along others.
         starts = torch.zeros(every.inputs.num_segments, every.num_offsets, dtype=torch.float64)
         for place in (z, *elite):
             z, least = place, float(_errors(every, place[None], starts, ranges))
@@ -153,9 +153,9 @@ def _spread_out(segments: SegmentModel, seed: int) -> SegmentModel:
 
 
 def _errors(segments: SegmentModel, z: Tensor, starts: Tensor, ranges: Tensor) -> Tensor:
-    """Returns how far simulations at points ``(n, d)`` are from the recording, ``(n,)``.
+    """Returns the distance of simulations at points ``(n, d)`` from the recording, ``(n,)``.
 
-    The mean over the channels of the root-mean-square error in units of the range.
+    It is the mean, over channels, of the root-mean-square error relative to the channel's range.
     """
     residual = segments.residuals(z, starts.expand(len(z), -1, -1), ranges)
     square = residual.square().unflatten(-1, (-1, len(ranges))).sum((1, 2))

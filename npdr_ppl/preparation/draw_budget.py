@@ -1,4 +1,4 @@
-"""How many simulated trajectories are held in memory at once."""
+"""The number of simulated trajectories that are held in memory at once."""
 
 from collections.abc import Iterator, Mapping
 
@@ -18,7 +18,7 @@ BYTES = 8
 def affordable_draws(
     wanted: int, num_readings: int, *, budget: int = DRAW_BUDGET.most_bytes
 ) -> int:
-    """Returns how many draws of a trajectory are kept: all that are wanted, if memory allows it.
+    """Returns the number of draws of a trajectory to keep: all, if memory allows it.
 
     Args:
         wanted: Number of draws if the recording is short.
@@ -31,9 +31,9 @@ def affordable_draws(
 def executed_in_parts(
     prior: Prior, z: Tensor, num_readings: int
 ) -> Iterator[tuple[Tensor, Mapping[str, Tensor]]]:
-    """Simulates a program at many points, of which only a part is in memory at a time.
+    """Simulates a program at many points, a part of them at a time to bound memory.
 
-    Random numbers follow each other from torch's global stream.
+    Random numbers come from torch's global stream, part after part.
 
     Args:
         prior: The program.

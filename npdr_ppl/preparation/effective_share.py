@@ -1,20 +1,20 @@
-"""How much a recording says where its residuals are correlated in time."""
+"""The effective share of measurements whose residuals are correlated in time."""
 
 import torch
 from torch import Tensor
 
 __all__ = ["effective_share"]
 
-MIN_STEPS = 8
+LEAST_STEPS = 8
 """Steps of a segment below which autocorrelation cannot be estimated."""
 
 
 def effective_share(residual: Tensor, mask: Tensor) -> Tensor:
-    """Returns which share of a segment's readings is worth an independent one, per channel.
+    """Returns the effective number of a segment's measurements as a share of all, per channel.
 
     The residuals of the segments are treated as chains, whose effective sample size ArviZ
-    estimates; readings weighted by it make a composite likelihood of the right magnitude (Ribatet,
-    Cooley & Davison 2012).
+    estimates. Measurements with this weight give a composite likelihood of the right magnitude
+    (Ribatet, Cooley & Davison 2012).
 
     Args:
         residual: Residuals, ``(plates × segments, steps, channels)``.
@@ -25,7 +25,7 @@ def effective_share(residual: Tensor, mask: Tensor) -> Tensor:
     whole = mask.all(-1).repeat(len(residual) // len(mask))
     chains = residual[whole] if bool(whole.any()) else residual
     total = chains.shape[0] * chains.shape[1]
-    if chains.shape[1] < MIN_STEPS:
+    if chains.shape[1] < LEAST_STEPS:
         return torch.ones(residual.shape[-1], dtype=torch.float64)
     sizes = [ess_of_array(values.numpy(), method="mean") for values in chains.unbind(-1)]
     share = torch.tensor(sizes, dtype=torch.float64) / total

@@ -1,4 +1,4 @@
-"""How far a model at given parameters is from measured rollouts."""
+"""The distance of a model with given parameters from measured rollouts."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,13 +27,13 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Replay:
-    """Recorded actions replayed through a model, noise-free.
+    """Simulation of recorded actions, without noise.
 
     Attributes:
         trajectory: Readings after each step, ``(n, S, K, C)``.
         inputs: The segments.
         channel_names: Names of the C measured channels.
-        units: Their units: the recording's, or where it has none, the simulator's.
+        units: Their units, from the recording or, if it has none, from the simulator.
     """
 
     trajectory: Tensor
@@ -127,6 +127,6 @@ def nominal_parameters(model: Callable[..., Any], inputs: Inputs) -> dict[str, T
 
 
 def declares_noise(model: Callable[..., Any], rollouts: Rollouts, options: DataOptions) -> bool:
-    """Returns whether a model gives its readings noise of its own."""
+    """Returns whether a model declares measurement noise."""
     inputs = options.with_certain_start().inputs(rollouts)
     return any(box.noise is not None for box in Prior(model, (inputs,)).black_boxes.values())

@@ -1,10 +1,10 @@
 """Adaptive importance sampling of a posterior whose likelihood can be evaluated.
 
 Draws z_i of proposals q_t are weighted by p(recording | z) p(z) / Σ_t n_t/n q_t(z), the mixture of
-all proposals so far (deterministic mixture weights; Cornuet, Marin, Mira & Robert 2012). While the
-weights are too uneven, the next proposal is a kernel density estimate of the weighted draws, which
-follows ridges that bend. Pareto smoothing of the weights says whether they can be relied on
-(Vehtari, Simpson, Gelman, Yao & Gabry 2024).
+all proposals so far (deterministic mixture weights; Cornuet, Marin, Mira & Robert 2012). If the
+weights are too unequal, the next proposal is a kernel density estimate of the weighted draws,
+which follows curved ridges. The tail of the weights, fitted by Pareto smoothing, shows whether
+they are reliable (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
 """
 
 import math
@@ -39,7 +39,7 @@ class WeightedDraws:
         z: Reference coordinates, ``(n, d)``.
         w: The same in coordinates in which ridges are straight, ``(n, d)``.
         space: These coordinates.
-        log_weights: Logarithms of their weights, one in all, ``(n,)``.
+        log_weights: Logarithms of their weights, whose sum is one, ``(n,)``.
         k_hat: Shape of the tail of the weights; reliable up to ``IMPORTANCE_SAMPLING.reliable_k``.
         effective: Effective sample size.
         iterations: Iterations that were needed.
@@ -94,13 +94,13 @@ def sample_posterior(
 ) -> WeightedDraws:
     """Draws from the posterior of a recording by adaptive importance sampling.
 
-    Begins with Laplace's approximation at the closest fit, in coordinates in which ridges are
-    straight; see :mod:`npdr_ppl.preparation.ridges`.
+    The first proposal is Laplace's approximation at the closest fit, in coordinates in which
+    ridges are straight; see :mod:`npdr_ppl.preparation.ridges`.
 
     Args:
         likelihood: The recording's likelihood.
-        proposals: Further densities over reference coordinates to begin with, e.g. posteriors
-            that a backend has learnt.
+        proposals: Further first proposals, densities over reference coordinates; for example
+            posteriors that a backend has learnt.
         seed: Seed of the draws.
     """
     prior = likelihood.segments.prior
@@ -156,9 +156,9 @@ def sample_posterior(
 
 
 def smoothed_weights(log_weights: Tensor) -> tuple[Tensor, float]:
-    """Returns Pareto-smoothed log weights, one in all, ``(n,)``, and the shape of their tail.
+    """Returns Pareto-smoothed log weights, normalised, ``(n,)``, and the shape of their tail.
 
-    Where too few draws have a weight all count alike, and the shape is infinite.
+    If too few draws have a weight, all weights are equal and the shape is infinite.
     """
     from npdr_ppl.arviz_module import pareto_smoothed
 
@@ -177,8 +177,8 @@ def effective_size(log_weights: Tensor) -> float:
 def _adapted(y: Tensor, log_weights: Tensor, seed: int, iteration: int) -> GaussianMixture:
     """Returns the next proposal: a kernel density estimate of the weighted draws.
 
-    The weights are tempered where hardly any draw has one, so that the proposal approaches the
-    posterior step by step.
+    If few draws have most of the weight, the weights are tempered, so that the proposal
+    approaches the posterior over several iterations.
     """
     d = y.shape[1]
     exponent = longest_step(

@@ -1,10 +1,11 @@
-"""The states that segments start from, estimated with a fitted model's help.
+"""Estimates of the segments' initial states, with the help of a fitted model.
 
-A smoother knows nothing of the commands: where they change, rates are kinked, and a polynomial
-through the readings is biased by what the command does, which is what a delay would look like.
-What a model leaves of the readings has no such kinks. So it is what is smoothed: the readings up
-to a segment's start less those that the model predicts from a state before it. Readings after the
-start are the segment's own, and say what they have to say there.
+A smoother does not know the commands. Where a command changes, rates change abruptly, and a
+polynomial through the measurements is biased in a way that looks like a delay. The difference
+between measurements and a model's prediction has no such abrupt changes. It is therefore this
+difference that is smoothed: measurements before a segment's start minus those that the model
+predicts from an earlier state. Measurements after the start are not used, because the segment
+itself is fitted to them.
 """
 
 import copy
@@ -29,10 +30,10 @@ __all__ = ["InitialStates", "error_factors", "estimate_starts", "uncertain_compo
 
 @dataclass(frozen=True)
 class InitialStates:
-    """What S segments start from, ``(S, channels)`` each.
+    """Initial states of S segments, ``(S, channels)`` each.
 
     Attributes:
-        values: Readings without their noise, in the channels' units.
+        values: Measured channels without their noise, in their units.
         rates: Their time derivatives, in units per second.
         value_errors: Standard deviations of the values' errors.
         rate_errors: Standard deviations of the rates' errors.
@@ -45,7 +46,7 @@ class InitialStates:
 
     @classmethod
     def of(cls, inputs: Inputs) -> "InitialStates | None":
-        """Returns what inputs start from; ``None`` unless that is uncertain."""
+        """Returns the initial states of inputs; ``None`` if they are certain."""
         found = (
             inputs.initial_values,
             inputs.initial_rates,
@@ -58,8 +59,8 @@ class InitialStates:
         """Returns the same with larger or smaller errors.
 
         Args:
-            inputs: Inputs with these starts.
-            factors: Of each component that is off; see :func:`uncertain_components`.
+            inputs: Inputs with these initial states.
+            factors: Factor of each uncertain component; see :func:`uncertain_components`.
         """
         errors = {"initial_values": self.value_errors, "initial_rates": self.rate_errors}
         errors = {name: error.clone() for name, error in errors.items()}
@@ -70,16 +71,16 @@ class InitialStates:
         )
 
     def segments(self, index: Tensor) -> "InitialStates":
-        """Returns what some of the segments start from."""
+        """Returns the initial states of some of the segments."""
         return InitialStates(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def replaced(self, rows: Tensor, new: "InitialStates", where: Tensor) -> "InitialStates":
-        """Returns the same with others in some rows, where a mask says so.
+        """Returns the same with some values replaced.
 
         Args:
             rows: Indices of the n segments.
-            new: The others, ``(n, channels)`` each.
-            where: The mask, ``(n, channels)``.
+            new: Their new values, ``(n, channels)`` each.
+            where: Mask of the values that are replaced, ``(n, channels)``.
         """
         changed = {}
         for field in fields(self):
@@ -89,7 +90,7 @@ class InitialStates:
         return InitialStates(**changed)
 
     def put_into(self, inputs: Inputs) -> Inputs:
-        """Returns inputs that start from here."""
+        """Returns inputs with these initial states."""
         return replace(
             inputs,
             initial_values=self.values,
@@ -100,7 +101,7 @@ class InitialStates:
 
 
 def uncertain_components(inputs: Inputs) -> list[tuple[str, int, Tensor]]:
-    """Returns field, channel and standard deviations ``(S,)`` of what may be off at a start."""
+    """Returns field, channel and standard deviations ``(S,)`` of each uncertain component."""
     found = []
     for name, errors in (
         ("initial_values", inputs.initial_value_errors),
@@ -117,10 +118,10 @@ def uncertain_components(inputs: Inputs) -> list[tuple[str, int, Tensor]]:
 def estimate_starts(
     box: SimulatorBlackBox, inputs: Inputs, rollouts: Rollouts
 ) -> InitialStates | None:
-    """Estimates the states at segments' starts from what a model leaves of the readings there.
+    """Estimates initial states from the difference between measurements and a model.
 
-    Rollouts' first states, which nothing comes before, stay as they are, as do those where the
-    model cannot be simulated.
+    The first state of a rollout is kept, because no measurement precedes it, and so are states at
+    which the model cannot be simulated.
 
     Args:
         box: The simulator and its parameters, those of a fit.
@@ -128,7 +129,7 @@ def estimate_starts(
         rollouts: The recording.
 
     Returns:
-        ``None`` if the inputs' starts are certain.
+        The initial states; ``None`` if those of the inputs are certain.
     """
     known = InitialStates.of(inputs)
     if known is None:
@@ -136,7 +137,7 @@ def estimate_starts(
     length = inputs.num_steps
     wanted = list(zip(inputs.rollout.tolist(), inputs.start.tolist(), strict=True))
     layout = [
-        (rollout, max(0, start - length), start + 1)  # a step more, for the rates
+        (rollout, max(0, start - length), start + 1)  # one more step, for the rates
         for rollout, start in wanted
     ]
     around = cut(
@@ -180,7 +181,7 @@ def estimate_starts(
 def _predicted(simulator: Simulator, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
     """Returns the recorded channels from each segment's start on, ``(S, K + 1, channels)``.
 
-    Channels that the simulator has not are zero.
+    Channels that the simulator does not have are zero.
     """
     names = [sensor.name for sensor in simulator.sensors]
     simulated = simulator.simulate(parameters, inputs).reshape(
@@ -201,8 +202,8 @@ def _predicted_rates(
 ) -> Tensor:
     """Returns the rates of the recorded channels at one step of each segment, ``(S, channels)``.
 
-    The simulated velocity, where there is one and nothing else changes the position's readings;
-    otherwise half the difference between the readings after and before.
+    It is the simulated velocity, if there is one and nothing else changes the position;
+    otherwise the central difference of the simulated measurements.
     """
     simulator = box.simulator
     row = torch.arange(len(places))
@@ -233,11 +234,11 @@ def _predicted_rates(
 
 
 def error_factors(residual: Tensor, by_starts: Tensor) -> Tensor:
-    """Returns by how much the starts' errors are larger than was thought, by component, ``(m,)``.
+    """Returns the factors by which the initial states' errors are larger than assumed, ``(m,)``.
 
-    The likeliest standard deviations of the offsets (expectation maximisation; Dempster, Laird &
-    Rubin 1977), all else being as fitted. Segments in which they cannot be computed, because the
-    simulation diverges, are left out.
+    They are the most likely standard deviations of the offsets at the fitted parameters
+    (expectation maximisation; Dempster, Laird & Rubin 1977). Segments in which the simulation
+    diverges are left out.
 
     Args:
         residual: Whitened residuals with all offsets at zero, ``(S, N)``.
@@ -247,7 +248,7 @@ def error_factors(residual: Tensor, by_starts: Tensor) -> Tensor:
     score = (by_starts.mT @ residual[..., None])[..., 0]
     eye = torch.eye(by_starts.shape[-1], dtype=torch.float64)
     factors = torch.ones(by_starts.shape[-1], dtype=torch.float64)
-    # At the largest factors, where the unit matrix keeps least apart.
+    # Checked at the largest factors, at which the matrix is closest to singular.
     is_known = is_invertible(eye / INITIAL_STATES.factor_limits[1] ** 2 + information)
     if not bool(is_known.any()):
         return factors

@@ -1,16 +1,17 @@
-"""Coordinates along a ridge of a posterior that bends.
+"""Coordinates along a curved ridge of a posterior.
 
-Where a motion determines fewer combinations than there are parameters, the posterior is a thin
-sheet: stiff directions, a thousand times narrower than the prior, across weak ones that are hardly
-narrower. Even a slight bend of the sheet defeats a normal approximation. With weak coordinates a
-and stiff coordinates b of the prior-whitened information, b = g(a) is traced by Newton steps with
-the Jacobian of the closest fit (the chord method), fitted by a polynomial, and subtracted. The
-shear (a, b) → (a, b − g(a)) keeps volumes, so densities need no correction for it.
+If a motion determines fewer combinations than there are parameters, the posterior is a thin sheet.
+Across it are stiff directions, in which it is a thousand times narrower than the prior; along it
+are weak ones, in which it is hardly narrower. If the sheet is curved even slightly, a normal
+approximation fails. Let a be the weak and b the stiff coordinates of the prior-whitened
+information. The ridge b = g(a) is traced by Newton steps with the Jacobian of the closest fit (the
+chord method), fitted by a polynomial, and subtracted. The shear (a, b) → (a, b − g(a)) preserves
+volumes, so densities need no correction for it.
 
-How far the ridge reaches is not to be seen from the closest fit: where it bends, the curvature
-there makes it look short. The traced points themselves tell: they are weighted by their density
-over that of the points tried, and the next are spread as these say (adaptive importance sampling
-along the ridge), until they say the same again.
+The curvature at the closest fit makes a curved ridge look shorter than it is. Its length is
+therefore found from the traced points. They are weighted by the ratio of their posterior density
+to the density that they were drawn from. The next points are drawn with the mean and covariance of
+the weighted ones (adaptive importance sampling along the ridge), until these no longer change.
 """
 
 from collections.abc import Mapping
@@ -35,15 +36,15 @@ class RidgeCoordinates:
     """Coordinates w of a posterior in which its ridges are straight and along axes.
 
     Attributes:
-        space: The coordinates y that w are made of.
+        space: The coordinates y from which w are computed.
         centre: The closest fit in them, ``(d,)``.
         basis: Columns map w − shear to y − centre, ``(d, d)``.
         information: Information of the recording in units of the prior's, ``(d,)`` ascending.
-        num_weak: How many of w are weak; they come first.
+        num_weak: Number of weak coordinates, which come first in w.
         coefficients: Polynomial g in the weak ones, ``(terms, d − num_weak)``.
-        degree: Its degree, 0 where there is no bend to trace.
-        weak_mean: Mean of the posterior's weak coordinates, as far as tracing tells,
-            ``(num_weak,)``.
+        degree: Its degree; 0 if no ridge was traced.
+        weak_mean: Mean of the posterior's weak coordinates, estimated from the traced
+            points, ``(num_weak,)``.
         weak_covariance: Their covariance, ``(num_weak, num_weak)``.
     """
 
@@ -67,8 +68,8 @@ class RidgeCoordinates:
         scaled = likelihood.information() * (spread / slope)[:, None] * (spread / slope)
         information, vectors = torch.linalg.eigh(0.5 * (scaled + scaled.mT))
         information = information.clamp_min(0.0)
-        # A direction of width δ bends by about δ², in units of the prior; it is weak where that
-        # shows in the stiffest one.
+        # Along a direction of width δ the ridge departs from a line by about δ², in units of the
+        # prior. The direction is weak if that exceeds the width of the stiffest one.
         num_weak = int((information**2 < information[-1]).sum())
         straight = cls(
             space,
@@ -86,7 +87,7 @@ class RidgeCoordinates:
         return straight._traced(likelihood, slope, seed)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Returns what the coordinates consist of beside the prior, to be written to disk."""
+        """Returns the tensors from which, with the prior, the coordinates can be rebuilt."""
         return {
             "centre": self.centre,
             "basis": self.basis,
@@ -114,7 +115,7 @@ class RidgeCoordinates:
         )
 
     def moments(self) -> tuple[Tensor, Tensor]:
-        """Returns about which mean ``(d,)`` and covariance ``(d, d)`` the posterior has in w."""
+        """Returns approximate mean ``(d,)`` and covariance ``(d, d)`` of the posterior in w."""
         k, d = self.num_weak, len(self.centre)
         mean = torch.zeros(d, dtype=torch.float64)
         covariance = torch.diag(1.0 / (1.0 + self.information))
@@ -145,7 +146,7 @@ class RidgeCoordinates:
     def _traced(
         self, likelihood: SegmentLikelihood, slope: Tensor, seed: int
     ) -> "RidgeCoordinates":
-        """Returns the coordinates with the polynomial that the ridge follows."""
+        """Returns the coordinates with a polynomial fitted to the ridge."""
         k, d, found = self.num_weak, len(self.centre), self
         number = max(RIDGE.fewest_points, RIDGE.points_per_term * _num_terms(k, 2))
         points, values = torch.empty(0, d).double(), torch.empty(0).double()
@@ -171,11 +172,11 @@ class RidgeCoordinates:
             weights = (exponent * log_weights).nan_to_num(-torch.inf).softmax(0)
             mean = weights @ weak
             away = weak - mean
-            # The little that is added keeps a direction in which few points have weight.
+            # The small addition keeps the matrix regular if only few points have weight.
             covariance = (weights[:, None] * away).mT @ away + 1e-6 * found.weak_covariance
             grown = torch.linalg.eigvals(torch.linalg.solve(found.weak_covariance, covariance))
             found = replace(found, weak_mean=mean, weak_covariance=covariance)
-            # Where it was expected and spread as before: there is no more to find.
+            # The points lie where they were predicted, and their spread no longer grows.
             if (
                 missed < RIDGE.close_gain
                 and exponent == 1.0
@@ -190,9 +191,9 @@ class RidgeCoordinates:
         """Returns the points of a ridge above weak coordinates ``(n, k)``.
 
         Returns:
-            The points without the bend, ``(n, d)``; log densities up to a constant where the
-            polynomial has them, ``(n,)``, and at the points; minus infinity for those that were
-            not found.
+            The points before the shear, ``(n, d)``; log densities, up to a constant, where the
+            polynomial predicts the points, ``(n,)``; and log densities at the points, minus
+            infinity for points that were not found.
         """
         k, d = self.num_weak, len(self.centre)
         straight = replace(self, coefficients=torch.zeros(1, d - k).double(), degree=0)
@@ -203,7 +204,7 @@ class RidgeCoordinates:
         predicted, prior = value, likelihood.segments.prior
         for step in range(steps + 1):
             z, inside = straight.to_reference(w)
-            # Beyond the support nothing can be simulated: there the point has no score.
+            # Points outside the support cannot be simulated and have no score.
             score, density = torch.full_like(w, torch.nan), torch.full_like(value, -torch.inf)
             if bool(inside.any()):
                 at = z[inside]
@@ -215,7 +216,7 @@ class RidgeCoordinates:
                 predicted = density
             is_better = density > value
             best[is_better], value[is_better] = w[is_better], density[is_better]
-            # The prior's own pull is that of a normal one of the same variance.
+            # The prior's gradient is approximated by that of a normal one of the same variance.
             change = ((score @ by_w)[:, k:] - w[:, k:]) / stiff
             w = w.clone()
             w[:, k:] += change.nan_to_num(0.0).clamp(-RIDGE.longest_step, RIDGE.longest_step)
@@ -224,12 +225,13 @@ class RidgeCoordinates:
     def _bent_through(self, w: Tensor, log_density: Tensor) -> "RidgeCoordinates":
         """Returns the coordinates with a polynomial through points of the ridge, ``(n, d)``.
 
-        Its degree is that of least leave-one-out error in standard deviations of the posterior.
+        The degree is the one with the smallest leave-one-out error, in standard deviations of the
+        posterior.
         """
         k = self.num_weak
         near = log_density.argsort(descending=True)[: int(RIDGE.fitted_share * len(w))]
         near = near[log_density[near].isfinite()]
-        # Points off the ridge by more than others say less of where it is.
+        # Points that are farther from the ridge than others have smaller weights.
         excess = log_density[near].max() - log_density[near]
         weight = (1.0 + excess / excess.median().clamp_min(0.5)).rsqrt()[:, None]
         wanted = weight * w[near, k:]
@@ -253,7 +255,7 @@ def _num_terms(number: int, degree: int) -> int:
 
 
 def _exponents(number: int, degree: int) -> list[tuple[int, ...]]:
-    """Returns which variables each monomial multiplies, the constant first."""
+    """Returns the variables whose product is each monomial, the constant first."""
     return [
         chosen
         for power in range(degree + 1)

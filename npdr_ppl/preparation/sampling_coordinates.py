@@ -1,8 +1,8 @@
 """Coordinates in which posteriors of physical parameters are close to normal.
 
-What a motion determines are products and ratios of masses, lengths and gains. Where several
-parameters only occur in one product, the posterior is a ridge, which bends in the prior's
-reference coordinates and is straight in the parameters' logarithms.
+A motion determines products and ratios of masses, lengths and gains. If several parameters occur
+only in one product, the posterior is a ridge. The ridge is curved in the prior's reference
+coordinates and straight in the parameters' logarithms.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ __all__ = ["SamplingCoordinates"]
 
 @dataclass(frozen=True)
 class SamplingCoordinates:
-    """Coordinates y of a prior: a parameter, or its logarithm where it is bounded away from zero.
+    """Coordinates y of a prior: each parameter, or its logarithm if it cannot be close to zero.
 
     Priors whose sites are not independent scalars keep their reference coordinates.
 
@@ -54,7 +54,7 @@ class SamplingCoordinates:
         z = torch.randn(
             SAMPLING_COORDINATES.num_prior_draws, d, generator=generator, dtype=torch.float64
         )
-        # A site that depends on others does not take its own values when only they change.
+        # If a site depends on others, its values change with theirs.
         alone = torch.where(
             torch.eye(d, dtype=torch.bool), SAMPLING_COORDINATES.tail_coordinate, 0.0
         ).double()
@@ -75,7 +75,7 @@ class SamplingCoordinates:
     def to_reference(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Maps y ``(n, d)`` to reference coordinates; also returns which lie on the support.
 
-        Those that do not are mapped to the centre.
+        Points outside the support are mapped to the centre.
         """
         if not self.is_elementwise:
             return y, torch.ones(len(y), dtype=torch.bool)

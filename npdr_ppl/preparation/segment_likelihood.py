@@ -6,10 +6,10 @@ covariance C_s = 1 + G_s G_sᵀ, and
 
     log p(x | z) = −½ w Σ_s [ r_s(z)ᵀ C_s⁻¹ r_s(z) / v + log |C_s| + N_s log v + constants ]
 
-G is taken at the closest fit. The variance v is what the closest fit leaves, per degree of
-freedom, or one where the model declares its noise. The weight w is the share of measurements that
-are worth an independent one: correlated residuals say less than their number (composite
-likelihood; Ribatet, Cooley & Davison 2012).
+G is computed at the closest fit. The variance v is its squared residual per degree of freedom, or
+one if the model declares its noise. The weight w is the effective number of
+measurements as a share of all, because correlated residuals carry less information than
+independent ones (composite likelihood; Ribatet, Cooley & Davison 2012).
 """
 
 import math
@@ -35,7 +35,7 @@ class SegmentLikelihood:
         segments: The model along the recording.
         fit: The closest fit, whose scale whitens the residuals.
         linearisation: Residuals and derivatives there.
-        share: Share of measurements worth an independent one, in (0, 1].
+        share: Effective number of measurements as a share of all, in (0, 1].
         is_noise_declared: Whether the fit's scale is noise that the model declares.
     """
 
@@ -63,7 +63,7 @@ class SegmentLikelihood:
 
     @cached_property
     def misfit(self) -> float:
-        """Misfit per degree of freedom at the closest fit: one where noise is all that is left."""
+        """Misfit per degree of freedom at the closest fit: one if the residuals are only noise."""
         now = self.linearisation
         residual = now.residual + (now.by_starts @ self.fit.offsets[..., None])[..., 0]
         freedom = float(self.num_measurements.sum()) - len(self.fit.z)
@@ -98,7 +98,7 @@ class SegmentLikelihood:
         return self.share * self.linearisation.information() / self.variance
 
     def scores(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns scores and misfits at points ``(n, d)``, for derivatives as at the closest fit.
+        """Returns scores and misfits at points ``(n, d)``, with the closest fit's derivatives.
 
         The score is Jᵀ C⁻¹ r of the residuals r there, ``(n, d)``, and the misfit rᵀ C⁻¹ r,
         ``(n,)``, both in units of the variance and weighted by the share.
@@ -112,7 +112,7 @@ class SegmentLikelihood:
         return factor * torch.cat(scores), factor * torch.cat(misfits)
 
     def _residuals(self, z: Tensor) -> Iterator[Tensor]:
-        """Yields whitened residuals ``(n, S, N)`` with unmoved initial states, in chunks."""
+        """Yields whitened residuals ``(n, S, N)`` at zero offsets, in chunks."""
         together = max(1, MAX_READINGS_PER_CHUNK // max(1, self.segments.observed.numel()))
         offsets = self.fit.offsets[None]
         moved = (self.linearisation.by_starts @ self.fit.offsets[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""Linear systems of many segments at once, of which some may not be solvable."""
+"""Linear systems of many segments at once, some of which may be singular."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,8 @@ def solve_or_zero(matrix: Tensor, sides: Tensor) -> tuple[Tensor, Tensor]:
     """Solves linear systems; where that fails the solution is zero.
 
     A simulation that diverges has derivatives so large that a matrix of their squares is singular
-    to working precision. Which machine meets an exact zero there depends on its rounding.
+    to working precision. Whether a solver meets an exact zero there depends on the machine's
+    rounding.
 
     Args:
         matrix: The matrices, ``(…, m, m)``.
@@ -27,7 +28,7 @@ def solve_or_zero(matrix: Tensor, sides: Tensor) -> tuple[Tensor, Tensor]:
 def is_invertible(matrix: Tensor) -> Tensor:
     """Returns which matrices have an inverse to working precision, a mask ``(…)``.
 
-    Of those that have not, rounding alone decides what a solver returns. An empty matrix has one.
+    For the others a solver's result depends on rounding alone. An empty matrix has an inverse.
 
     Args:
         matrix: Symmetric positive semidefinite matrices of finite entries, ``(…, m, m)``.
