@@ -4,13 +4,24 @@ import dataclasses
 
 import pytest
 
+from npdr_ppl.discovery import settings as discovery_settings
+from npdr_ppl.discovery.proof import settings as proof_settings
+from npdr_ppl.discovery.screening import settings as screening_settings
+from npdr_ppl.discovery.search import settings as search_settings
 from npdr_ppl.posterior import settings as posterior_settings
 from npdr_ppl.preparation import settings as preparation_settings
 from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING, SEGMENT_FIT
 
 STAGES = [
     getattr(module, name)
-    for module in (preparation_settings, posterior_settings)
+    for module in (
+        preparation_settings,
+        discovery_settings,
+        screening_settings,
+        search_settings,
+        proof_settings,
+        posterior_settings,
+    )  # fmt: skip
     for name in module.__all__
     if name.isupper()
 ]
@@ -20,7 +31,7 @@ STAGES = [
 def test_every_setting_is_validated(stage):
     for field in dataclasses.fields(stage):
         value = getattr(stage, field.name)
-        wrong = (-1,) * len(value) if isinstance(value, tuple) else -1
+        wrong = (-99,) * len(value) if isinstance(value, tuple) else -99
         with pytest.raises(ValueError, match="must lie in"):
             dataclasses.replace(stage, **{field.name: wrong})
 

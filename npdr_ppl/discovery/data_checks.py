@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis
+from npdr_ppl.discovery.settings import DATA_CHECKS
 from npdr_ppl.errors import DataError, NpdrError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.preparation.data_options import DataOptions
@@ -21,30 +22,6 @@ from npdr_ppl.rollouts.simulator_checks import OTHER_UNITS, check_units
 
 __all__ = ["data_problems", "recording_problems"]
 
-GROSS = 0.1
-"""Residual, relative to the change of a window's measurements, above which remedies are tried."""
-
-CURE = 0.5
-"""A problem is reported if its remedy reduces the residual to less than this fraction."""
-
-SHIFTS = (1, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20)
-"""Shifts of the commands' time stamps that are tried, in steps."""
-
-LONGEST_DELAY = 0.04
-"""Longest time in seconds that a device takes to answer a command. Early time stamps of commands
-look the same, so only larger shifts are tried for them."""
-
-SPIKE = 12.0
-"""Jump that indicates lost samples, in standard deviations of a channel's second differences."""
-
-RESTS = 0.01
-"""A channel rests in a step if it changes by less than this fraction of its root-mean-square
-change."""
-
-MIN_STEPS = 20
-
-MOST_LOST = 0.02
-"""If more than this share of the steps are jumps, they are taken for the device's motion."""
 
 Array = NDArray[np.float64]
 
@@ -82,7 +59,7 @@ def _wrong_readings(hypothesis: Hypothesis, rollouts: Rollouts, options: DataOpt
     # followed the wrong measurements.
     as_read = fit_hypothesis(hypothesis.model, rollouts, options, max_steps=6, is_rough=True)
     present = _relative_misfit(as_read)
-    if present < GROSS:
+    if present < DATA_CHECKS.large_residual:
         return []
     cured: dict[str, float] = {}
     for problem, changed in _remedies(hypothesis, rollouts):
@@ -94,7 +71,7 @@ def _wrong_readings(hypothesis: Hypothesis, rollouts: Rollouts, options: DataOpt
     if not cured:
         return []
     best = min(cured, key=lambda problem: cured[problem])
-    return [best] if cured[best] < CURE * present else []
+    return [best] if cured[best] < DATA_CHECKS.remedy_factor * present else []
 
 
 def _relative_misfit(hypothesis: Hypothesis) -> float:
@@ -126,13 +103,13 @@ def _remedies(hypothesis: Hypothesis, rollouts: Rollouts) -> Iterator[tuple[str,
         actions = [_column(a, k, lambda x: -x) for a in rollouts.actions]
         text = f"The sign of {name} looks inverted."
         yield text, replace(rollouts, actions=tuple(actions))
-    for steps in SHIFTS:
+    for steps in DATA_CHECKS.shifts:
         if 4 * steps < min(rollouts.lengths):
             yield (
                 f"The time stamps of the commands look about {steps} steps too late.",
                 _shifted(rollouts, steps),
             )
-            if steps * rollouts.time_step > LONGEST_DELAY:
+            if steps * rollouts.time_step > DATA_CHECKS.longest_delay:
                 text = f"The time stamps of the commands look about {steps} steps too early."
                 yield text, _shifted(rollouts, -steps)
 
@@ -169,9 +146,9 @@ def _lost_samples(rollouts: Rollouts, channels: Sequence[str]) -> list[str]:
         second = np.abs(np.diff(first, axis=0))
         first = np.abs(first[1:])
         # Only steps in which the device moves: it may have rested most of the time.
-        rests = first <= RESTS * np.sqrt(np.square(first).mean(0))
+        rests = first <= DATA_CHECKS.rest_change * np.sqrt(np.square(first).mean(0))
         moves = rests.mean(1) <= 0.5
-        if moves.sum() < MIN_STEPS:
+        if moves.sum() < DATA_CHECKS.least_steps:
             continue
         # Only moving channels can jump; a step of the encoder resolution is no jump.
         steady = np.median(first[moves], axis=0)
@@ -179,10 +156,10 @@ def _lost_samples(rollouts: Rollouts, channels: Sequence[str]) -> list[str]:
         moving = steady > 0
         if moving.sum() < 2:
             continue
-        jumps = second[:, moving] > SPIKE * spread[moving]
+        jumps = second[:, moving] > DATA_CHECKS.jump_size * spread[moving]
         together = jumps.mean(1) > 0.5
         count = int((np.diff(together.astype(int), prepend=0) == 1).sum())
-        if 0 < count and together.mean() < MOST_LOST:
+        if 0 < count and together.mean() < DATA_CHECKS.most_lost:
             begin = float(np.flatnonzero(together)[0] + 1) * rollouts.time_step
             problems.append(
                 f"Rollout {index} seems to have lost samples (number of gaps: {count}, the first "

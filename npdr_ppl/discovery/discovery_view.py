@@ -6,7 +6,8 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from npdr_ppl.discovery.finding import Finding
-from npdr_ppl.discovery.proof.held_out_gap import LEVEL, Gap
+from npdr_ppl.discovery.proof.held_out_gap import Gap
+from npdr_ppl.discovery.proof.settings import GAP
 from npdr_ppl.drawing.html import table
 from npdr_ppl.drawing.panels import panels
 from npdr_ppl.drawing.theme import COLORS
@@ -113,7 +114,7 @@ def draw_gap(axis: "Axes", metric: str, gap: Gap) -> None:
     if gap.noise_floor is not None:
         axis.axhline(gap.noise_floor, color="k", ls="--", lw=1.0, label="noise floor")
     elif metric == "coverage":
-        axis.axhline(LEVEL, color="k", ls=":", lw=1.2, label="what it should be")
+        axis.axhline(GAP.level, color="k", ls=":", lw=1.2, label="what it should be")
     # Below the axis, where no line crosses the numbers.
     axis.set_xticks(
         [0, 1], [f"{w}\n{v:.3g}" for w, v in zip(("before", "after"), values, strict=True)]
@@ -121,7 +122,7 @@ def draw_gap(axis: "Axes", metric: str, gap: Gap) -> None:
     axis.set_xlim(-0.5, 1.5)
     finite = [v for v in (*values, gap.noise_floor or 0.0) if math.isfinite(v)]
     axis.set_ylim(0.0, 1.15 * max([*finite, 1e-12]))
-    title = metric.upper() if metric != "coverage" else f"coverage of {LEVEL:.0%} bands"
+    title = metric.upper() if metric != "coverage" else f"coverage of {GAP.level:.0%} bands"
     closed = gap.closed
     axis.set_title(title if closed is None else f"{title}: {closed:.0%} closed")
 

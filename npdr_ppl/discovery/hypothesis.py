@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npdr_ppl.discovery.settings import HYPOTHESIS
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import add_effect
@@ -23,21 +24,6 @@ from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Hypothesis", "fit_hypothesis", "with_effects"]
 
-LEAST_PENALISED = -1.0
-"""Reference coordinate below which the prior penalty grows no further: a small effect is no less
-credible, and half-normal priors have zero strength at minus infinity."""
-
-MOST_READINGS = 100_000
-"""Number of measurements above which neighbouring ones are averaged before candidates are tested.
-With this many, ten thousand candidate columns take a minute. The benchmarks' recordings have
-fewer."""
-
-FEWEST_AVERAGES = 40
-"""Fewest averages per segment: four for each of its ten pulses of force."""
-
-EDGE = 3.0
-"""Absolute reference coordinate above which a value is implausible: three standard deviations of a
-normal prior."""
 
 Model = Callable[..., Any]
 
@@ -83,7 +69,7 @@ class Hypothesis:
 
         For a :class:`Projection` only: a likelihood needs all measurements.
         """
-        segments = self.segments.averaged(MOST_READINGS, FEWEST_AVERAGES)
+        segments = self.segments.averaged(HYPOTHESIS.most_measurements, HYPOTHESIS.least_averages)
         return self if segments is self.segments else replace(self, segments=segments)
 
     @property
@@ -159,7 +145,9 @@ class Hypothesis:
             sites[site.name]
             for site in self.segments.prior.sites
             if sites.get(site.name) in shapes
-            and bool((self.fit.z[site.coordinates].abs() > EDGE).any())
+            and bool(
+                (self.fit.z[site.coordinates].abs() > HYPOTHESIS.implausible_coordinate).any()
+            )
         )
 
     @property
@@ -170,7 +158,7 @@ class Hypothesis:
         parameter of an effect: each prior is worth one segment (Kass & Wasserman 1995). Priors as
         wide as typical sizes would penalise every effect that is small but clearly detected.
         """
-        z = self.fit.z.clamp_min(LEAST_PENALISED)
+        z = self.fit.z.clamp_min(HYPOTHESIS.least_penalised)
         num = sum(len(effect.parameters) for effect in self.effects)
         return 0.5 * float(z.square().sum()) + 0.5 * num * math.log(len(self.fit.offsets))
 

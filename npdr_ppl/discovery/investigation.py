@@ -25,11 +25,11 @@ from npdr_ppl.discovery.proof.residual_map import Spot, worst_windows
 from npdr_ppl.discovery.screening.encoder_resolution import counts
 from npdr_ppl.discovery.screening.equivalents import equivalents
 from npdr_ppl.discovery.search.alternatives import Added
-from npdr_ppl.discovery.search.effect_search import LEADING, Round, Search, Searcher, explained
-from npdr_ppl.discovery.search.evidence import SURVIVES
+from npdr_ppl.discovery.search.effect_search import Round, Search, Searcher, explained
 from npdr_ppl.discovery.search.limits import limits
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
-from npdr_ppl.discovery.search.trials import PLAINLY
+from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
+from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
@@ -37,20 +37,6 @@ from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Investigation", "discover"]
 
-MOST_UNEXPLAINED = 0.01
-"""Share of the misfit that may stay unexplained. If more is left and the alarm detects it, the
-verdict is ``unknown``."""
-
-MOST_UNHEARD = 0.05
-"""The same limit for a remainder that the alarm does not detect, although the evidence for it is
-larger than :data:`~npdr_ppl.discovery.search.trials.PLAINLY`."""
-
-MINOR = 0.1
-"""Share of the explained misfit. Uncertain effects that together explain no more than this do not
-prevent the verdict ``named``."""
-
-TOLD_APART = 3
-"""Greatest number of alternatives, the likeliest, that the next experiment should separate."""
 
 COARSE = (
     "The model's integration steps are too coarse for this recording; the revised model takes "
@@ -183,7 +169,7 @@ class Investigation:
         with _timed(self.seconds, "limits"):
             for added in search.added:
                 names = list(final.at_edge(added.effect))
-                if added.share > MINOR * explains:
+                if added.share > VERDICT.minor_share * explains:
                     names += limits(final, added.effect, self._searcher.trials)
                 result.append(tuple(dict.fromkeys(names)))
         return result
@@ -222,7 +208,11 @@ class Investigation:
         search = self.search
         added = next(a for a in search.added if a.effect.name == name)
         likeliest = sorted(added.alternatives, key=lambda n: added.alternatives[n], reverse=True)
-        names = [n for n in likeliest[:TOLD_APART] if added.alternatives[n] >= SURVIVES]
+        names = [
+            n
+            for n in likeliest[: VERDICT.most_separated]
+            if added.alternatives[n] >= EVIDENCE.least_probability
+        ]
         alternatives = [search.trials[added.place, n] for n in names]
         if len(alternatives) < 2:
             return None
@@ -262,7 +252,7 @@ class Investigation:
             effects=effects,
             ranking=self.first.ranking,
             separation=self.first.separation,
-            separation_names=tuple(c.name for c in self.first.ranking[:LEADING]),
+            separation_names=tuple(c.name for c in self.first.ranking[: SEARCH.num_leading]),
             gap=gap,
             next_experiment=advice,
             model=search.rounds[0].hypothesis.model,
@@ -321,14 +311,16 @@ def _judge(
     # Not corrected for the number of rounds: this test only reports a remainder.
     is_heard = left.p_value <= options.false_alarm_rate
     # The alarm allows for every kind of noise, so it misses a remainder in only a few segments.
-    is_plain = 0.5 * search.final.share * left.gain > PLAINLY
-    if (is_heard and unexplained > MOST_UNEXPLAINED) or (is_plain and unexplained > MOST_UNHEARD):
+    is_plain = 0.5 * search.final.share * left.gain > TRIALS.certain_evidence
+    if (is_heard and unexplained > VERDICT.most_unexplained) or (
+        is_plain and unexplained > VERDICT.most_undetected
+    ):
         return "unknown", (
             f"The effects that were found leave {unexplained:.0%} of the misfit unexplained. "
             f"The strongest sign of it is {left.strongest}."
         )
     explains = sum(f.share for f in effects)
-    strained = [f for f in effects if f.at_edge and f.share > MINOR * explains]
+    strained = [f for f in effects if f.at_edge and f.share > VERDICT.minor_share * explains]
     if strained:
         return "unknown", (
             f"{strained[0].effect.name} explains the misfit with an implausible value of "
@@ -336,10 +328,12 @@ def _judge(
         )
     unsure = [f for f in effects if f.probability < options.confidence]
     sure = [f for f in effects if f.probability >= options.confidence]
-    if sure and sum(f.share for f in unsure) <= MINOR * explains:
+    if sure and sum(f.share for f in unsure) <= VERDICT.minor_share * explains:
         return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
     doubtful = _most_doubtful(effects, options)
-    names = " or ".join(n for n, p in doubtful.alternatives.items() if p >= SURVIVES)
+    names = " or ".join(
+        n for n, p in doubtful.alternatives.items() if p >= EVIDENCE.least_probability
+    )
     return "ambiguous", f"The recording cannot tell which effect is missing: {names}."
 
 
@@ -350,7 +344,8 @@ def _finding(
     alternatives = [
         name
         for name, probability in added.alternatives.items()
-        if (probability >= SURVIVES or name in added.fitting) and name != effect.name
+        if (probability >= EVIDENCE.least_probability or name in added.fitting)
+        and name != effect.name
     ]
     known = equivalents(effect, search.final.names)
     ids = dict.fromkeys([name.rsplit(".", 1)[1] for name in alternatives] + list(known))

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
-from npdr_ppl.discovery.search.trials import SHORTLIST
+from npdr_ppl.discovery.search.settings import TRIALS
 from npdr_ppl.progress import Reporter, reporter
 
 __all__ = ["sentences"]
@@ -24,7 +24,7 @@ def sentences(
     """
     # The original model has two sentences. Each effect has one for each trial, one when it is
     # added, one for the next screening and one for its probability at the end.
-    total = 2 + options.max_effects * (SHORTLIST + 3)
+    total = 2 + options.max_effects * (TRIALS.shortlist + 3)
     said = 0
     with reporter(show) as bars:
         step = bars.stage("discover")

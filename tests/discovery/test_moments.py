@@ -9,15 +9,15 @@ from hidden_rigs import make_case
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
-from npdr_ppl.discovery.screening.alarm import MOMENT_SHARE
 from npdr_ppl.discovery.screening.latent_force import responses
-from npdr_ppl.discovery.screening.moments import MOST, SHAPES, forces_at_moments
+from npdr_ppl.discovery.screening.moments import forces_at_moments
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.settings import ALARM, MOMENT_TEST
 
 SEED = 2000
 """No seed of the benchmark's, neither of its tuning nor of its reporting."""
 
-HEARD = MOMENT_SHARE * npdr.DiscoveryOptions().false_alarm_rate
+HEARD = ALARM.moment_share * npdr.DiscoveryOptions().false_alarm_rate
 """From which on the alarm fires."""
 
 
@@ -37,7 +37,9 @@ def test_bursts_of_force_stand_out():
     found = moments(*seen("outside", (("hinge", "torque_bursts"),)))
     assert found.name == "hinge: force at moments"
     assert found.p_value < HEARD
-    assert found.gain > SHAPES * MOST  # what chance explains in as many segments
+    assert (
+        found.gain > MOMENT_TEST.num_directions * MOMENT_TEST.most_segments
+    )  # what chance explains in as many segments
 
 
 @pytest.mark.slow
@@ -85,7 +87,7 @@ def test_outliers_are_seldom_taken_for_forces():
 
 def test_segments_of_few_readings_say_nothing():
     projection, found = seen("null")
-    few = SHAPES + 1
+    few = MOMENT_TEST.num_directions + 1
     short = types.SimpleNamespace(residual=projection.residual[:, :few], whitened=lambda x: x)
     ports = {port: change[:, :few] for port, change in found.by_port.items()}
     assert forces_at_moments(short, dataclasses.replace(found, by_port=ports)) == []

@@ -20,13 +20,13 @@ import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.proof.parameter_intervals import Estimate
 from npdr_ppl.discovery.revised_model import revised_source
-from npdr_ppl.discovery.screening.alarm import RINGING_SHARE
 from npdr_ppl.discovery.screening.equivalents import equivalents, irreducible
 from npdr_ppl.discovery.screening.generic_laws import reading_laws, ringing_laws
 from npdr_ppl.discovery.screening.latent_force import latent_force, responses
 from npdr_ppl.discovery.screening.permutation_tests import LargestStatistic
 from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
+from npdr_ppl.discovery.screening.settings import ALARM
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.trials import Trials
@@ -151,7 +151,7 @@ def test_what_rings_is_heard_at_its_frequency(quiet):
         gains = [projection.scores(law.change).gain(slice(None)) for law in laws]
         return min(values), laws[gains.index(max(gains))].name
 
-    from_which_on = RINGING_SHARE * npdr.DiscoveryOptions().false_alarm_rate
+    from_which_on = ALARM.ringing_share * npdr.DiscoveryOptions().false_alarm_rate
     assert heard(Projection(quiet))[0] > from_which_on
     p_value, strongest = heard(ringing)
     assert p_value <= from_which_on

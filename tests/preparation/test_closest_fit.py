@@ -10,8 +10,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.hypothesis import EDGE, fit_hypothesis
+from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.search.base_fit import off_the_ends
+from npdr_ppl.discovery.settings import HYPOTHESIS
 from npdr_ppl.errors import IntractableError
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.models.pendulum import Pendulum
@@ -156,9 +157,9 @@ def test_a_fit_at_the_end_of_a_prior_is_made_once_more_from_inside(rollouts):
     binding = DataOptions(None, 40, "uncertain")
     end = {"mass": torch.tensor(1.6999), "length": torch.tensor(0.85)}
     stuck = fit_hypothesis(model, rollouts, binding, start=end, max_steps=0)
-    assert float(stuck.fit.z.abs().max()) > EDGE
+    assert float(stuck.fit.z.abs().max()) > HYPOTHESIS.implausible_coordinate
     freed = off_the_ends(stuck, model, rollouts, binding)
-    assert float(freed.fit.z.abs().max()) < EDGE
+    assert float(freed.fit.z.abs().max()) < HYPOTHESIS.implausible_coordinate
     assert float(freed.parameters["mass"]) == pytest.approx(MASS, rel=0.02)
     # A fit that is not at an end is left as it is.
     assert off_the_ends(freed, model, rollouts, binding) is freed

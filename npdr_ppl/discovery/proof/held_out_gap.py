@@ -8,6 +8,7 @@ from torch import Tensor
 from npdr_ppl import metrics
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.proof.parameter_intervals import Draws
+from npdr_ppl.discovery.proof.settings import GAP
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.initial_states import error_factors
 from npdr_ppl.preparation.segment_model import SegmentModel
@@ -15,12 +16,6 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts, stitch
 
 __all__ = ["Gap", "prove"]
-
-NUM_DRAWS = 40
-"""Number of posterior predictive trajectories."""
-
-LEVEL = 0.9
-"""Probability of the predictive interval whose coverage is reported."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +73,8 @@ def prove(
         seed: Seed of the predictive draws.
     """
     with seeded(seed, "discovery", "proof"):
-        drawn = draws_after.resampled(NUM_DRAWS)
-        old = _Scores.of(before, draws_before.resampled(NUM_DRAWS), rollouts, options)
+        drawn = draws_after.resampled(GAP.num_draws)
+        old = _Scores.of(before, draws_before.resampled(GAP.num_draws), rollouts, options)
         new = _Scores.of(after, drawn, rollouts, options)
         floor = _floor(after, drawn, rollouts, options)
     return {
@@ -185,4 +180,4 @@ def _crps(segments: SegmentModel, draws: Tensor, observed: Tensor) -> float:
 
 def _coverage(segments: SegmentModel, draws: Tensor) -> float:
     values = metrics.pit(draws, segments.observed.double())
-    return float(metrics.coverage(values, [LEVEL], segments.inputs.mask)[0])
+    return float(metrics.coverage(values, [GAP.level], segments.inputs.mask)[0])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.proof.settings import EXPERIMENT
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effect_context import EquivalenceClass, Excitation
@@ -24,12 +25,6 @@ from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["NextExperiment", "excitation_commands", "next_experiment"]
-
-SECONDS = 4.0
-
-SAFE_SHARE = 1.0
-"""Amplitude as a share of the recording's greatest command, so that no command is larger than one
-that the device has already had."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +55,6 @@ class NextExperiment:
         }
 
 
-ENOUGH = 5.0
-"""Separation, in standard deviations of the measurements, from which an experiment is useful."""
-
-
 def next_experiment(
     alternatives: Sequence[Hypothesis],
     rollouts: Rollouts,
@@ -80,7 +71,7 @@ def next_experiment(
     """
     largest = np.max([np.abs(actions).max(0) for actions in rollouts.actions], axis=0)
     shapes = excitation_commands(rollouts.time_step)
-    commands = SAFE_SHARE * largest * np.stack(list(shapes.values()))[..., None]
+    commands = EXPERIMENT.safe_share * largest * np.stack(list(shapes.values()))[..., None]
     made = [_made(alternative, rollouts, commands) for alternative in alternatives]
     works = np.all([np.isfinite(readings).all((1, 2)) for readings in made], axis=0)
     smallest = np.where(works, math.inf, math.nan)
@@ -93,28 +84,30 @@ def next_experiment(
     separations = dict(zip(shapes, smallest.tolist(), strict=True))
     finite = {name: s for name, s in separations.items() if math.isfinite(s)}
     best = max(finite, key=lambda name: finite[name]) if finite else None
-    if best is not None and finite[best] < ENOUGH:
+    if best is not None and finite[best] < EXPERIMENT.useful_separation:
         best = None
     return NextExperiment(
         best,  # pyright: ignore[reportArgumentType]
         separations,
-        dict(zip(rollouts.action_names, (SAFE_SHARE * largest).tolist(), strict=True)),
+        dict(zip(rollouts.action_names, (EXPERIMENT.safe_share * largest).tolist(), strict=True)),
         "; ".join(dict.fromkeys(group.separated_by for group in classes)),
     )
 
 
 def excitation_commands(time_step: float) -> dict[str, NDArray[np.float64]]:
     """Returns commands between −1 and 1, ``(T,)`` each."""
-    t = np.arange(round(SECONDS / time_step)) * time_step
+    t = np.arange(round(EXPERIMENT.seconds / time_step)) * time_step
     levels = np.array([0.5, -0.25, 1.0, -0.75, 0.25, -1.0, 0.75, -0.5])
-    phase = 2 * np.pi * (0.3 * t + 0.5 * (8.0 - 0.3) / SECONDS * t**2)
+    phase = 2 * np.pi * (0.3 * t + 0.5 * (8.0 - 0.3) / EXPERIMENT.seconds * t**2)
     waves = np.zeros_like(t)
     for k, frequency in enumerate((0.4, 0.9, 1.7, 3.1)):
         waves += np.sin(2 * np.pi * frequency * t + k)
     shapes = {
-        "slow_ramp": 2.0 * np.abs(2.0 * (t / SECONDS - np.floor(t / SECONDS + 0.5))) - 1.0,
+        "slow_ramp": 2.0
+        * np.abs(2.0 * (t / EXPERIMENT.seconds - np.floor(t / EXPERIMENT.seconds + 0.5)))
+        - 1.0,
         "reversals": np.sign(np.sin(2 * np.pi * 1.5 * t)),
-        "steps": levels[(t / SECONDS * len(levels)).astype(int)],
+        "steps": levels[(t / EXPERIMENT.seconds * len(levels)).astype(int)],
         "chirp": np.sin(phase),
         "hold": np.full_like(t, 0.3),
         "wide_range": waves / np.abs(waves).max(),

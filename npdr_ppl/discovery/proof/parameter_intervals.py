@@ -8,20 +8,12 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.proof.settings import INTERVALS
 from npdr_ppl.inference.parts.samplers.importance_weights import systematic
 from npdr_ppl.preparation.importance_sampling import sample_posterior
 from npdr_ppl.randomness import derived_seed
 
 __all__ = ["Draws", "Estimate", "estimates", "posterior_draws"]
-
-COPIES = 16
-BANDWIDTH = 0.3
-"""Before an interval is computed, each draw is replaced by ``COPIES`` draws, spread by
-``BANDWIDTH`` posterior standard deviations. The shortest interval of unsmoothed draws would be
-where they happen to be dense."""
-
-MASS = 0.94
-"""Probability of the interval of highest density."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +56,15 @@ class Draws:
         """Returns draws with smooth marginals of the same mean and variance (West 1993)."""
         mean = self.weights @ self.z
         sd = (self.weights @ (self.z - mean).square()).sqrt()
-        places = torch.special.ndtri((torch.arange(COPIES).double() + 0.5) / COPIES)
-        shrunk = mean + (1.0 - BANDWIDTH**2) ** 0.5 * (self.z - mean)
-        smeared = shrunk[:, None] + BANDWIDTH * (places / places.std())[:, None] * sd
-        return Draws(smeared.flatten(0, 1), self.weights.repeat_interleave(COPIES) / COPIES)
+        places = torch.special.ndtri(
+            (torch.arange(INTERVALS.copies).double() + 0.5) / INTERVALS.copies
+        )
+        shrunk = mean + (1.0 - INTERVALS.bandwidth**2) ** 0.5 * (self.z - mean)
+        smeared = shrunk[:, None] + INTERVALS.bandwidth * (places / places.std())[:, None] * sd
+        return Draws(
+            smeared.flatten(0, 1),
+            self.weights.repeat_interleave(INTERVALS.copies) / INTERVALS.copies,
+        )
 
     def resampled(self, num: int) -> Tensor:
         """Returns draws of equal weight, ``(num, d)``, chosen from torch's global stream."""
@@ -117,11 +114,11 @@ def estimates(
 
 
 def _shortest(values: Tensor, weights: Tensor) -> tuple[float, float]:
-    """Returns the ends of the shortest interval with the probability ``MASS``."""
+    """Returns the ends of the shortest interval with the probability ``INTERVALS.mass``."""
     ordered, order = values.sort()
     # Half of a draw's weight is on each side of it.
     mass = weights[order].cumsum(0) - 0.5 * weights[order]
-    end = torch.searchsorted(mass, mass + MASS)
+    end = torch.searchsorted(mass, mass + INTERVALS.mass)
     inside = end < len(ordered)
     widths = torch.where(inside, ordered[end.clamp_max(len(ordered) - 1)] - ordered, math.inf)
     start = int(widths.argmin())

@@ -21,14 +21,11 @@ from npdr_ppl.discovery.screening.permutation_tests import LargestStatistic
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.screening import Screened, Screening
 from npdr_ppl.discovery.screening.sensitivities import Variant
+from npdr_ppl.discovery.screening.settings import ALARM
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.effects import Effect
 
 __all__ = ["Alarm", "sound_alarm"]
-
-CATALOGUE_SHARE, LAW_SHARE, RINGING_SHARE, MOMENT_SHARE = 0.6, 0.2, 0.1, 0.1
-"""Shares of the false-alarm rate for the catalogue's candidates, generic laws, ringing, and forces
-at some moments."""
 
 
 @dataclass(frozen=True)
@@ -86,24 +83,24 @@ def sound_alarm(
     effects: list[Effect] = []
     changes = _screened(variants, screening, effects)
     for p, effect in zip(chance.p_values(changes), effects, strict=True):
-        values[effect.name] = min(values.get(effect.name, 1.0), p / CATALOGUE_SHARE)
+        values[effect.name] = min(values.get(effect.name, 1.0), p / ALARM.catalogue_share)
     ranking = screening.ranking()
     gains = {candidate.name: candidate.gain for candidate in ranking}
     names: list[str] = []
     changes = _unexplained(generic, projection, gains, names)
     p_values = chance.p_values(chain(changes, (law.change for law in listed)))
     for p, name in zip(p_values, (*names, *(law.name for law in listed)), strict=True):
-        values[name] = min(1.0, p / LAW_SHARE)
+        values[name] = min(1.0, p / ALARM.law_share)
     names = []
     changes = _unexplained(ringing_laws(projection), projection, gains, names)
     for p, name in zip(chance.p_values(changes), names, strict=True):
-        values[name] = min(1.0, p / RINGING_SHARE)
+        values[name] = min(1.0, p / ALARM.ringing_share)
     for effect in {effect.name: effect for effect in effects if effect.wave}.values():
         own = [values[wave.name] for wave in waves.get(effect.port, [])]
         values[effect.name] = min([values[effect.name], *own])
     moments = forces_at_moments(projection, found)
     for moment in moments:
-        values[moment.name] = min(1.0, len(moments) * moment.p_value / MOMENT_SHARE)
+        values[moment.name] = min(1.0, len(moments) * moment.p_value / ALARM.moment_share)
     # Some segments stand out by chance: their gain is used only where that is unlikely.
     unlikely = [moment for moment in moments if values[moment.name] <= options.false_alarm_rate]
     gains |= {moment.name: moment.gain for moment in unlikely}

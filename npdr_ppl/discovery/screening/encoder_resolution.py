@@ -11,17 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.settings import ENCODER
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Count", "count_of", "counts"]
-
-RESOLUTION = 5e-7
-"""Smallest step that is considered, relative to the largest measurement. Single precision itself
-has steps of 6e-8."""
-
-NEARLY = 0.1
-"""Greatest distance of a measurement from a whole multiple, as a fraction of the resolution.
-Measurements written as decimals are not exact multiples."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +62,14 @@ def count_of(readings: NDArray[np.floating]) -> float | None:
     """
     levels = np.unique(readings.astype(np.float64))
     steps = np.diff(levels)
-    steps = steps[steps > RESOLUTION * np.abs(levels).max()]
+    steps = steps[steps > ENCODER.least_resolution * np.abs(levels).max()]
     if not len(steps):
         return None
     # The sum of all steps gives more digits than the smallest step.
     count = float(steps.sum() / np.round(steps / steps.min()).sum())
     multiples = (levels - levels[0]) / count
-    return count if bool(np.all(np.abs(multiples - np.round(multiples)) < NEARLY)) else None
+    return (
+        count
+        if bool(np.all(np.abs(multiples - np.round(multiples)) < ENCODER.multiple_tolerance))
+        else None
+    )

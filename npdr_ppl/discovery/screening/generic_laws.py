@@ -17,12 +17,11 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.latent_force import Responses
-from npdr_ppl.discovery.screening.permutation_tests import MOST_NUMBERS
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.settings import GENERIC_LAWS, PERMUTATION_TEST
 from npdr_ppl.language.channels import Channel
 
 __all__ = [
-    "FREQUENCIES",
     "GenericLaw",
     "generic_laws",
     "reading_laws",
@@ -31,26 +30,6 @@ __all__ = [
     "strongest_frequency",
     "wave_laws",
 ]
-
-SIGN_WIDTH = 0.1
-"""Width over which a sign changes, as a fraction of the channel's spread."""
-
-FREQUENCIES = 120
-"""Number of frequencies tried for a wave in time, spaced by half the resolution of the longest
-rollout."""
-
-RIPPLES = 40
-"""Number of wave numbers tried for a ripple, spaced by half the resolution of a position's
-range."""
-
-RINGS = 30
-"""Number of ringing frequencies tried, evenly spaced in their logarithm."""
-
-SLOWEST_RING = 0.02
-"""Lowest ringing frequency, in periods per time step; the highest is half a period."""
-
-RING_DAMPING = 0.1
-"""Damping ratio of the ringing."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +105,7 @@ def ripple_laws(found: Responses, sensors: Sequence[Channel]) -> list[GenericLaw
         if position.name in velocities:
             direction = _sign(found.channels[velocities[position.name]])
             factors["direction times "] = direction
-        for j in range(1, RIPPLES + 1):
+        for j in range(1, GENERIC_LAWS.num_ripples + 1):
             number = j * math.pi / extent
             name = f"ripple of {number:.3g} 1/{position.unit} in {position.name}"
             laws += [
@@ -200,7 +179,11 @@ def ringing_laws(projection: Projection) -> list[GenericLaw]:
         if rate is None:
             moving = moving.diff(dim=1, prepend=moving[:, :1])
         kick = moving.diff(dim=1, prepend=moving[:, :1])
-        for periods in torch.logspace(math.log10(SLOWEST_RING), math.log10(0.5), RINGS).tolist():
+        for periods in torch.logspace(
+            math.log10(GENERIC_LAWS.lowest_ringing_frequency),
+            math.log10(0.5),
+            GENERIC_LAWS.num_ringing_frequencies,
+        ).tolist():
             make = partial(_rung, hypothesis, kick, position, rate, periods)
             frequency = periods / segments.inputs.time_step
             laws.append(GenericLaw(f"{name}: ringing at {frequency:.3g} Hz", make))
@@ -223,7 +206,10 @@ def _rung(
     steps = torch.arange(kick.shape[1])
     ages = (steps[:, None] - steps).clamp_min(0)
     angle = 2.0 * math.pi * periods
-    decay = complex(-RING_DAMPING, math.sqrt(1.0 - RING_DAMPING**2)) * angle
+    decay = (
+        complex(-GENERIC_LAWS.ringing_damping, math.sqrt(1.0 - GENERIC_LAWS.ringing_damping**2))
+        * angle
+    )
     after = torch.exp(decay * ages).tril()
     swing = kick.to(after.dtype) @ after.mT  # of the rate, (S, K)
     changed = torch.zeros((*segments.observed.shape, 2), dtype=torch.float64)
@@ -260,7 +246,9 @@ def strongest_frequency(projection: Projection, found: Responses, port: str) -> 
     frequencies = _frequencies(found)
     change = found.by_port[port]
     gains: list[float] = []
-    for chunk in frequencies.split(max(1, MOST_NUMBERS // (2 * change[..., 0].numel()))):
+    for chunk in frequencies.split(
+        max(1, PERMUTATION_TEST.numbers_per_part // (2 * change[..., 0].numel()))
+    ):
         waves = torch.cat([_wave(found, frequency) for frequency in chunk.tolist()], dim=-1)
         scores = projection.scores(change @ waves)
         gains += [scores.gain(slice(2 * k, 2 * k + 2)) for k in range(len(chunk))]
@@ -269,7 +257,7 @@ def strongest_frequency(projection: Projection, found: Responses, port: str) -> 
 
 def _frequencies(found: Responses) -> Tensor:
     step = 0.5 / float(found.time.max() - found.time.min())
-    return step * torch.arange(1, FREQUENCIES + 1, dtype=torch.float64)
+    return step * torch.arange(1, GENERIC_LAWS.num_frequencies + 1, dtype=torch.float64)
 
 
 def _wave(found: Responses, frequency: float) -> Tensor:
@@ -279,8 +267,8 @@ def _wave(found: Responses, frequency: float) -> Tensor:
 
 
 def _sign(x: Tensor) -> Tensor:
-    """Returns the sign of a channel, smoothed over :data:`SIGN_WIDTH`."""
-    return torch.tanh(x / x.square().mean().sqrt().clamp_min(1e-12) / SIGN_WIDTH)
+    """Returns the sign of a channel, smoothed over :data:`GENERIC_LAWS.sign_width`."""
+    return torch.tanh(x / x.square().mean().sqrt().clamp_min(1e-12) / GENERIC_LAWS.sign_width)
 
 
 def _dictionary(found: Responses, angles: set[str]) -> dict[str, Tensor]:

@@ -18,17 +18,12 @@ from torch.distributions import Distribution
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.settings import LATENT_FORCE
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Start
 from npdr_ppl.models.effects.timed import TimedForceEffect
 
 __all__ = ["LatentForce", "Responses", "latent_force", "responses"]
-
-PULSES = 10
-"""Pulses per segment and joint."""
-
-SMALL = 1e-3
-"""Height of a pulse, as a fraction of the port's rated force: a response is a derivative."""
 
 
 class Pulse(TimedForceEffect):
@@ -106,7 +101,9 @@ def responses(hypothesis: Hypothesis) -> Responses:
     segments, fit = hypothesis.segments, hypothesis.fit
     inputs, simulator = segments.inputs, hypothesis.simulator
     steps = inputs.num_steps
-    edges = torch.linspace(0, steps, min(PULSES, steps) + 1).round().long().unique()
+    edges = (
+        torch.linspace(0, steps, min(LATENT_FORCE.num_pulses, steps) + 1).round().long().unique()
+    )
     seconds = edges.double() * inputs.time_step
     box = segments.black_box(fit.z[None])
     base = segments.run(simulator, box.parameters, fit.offsets[None])[0]
@@ -115,7 +112,7 @@ def responses(hypothesis: Hypothesis) -> Responses:
         if port.kind != "force":
             continue
         pulse = Pulse(port.name)
-        height = SMALL * port.rated
+        height = LATENT_FORCE.pulse_height * port.rated
         batch = {
             f"{pulse.name}.height": torch.full((len(edges) - 1,), height, dtype=torch.float64),
             f"{pulse.name}.begin": seconds[:-1],

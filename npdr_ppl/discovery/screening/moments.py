@@ -22,17 +22,10 @@ from scipy import special
 from torch import Tensor
 
 from npdr_ppl.discovery.screening.latent_force import Responses
-from npdr_ppl.discovery.screening.permutation_tests import FEWEST_BLOCKS
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.settings import MOMENT_TEST, PERMUTATION_TEST
 
 __all__ = ["Moments", "forces_at_moments"]
-
-SHAPES = 3
-"""Number of directions in which a force may act in one segment: those that change the measurements
-most."""
-
-MOST = 20
-"""Greatest number k of segments that are tested together."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +54,12 @@ def forces_at_moments(projection: Projection, found: Responses) -> list[Moments]
     """
     residual = projection.whitened(projection.residual[..., None])[..., 0]
     num, size = residual.shape
-    if num < FEWEST_BLOCKS or size < SHAPES + 2:
+    if num < PERMUTATION_TEST.least_blocks or size < MOMENT_TEST.num_directions + 2:
         return []
     result = []
     for port, change in found.by_port.items():
         directions = torch.linalg.svd(projection.whitened(change), full_matrices=False)[0]
-        directions = directions[..., :SHAPES]
+        directions = directions[..., : MOMENT_TEST.num_directions]
         shapes = directions.shape[-1]
         along, across = _energies(residual, directions)
         freedom = size - shapes
@@ -76,7 +69,7 @@ def forces_at_moments(projection: Projection, found: Responses) -> list[Moments]
         across = across / (freedom - 1)
         ratio = along / shapes / across / usual
         tails = torch.from_numpy(special.fdtrc(shapes, freedom - 1, ratio.numpy()))
-        order = tails.argsort()[:MOST]
+        order = tails.argsort()[: MOMENT_TEST.most_segments]
         least = tails[order].numpy()
         together = special.bdtrc(np.arange(len(order)), num, least)
         best = int(together.argmin())

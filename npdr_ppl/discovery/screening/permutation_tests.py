@@ -25,27 +25,14 @@ from scipy import special
 from torch import Tensor
 
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.settings import PERMUTATION_TEST
 
-__all__ = ["FEWEST_BLOCKS", "LargestStatistic", "block_sums"]
-
-DRAWS = 2000
-"""Number of permutations; a p-value is at least one divided by it."""
-
-FEWEST_BLOCKS = 24
-"""Neighbouring segments are joined in pairs as long as this many pairs remain."""
-
-MOST_BLOCKS = 100
-"""In long recordings more neighbours are joined, until at most this many blocks remain. More would
-not improve the test, and its time grows with the cube of their number."""
-
-MOST_NUMBERS = 1_000_000
-"""Numbers in the changes of candidates that are processed together, at least one candidate's. With
-their tables they fit into a processor's caches."""
+__all__ = ["LargestStatistic", "block_sums"]
 
 
 def block_sums(by_segment: Tensor) -> Tensor:
     """Adds the terms of neighbouring segments in pairs, ``(S, P)`` to ``(blocks, P)``."""
-    if len(by_segment) < 2 * FEWEST_BLOCKS:
+    if len(by_segment) < 2 * PERMUTATION_TEST.least_blocks:
         return by_segment
     even = len(by_segment) - len(by_segment) % 2
     joined = by_segment[:even].unflatten(0, (-1, 2)).sum(1)
@@ -61,11 +48,13 @@ class LargestStatistic:
         draws: Number of permutations; the first is the observed order.
     """
 
-    def __init__(self, projection: Projection, *, seed: int, draws: int = DRAWS) -> None:
+    def __init__(
+        self, projection: Projection, *, seed: int, draws: int = PERMUTATION_TEST.num_permutations
+    ) -> None:
         self._projection = projection
         residual = projection.whitened(projection.residual[..., None])[..., 0]
-        width = max(1, -(-len(residual) // MOST_BLOCKS))
-        if len(residual) >= 2 * FEWEST_BLOCKS:
+        width = max(1, -(-len(residual) // PERMUTATION_TEST.most_blocks))
+        if len(residual) >= 2 * PERMUTATION_TEST.least_blocks:
             width = max(2, width)
         self._blocks = len(residual) // width
         self._num_used = self._blocks * width
@@ -159,7 +148,7 @@ def _in_batches(groups: Iterable[Tensor]) -> Iterator[tuple[list[int], list[Tens
         places, alike = waiting.setdefault(size, ([], []))
         places.append(place)
         alike.append(group)
-        if (len(alike) + 1) * group.numel() > MOST_NUMBERS:
+        if (len(alike) + 1) * group.numel() > PERMUTATION_TEST.numbers_per_part:
             yield waiting.pop(size)
     yield from waiting.values()
 

@@ -9,24 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.settings import REPETITION
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["keeps_in_step", "period_of"]
 
-REPEATS = 0.1
-"""A motion is periodic if its change after one period is below this fraction of its change between
-unrelated times."""
-
-FORGETS = 0.5
-"""Change, as the same fraction, above which a motion has left its initial state, so that a period
-can end."""
-
-MOST_POINTS = 1_000
-"""Points of a rollout in the coarse search for a period; the best period is then refined."""
-
-SLIPS = 0.25
-"""Phase error, in turns, that a synchronous wave stays below at the end of a rollout."""
 
 Array = NDArray[np.float64]
 
@@ -53,7 +41,7 @@ def _is_in_step(frequency: float, readings: Array, time_step: float) -> bool:
         return False
     turns = frequency * period * time_step
     slip = abs(turns - round(turns)) * len(readings) / period
-    return round(turns) > 0 and slip < SLIPS
+    return round(turns) > 0 and slip < REPETITION.largest_phase_error
 
 
 def period_of(readings: Array) -> int | None:
@@ -71,16 +59,16 @@ def period_of(readings: Array) -> int | None:
     def change(lag: int) -> float:
         return float(np.sqrt(np.square(scaled[lag:] - scaled[:-lag]).mean(0).max()))
 
-    stride = max(1, len(scaled) // MOST_POINTS)
+    stride = max(1, len(scaled) // REPETITION.most_points)
     lags = range(stride, len(scaled) // 2 + 1, stride)
     changes = np.array([change(lag) for lag in lags])
-    left = np.flatnonzero(changes > FORGETS)
+    left = np.flatnonzero(changes > REPETITION.departed_change)
     if not len(left):
         return None
-    back = np.flatnonzero(changes[left[0] :] < REPEATS)
+    back = np.flatnonzero(changes[left[0] :] < REPETITION.periodic_change)
     if not len(back):
         return None
     first = left[0] + back[0]
-    until = first + int(np.argmax(np.append(changes[first:] > FORGETS, True)))
+    until = first + int(np.argmax(np.append(changes[first:] > REPETITION.departed_change, True)))
     best = lags[first + int(np.argmin(changes[first:until]))]
     return min(range(max(1, best - stride), best + stride + 1), key=change)

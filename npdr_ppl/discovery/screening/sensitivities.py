@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.settings import SENSITIVITY
 from npdr_ppl.engines.pooled.pool_simulator import PooledSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
@@ -23,37 +24,6 @@ from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["Variant", "sensitivities"]
-
-NEXT = 1.1
-"""Ratio between neighbouring sizes that are tried of a resonance. A lightly damped resonance is a
-tenth wide."""
-
-SIZES = (1.0, 0.25)
-"""Sizes of an effect that is not smooth, as multiples of its probe."""
-
-RESONANT_SIZES = tuple(0.05 * NEXT**k for k in range(40))
-"""Sizes of a resonance, as multiples of its probe: up to about twice its size."""
-
-BITES = 0.7
-"""First value tried for a limit of commands, as a fraction of the largest command."""
-
-ROUNDING = 100.0
-"""A change below this many rounding errors of the largest measurement is treated as zero. Effects
-without influence leave such errors: an encoder's bias, where no force depends on its position."""
-
-SMALL = 0.05
-"""Size of a smooth effect, as a multiple of its probe: small enough for a linear change."""
-
-SHAPE_QUANTILES = (0.5, 0.15, 0.85)
-"""Quantiles of the priors at which shape parameters are tried. The first stands for the parameters
-that are not varied; they have their nominal values."""
-
-MOST_SHAPES = 7
-"""Greatest number of shapes tried for one effect."""
-
-
-MOST_TOGETHER = 10_000
-"""Segments simulated together: the states of more exceed a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +88,7 @@ def sensitivities(
             _probe(effect, segments.inputs, box.simulator, (hints or {}).get(effect.name))
         )
     largest = float(segments.whitened(base, fit.scale).abs().max())
-    rounding = ROUNDING * torch.finfo(base.dtype).eps * largest
+    rounding = SENSITIVITY.rounding_errors * torch.finfo(base.dtype).eps * largest
     for group in _groups(probes, box.simulator, segments.inputs.num_segments):
         changed = box.simulator.with_effects(*(probe.effect for probe in group))
         starts = fit.offsets[None].expand(sum(len(probe.runs) for probe in group), -1, -1)
@@ -165,9 +135,9 @@ def _probe(
     shapes = [(shape, False) for shape in _shapes(effect, priors, strengths)]
     if hint:
         shapes.append(({**shapes[0][0], **hint}, True))
-    sizes = SIZES if _needs_size(effect, strengths) else (SMALL,)
+    sizes = SENSITIVITY.sizes if _needs_size(effect, strengths) else (SENSITIVITY.smooth_size,)
     if effect.is_resonant:
-        shapes, sizes = shapes[:1], RESONANT_SIZES
+        shapes, sizes = shapes[:1], SENSITIVITY.resonant_sizes
     cases = [
         ({**probe, **shape}, is_hinted, size)
         for (shape, is_hinted), size in itertools.product(shapes, sizes)
@@ -189,7 +159,7 @@ def _groups(
     An effect at zero strength changes nothing, and a step of many simulations costs little more
     than one of a few. If each simulation is a call of an engine, every effect is its own group.
     """
-    together = 1 if isinstance(simulator, PooledSimulator) else MOST_TOGETHER
+    together = 1 if isinstance(simulator, PooledSimulator) else SENSITIVITY.segments_per_part
     kinds: dict[object, list[_Probe]] = {}
     for probe in probes:
         effect = probe.effect
@@ -234,7 +204,10 @@ def _variants(probe: _Probe, rows: Tensor, rounding: float) -> list[Variant]:
         full = torch.tensor([values[n] for n in strengths], dtype=torch.float64)
         lower, upper, deviation = _limits(probe.priors, strengths, nominal, full)
         if probe.effect.is_resonant:
-            lower, upper = lower.clamp_min(size / NEXT), upper.clamp_max(size * NEXT)
+            lower, upper = (
+                lower.clamp_min(size / SENSITIVITY.resonance_ratio),
+                upper.clamp_max(size * SENSITIVITY.resonance_ratio),
+            )
         change = difference.permute(1, 2, 0)
         result.append(
             Variant(
@@ -273,10 +246,10 @@ def _shapes(
     varied = [p for p in effect.parameters if p.name not in strengths]
     shapes: list[dict[str, float]] = [{p.name: p.nominal for p in varied}]
     for parameter in varied:
-        for quantile in SHAPE_QUANTILES[1:]:
+        for quantile in SENSITIVITY.shape_quantiles[1:]:
             value = float(priors[parameter.name].icdf(torch.tensor(quantile)))
             shapes.append({**shapes[0], parameter.name: value})
-    return shapes[:MOST_SHAPES]
+    return shapes[: SENSITIVITY.most_shapes]
 
 
 def _needs_size(effect: Effect, strengths: tuple[str, ...]) -> bool:
@@ -293,14 +266,14 @@ def _within_reach(effect: Effect, probe: dict[str, float], inputs: Inputs) -> di
     k = inputs.action_names.index(effect.port)
     peak = float(inputs.actions[..., k].abs().max())
     return {
-        p.name: probe[p.name] if math.isfinite(p.nominal) else BITES * peak
+        p.name: probe[p.name] if math.isfinite(p.nominal) else SENSITIVITY.first_limit * peak
         for p in effect.parameters
     }
 
 
 def _resting(nominal: float, probe: float) -> float:
     """Returns zero strength as a finite number; for a limit, the largest command."""
-    return nominal if math.isfinite(nominal) else probe / BITES
+    return nominal if math.isfinite(nominal) else probe / SENSITIVITY.first_limit
 
 
 def _limits(

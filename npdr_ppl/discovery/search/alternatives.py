@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.candidate_effects import candidates_at, variants_of
-from npdr_ppl.discovery.screening.generic_laws import FREQUENCIES
 from npdr_ppl.discovery.screening.latent_force import responses
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.screening import screen
-from npdr_ppl.discovery.search.evidence import INDISTINCT, closest, weigh
+from npdr_ppl.discovery.screening.settings import GENERIC_LAWS
+from npdr_ppl.discovery.search.evidence import closest, weigh
+from npdr_ppl.discovery.search.settings import EVIDENCE
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.language.effects import Effect
 
@@ -162,7 +163,7 @@ def weigh_alternatives(
 def log_prior(hypothesis: Hypothesis) -> float:
     """Returns the penalty for searching frequencies: all of them share one hypothesis's prior."""
     waves = sum(bool(effect.wave) for effect in hypothesis.effects)
-    return -waves * math.log(FREQUENCIES)
+    return -waves * math.log(GENERIC_LAWS.num_frequencies)
 
 
 def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
@@ -173,7 +174,8 @@ def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
         name
         for name, trial in trials.items()
         if name != best
-        and reference.share * float(trial.losses(reference.fit.scale).sum() - least) < INDISTINCT
+        and reference.share * float(trial.losses(reference.fit.scale).sum() - least)
+        < EVIDENCE.indistinct_loss
     )
 
 

@@ -13,14 +13,15 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import (
-    EDGE,
     Hypothesis,
     Model,
     fit_hypothesis,
     with_effects,
 )
 from npdr_ppl.discovery.search.evidence import closest, weigh
+from npdr_ppl.discovery.search.settings import BASE_FIT
 from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.discovery.settings import HYPOTHESIS
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import with_finer_steps
 from npdr_ppl.preparation.closest_fit import search_prior
@@ -30,19 +31,7 @@ from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["CONFIDENCE", "BaseFit", "fit_base", "in_finer_steps", "off_the_ends"]
-
-NOTICEABLE = 5.0
-"""Change of all simulated measurements together by steps of a higher order, in standard deviations
-of the residuals. Above it, these steps are used unless the recording contradicts them, because
-false effects would compensate for it. Refitted parameters compensate for four fifths of it."""
-
-CONFIDENCE = 0.9
-"""Probability above which the recording itself is taken to be simulated with coarse steps."""
-
-
-ATTEMPTS = 4
-"""Greatest number of refits from inside the priors, each from the result of the previous one."""
+__all__ = ["BaseFit", "fit_base", "in_finer_steps", "off_the_ends"]
 
 
 @dataclass(frozen=True)
@@ -118,9 +107,9 @@ def off_the_ends(
         rollouts: The recording.
         binding: How it is cut into segments.
     """
-    for _ in range(ATTEMPTS):
+    for _ in range(BASE_FIT.most_refits):
         z = fitted.fit.z
-        is_at_end = z.abs() > EDGE
+        is_at_end = z.abs() > HYPOTHESIS.implausible_coordinate
         if not bool(is_at_end.any()):
             break
         inside = torch.where(is_at_end, z.sign(), z)
@@ -173,11 +162,14 @@ def in_finer_steps(
         finer_model = with_finer_steps(model)
         trials = Trials(finer_model, rollouts, binding)
         finer = None
-        if _step_error(current, finer_model, rollouts, binding) > NOTICEABLE:
+        if _step_error(current, finer_model, rollouts, binding) > BASE_FIT.noticeable_change:
             finer = trials.refitted(current)
             if finer is not None:
                 finer = off_the_ends(finer, finer_model, rollouts, binding)
-        if finer is None or weigh([current, finer], [0.0, 0.0], seed=0)[0] > CONFIDENCE:
+        if (
+            finer is None
+            or weigh([current, finer], [0.0, 0.0], seed=0)[0] > BASE_FIT.coarse_probability
+        ):
             break
         report("the model's integration steps are too coarse for this recording; refining them")
         is_coarse, model = True, finer_model

@@ -24,9 +24,10 @@ from npdr_ppl.discovery.search.alternatives import (
     weigh_alternatives,
 )
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps
-from npdr_ppl.discovery.search.evidence import SURVIVES, closest, weigh
+from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
-from npdr_ppl.discovery.search.trials import PLAINLY, Trials
+from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
+from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.memory import release_freed_memory
@@ -34,16 +35,6 @@ from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Round", "Search", "Searcher", "explained"]
-
-LEAST_SHARE = 1e-4
-"""Stop when the unexplained misfit is below this fraction of the explained misfit. If a large
-effect was missing, differences between integrators and in details of the laws are this large."""
-
-LEADING = 10
-"""Number of best candidates whose pairwise distances are computed."""
-
-PRIOR_OF_ANY = 0.5
-"""Prior probability that any effect of the catalogue is missing."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +174,7 @@ class Searcher:
         while (
             now.alarm.fired
             and len(current.effects) < max_effects
-            and now.alarm.gain > LEAST_SHARE * explained(first.hypothesis, current)
+            and now.alarm.gain > SEARCH.least_unexplained * explained(first.hypothesis, current)
         ):
             best, weights, tried = self._extended(current, now)
             rounds[-1] = replace(now, weights=weights, trials=tried)
@@ -220,7 +211,7 @@ class Searcher:
         sensors = hypothesis.simulator.sensors
         looks = len(hypothesis.effects)
         alarm, ranking = sound_alarm(projection, variants, found, sensors, self.options, looks)
-        separation = separation_matrix(projection, ranking[:LEADING])
+        separation = separation_matrix(projection, ranking[: SEARCH.num_leading])
         ranking = [candidate.without_change() for candidate in ranking]
         width = averaged.segments.steps_per_average
         if width > 1:
@@ -249,9 +240,12 @@ class Searcher:
         if not trials:
             return None, {}, {}
         trials = self.trials.converged(trials)
-        each = math.log(PRIOR_OF_ANY / max(1, len(ranking)))
+        each = math.log(SEARCH.prior_of_any / max(1, len(ranking)))
         hypotheses = [current, *trials.values()]
-        prior = [math.log(1 - PRIOR_OF_ANY), *(each + log_prior(t) for t in trials.values())]
+        prior = [
+            math.log(1 - SEARCH.prior_of_any),
+            *(each + log_prior(t) for t in trials.values()),
+        ]
         weights = dict(zip(("", *trials), weigh(hypotheses, prior, seed=0), strict=True))
         best = max(trials, key=lambda name: weights[name])
         trials = self.trials.apart_from_waves_in_step(trials)
@@ -260,7 +254,7 @@ class Searcher:
             if not trials:
                 return None, weights, trials
             wave, best = best, max(trials, key=lambda name: weights[name])
-            if weights[best] < SURVIVES * weights[wave]:
+            if weights[best] < EVIDENCE.least_probability * weights[wave]:
                 return None, weights, trials
         is_chance = now.alarm.p_values.get(best, 1.0) > self.options.false_alarm_rate
         if is_chance and weights[""] > 1.0 - self.options.confidence:
@@ -272,7 +266,7 @@ class Searcher:
         """Removes effects that are no longer needed after the last addition."""
         removed: list[str] = []
         for effect in current.effects[:-1]:
-            if loss_without(current, effect) > PLAINLY:
+            if loss_without(current, effect) > TRIALS.certain_evidence:
                 continue
             without = self.trials.without(current, effect)
             if without is None:
@@ -341,7 +335,7 @@ def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:
 
 def _is_negligible(first: Hypothesis, current: Hypothesis, extended: Hypothesis) -> bool:
     """Returns whether the last effect explains a negligible share of all that was explained."""
-    return explained(current, extended) < LEAST_SHARE * explained(first, extended)
+    return explained(current, extended) < SEARCH.least_unexplained * explained(first, extended)
 
 
 def explained(first: Hypothesis, final: Hypothesis) -> float:

@@ -18,17 +18,9 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.permutation_tests import block_sums
+from npdr_ppl.discovery.search.settings import EVIDENCE
 
-__all__ = ["INDISTINCT", "SURVIVES", "closest", "evidence", "weigh"]
-
-RESAMPLINGS = 1000
-
-SURVIVES = 0.05
-"""Probability from which an alternative remains possible."""
-
-INDISTINCT = 2.0
-"""Loss of log density up to which a recording cannot distinguish two laws, or a law from its
-limit: two standard deviations of a likelihood ratio of one parameter."""
+__all__ = ["closest", "evidence", "weigh"]
 
 
 def closest(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
@@ -66,7 +58,9 @@ def weigh(
     """
     rows = evidence(hypotheses, log_prior, closest(hypotheses))
     generator = torch.Generator().manual_seed(seed)
-    draws = torch.rand(RESAMPLINGS, rows.shape[1], generator=generator, dtype=torch.float64)
+    draws = torch.rand(
+        EVIDENCE.num_resamplings, rows.shape[1], generator=generator, dtype=torch.float64
+    )
     weights = -draws.clamp_min(1e-300).log()  # exponential, hence Dirichlet once normalised
     weights = weights / weights.mean(-1, keepdim=True)
     return (weights @ rows.mT).nan_to_num(-math.inf).softmax(-1).mean(0).tolist()

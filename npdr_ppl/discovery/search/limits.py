@@ -11,7 +11,7 @@ import math
 from torch.distributions import constraints
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.search.evidence import INDISTINCT
+from npdr_ppl.discovery.search.settings import EVIDENCE
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.preparation.settings import LINEARISATION
@@ -66,7 +66,7 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
     result = []
     for name, low, high in zip(shapes.values(), lost[::2], lost[1::2], strict=True):
         near, far = (low, math.inf) if name == effect.wave else (min(low, high), max(low, high))
-        if near < INDISTINCT and far > DISTINCT:
+        if near < EVIDENCE.indistinct_loss and far > DISTINCT:
             result.append(name)
     return tuple(result)
 

@@ -14,6 +14,7 @@ from scipy import stats
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
+from npdr_ppl.discovery.search.settings import PRIOR_ENDS
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.wider_priors import described_prior, widened, with_wider_priors
@@ -21,19 +22,6 @@ from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["PriorEnd", "Widened", "beyond", "widen_where_it_helps"]
-
-NEAR_END = 1.64
-"""Absolute reference coordinate above which a parameter is near an end of its prior: in the
-outermost 5 % on either side. Only the priors of these are widened, which costs one fit."""
-
-FALSE_ALARM_RATE = 1e-3
-"""Probability that the likelihood-ratio test reports a prior with the true value as too narrow."""
-
-OUTSIDE = 1e-3
-"""A value is outside its prior if the prior probability beyond it is at most this."""
-
-MOST_WIDENINGS = 3
-"""Greatest number of times that priors are widened, each time threefold."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +78,7 @@ def widen_where_it_helps(
     """
     result: Widened | None = None
     priors = current.segments.prior.distributions
-    for _ in range(MOST_WIDENINGS):
+    for _ in range(PRIOR_ENDS.most_widenings):
         names = [name for name in _at_end(current) if widened(priors[name]) is not None]
         if not names:
             break
@@ -106,7 +94,7 @@ def widen_where_it_helps(
             )
         except NpdrError:
             break
-        threshold = 0.5 * float(stats.chi2.isf(FALSE_ALARM_RATE, len(names)))
+        threshold = 0.5 * float(stats.chi2.isf(PRIOR_ENDS.false_alarm_rate, len(names)))
         if _gain(current, fitted) < threshold:
             break
         fitted = Trials(wider, rollouts, binding).with_own_starts(fitted)
@@ -121,7 +109,8 @@ def _at_end(hypothesis: Hypothesis) -> list[str]:
     return [
         site.name
         for site in hypothesis.segments.prior.sites
-        if site.shape.numel() == 1 and bool((z[site.coordinates].abs() > NEAR_END).all())
+        if site.shape.numel() == 1
+        and bool((z[site.coordinates].abs() > PRIOR_ENDS.near_coordinate).all())
     ]
 
 
@@ -138,9 +127,12 @@ def beyond(priors: Mapping[str, Any], found: Hypothesis) -> tuple[PriorEnd, ...]
         if name not in priors:  # a parameter of an added effect
             continue
         below = _probability_below(priors[name], value) if value.numel() == 1 else None
-        if below is None or OUTSIDE < below < 1.0 - OUTSIDE:
+        if (
+            below is None
+            or PRIOR_ENDS.outside_probability < below < 1.0 - PRIOR_ENDS.outside_probability
+        ):
             continue
-        end = "lower" if below <= OUTSIDE else "upper"
+        end = "lower" if below <= PRIOR_ENDS.outside_probability else "upper"
         ends.append(PriorEnd(name, end, described_prior(priors[name]), float(value)))
     return tuple(ends)
 

@@ -11,6 +11,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
 from npdr_ppl.discovery.screening.repetition import keeps_in_step
 from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.search.evidence import closest
+from npdr_ppl.discovery.search.settings import TRIALS
 from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
@@ -19,37 +20,7 @@ from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["PLAINLY", "SHORTLIST", "Trials"]
-
-SHORTLIST = 6
-"""Greatest number of candidates that are fitted in full in each round."""
-
-MAX_STEPS = 12
-"""Greatest number of steps of a fit."""
-
-TRIAL_STEPS = 6
-"""Greatest number of steps of a first fit, which shows whether a longer fit is worth it."""
-
-CONTENDERS = 3
-"""Greatest number of candidates that are fitted until convergence."""
-
-CONTENDS = 0.3
-"""A candidate is fitted until convergence if its loss exceeds the least by at most this share of
-it …"""
-
-CONTENDS_ANYWAY = 20.0
-"""… or by at most this much in log density."""
-
-TOGETHER = 2
-"""Number of candidates that are tried before each decision whether to try more."""
-
-GROWTH = 4.0
-"""Greatest factor by which a full fit may explain more than a candidate's linear gain predicts,
-relative to the best candidate. On the tuning rigs it is at most 3.4 for candidates that explain a
-tenth or more."""
-
-PLAINLY = 30.0
-"""Difference of log evidence above which one of two hypotheses is taken as certain."""
+__all__ = ["Trials"]
 
 
 @dataclass(frozen=True)
@@ -104,9 +75,12 @@ class Trials:
             report: Called with a sentence about each candidate.
         """
         trials: dict[str, Hypothesis] = {}
-        waiting = list(ranking[:SHORTLIST])
+        waiting = list(ranking[: TRIALS.shortlist])
         while waiting:
-            tried, waiting = waiting[:TOGETHER], waiting[TOGETHER:]
+            tried, waiting = (
+                waiting[: TRIALS.candidates_per_decision],
+                waiting[TRIALS.candidates_per_decision :],
+            )
             asked = [
                 _Fit(
                     (*current.effects, candidate.variant.effect),
@@ -123,7 +97,9 @@ class Trials:
                     report(f"tried {candidate.name}: {_shown(found)}")
             if trials:
                 far = _far_behind(current, closest(list(trials.values())))
-                waiting = [c for c in waiting if c.gain * GROWTH > far * ranking[0].gain]
+                waiting = [
+                    c for c in waiting if c.gain * TRIALS.largest_growth > far * ranking[0].gain
+                ]
         return trials
 
     def converged(
@@ -140,8 +116,10 @@ class Trials:
         least = min(losses.values())
         contenders = [
             name
-            for name in sorted(losses, key=lambda name: losses[name])[:CONTENDERS]
-            if name != done and losses[name] <= least + max(CONTENDS_ANYWAY, CONTENDS * abs(least))
+            for name in sorted(losses, key=lambda name: losses[name])[: TRIALS.most_converged]
+            if name != done
+            and losses[name]
+            <= least + max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))
         ]
         asked = [
             _Fit(trial.effects, trial.parameters, trial.fit.offsets, trial.segments.starts)
@@ -238,7 +216,7 @@ def _fitted(trials: Trials, asked: _Fit) -> Hypothesis | None:
             offsets=asked.offsets,
             starts=asked.starts,
             held=asked.held,
-            max_steps=TRIAL_STEPS if asked.is_trial else MAX_STEPS,
+            max_steps=TRIALS.first_steps if asked.is_trial else TRIALS.most_steps,
             is_rough=asked.is_trial,
         )
     except NpdrError:
@@ -251,7 +229,7 @@ def _far_behind(current: Hypothesis, best: Hypothesis) -> float:
     """Returns the share of the best trial's gain that another must reach to be an alternative."""
     scale = best.fit.scale
     explained = best.share * float((current.losses(scale) - best.losses(scale)).sum())
-    return 1.0 - PLAINLY / max(explained, PLAINLY)
+    return 1.0 - TRIALS.certain_evidence / max(explained, TRIALS.certain_evidence)
 
 
 def _shown(hypothesis: Hypothesis) -> str:

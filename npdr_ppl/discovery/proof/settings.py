@@ -1,0 +1,82 @@
+"""The numbers of the proof on held-out data, one validated object per stage."""
+
+import math
+from dataclasses import dataclass
+
+from npdr_ppl.settings import check_range
+
+__all__ = [
+    "EXPERIMENT",
+    "GAP",
+    "INTERVALS",
+    "ExperimentSettings",
+    "GapSettings",
+    "IntervalSettings",
+]
+
+
+@dataclass(frozen=True)
+class GapSettings:
+    """The gap between simulation and held-out measurements.
+
+    Attributes:
+        num_draws: Number of posterior predictive trajectories.
+        level: Probability of the predictive interval whose coverage is reported.
+    """
+
+    num_draws: int = 40
+    level: float = 0.9
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, math.inf, "num_draws")
+        check_range(self, 0.0, 1.0, "level")
+
+
+@dataclass(frozen=True)
+class ExperimentSettings:
+    """The experiment that separates alternatives.
+
+    Attributes:
+        seconds: Length of the experiment in seconds.
+        safe_share: Amplitude as a share of the recording's greatest command, so that no command is
+            larger than one that the device has already had.
+        useful_separation: Separation, in standard deviations of the measurements, from which an
+            experiment is useful.
+    """
+
+    seconds: float = 4.0
+    safe_share: float = 1.0
+    useful_separation: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 0.1, 1000.0, "seconds")
+        check_range(self, 0.0, 1.0, "safe_share")
+        check_range(self, 0.0, 100.0, "useful_separation")
+
+
+@dataclass(frozen=True)
+class IntervalSettings:
+    """Intervals of the parameters.
+
+    Attributes:
+        copies: Number of draws that replace each draw before an interval is computed. The shortest
+            interval of draws that are not smoothed would be where they happen to be dense.
+        bandwidth: Spread of these draws, in standard deviations of the posterior.
+        mass: Probability of the interval of highest density.
+    """
+
+    copies: int = 16
+    bandwidth: float = 0.3
+    mass: float = 0.94
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, 1000, "copies")
+        check_range(self, 0.0, 1.0, "bandwidth", "mass")
+
+
+EXPERIMENT = ExperimentSettings()
+GAP = GapSettings()
+INTERVALS = IntervalSettings()

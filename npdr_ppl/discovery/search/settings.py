@@ -1,0 +1,172 @@
+"""The numbers of the search, one validated object per stage."""
+
+import math
+from dataclasses import dataclass
+
+from npdr_ppl.settings import check_range
+
+__all__ = [
+    "BASE_FIT",
+    "EVIDENCE",
+    "PRIOR_ENDS",
+    "SEARCH",
+    "TRIALS",
+    "BaseFitSettings",
+    "EvidenceSettings",
+    "PriorEndSettings",
+    "SearchSettings",
+    "TrialSettings",
+]
+
+
+@dataclass(frozen=True)
+class BaseFitSettings:
+    """The fit of the original model, and its integration steps.
+
+    Attributes:
+        noticeable_change: Change of all simulated measurements together by steps of a higher
+            order, in standard deviations of the residuals. Above it, these steps are used unless
+            the recording contradicts them, because false effects would compensate for it. Refitted
+            parameters compensate for four fifths of it.
+        coarse_probability: Probability above which the recording itself is taken to be simulated
+            with coarse steps.
+        most_refits: Greatest number of refits from inside the priors, each from the result of the
+            previous one.
+    """
+
+    noticeable_change: float = 5.0
+    coarse_probability: float = 0.9
+    most_refits: int = 4
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 0.0, 100.0, "noticeable_change")
+        check_range(self, 0.5, 1.0, "coarse_probability")
+        check_range(self, 1, 100, "most_refits")
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """The rounds of the search.
+
+    Attributes:
+        least_unexplained: Stop when the unexplained misfit is below this fraction of the explained
+            misfit. If a large effect was missing, differences between integrators and in details
+            of the laws are this large.
+        num_leading: Number of best candidates whose pairwise distances are computed.
+        prior_of_any: Prior probability that any effect of the catalogue is missing.
+    """
+
+    least_unexplained: float = 1e-4
+    num_leading: int = 10
+    prior_of_any: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 0.0, 1.0, "least_unexplained", "prior_of_any")
+        check_range(self, 2, 1000, "num_leading")
+
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """Probabilities of the alternatives.
+
+    Attributes:
+        num_resamplings: Number of bootstrap resamplings of the segments.
+        least_probability: Probability from which an alternative remains possible.
+        indistinct_loss: Loss of log density up to which a recording cannot distinguish two laws,
+            or a law from its limit: two standard deviations of a likelihood ratio of one
+            parameter.
+    """
+
+    num_resamplings: int = 1000
+    least_probability: float = 0.05
+    indistinct_loss: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, math.inf, "num_resamplings")
+        check_range(self, 0.0, 1.0, "least_probability")
+        check_range(self, 0.0, 100.0, "indistinct_loss")
+
+
+@dataclass(frozen=True)
+class PriorEndSettings:
+    """Fits at the end of a prior.
+
+    Attributes:
+        near_coordinate: Absolute reference coordinate above which a parameter is near an end of
+            its prior: in the outermost 5 % on either side. Only the priors of these are widened,
+            which costs one fit.
+        false_alarm_rate: Probability that the likelihood-ratio test reports a prior with the true
+            value as too narrow.
+        outside_probability: A value is outside its prior if the prior probability beyond it is at
+            most this.
+        most_widenings: Greatest number of times that priors are widened, each time threefold.
+    """
+
+    near_coordinate: float = 1.64
+    false_alarm_rate: float = 1e-3
+    outside_probability: float = 1e-3
+    most_widenings: int = 3
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 0.0, 10.0, "near_coordinate")
+        check_range(self, 0.0, 1.0, "false_alarm_rate", "outside_probability")
+        check_range(self, 0, 100, "most_widenings")
+
+
+@dataclass(frozen=True)
+class TrialSettings:
+    """Fits of candidates in a round.
+
+    Attributes:
+        shortlist: Greatest number of candidates that are fitted in full in each round.
+        most_steps: Greatest number of steps of a fit.
+        first_steps: Greatest number of steps of a first fit, which shows whether a longer fit is
+            worth it.
+        most_converged: Greatest number of candidates that are fitted until convergence.
+        converged_share: Excess of a candidate's loss over the least one, as a share of it, up to
+            which it is fitted until convergence.
+        converged_loss: The same in log density. Either condition is enough.
+        candidates_per_decision: Number of candidates that are tried before each decision whether
+            to try more.
+        largest_growth: Greatest factor by which a full fit may explain more than a candidate's
+            linear gain predicts, relative to the best candidate. On the tuning rigs it is at most
+            3.4 for candidates that explain a tenth or more.
+        certain_evidence: Difference of log evidence above which one of two hypotheses is taken as
+            certain.
+    """
+
+    shortlist: int = 6
+    most_steps: int = 12
+    first_steps: int = 6
+    most_converged: int = 3
+    converged_share: float = 0.3
+    converged_loss: float = 20.0
+    candidates_per_decision: int = 2
+    largest_growth: float = 4.0
+    certain_evidence: float = 30.0
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(
+            self,
+            1,
+            100,
+            "shortlist",
+            "most_steps",
+            "first_steps",
+            "most_converged",
+            "candidates_per_decision",
+        )
+        check_range(self, 0.0, 1.0, "converged_share")
+        check_range(self, 0.0, 1000.0, "converged_loss", "largest_growth", "certain_evidence")
+
+
+BASE_FIT = BaseFitSettings()
+EVIDENCE = EvidenceSettings()
+PRIOR_ENDS = PriorEndSettings()
+SEARCH = SearchSettings()
+TRIALS = TrialSettings()

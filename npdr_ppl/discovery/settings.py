@@ -1,0 +1,119 @@
+"""The numbers of discovery as a whole, one validated object per stage."""
+
+import math
+from dataclasses import dataclass
+
+from npdr_ppl.settings import check_range
+
+__all__ = [
+    "DATA_CHECKS",
+    "HYPOTHESIS",
+    "VERDICT",
+    "DataCheckSettings",
+    "HypothesisSettings",
+    "VerdictSettings",
+]
+
+
+@dataclass(frozen=True)
+class DataCheckSettings:
+    """Checks of a recording for wrong units, signs, time stamps and lost samples.
+
+    Attributes:
+        large_residual: Residual, relative to the change of a window's measurements, above which
+            remedies are tried.
+        remedy_factor: A problem is reported if its remedy reduces the residual to less than this
+            fraction.
+        shifts: Shifts of the commands' time stamps that are tried, in steps.
+        longest_delay: Longest time in seconds that a device takes to answer a command. Early time
+            stamps of commands look the same, so only larger shifts are tried for them.
+        jump_size: Jump that indicates lost samples, in standard deviations of a channel's second
+            differences.
+        rest_change: A channel rests in a step if it changes by less than this fraction of its
+            root-mean-square change.
+        least_steps: Least number of steps of a rollout that is checked.
+        most_lost: If more than this share of the steps are jumps, they are taken for the device's
+            motion.
+    """
+
+    large_residual: float = 0.1
+    remedy_factor: float = 0.5
+    shifts: tuple[int, ...] = (1, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20)
+    longest_delay: float = 0.04
+    jump_size: float = 12.0
+    rest_change: float = 0.01
+    least_steps: int = 20
+    most_lost: float = 0.02
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(
+            self,
+            0.0,
+            1.0,
+            "large_residual",
+            "remedy_factor",
+            "rest_change",
+            "most_lost",
+            "longest_delay",
+        )
+        check_range(self, 1, 1000, "shifts", "jump_size", "least_steps")
+
+
+@dataclass(frozen=True)
+class HypothesisSettings:
+    """The fit of a model with its effects.
+
+    Attributes:
+        least_penalised: Reference coordinate below which the prior penalty grows no further: a
+            small effect is no less credible, and half-normal priors have zero strength at minus
+            infinity.
+        most_measurements: Number of measurements above which neighbouring ones are averaged before
+            candidates are tested. With this many, ten thousand candidate columns take a minute.
+            The benchmarks' recordings have fewer.
+        least_averages: Fewest averages per segment: four for each of its ten pulses of force.
+        implausible_coordinate: Absolute reference coordinate above which a value is implausible:
+            three standard deviations of a normal prior.
+    """
+
+    least_penalised: float = -1.0
+    most_measurements: int = 100_000
+    least_averages: int = 40
+    implausible_coordinate: float = 3.0
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, -10.0, 0.0, "least_penalised")
+        check_range(self, 1, math.inf, "most_measurements", "least_averages")
+        check_range(self, 1.0, 10.0, "implausible_coordinate")
+
+
+@dataclass(frozen=True)
+class VerdictSettings:
+    """The verdict of a discovery.
+
+    Attributes:
+        most_unexplained: Share of the misfit that may stay unexplained. If more is left and the
+            alarm detects it, the verdict is ``unknown``.
+        most_undetected: The same limit for a remainder that the alarm does not detect, although
+            the evidence for it is larger than that of ``TrialSettings.certain_evidence``.
+        minor_share: Share of the explained misfit. Uncertain effects that together explain no more
+            than this do not prevent the verdict ``named``.
+        most_separated: Greatest number of alternatives, the likeliest, that the next experiment
+            should separate.
+    """
+
+    most_unexplained: float = 0.01
+    most_undetected: float = 0.05
+    minor_share: float = 0.1
+    most_separated: int = 3
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 0.0, 1.0, "most_unexplained", "most_undetected", "minor_share")
+        check_range(self, 2, 100, "most_separated")
+
+
+DATA_CHECKS = DataCheckSettings()
+HYPOTHESIS = HypothesisSettings()
+VERDICT = VerdictSettings()
