@@ -26,7 +26,7 @@ from npdr_ppl.discovery.screening.latent_force import latent_force, responses
 from npdr_ppl.discovery.screening.permutation_tests import LargestStatistic
 from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
-from npdr_ppl.discovery.screening.settings import ALARM
+from npdr_ppl.discovery.screening.settings import ALARM, SENSITIVITY
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.trials import Trials
@@ -342,7 +342,8 @@ def test_averages_of_neighbours_keep_noise_white_and_slow_changes_apart(quiet):
 def test_effects_that_are_simulated_together_do_what_each_does_alone(quiet, monkeypatch):
     effects = candidate_effects(quiet.simulator)
     together = list(sensitivities(quiet, effects))
-    monkeypatch.setattr("npdr_ppl.discovery.screening.sensitivities.MOST_TOGETHER", 0)
+    one_by_one = replace(SENSITIVITY, segments_per_part=1)
+    monkeypatch.setattr("npdr_ppl.discovery.screening.sensitivities.SENSITIVITY", one_by_one)
     alone = list(sensitivities(quiet, effects))
     by_name = {variant.effect.name: [] for variant in alone}
     for variant in alone:
