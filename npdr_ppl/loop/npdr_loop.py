@@ -204,9 +204,7 @@ class _Loop:
 
     def _iterate(self, index: int, report: Reporter) -> dict[str, Any]:
         """Runs one iteration, or restores it if an earlier process finished it."""
-        number = self.options.rollouts
-        new = [self.rollouts.collect(self.policy, self.domain) for _ in range(number)]
-        returns = [float(rollout.rewards[0].sum()) for rollout in new if rollout.rewards]
+        returns = self._real_returns(index)
         real_return = sum(returns) / len(returns)
         self.tried.append(Tried(self.policy, self.domain, real_return))
         saved = self.folder.iteration(index)
@@ -223,6 +221,22 @@ class _Loop:
         record = plain(record)
         self.folder.save_iteration(index, record)
         return record
+
+    def _real_returns(self, index: int) -> list[float]:
+        """Runs the policy on the target; returns its return in each episode.
+
+        While the mean return would end the loop by itself, extra rollouts confirm it.
+        """
+        options = self.options
+        returns: list[float] = []
+        while len(returns) < options.rollouts or (
+            len(returns) < options.rollouts + options.num_confirmations
+            and self._is_good_enough(sum(returns) / len(returns))
+            and self.rollouts.extra_left(index)
+        ):
+            rollout = self.rollouts.collect(self.policy, self.domain)
+            returns += [float(rewards.sum()) for rewards in rollout.rewards or ()]
+        return returns
 
     def _is_good_enough(self, real_return: float) -> bool:
         """Returns whether the measured return is enough to end the loop."""

@@ -38,13 +38,14 @@ class HandmadePendulum(TargetDomain):
     sensors = Pendulum.sensors
     actions = Pendulum.actions
     time_step = Pendulum.time_step
+    first_state = (0.5, 0.0)
 
     def __init__(self, log=None):
         self.log = log
 
     def run(self, controller, num_steps, *, episode=0, seed):
         rng = np.random.default_rng(seed)
-        state = np.array([0.5, 0.0]) + 0.02 * rng.standard_normal(2)
+        state = np.array(self.first_state) + 0.02 * rng.standard_normal(2)
         readings, actions = [state], []
         for step in range(num_steps):
             torque = self.limit(controller(state, step * self.time_step))

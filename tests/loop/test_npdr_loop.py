@@ -215,6 +215,53 @@ def test_a_measured_return_may_be_enough_to_end_the_loop(tmp_path, monkeypatch):
     assert again.posterior is not None and result.posterior is not None
 
 
+class Fickle(HandmadePendulum):
+    """Starts some episodes with a push after which no policy holds it."""
+
+    def __init__(self, *pushed):
+        super().__init__()
+        self.pushed = pushed
+
+    def run(self, controller, num_steps, *, episode=0, seed):
+        push = 20.0 if episode in self.pushed else 0.0
+        self.first_state = (0.5, push)
+        return super().run(controller, num_steps, episode=episode, seed=seed)
+
+
+CONFIRMED = {
+    "iterations": 2, "starts_from_prior": False, "search_iterations": 4, "num_simulations": 300,
+    "stop_return": 20.0, "stops": "measured return", "extra_rollouts": 1,
+}  # fmt: skip
+
+
+def test_an_extra_rollout_confirms_a_measured_return_that_ends_the_loop(tmp_path, monkeypatch):
+    asked = scripted(monkeypatch)
+    result = run(tmp_path, small_options(**CONFIRMED))
+    returns = result.iterations[-1]["real_returns"]
+    assert len(returns) == 2 and min(returns) > 20.0
+    assert actions(result, 1) == [Action.KEPT] and result.iterations[-1]["num_rollouts"] == 3
+    assert len(asked) == 1
+    again = run(tmp_path, small_options(**CONFIRMED))
+    assert again.to_dict() == result.to_dict()
+
+
+def test_a_return_that_is_not_confirmed_does_not_end_the_loop(tmp_path, monkeypatch):
+    asked = scripted(monkeypatch)
+    result = run(tmp_path, small_options(**CONFIRMED), target=Fickle(2))
+    record = result.iterations[-1]
+    assert record["real_returns"][0] > 20.0 > record["real_return"]
+    assert actions(result, 1) == [Action.TRAINED]
+    assert len(asked) == 2 and len(result.rollouts) == 3
+    again = run(tmp_path, small_options(**CONFIRMED), target=Fickle(2))
+    assert again.to_dict() == result.to_dict()
+
+
+def test_confirmation_can_be_switched_off(tmp_path, monkeypatch):
+    scripted(monkeypatch)
+    result = run(tmp_path, small_options(**CONFIRMED, num_confirmations=0))
+    assert len(result.iterations[-1]["real_returns"]) == 1 and len(result.rollouts) == 2
+
+
 def test_decisions_may_be_logged_only(tmp_path, monkeypatch):
     scripted(monkeypatch, Decision.STOP, Decision.MORE_ROUNDS)
     result = run(tmp_path, small_options(follows_decisions=False))
