@@ -25,6 +25,7 @@ with warnings.catch_warnings():
     import arviz as az
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.hdf5_checks import check_self_contained
 
 __all__ = [
     "HAS_DATATREE",
@@ -260,12 +261,25 @@ def to_netcdf(data: Data, path: str | PathLike[str]) -> None:
 
 
 def from_netcdf(path: str | PathLike[str]) -> Data:
-    """Reads an ArviZ object into memory and closes the file."""
-    if HAS_DATATREE:
-        with xr.open_datatree(fspath(path), engine="h5netcdf") as tree:
-            return tree.load()
-    with _any_group(), _az.rc_context({"data.load": "eager"}):
-        return _az.from_netcdf(fspath(path), engine="h5netcdf")
+    """Reads an ArviZ object into memory and closes the file.
+
+    Raises:
+        DataError: The file is damaged, or takes data from another file.
+    """
+    try:
+        check_self_contained(path)
+        if HAS_DATATREE:
+            with xr.open_datatree(fspath(path), engine="h5netcdf") as tree:
+                return tree.load()
+        with _any_group(), _az.rc_context({"data.load": "eager"}):
+            return _az.from_netcdf(fspath(path), engine="h5netcdf")
+    except DataError as error:
+        raise DataError(f"{fspath(path)}: {error}") from None
+    # Decoders raise nearly any error for corrupt bytes.
+    except Exception as error:
+        raise DataError(
+            f"{fspath(path)} is not a readable NetCDF file ({type(error).__name__})."
+        ) from error
 
 
 @contextmanager

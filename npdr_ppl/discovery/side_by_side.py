@@ -6,6 +6,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import TypeVar, cast
 
 from npdr_ppl.engines.pooled.pool_simulator import PooledSimulator
+from npdr_ppl.engines.workers.safe_path import safe_path
 from npdr_ppl.engines.workers.session import num_local_processes
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.simulator import Simulator
@@ -45,13 +46,15 @@ def side_by_side(
         # filter stays, because a thread of the executor may warn at any time.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         parallel = Parallel(number, backend="loky", return_as="generator", max_nbytes=None)
-        results = cast(
-            Generator[Result, None, None], parallel(delayed(function)(item) for item in items)
-        )
+        with safe_path():
+            results = cast(
+                Generator[Result, None, None], parallel(delayed(function)(item) for item in items)
+            )
         try:
-            for result in results:
-                yield result
-                done += 1
+            with safe_path():  # a process may be replaced at any time
+                for result in results:
+                    yield result
+                    done += 1
         except NpdrError:
             raise
         except GeneratorExit:

@@ -1,17 +1,22 @@
 """Executors, which pass chunks to workers; all but the serial one use joblib."""
 
 import logging
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from npdr_ppl.engines.workers.crew import Crew, run_chunk
 from npdr_ppl.engines.workers.options import WorkerOptions
+from npdr_ppl.engines.workers.safe_path import safe_path
 from npdr_ppl.engines.workers.supervisor import Chunk, ChunkResult
 from npdr_ppl.errors import DependencyError, SimulationError
 
 __all__ = ["ChunkExecutor", "open_executor"]
+
+RAY_CLUSTERS = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 
 
 class ChunkExecutor(ABC):
@@ -115,6 +120,7 @@ def open_executor(options: WorkerOptions) -> ChunkExecutor:
         return _Serial()
     number = options.num_workers
     with ExitStack() as stack:
+        stack.enter_context(safe_path())
         if options.executor == "threads":
             executor = _Joblib(number, "threading", {}, stack, crew=Crew())
         elif options.executor == "dask":
@@ -154,18 +160,27 @@ def _dask_client(options: WorkerOptions, stack: ExitStack) -> Any:
 
 def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
     """Connects this process to a Ray cluster, or starts one on this machine."""
+    is_local = options.address is None
     try:
         import ray
+        from ray._private import ray_constants
         from ray.util.joblib import register_ray
     except ImportError as error:
         raise _missing("ray") from error
     register_ray()
     if ray.is_initialized():  # the caller's own connection
         return
-    is_local = options.address is None
+    if is_local:
+        # On Linux, Ray listens on all interfaces. Its switch for other systems, which its own
+        # processes read from the environment, makes it use the loopback interface only.
+        stack.enter_context(_set_variable(RAY_CLUSTERS, "0"))
+        stack.enter_context(_set_attribute(ray_constants, "ENABLE_RAY_CLUSTER", False))
+    # Ray would put the current folder on the module search path of its workers.
+    empty = stack.enter_context(TemporaryDirectory(prefix="npdr-ray-"))
     try:
         ray.init(
             address="local" if is_local else options.address,
+            runtime_env={"working_dir": empty},
             num_cpus=options.num_workers if is_local else None,
             include_dashboard=False if is_local else None,
             log_to_driver=False,
@@ -174,6 +189,31 @@ def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
     except (OSError, ValueError, RuntimeError) as error:
         raise _unreachable(options, error) from error
     stack.callback(ray.shutdown)
+
+
+@contextmanager
+def _set_variable(name: str, value: str) -> Iterator[None]:
+    """Sets an environment variable inside the block."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
+
+
+@contextmanager
+def _set_attribute(module: Any, name: str, value: Any) -> Iterator[None]:
+    """Sets a module's attribute inside the block."""
+    before = getattr(module, name)
+    setattr(module, name, value)
+    try:
+        yield
+    finally:
+        setattr(module, name, before)
 
 
 def _missing(executor: str) -> DependencyError:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from npdr_ppl.engines.workers.faults import Fault, Faults
+from npdr_ppl.engines.workers.safe_path import inherited_environment
 from npdr_ppl.engines.workers.task import Draw
 from npdr_ppl.errors import NpdrError, SimulationError
 
@@ -236,7 +237,8 @@ def _environment() -> dict[str, str]:
     Dask sets its workers' allocator to return memory to the system at once. An engine that builds
     a scene for each draw would then request every page again and be three times as slow.
     """
-    kept = {name: v for name, v in os.environ.items() if name != "MALLOC_TRIM_THRESHOLD_"}
+    inherited = inherited_environment()
+    kept = {name: v for name, v in inherited.items() if name != "MALLOC_TRIM_THRESHOLD_"}
     return kept | _ONE_THREAD
 
 
@@ -248,7 +250,8 @@ class _Template:
             raise SimulationError("Workers need a system that can fork: Linux or macOS.")
         ours, theirs = socket.socketpair()
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _BOOT, str(theirs.fileno()), json.dumps(sys.path)],
+            # Without -P, the first import would look for a module in the current folder.
+            [sys.executable, "-P", "-c", _BOOT, str(theirs.fileno()), json.dumps(sys.path)],
             pass_fds=(theirs.fileno(),),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,  # engines print, but a command's output may be JSON

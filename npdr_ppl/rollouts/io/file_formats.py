@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.hdf5_checks import check_self_contained
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.collection import stacked
 from npdr_ppl.rollouts.io.atomic_files import replacing
@@ -330,15 +331,13 @@ def write_netcdf(rollouts: Recording, path: AnyPath) -> None:
 
 def read_netcdf(path: AnyPath) -> Recording:
     """Reads a NetCDF4 file; see :meth:`Rollouts.from_netcdf`."""
-    import h5py
     import xarray as xr
 
     path = rollout_checks.check_file(path)
     with rollout_checks.named(path), _refusing("NetCDF"):
-        # h5netcdf opens files in the same way. If that failed inside it, its half-made object
-        # would report a second error when it is deleted.
-        with h5py.File(path, "r") as file:
-            dict(file.attrs)
+        # If h5netcdf failed to open it, its half-made object would report a second error when it
+        # is deleted.
+        check_self_contained(path)
         # Times are seconds without a date, so they must not be decoded with a calendar.
         with xr.open_dataset(
             path, engine="h5netcdf", decode_times=False, decode_timedelta=False

@@ -1,0 +1,70 @@
+"""HDF5 files that take their data from elsewhere are refused before any data are read."""
+
+import h5py
+import numpy as np
+import pytest
+
+from npdr_ppl.arviz_module import from_netcdf
+from npdr_ppl.errors import DataError
+from npdr_ppl.hdf5_checks import check_self_contained
+from npdr_ppl.rollouts import Rollouts
+
+SECRET = np.arange(21.0)
+
+
+@pytest.fixture
+def elsewhere(tmp_path):
+    SECRET.tofile(tmp_path / "secret.bin")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["secret"] = SECRET
+    return tmp_path
+
+
+def external_storage(file, folder):
+    file.create_dataset(
+        "angle", (21,), "f8", external=[(str(folder / "secret.bin"), 0, h5py.h5f.UNLIMITED)]
+    )
+
+
+def external_link(file, folder):
+    file["angle"] = h5py.ExternalLink(str(folder / "other.h5"), "secret")
+
+
+def soft_link(file, folder):
+    file["angle"] = h5py.SoftLink("/somewhere")
+
+
+def virtual_data_set(file, folder):
+    layout = h5py.VirtualLayout((21,), "f8")
+    layout[:] = h5py.VirtualSource(str(folder / "other.h5"), "secret", (21,))
+    file.create_virtual_dataset("angle", layout)
+
+
+def link_in_a_group(file, folder):
+    external_link(file.create_group("deep/deeper"), folder)
+
+
+@pytest.mark.parametrize("read", [Rollouts.from_netcdf, from_netcdf, Rollouts.load])
+@pytest.mark.parametrize(
+    "write",
+    [external_storage, external_link, soft_link, virtual_data_set, link_in_a_group],
+    ids=lambda function: function.__name__,
+)
+def test_a_file_that_takes_data_from_elsewhere_is_refused(elsewhere, write, read):
+    path = elsewhere / "recording.nc"
+    with h5py.File(path, "w") as file:
+        write(file, elsewhere)
+    with pytest.raises(DataError, match=r"recording\.nc: 'angle' .*not read"):
+        read(path)
+
+
+def test_groups_that_contain_each_other_are_checked_once(tmp_path):
+    with h5py.File(tmp_path / "circle.nc", "w") as file:
+        file.create_group("a")["b"] = file
+    check_self_contained(tmp_path / "circle.nc")
+
+
+def test_a_damaged_posterior_gets_one_sentence(tmp_path):
+    (tmp_path / "posterior.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    with pytest.raises(DataError, match="not a readable NetCDF file"):
+        from_netcdf(tmp_path / "posterior.nc")
