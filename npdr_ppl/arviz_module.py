@@ -24,6 +24,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", FutureWarning)
     import arviz as az
 
+from npdr_ppl.atomic_files import replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.hdf5_checks import check_self_contained
 
@@ -257,7 +258,15 @@ def _judged_draws(data: Data) -> Data:
 
 def to_netcdf(data: Data, path: str | PathLike[str]) -> None:
     """Writes an ArviZ object as NetCDF; either release reads the other's files."""
-    data.to_netcdf(fspath(path), engine="h5netcdf")
+    if HAS_DATATREE:
+        tree = data
+    else:
+        tree = xr.DataTree.from_dict({name: data[name] for name in data.groups()})
+        tree.attrs = data.attrs
+    # HDF5 crashes if the disk is full while it writes to a file.
+    content = tree.to_netcdf(engine="h5netcdf")
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def from_netcdf(path: str | PathLike[str]) -> Data:

@@ -4,25 +4,29 @@ import functools
 import inspect
 import json
 import math
+import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from pyro.poutine.messenger import Messenger
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
+from npdr_ppl.atomic_files import replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors
-from npdr_ppl.rollouts.io.atomic_files import replacing
 
 __all__ = [
+    "claimed",
     "engine_settings",
     "holds_this_run",
     "load_tensors",
@@ -34,6 +38,9 @@ __all__ = [
     "versions",
     "write_json",
 ]
+
+LOCK = ".lock"
+"""Name of the file in a folder of results that the process which uses the folder has locked."""
 
 IN_WORDS = {
     "binding": "how the data are prepared",
@@ -61,6 +68,45 @@ def make_folder(path: Path) -> None:
     path.mkdir(parents=True, exist_ok=True)
 
 
+@contextmanager
+def claimed(path: Path | None) -> Iterator[None]:
+    """Makes a folder for results, and keeps other processes from writing to it in the block.
+
+    Args:
+        path: The folder; nothing is done if it is ``None``.
+
+    Raises:
+        DataError: Another process uses the folder, or it cannot be written to.
+    """
+    if path is None:
+        yield
+        return
+    make_folder(path)
+    # One lock per path, so that blocks of the same process may be nested.
+    lock = FileLock(path / LOCK, timeout=0, is_singleton=True)
+    owner = _owner(path)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise DataError(
+            f"{path} is in use by {owner}; wait until it has ended, or choose another folder."
+        ) from None
+    try:
+        (path / LOCK).write_text(str(os.getpid()))
+        yield
+    finally:
+        lock.release()
+
+
+def _owner(path: Path) -> str:
+    """Returns the process that uses a folder, in words."""
+    try:
+        number = (path / LOCK).read_text().strip()
+    except OSError:
+        number = ""
+    return f"process {number}" if number.isdecimal() else "another process"
+
+
 def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
     """Returns whether a folder already describes this run.
 
@@ -80,7 +126,7 @@ def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
     differing = [str(k) for k, value in plain(description).items() if present.get(k) != value]
     if not differing:
         return True
-    inputs = {file, *file.parent.glob("data_*")}
+    inputs = {file, file.parent / LOCK, *file.parent.glob("data_*")}
     if not any(entry not in inputs for entry in file.parent.iterdir()):
         return False
     words = ", ".join(dict.fromkeys(IN_WORDS.get(key, key) for key in differing))
@@ -166,8 +212,9 @@ def plain(value: Any) -> Any:
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
     """Writes tensors atomically."""
+    content = save({k: v.detach().cpu().contiguous() for k, v in tensors.items()})
     with replacing(path) as temporary:
-        save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary)
+        temporary.write_bytes(content)
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:

@@ -97,6 +97,7 @@ def discover(
         write_discovery_figures,
         write_stage_figures,
     )
+    from npdr_ppl.run_files import claimed
 
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_holdout(data, holdout, holdout_data)
@@ -108,27 +109,28 @@ def discover(
         seed=seed,
     )
     folder = DiscoveryFolder(out)
-    folder.begin(chosen, train, test, options)
-    found = folder.finished(stage.value)
-    if found is None:
-        with (
-            resumable(f"the same command again restarts the search in {out}."),
-            chosen_workers(executor, workers, address, time_limit),
-        ):
-            with sentences(options, False if quiet else None) as report:
-                investigation = Investigation(
-                    chosen,
-                    train,
-                    holdout=test if stage is LastStage.PROVE else None,
-                    options=options,
-                    report=report,
-                )
-                found, discovery = findings_until(investigation, stage.value)
-            if discovery is None:
-                write_stage_figures(investigation, stage.value, out)
-            else:
-                write_discovery_figures(discovery, out)
-        folder.finish(found, None if discovery is None else discovery.source())
+    with claimed(out):
+        folder.begin(chosen, train, test, options)
+        found = folder.finished(stage.value)
+        if found is None:
+            with (
+                resumable(f"the same command again restarts the search in {out}."),
+                chosen_workers(executor, workers, address, time_limit),
+            ):
+                with sentences(options, False if quiet else None) as report:
+                    investigation = Investigation(
+                        chosen,
+                        train,
+                        holdout=test if stage is LastStage.PROVE else None,
+                        options=options,
+                        report=report,
+                    )
+                    found, discovery = findings_until(investigation, stage.value)
+                if discovery is None:
+                    write_stage_figures(investigation, stage.value, out)
+                else:
+                    write_discovery_figures(discovery, out)
+            folder.finish(found, None if discovery is None else discovery.source())
     if as_json:
         typer.echo((out / "discovery.json").read_text(), nl=False)
     elif not quiet:

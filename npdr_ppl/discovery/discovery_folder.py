@@ -14,11 +14,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from npdr_ppl.atomic_files import replacing
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery, describe_candidate
 from npdr_ppl.discovery.investigation import Investigation
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.io.atomic_files import replacing
 from npdr_ppl.run_files import (
     holds_this_run,
     make_folder,

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from npdr_ppl.atomic_files import replacing
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.finding import Finding
 from npdr_ppl.discovery.proof.held_out_gap import Gap
@@ -21,7 +22,6 @@ from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.search.effect_search import Search
 from npdr_ppl.discovery.search.prior_ends import PriorEnd
 from npdr_ppl.language.handlers import num_finer_steps
-from npdr_ppl.rollouts.io.atomic_files import replacing
 from npdr_ppl.run_files import write_json
 
 __all__ = ["Discovery", "Verdict", "describe_candidate"]

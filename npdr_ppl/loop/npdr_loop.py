@@ -67,7 +67,7 @@ from npdr_ppl.posterior.fit import describe
 from npdr_ppl.posterior.posterior import Posterior
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.randomness import derived_seed, seeded
-from npdr_ppl.run_files import plain
+from npdr_ppl.run_files import claimed, plain
 from npdr_ppl.targets.base import TargetDomain
 
 __all__ = ["Training", "train"]
@@ -116,6 +116,7 @@ def train(
         folder = LoopFolder(Path(path))
         loop = _Loop(model, target, task, options, folder, revise, seed, report)
         # Made after the checks, so that a model or target that does not match leaves no folder.
+        stack.enter_context(claimed(folder.path))
         folder.begin(model, target, task, options, seed=seed)
         return loop.run()
 

@@ -22,7 +22,7 @@ from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.evaluation import score
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.run_files import engine_settings, write_json
+from npdr_ppl.run_files import claimed, engine_settings, write_json
 
 if TYPE_CHECKING:
     from npdr_ppl.arviz_module import Data
@@ -65,7 +65,7 @@ def fit(
     Returns:
         The posterior and the content of ``fit.json``.
     """
-    with reporter(progress) as report:
+    with reporter(progress) as report, claimed(out):
         with collect_faults() as before:
             prepared = prepare(
                 model,

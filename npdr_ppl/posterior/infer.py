@@ -30,6 +30,7 @@ from npdr_ppl.preparation.data_options import (
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.run_files import claimed
 
 __all__ = ["infer", "run_round", "simulate_features"]
 
@@ -126,16 +127,17 @@ def infer(
     states = [method.init(problem)]
     infos: list[RoundInfo] = []
     seconds = {"simulate": 0.0, "train": 0.0}
-    store = None if checkpoint is None else RunFolder(Path(checkpoint))
-    if store is not None:
-        store.begin(bound, method, seed=seed, rounds=rounds, num_simulations=num_simulations)
-        if prepared is not None:
-            store.save_preparation(prepared)
-        for index in store.rounds()[:rounds]:
-            saved = store.load_round(index)
-            states.append(method.restore(problem, saved.tensors, saved.values))
-            infos, seconds = saved.infos, saved.seconds
-    with reporter(progress) as report:
+    folder = None if checkpoint is None else Path(checkpoint)
+    store = None if folder is None else RunFolder(folder)
+    with reporter(progress) as report, claimed(folder):
+        if store is not None:
+            store.begin(bound, method, seed=seed, rounds=rounds, num_simulations=num_simulations)
+            if prepared is not None:
+                store.save_preparation(prepared)
+            for index in store.rounds()[:rounds]:
+                saved = store.load_round(index)
+                states.append(method.restore(problem, saved.tensors, saved.values))
+                infos, seconds = saved.infos, saved.seconds
         for index in range(len(infos), rounds):
             label = f"round {index + 1}/{rounds}"
             state, info, spent = run_round(
@@ -160,9 +162,9 @@ def infer(
         estimator, correction = check_estimator(
             learnt.densities, bound.likelihood, seed=seed, corrects=corrects
         )
-    posterior = learnt.corrected(estimator, correction)
-    if store is not None:
-        store.save_correction(correction, posterior.checks())
+        posterior = learnt.corrected(estimator, correction)
+        if store is not None:
+            store.save_correction(correction, posterior.checks())
     return posterior
 
 

@@ -29,7 +29,7 @@ from npdr_ppl.preparation.evaluation import nominal_parameters, score
 from npdr_ppl.reproduction.table2 import PAPER, SEGMENT_LENGTH
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import InitialState
-from npdr_ppl.run_files import read_json, write_json
+from npdr_ppl.run_files import claimed, read_json, write_json
 
 __all__ = ["Story", "load_recordings", "reproduce_missing_effect"]
 
@@ -110,14 +110,17 @@ def reproduce_missing_effect(
     test = swing_ups[list(holdout)]
     options = options or DiscoveryOptions()
     folder, file = DiscoveryFolder(out), out / "missing-effect.json"
-    folder.begin(furuta, train, test, options)
-    if file.exists():
-        return None, read_json(file)
-    with sentences(options, progress) as report:
-        investigation = Investigation(furuta, train, holdout=test, options=options, report=report)
-        found, discovery = findings_until(investigation, "prove")
-    assert discovery is not None
-    folder.finish(found, discovery.source())
+    with claimed(out):
+        folder.begin(furuta, train, test, options)
+        if file.exists():
+            return None, read_json(file)
+        with sentences(options, progress) as report:
+            investigation = Investigation(
+                furuta, train, holdout=test, options=options, report=report
+            )
+            found, discovery = findings_until(investigation, "prove")
+        assert discovery is not None
+        folder.finish(found, discovery.source())
     nominal = nominal_parameters(furuta, train.inputs(SEGMENT_LENGTH))
     story = Story(
         discovery,

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from npdr_ppl.atomic_files import replacing
 from npdr_ppl.display.reports.comparison_report import comparison_report
 from npdr_ppl.display.reports.content import Report
 from npdr_ppl.display.reports.demo_report import demo_report
@@ -11,7 +12,6 @@ from npdr_ppl.display.reports.fit_report import fit_report
 from npdr_ppl.display.reports.page import render
 from npdr_ppl.display.reports.training_report import training_report
 from npdr_ppl.errors import DataError
-from npdr_ppl.rollouts.io.atomic_files import replacing
 
 __all__ = ["read_run", "write_report"]
 

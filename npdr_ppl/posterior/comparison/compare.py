@@ -31,7 +31,7 @@ from npdr_ppl.preparation.data_options import PLAIN_FEATURES, DataOptions
 from npdr_ppl.preparation.evaluation import score
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.run_files import holds_this_run, make_folder, read_json, write_json
+from npdr_ppl.run_files import claimed, holds_this_run, read_json, write_json
 
 __all__ = ["compare"]
 
@@ -111,7 +111,7 @@ def compare(
         "evaluated_on": "fitted" if test is None else "held-out",
         "elpd": "PSIS-LOO" if test is None else "held-out segments",
     }
-    with reporter(progress) as report:
+    with reporter(progress) as report, claimed(out):
         error_model = find_error_model(
             model,
             train,
@@ -141,7 +141,7 @@ def compare(
             seed=seed,
         )
         if out is not None:
-            _claim(out, settings)
+            _begin(out, settings)
         rows: dict[str, Row] = {}
         posteriors: dict[str, Posterior] = {}
         for label, candidate in named.items():
@@ -314,13 +314,12 @@ def _described(options: DataOptions) -> dict[str, Any]:
     return values | {"embedding": embedding if isinstance(embedding, str) else repr(embedding)}
 
 
-def _claim(out: Path, settings: Mapping[str, Any]) -> None:
+def _begin(out: Path, settings: Mapping[str, Any]) -> None:
     """Notes the settings, or checks that the folder holds this very comparison already.
 
     Raises:
         DataError: The folder holds a comparison with other settings.
     """
-    make_folder(out)
     file = out / "settings.json"
     if not holds_this_run(file, settings):
         write_json(file, settings)

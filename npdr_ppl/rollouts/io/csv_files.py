@@ -10,9 +10,9 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
+from npdr_ppl.atomic_files import replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.io.atomic_files import replacing
 from npdr_ppl.rollouts.io.tables import from_table, to_table
 from npdr_ppl.rollouts.recording import Recording
 

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from npdr_ppl.atomic_files import replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.hdf5_checks import check_self_contained
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.collection import stacked
-from npdr_ppl.rollouts.io.atomic_files import replacing
 from npdr_ppl.rollouts.io.csv_files import read_csv
 from npdr_ppl.rollouts.io.tables import from_table, to_table
 from npdr_ppl.rollouts.recording import Recording
@@ -325,8 +325,10 @@ def write_netcdf(rollouts: Recording, path: AnyPath) -> None:
     """Writes a NetCDF4 file; see :meth:`Rollouts.to_netcdf`."""
     dataset = to_xarray(rollouts)
     compressed = {str(name): {"zlib": True} for name in dataset.data_vars if name != "num_steps"}
+    # HDF5 crashes if the disk is full while it writes to a file.
+    content = dataset.to_netcdf(engine="h5netcdf", encoding=compressed)
     with replacing(path) as temporary:
-        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=compressed)
+        temporary.write_bytes(content)
 
 
 def read_netcdf(path: AnyPath) -> Recording:

@@ -31,5 +31,8 @@ def replacing(path: str | PathLike[str]) -> Iterator[Path]:
         with temporary.open("rb") as written:
             os.fsync(written.fileno())
         os.replace(temporary, target)
+    except OSError as error:  # such as a full disk, which does not say which file it is about
+        error.filename = str(target)
+        raise
     finally:
         temporary.unlink(missing_ok=True)

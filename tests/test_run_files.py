@@ -1,0 +1,103 @@
+"""Folders of results: one process at a time, and nothing lost if the disk is full."""
+
+import os
+import resource
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from npdr_ppl.arviz_module import from_dict, from_netcdf, to_netcdf
+from npdr_ppl.errors import DataError
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.run_files import claimed, load_tensors, read_json, save_tensors, write_json
+
+HOLD = """
+import sys
+from pathlib import Path
+from npdr_ppl.run_files import claimed
+
+with claimed(Path(sys.argv[1])):
+    print("claimed", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def other_process(tmp_path):
+    """A process that has claimed the folder ``run`` until it is killed."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path / "run")],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdout.readline() == "claimed\n"
+        yield process
+        process.kill()
+
+
+def test_a_folder_in_use_is_refused_with_the_other_process_named(tmp_path, other_process):
+    with (
+        pytest.raises(DataError, match=f"in use by process {other_process.pid};"),
+        claimed(tmp_path / "run"),
+    ):
+        pass
+
+
+def test_a_killed_process_gives_its_folder_back(tmp_path, other_process):
+    other_process.kill()
+    other_process.wait()
+    with claimed(tmp_path / "run"):
+        pass
+
+
+def test_a_process_may_claim_a_folder_twice(tmp_path):
+    with claimed(tmp_path), claimed(tmp_path), claimed(None):
+        pass
+    with claimed(tmp_path):
+        pass
+
+
+def write_rollouts(path, size):
+    angle = np.random.default_rng(0).normal(size=(size, 1))
+    rollouts = Rollouts.from_arrays(
+        readings=[angle], actions=[angle[1:]], channel_names=("angle",),
+        action_names=("torque",), time_step=0.1,
+    )  # fmt: skip
+    rollouts.to_netcdf(path)
+
+
+def write_posterior(path, size):
+    to_netcdf(
+        from_dict({"posterior": {"mass": np.random.default_rng(0).normal(size=(1, size))}}), path
+    )
+
+
+WRITERS = {
+    "run.json": (lambda path, size: write_json(path, {"a": ["x"] * size}), read_json),
+    "state.safetensors": (lambda p, size: save_tensors(p, {"a": torch.rand(size)}), load_tensors),
+    "data.nc": (write_rollouts, Rollouts.from_netcdf),
+    "posterior.nc": (write_posterior, from_netcdf),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_leaves_the_old_file_and_says_which_it_is(tmp_path, name):
+    write, read = WRITERS[name]
+    path = tmp_path / name
+    write(path, 20)
+    before = path.read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    generator = np.random.default_rng(0)
+    for size in (0, *generator.integers(1, 30_000, 24).tolist()):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+        try:
+            with pytest.raises(OSError) as caught:
+                write(path, 20_000)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert caught.value.filename == str(path)
+        assert path.read_bytes() == before
+        assert os.listdir(tmp_path) == [name]
+    read(path)
