@@ -86,12 +86,13 @@ class _Quantile(ReferenceMap):
         self.event_shape = torch.Size()
 
     def __call__(self, z: Tensor) -> Tensor:
-        probability = torch.special.ndtr(z.clamp(-_MAX_Z, _MAX_Z))
-        return _icdf(self.distribution, probability)
+        # In float32, Φ(5.4) is already 1, where many quantiles are infinite.
+        probability = torch.special.ndtr(z.double().clamp(-_MAX_Z, _MAX_Z))
+        return _icdf(self.distribution, probability).to(z.dtype)
 
     def inverse(self, value: Tensor) -> Tensor:
-        probability = _cdf(self.distribution, value)
-        return torch.special.ndtri(probability).clamp(-_MAX_Z, _MAX_Z)
+        probability = _cdf(self.distribution, value.double())
+        return torch.special.ndtri(probability).clamp(-_MAX_Z, _MAX_Z).to(value.dtype)
 
 
 class _Transformed(ReferenceMap):

@@ -9,6 +9,7 @@ from scipy import stats
 import npdr_ppl as npdr
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.reference import reference_map
 
 
 def total(**parameters):
@@ -194,3 +195,14 @@ def test_a_conditioned_site_is_not_latent():
 def test_nothing_to_infer_is_said():
     with pytest.raises(ModelError, match="nothing to infer"):
         Prior(lambda: npdr.simulate("x", total, {"mass": torch.ones(())}))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_values_far_in_a_tail_are_finite(dtype):
+    z = torch.tensor([-8.0, -5.5, 5.5, 8.0], dtype=dtype)
+    for distribution in (
+        dist.HalfNormal(1e-3), dist.Exponential(2.0), dist.Gamma(2.0, 3.0), dist.Cauchy(0.0, 1.0),
+    ):  # fmt: skip
+        values = reference_map(distribution)(z)
+        assert values.dtype == dtype and values.isfinite().all()
+        assert (values.diff() > 0).all()
