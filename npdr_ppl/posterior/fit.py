@@ -65,7 +65,7 @@ def fit(
     Returns:
         The posterior and the content of ``fit.json``.
     """
-    with reporter(progress) as report, claimed(out):
+    with reporter(progress) as report:
         with collect_faults() as before:
             prepared = prepare(
                 model,
@@ -77,6 +77,8 @@ def fit(
         options = prepared.options
         started = time.perf_counter()
         with ExitStack() as stack, collect_faults() as after:
+            # Not before: a recording that does not fit the model leaves no folder.
+            stack.enter_context(claimed(out))
             folder = (
                 stack.enter_context(TemporaryDirectory(prefix="npdr-")) if out is None else out
             )

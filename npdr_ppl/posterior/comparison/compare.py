@@ -3,6 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ def compare(
         "evaluated_on": "fitted" if test is None else "held-out",
         "elpd": "PSIS-LOO" if test is None else "held-out segments",
     }
-    with reporter(progress) as report, claimed(out):
+    with reporter(progress) as report, ExitStack() as stack:
         error_model = find_error_model(
             model,
             train,
@@ -140,6 +141,7 @@ def compare(
             is_held_out=test is not None,
             seed=seed,
         )
+        stack.enter_context(claimed(out))
         if out is not None:
             _begin(out, settings)
         rows: dict[str, Row] = {}
