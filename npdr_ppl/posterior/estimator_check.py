@@ -170,7 +170,7 @@ def _corrected(draws: WeightedDraws, seed: int) -> Correction:
     # If only a few draws have a weight, tempered weights make the posterior wider; the check then
     # reports that it is not reliable.
     finite = int(draws.log_weights.isfinite().sum())
-    wanted = min(1.0, 0.5 * IMPORTANCE_SAMPLING.enough_effective / max(1, finite))
+    wanted = min(1.0, IMPORTANCE_SAMPLING.least_effective / max(1, finite))
     exponent = longest_step(draws.log_weights, 1.0, wanted)
     log_weights = torch.where(
         draws.log_weights.isfinite(), exponent * draws.log_weights, -torch.inf

@@ -63,7 +63,7 @@ class WeightedDraws:
         """Whether the draws represent the posterior."""
         return (
             self.k_hat <= IMPORTANCE_SAMPLING.reliable_k
-            and self.effective >= 0.5 * IMPORTANCE_SAMPLING.enough_effective
+            and self.effective >= IMPORTANCE_SAMPLING.least_effective
         )
 
     def moments(self) -> tuple[Tensor, Tensor]:
@@ -105,6 +105,10 @@ def sample_posterior(
     """
     prior = likelihood.segments.prior
     space = RidgeCoordinates.of(likelihood, seed=seed)
+    enough = (
+        IMPORTANCE_SAMPLING.enough_effective
+        + IMPORTANCE_SAMPLING.enough_per_weak_coordinate * space.num_weak
+    )
     own = [heavy_tailed(*space.moments())]
     shares: list[int] = []
     learnt = list(proposals)
@@ -145,10 +149,7 @@ def sample_posterior(
         smoothed, k_hat = smoothed_weights(log_weights)
         size = effective_size(smoothed)
         result = WeightedDraws(z, w, space, smoothed, k_hat, size, iteration + 1)
-        if (
-            result.k_hat <= IMPORTANCE_SAMPLING.reliable_k
-            and result.effective >= IMPORTANCE_SAMPLING.enough_effective
-        ):
+        if result.k_hat <= IMPORTANCE_SAMPLING.reliable_k and result.effective >= enough:
             break
         own.append(_adapted(w, log_weights, seed, iteration))
     assert result is not None

@@ -261,8 +261,15 @@ class ImportanceSamplingSettings:
         most_iterations: Greatest number of iterations.
         reliable_k: Greatest Pareto shape k̂ of the weights with which estimates are reliable
             (Vehtari et al. 2024).
-        enough_effective: Effective sample size at which sampling ends. The ends of a 90 % interval
-            are then known to a tenth of a standard deviation.
+        enough_effective: Effective sample size at which sampling ends, if the recording determines
+            all parameters. The ends of a 90 % interval are then known to a tenth of a standard
+            deviation.
+        enough_per_weak_coordinate: Increase of this size for each weak coordinate of a ridge.
+            Proposals reach the ends of a ridge only after some adaptation. On tuning recordings
+            of a Furuta pendulum, which has three weak coordinates, standard deviations from 200
+            effective draws were 3 to 13 % smaller than those from 2500; from 1100, up to 4 %.
+        least_effective: Effective sample size below which the draws do not represent the
+            posterior.
         draws_of_given: Number of draws of each density that is given as a first proposal.
         effective_per_parameter: Effective draws per parameter that are needed to estimate a
             proposal's covariance.
@@ -272,9 +279,11 @@ class ImportanceSamplingSettings:
     """
 
     draws_per_iteration: int = 512
-    most_iterations: int = 8
+    most_iterations: int = 16
     reliable_k: float = 0.7
     enough_effective: float = 200.0
+    enough_per_weak_coordinate: float = 300.0
+    least_effective: float = 100.0
     draws_of_given: int = 128
     effective_per_parameter: float = 8.0
     num_kernels: int = 64
@@ -283,7 +292,8 @@ class ImportanceSamplingSettings:
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, math.inf, "draws_per_iteration", "most_iterations", "num_kernels")
-        check_range(self, 1, math.inf, "enough_effective", "draws_of_given")
+        check_range(self, 1, math.inf, "enough_effective", "least_effective", "draws_of_given")
+        check_range(self, 0.0, math.inf, "enough_per_weak_coordinate")
         check_range(self, 0.0, 1.0, "reliable_k")
         check_range(self, 1.0, math.inf, "effective_per_parameter")
         check_range(self, 0.0, math.inf, "tails")
