@@ -1,0 +1,24 @@
+"""Fitted models of hidden pendulums, for tests of single parts of discovery."""
+
+import pytest
+from hidden_rigs import make_case
+
+import npdr_ppl as npdr
+from npdr_ppl.discovery.hypothesis import fit_hypothesis
+
+
+@pytest.fixture(scope="session")
+def quiet():
+    """A pendulum without anything hidden, fitted."""
+    case = make_case("pendulum", "null", (), seed=2001)
+    binding = npdr.DiscoveryOptions().binding(case.fit)
+    return fit_hypothesis(case.model, case.fit, binding)
+
+
+@pytest.fixture(scope="session")
+def dragged():
+    """A pendulum in a hidden drag, fitted without it."""
+    place = ("hinge", "quadratic_drag")
+    case = make_case("pendulum", "one", (place,), strength=0.3, seed=2001)
+    binding = npdr.DiscoveryOptions().binding(case.fit)
+    return case, fit_hypothesis(case.model, case.fit, binding)

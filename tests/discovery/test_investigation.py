@@ -1,0 +1,60 @@
+"""The whole search: the same seed, the same result; and recordings and options it refuses."""
+
+import re
+
+import pytest
+from hidden_rigs import make_case, places
+
+import npdr_ppl as npdr
+from npdr_ppl.errors import DataError
+from npdr_ppl.models.effects import CoulombFriction, QuadraticDrag
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_result():
+    place = ("hinge", "quadratic_drag")
+    case = make_case("pendulum", "one", (place,), strength=0.3, seed=2001)
+    effects = (QuadraticDrag("hinge"), CoulombFriction("hinge"))
+    options = npdr.DiscoveryOptions(effects=effects, max_effects=1)
+    first, second = (npdr.discover(case.model, case.fit, options=options) for _ in range(2))
+    assert first.effects[0].to_dict() == second.effects[0].to_dict()
+    assert first.alarm == second.alarm
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("place", "seed"),
+    [(0, 1040), (1, 1040), (1, 1041)],
+    ids=["infinite starts", "infinite derivatives", "derivatives with infinite squares"],
+)
+def test_angles_in_degrees_from_which_simulations_fail_are_reported_in_a_sentence(place, seed):
+    spoilt = places("cart_pole", "bad_data", seed)[place]
+    case = make_case("cart_pole", "bad_data", spoilt, seed=seed)
+    # Where some fit succeeds the recording is refused by its verdict, elsewhere by an error.
+    try:
+        found = npdr.discover(case.model, case.fit)
+    except DataError as error:
+        told = str(error)
+    else:
+        assert found.verdict == "unknown"
+        assert found.effects == []
+        told = found.reason
+    assert re.search(r"rad; are these degrees\?$", told)
+
+
+def test_numbers_in_place_of_held_out_rollouts_are_refused():
+    case = make_case("pendulum", "null", (), seed=2001)
+    with pytest.raises(DataError, match=r"takes rollouts, e.g. rollouts\[\[3\]\]"):
+        npdr.discover(case.model, case.fit, holdout=(3,))
+
+
+def test_too_short_a_recording_is_refused():
+    case = make_case("pendulum", "null", (), seed=2001)
+    with pytest.raises(DataError, match="too few"):
+        npdr.discover(case.model, case.fit, options=npdr.DiscoveryOptions(segment_length=500))
+
+
+@pytest.mark.parametrize("wrong", [{"segment_length": 1}, {"false_alarm_rate": 0.0}])
+def test_options_out_of_range_are_refused(wrong):
+    with pytest.raises(DataError):
+        npdr.DiscoveryOptions(**wrong)

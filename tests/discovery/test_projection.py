@@ -1,0 +1,39 @@
+"""What the fitted parameters and initial states can explain is projected out of residuals."""
+
+from dataclasses import replace
+
+import pytest
+
+import npdr_ppl as npdr
+from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.screening.projection import Projection, loss_without
+from npdr_ppl.errors import DataError
+from npdr_ppl.models.effects import QuadraticDrag
+
+
+def test_parameters_explain_nothing_of_a_projected_column(quiet):
+    projection = Projection(quiet)
+    own = quiet.linearisation.by_parameters
+    scores = projection.scores(own)
+    # The prior, worth one standard deviation, is all that keeps the rest from zero.
+    assert scores.information.diagonal().max() < 1.0
+    assert scores.absorbed.min() > 0.99
+
+
+def test_the_loss_without_an_effect_equals_that_of_a_fit_without_it(dragged):
+    case, without = dragged
+    drag = QuadraticDrag("hinge")
+    binding = npdr.DiscoveryOptions().binding(case.fit)
+    fitted = fit_hypothesis(case.model, case.fit, binding, effects=(drag,))
+    scale = fitted.fit.scale
+    lost = fitted.share * float((without.losses(scale) - fitted.losses(scale)).sum())
+    assert loss_without(fitted, drag) == pytest.approx(lost, rel=0.1)
+
+
+def test_a_fit_beside_which_a_segment_diverges_is_refused(quiet):
+    exploding = quiet.linearisation.by_starts.clone()
+    exploding[0] = 1e100  # finite, and so are its squares; 1 + Gᵀ G is singular
+    beside = replace(quiet)
+    vars(beside)["_linearised"] = replace(quiet.linearisation, by_starts=exploding)
+    with pytest.raises(DataError, match="Simulations fail right beside the model's closest fit"):
+        Projection(beside)

@@ -1,0 +1,47 @@
+"""Sensitivities of the measurements to candidate effects."""
+
+from dataclasses import replace
+
+import torch
+from hidden_rigs import make_case
+
+import npdr_ppl as npdr
+from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.screening.sensitivities import sensitivities
+from npdr_ppl.discovery.screening.settings import SENSITIVITY
+from npdr_ppl.models.effects import CoulombFriction, EncoderBias, QuadraticDrag, candidate_effects
+
+
+def test_sensitivities_equal_finite_differences(quiet):
+    (variant,) = sensitivities(quiet, (QuadraticDrag("hinge"),))
+    segments, fit = quiet.segments, quiet.fit
+    box = segments.black_box(fit.z[None])
+    values = {k: v[None] for k, v in variant.parameters(torch.tensor([0.01]).double()).items()}
+    changed = box.simulator.with_effects(variant.effect)
+    moved = segments.run(changed, {**box.parameters, **values}, fit.offsets[None])[0]
+    base = segments.run(box.simulator, box.parameters, fit.offsets[None])[0]
+    expected = ((moved - base).double() / fit.scale).flatten(-2) / 0.01
+    difference = (variant.change[..., 0] - expected).norm() / expected.norm()
+    assert difference < 0.02
+
+
+def test_an_effect_that_changes_nothing_but_the_last_digits_is_no_candidate():
+    case = make_case("emps", "null", seed=2001)
+    fitted = fit_hypothesis(case.model, case.fit, npdr.DiscoveryOptions().binding(case.fit))
+    # No force of this drive depends on where it is.
+    assert not list(sensitivities(fitted, (EncoderBias("position"),)))
+    assert list(sensitivities(fitted, (CoulombFriction("carriage"),)))
+
+
+def test_effects_simulated_in_one_batch_have_the_sensitivities_of_each_alone(quiet, monkeypatch):
+    effects = candidate_effects(quiet.simulator)
+    together = list(sensitivities(quiet, effects))
+    one_by_one = replace(SENSITIVITY, segments_per_part=1)
+    monkeypatch.setattr("npdr_ppl.discovery.screening.sensitivities.SENSITIVITY", one_by_one)
+    alone = list(sensitivities(quiet, effects))
+    by_name = {variant.effect.name: [] for variant in alone}
+    for variant in alone:
+        by_name[variant.effect.name].append(variant.change)
+    assert len(together) == len(alone)
+    for variant in together:
+        assert torch.equal(variant.change, by_name[variant.effect.name].pop(0))
