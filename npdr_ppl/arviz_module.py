@@ -55,6 +55,10 @@ FEWEST_WEIGHTS = 25
 """Minimum number of weights for fitting a Pareto distribution: a fifth of them form its tail, and
 its shape needs five."""
 
+EQUAL_LOG_WEIGHTS = 1e-6
+"""Greatest difference between log weights that count as equal: rounding of a double-precision
+simulation. A Pareto distribution cannot be fitted to their tail."""
+
 # A type checker sees only the installed release and does not know the other release's names.
 _az: Any = az
 
@@ -318,8 +322,8 @@ def pareto_smoothed(log_weights: ArrayLike) -> tuple[NDArray[np.float64], float]
         log_weights: Log weights of n draws, ``(n,)``; minus infinity for draws without weight.
 
     Returns:
-        Normalised log weights ``(n,)`` and the distribution's shape k, which is infinite if fewer
-        than ``FEWEST_WEIGHTS`` draws have a weight.
+        Normalised log weights ``(n,)`` and the distribution's shape k. It is infinite if fewer
+        than ``FEWEST_WEIGHTS`` draws have a weight, and zero if all weights are equal.
 
     References:
         A. Vehtari, D. Simpson, A. Gelman, Y. Yao and J. Gabry, Pareto smoothed importance
@@ -330,6 +334,8 @@ def pareto_smoothed(log_weights: ArrayLike) -> tuple[NDArray[np.float64], float]
     result = np.full(values.shape, -np.inf)
     if int(is_used.sum()) < FEWEST_WEIGHTS:
         return result, float("inf")
+    if is_used.all() and np.ptp(values) <= EQUAL_LOG_WEIGHTS:
+        return np.full(values.shape, -np.log(values.size)), 0.0
     if HAS_DATATREE:
         from arviz_stats.base import array_stats  # pyright: ignore[reportMissingImports]
 

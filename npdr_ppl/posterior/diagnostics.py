@@ -30,6 +30,7 @@ from npdr_ppl.posterior.diagnostic_values import (
     predictive_checks,
 )
 from npdr_ppl.posterior.exported_checks import ATTRIBUTE
+from npdr_ppl.posterior.settings import ESTIMATOR_CHECK
 
 if TYPE_CHECKING:
     from npdr_ppl.arviz_module import Data
@@ -346,6 +347,10 @@ class _Reading:
         share = self.figures.influential_share
         if not share > self.limits.influential_share or self.rollouts_left <= 0:
             return None
+        estimator = self.checks.get("estimator", {"is_corrected": True})
+        least = ESTIMATOR_CHECK.least_effective_share
+        if not (estimator["is_corrected"] or estimator["learnt_effective_share"] >= least):
+            return None  # the approximation makes the weights uneven, whatever the segments say
         return (
             Decision.NEW_ROLLOUT,
             f"The posterior depends on few segments ({share:.0%} of them have a Pareto k above "

@@ -155,10 +155,12 @@ def check_estimator(
         )
     smoothed, k = smoothed_weights(log_weights)
     share = effective_size(smoothed) / len(z)
-    if k <= IMPORTANCE_SAMPLING.reliable_k and share >= ESTIMATOR_CHECK.least_effective_share:
+    is_covered = k <= IMPORTANCE_SAMPLING.reliable_k
+    if is_covered and share >= ESTIMATOR_CHECK.least_effective_share:
         return EstimatorCheck(k, share, False, k, share * len(z), True), None
     if not corrects:
-        return EstimatorCheck(k, share, False, k, share * len(z), False), None
+        agrees = is_covered and share >= ESTIMATOR_CHECK.agreeing_share
+        return EstimatorCheck(k, share, False, k, share * len(z), agrees), None
     with torch.no_grad():
         draws = sample_posterior(likelihood, [learnt], seed=seed)
     check = EstimatorCheck(k, share, True, draws.k_hat, draws.effective, draws.is_reliable)

@@ -21,6 +21,7 @@ from npdr_ppl.arviz_module import (
     group_names,
     hdi,
     loo,
+    pareto_smoothed,
     rhat,
     summary,
     to_netcdf,
@@ -107,6 +108,15 @@ def test_convergence_figures():
         correlated[:, t] = 0.8 * correlated[:, t - 1] + noise[:, t]
     expected = correlated.size * 0.2 / 1.8
     assert abs(ess_of_array(correlated, method="mean") / expected - 1) < 0.2
+
+
+def test_equal_weights_have_no_tail_and_one_large_weight_has_a_heavy_one():
+    log_weights, k = pareto_smoothed(np.full(256, -1234.5))
+    assert k == 0.0 and log_weights == pytest.approx(np.full(256, -np.log(256)))
+    # Normal log weights with a standard deviation of 0.1, as of a posterior that is nearly right.
+    normal = np.random.default_rng(0).standard_normal(256)
+    assert pareto_smoothed(0.1 * normal)[1] < 0.5 < pareto_smoothed(5.0 * normal)[1]
+    assert pareto_smoothed(np.where(np.arange(256) < 20, 0.0, -np.inf))[1] == np.inf
 
 
 def test_summary_is_unrounded():

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.posterior.estimator_check import check_estimator
@@ -114,6 +115,49 @@ def test_a_posterior_that_is_right_is_kept_and_one_that_is_off_is_corrected(like
     check, correction = check_estimator([off], likelihood, seed=0, corrects=False)
     assert correction is None
     assert not check.is_reliable
+
+
+def test_a_posterior_that_is_slightly_off_agrees_where_it_is_not_corrected(likelihood):
+    mean, covariance = on_a_grid(likelihood)
+    sd = covariance.diagonal().sqrt()
+
+    def shifted(deviations):
+        """Returns the check of a normal density, whose share is about exp(−deviations²)."""
+        at = mean + sd * torch.tensor([0.0, deviations]).double()
+        density = GaussianMixture.from_moments(
+            torch.ones(1, dtype=torch.float64), at[None], 1.05 * covariance[None]
+        )
+        return check_estimator([density], likelihood, seed=0, corrects=False)[0]
+
+    near, far = shifted(0.2), shifted(1.0)
+    assert 0.8 < near.learnt_effective_share < 0.99 and near.is_reliable
+    assert far.learnt_effective_share < 0.8 and not far.is_reliable
+
+
+def test_draws_of_the_posterior_itself_need_no_correction(likelihood):
+    class Exact(Density):
+        """The posterior up to a constant, with draws of a grid's moments."""
+
+        def sample(self, num_samples):
+            mean, covariance = on_a_grid(likelihood)
+            normal = torch.distributions.MultivariateNormal(mean, covariance)
+            return normal.sample((num_samples,))
+
+        def log_prob(self, z):
+            return likelihood.log_prob(z) + likelihood.segments.prior.log_prob(z)
+
+    check, correction = check_estimator([Exact()], likelihood, seed=0, corrects=True)
+    assert correction is None and check.is_reliable
+    assert check.learnt_effective_share == pytest.approx(1.0)
+
+
+def test_the_information_is_the_curvature_of_the_likelihood(likelihood):
+    z, size = likelihood.fit.z, 0.3 / likelihood.information().diagonal().sqrt()
+    steps = torch.diag(size)
+    points = torch.cat([z[None], z + steps, z - steps])
+    values = likelihood.log_prob(points)
+    curvature = (2.0 * values[0] - values[1:3] - values[3:]) / size.square()
+    torch.testing.assert_close(likelihood.information().diagonal(), curvature, rtol=0.1, atol=0.0)
 
 
 def test_the_likelihood_of_other_starts_is_that_of_one_normal_distribution(likelihood):
