@@ -1,6 +1,7 @@
 import gc
 import math
 import os
+from dataclasses import replace
 
 import pyro
 import pyro.distributions as dist
@@ -14,6 +15,8 @@ from npdr_ppl.inference.registry import backend
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.models.pendulum import pendulum
+from npdr_ppl.posterior import estimator_check
+from npdr_ppl.preparation import importance_sampling
 from npdr_ppl.rollouts import Rollouts
 
 NOISE = {"angle": 0.05, "velocity": 0.2}
@@ -55,6 +58,18 @@ def short_kernels(monkeypatch):
 def quick():
     """A backend that trains in a second."""
     return backend("snpe-c", transforms=1, hidden=(32,), epochs=15, members=2)
+
+
+@pytest.fixture
+def few_draws(monkeypatch):
+    """Gives the check of a posterior too few draws to agree with the simulator."""
+    few = replace(
+        importance_sampling.IMPORTANCE_SAMPLING,
+        most_iterations=1, draws_per_iteration=8, draws_of_given=8,
+    )  # fmt: skip
+    monkeypatch.setattr(importance_sampling, "IMPORTANCE_SAMPLING", few)
+    fewer = replace(estimator_check.ESTIMATOR_CHECK, num_draws=16)
+    monkeypatch.setattr(estimator_check, "ESTIMATOR_CHECK", fewer)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Recordings of a driven pendulum by an integrator of their own, and a model with a ridge.
+"""Recordings of a driven pendulum by an integrator of their own, and models to fit to them.
 
 Runge-Kutta steps of 1 ms in NumPy; nothing of the package's engines is used.
 """
@@ -8,7 +8,7 @@ import pyro
 import pyro.distributions as dist
 
 import npdr_ppl as npdr
-from npdr_ppl.models.pendulum import Pendulum
+from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.rollouts import Rollouts
 
 TRUTH = {"mass": 1.1, "length": 0.9}
@@ -20,13 +20,14 @@ NOISE = {"angle": 0.002, "velocity": 0.01}
 TIME_STEP, SUBSTEPS = 0.02, 20
 
 
-def swinging(*, rollouts=3, steps=250, friction=0.0, seed=0):
+def swinging(*, rollouts=3, steps=250, friction=0.0, noise=NOISE, seed=0):
     """Returns rollouts of the pendulum under three sines of torque.
 
     Args:
         rollouts: Their number.
         steps: Samples of each, 20 ms apart.
         friction: Dry friction at the hinge, N m.
+        noise: Standard deviations of the measurements, rad and rad/s.
         seed: Seed of torques, initial states and noise.
     """
     generator = np.random.default_rng(seed)
@@ -41,8 +42,8 @@ def swinging(*, rollouts=3, steps=250, friction=0.0, seed=0):
             for _ in range(SUBSTEPS):
                 state = _step(state, command, friction, TIME_STEP / SUBSTEPS)
             states.append(state)
-        noise = generator.standard_normal((steps + 1, 2)) * [NOISE["angle"], NOISE["velocity"]]
-        readings.append(np.array(states) + noise)
+        errors = generator.standard_normal((steps + 1, 2)) * [noise["angle"], noise["velocity"]]
+        readings.append(np.array(states) + errors)
         actions.append(torque[:, None])
     return Rollouts.from_arrays(
         readings=readings,
@@ -60,6 +61,26 @@ def product(inputs):
     length = pyro.sample("length", dist.Uniform(0.3, 1.7))
     parameters = {"mass": density * volume, "length": length}
     return npdr.simulate("trajectory", Pendulum(), parameters, inputs)
+
+
+def too_short(inputs):
+    """A pendulum whose prior of the length excludes the true one."""
+    mass = pyro.sample("mass", dist.Uniform(0.3, 1.7))
+    length = pyro.sample("length", dist.Uniform(0.3, 0.75))
+    return npdr.simulate("trajectory", Pendulum(), {"mass": mass, "length": length}, inputs)
+
+
+def with_idle(inputs):
+    """A pendulum with a parameter that does nothing."""
+    pyro.sample("idle", dist.Uniform(0.0, 1.0))
+    return pendulum(inputs)
+
+
+def links(inputs):
+    """A pendulum of eight links, of whose masses a recording shows only the sum."""
+    masses = [pyro.sample(f"link{k}", dist.Normal(TRUTH["mass"] / 8, 0.03)) for k in range(8)]
+    length = pyro.sample("length", dist.Uniform(0.3, 1.7))
+    return npdr.simulate("trajectory", Pendulum(), {"mass": sum(masses), "length": length}, inputs)
 
 
 def _rate(state, torque, friction):

@@ -77,10 +77,12 @@ def _heun(state, torque, h):
     return state + 0.5 * h * (first + rate(state + h * first))
 
 
-class DryPendulum(HandmadePendulum):
-    """The same with dry friction of 0.6 N m at the hinge, which the zoo's pendulum lacks."""
+class NoisyPendulum(HandmadePendulum):
+    """The same in finer steps, with noisy measurements."""
 
-    name = "dry"
+    name = "noisy"
+    friction = 0.0
+    """Dry friction at the hinge, N m."""
 
     def run(self, controller, num_steps, *, episode=0, seed):
         rng = np.random.default_rng(seed)
@@ -89,13 +91,20 @@ class DryPendulum(HandmadePendulum):
         for step in range(num_steps):
             torque = self.limit(controller(readings[-1], step * self.time_step))
             for _ in range(20):
-                friction = 0.6 * math.tanh(state[1] / 0.01)
+                friction = self.friction * math.tanh(state[1] / 0.01)
                 state = _heun(state, torque[0] - friction, self.time_step / 20)
             readings.append(_read(state, rng))
             actions.append(torque)
         end_episode(controller, readings[-1])
         self.note(episode)
         return self.rollout(readings, actions)
+
+
+class DryPendulum(NoisyPendulum):
+    """The same with dry friction, which the zoo's pendulum lacks."""
+
+    name = "dry"
+    friction = 0.6
 
 
 def _read(state, rng):
@@ -126,11 +135,15 @@ def accurate_pendulum(inputs, *, noise=None):
     return npdr.simulate("trajectory", simulator, parameters, inputs, noise=noise)
 
 
-def swinging_task():
-    """A task whose first policy moves the pendulum enough to tell something by."""
+def swinging_task(gain=0.5):
+    """A task whose first policy moves the pendulum enough to tell something by.
+
+    Args:
+        gain: Torque by velocity, N m s/rad; 0.5 overcomes dry friction of 0.6 N m.
+    """
     policy = Linear(("angle", "velocity"), ("torque",), max_gain=20.0)
     gains = policy.parameters.clone()
-    gains[policy.names.index("torque.velocity")] = 0.5
+    gains[policy.names.index("torque.velocity")] = gain
     return ControlTask(
         "swing", policy.with_parameters(gains), reward, initial_states, 200, 30.0, None
     )

@@ -269,49 +269,6 @@ def test_options_out_of_range_are_refused():
         LoopOptions(num_checked=0)
 
 
-# The domains that reach the policy search.
-
-
-def trained_in(searches, accepted, folder, decision, **changed):
-    """Returns what the policy is trained in after a decision, and what was done about it."""
-    searches.clear()
-    accepted[:] = [decision]
-    options = small_options(iterations=1, num_domains=200, search_iterations=1, **changed)
-    result = run(folder, options)
-    return searches[-1][0].parameters["mass"], result.iterations[0]["decisions"][-1]["action"]
-
-
-def test_a_wrong_model_is_trained_in_wider_domains(tmp_path, searches, accepted):
-    def widths(decision, name):
-        """Returns how far domains are from the posterior's draws they were made of, relative."""
-        here = searches, accepted, tmp_path / f"{name}_spread", decision
-        spread, action = trained_in(*here, spread=0.1)
-        here = searches, accepted, tmp_path / f"{name}_plain", decision
-        plain, _ = trained_in(*here, spread=0.0)
-        return (spread / plain - 1.0).abs(), action
-
-    narrow, action = widths(Decision.ACCEPT, "accepted")
-    assert action == Action.TRAINED
-    wide, action = widths(Decision.REVISE_MODEL, "wrong")
-    assert action == Action.SPREAD
-    # Uniform numbers: half of the wider ones are beyond the narrower ones' end.
-    assert float(narrow.max()) <= 0.1 + 1e-5
-    assert float((wide > 0.1).double().mean()) == pytest.approx(0.5, abs=4 * 0.5 / 200**0.5)
-
-
-def test_a_widened_posterior_has_draws_of_the_prior(tmp_path, searches, accepted):
-    def masses(decision, name):
-        return trained_in(searches, accepted, tmp_path / name, decision, prior_share=0.3)
-
-    (narrow, first), (mixed, second) = masses(Decision.ACCEPT, "a"), masses(Decision.WIDEN, "b")
-    assert (first, second) == (Action.TRAINED, Action.MIXED)
-    assert len(narrow) == len(mixed) == 200
-    # The prior is uniform, 1 ± 0.7 kg: 60 draws have a standard deviation of 0.4 kg ± 10 %.
-    assert float(mixed[140:].std()) == pytest.approx(0.4, rel=0.3)
-    # The posterior of one short rollout has 0.28 kg; 1.25 is two standard errors of the ratio.
-    assert float(mixed[140:].std()) > 1.25 * float(narrow.std())
-
-
 # Excitations.
 
 

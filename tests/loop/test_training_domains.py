@@ -3,76 +3,98 @@
 import pytest
 import torch
 
-from npdr_ppl.loop import npdr_loop
-from npdr_ppl.loop.loop_options import Action
+import npdr_ppl as npdr
+from npdr_ppl.inference.registry import backend
+from npdr_ppl.loop.domains import domains_at
+from npdr_ppl.loop.loop_options import Action, LoopOptions
+from npdr_ppl.loop.training_domains import training_domains
 from npdr_ppl.models.pendulum import pendulum
-from npdr_ppl.posterior.diagnostics import Decision, Diagnosis
-from tests.helpers.small_loop import HandmadePendulum, small_options, small_task
+from npdr_ppl.preparation.data_options import DataOptions
+from tests.helpers.pendulum_recordings import swinging
 
-SHARE = 0.1
-"""Plain spread: parameters are multiplied by numbers uniform in 1 ± 0.1."""
-
-
-def trained_in(monkeypatch, decision, *, revise=None, **changed):
-    """Returns the domains that the policy is trained in after one iteration, and what was done."""
-    seen = []
-
-    def diagnose(data, thresholds=None, *, rounds_left=0, rollouts_left=1):
-        return Diagnosis(
-            decision, f"scripted {decision}", 1.0, 100.0, {}, {}, 0.9, 0.1, 0.5, (0.0, 1.0), 0.1
-        )
-
-    optimise = npdr_loop.optimise_policy
-
-    def noted(task, domains, *args, **kwargs):
-        seen.append(domains)
-        return optimise(task, domains, *args, **kwargs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(npdr_loop, "diagnose", diagnose)
-        patch.setattr(npdr_loop, "optimise_policy", noted)
-        options = small_options(
-            iterations=1, num_domains=50, num_initial_states=1, search_iterations=1, **changed
-        )
-        result = npdr_loop.train(
-            pendulum, HandmadePendulum(), small_task(), options, revise=revise, progress=False
-        )
-    assert len(seen) == 2  # on the prior, and on the posterior
-    return seen[1].parameters, result.iterations[0]["decisions"][-1]["action"]
+SPREAD = 0.1
+"""Parameters are multiplied by numbers uniform in 1 ± 0.1."""
 
 
-def deviations(domains, centres):
-    """Returns how far each parameter of each domain is from the draw it was made of, relative."""
-    return {name: (domains[name] / centres[name] - 1.0).abs() for name in ("mass", "length")}
+@pytest.fixture(scope="module")
+def posterior():
+    return npdr.infer(
+        pendulum, swinging(rollouts=1, steps=60), num_simulations=100, progress=False,
+        backend=backend("snpe-a", epochs=5, members=2, components=1),
+        options=DataOptions("all/10", 20, "recorded"),
+    )  # fmt: skip
 
 
-@pytest.mark.parametrize("domains", ["posterior", "most likely"])
-def test_domains_are_the_posteriors_draws_spread_apart(monkeypatch, domains):
-    centres, _ = trained_in(monkeypatch, Decision.ACCEPT, spread=0.0, domains=domains)
-    plain, action = trained_in(monkeypatch, Decision.ACCEPT, spread=SHARE, domains=domains)
-    assert action == Action.TRAINED
-    if domains == "most likely":
-        assert len(centres["mass"].unique()) == 1
-    for away in deviations(plain, centres).values():
+@pytest.fixture
+def domains(posterior):
+    """Returns the parameters of the training domains after an action."""
+
+    def of(action, *, num_restarts=0, **options):
+        def from_prior(number):
+            return domains_at(posterior.prior, prior_draws(posterior, number))
+
+        return training_domains(
+            posterior, LoopOptions(num_domains=50, **options), action, from_prior=from_prior,
+            seed=0, most_likely_seed=0, num_restarts=num_restarts,
+        ).parameters  # fmt: skip
+
+    return of
+
+
+def prior_draws(posterior, number):
+    generator = torch.Generator().manual_seed(1)
+    return torch.randn(number, posterior.prior.num_parameters, generator=generator).double()
+
+
+def factors(spread, plain):
+    """Returns by what each parameter of each domain was multiplied, less one."""
+    return {name: spread[name] / plain[name] - 1.0 for name in ("mass", "length")}
+
+
+@pytest.mark.parametrize("kind", ["posterior", "most likely"])
+def test_domains_are_spread_about_the_posteriors_draws(domains, posterior, kind):
+    plain = domains(Action.TRAINED, spread=0.0, domains=kind)
+    away = factors(domains(Action.TRAINED, spread=SPREAD, domains=kind), plain)
+    if kind == "most likely":
+        likeliest = posterior.most_likely(seed=0)
+        assert len(plain["mass"].unique()) == 1
+        assert plain["mass"][0] == pytest.approx(float(likeliest["mass"]), rel=1e-5)
+    else:
+        draws = posterior.sample(50)
+        assert plain["mass"].tolist() == pytest.approx(draws["mass"].tolist())
+    for factor in away.values():
         # The farthest of fifty uniform numbers is within the last tenth but once in 200 times.
-        assert 0.9 * SHARE < away.max() <= SHARE * (1 + 1e-5)
+        assert 0.9 * SPREAD < factor.abs().max() <= SPREAD * (1 + 1e-5)
     # Each parameter of each domain has a number of its own.
-    assert len((plain["mass"] / centres["mass"]).unique()) == 50
-    assert not torch.allclose(plain["mass"] / centres["mass"], plain["length"] / centres["length"])
+    assert len(away["mass"].unique()) == 50
+    assert not torch.allclose(away["mass"], away["length"])
 
 
-def test_where_the_model_is_wrong_domains_are_farther_apart_than_plain_spread_allows(monkeypatch):
-    centres, _ = trained_in(monkeypatch, Decision.ACCEPT, spread=0.0)
+@pytest.mark.parametrize(
+    ("action", "num_restarts", "factor"),
+    [
+        (Action.SPREAD, 0, 2.0),
+        (Action.NOTHING_FOUND, 0, 2.0),
+        (Action.TRAINED, 1, 0.5),
+        (Action.TRAINED, 2, 0.25),
+        (Action.SPREAD, 1, 1.0),
+    ],
+)
+def test_a_wrong_model_doubles_the_spread_and_each_restart_halves_it(
+    domains, action, num_restarts, factor
+):
+    plain = domains(Action.TRAINED, spread=0.0)
+    usual = factors(domains(Action.TRAINED, spread=SPREAD), plain)
+    other = factors(domains(action, spread=SPREAD, num_restarts=num_restarts), plain)
+    for name, away in other.items():
+        torch.testing.assert_close(away, factor * usual[name], rtol=0, atol=1e-5)
 
-    def share_beyond(decision, **options):
-        """Returns what was done, and the share of parameters that plain spread cannot reach."""
-        found, action = trained_in(monkeypatch, decision, spread=SHARE, **options)
-        away = torch.cat(list(deviations(found, centres).values()))
-        return action, float((away > SHARE * (1 + 1e-5)).double().mean())
 
-    assert share_beyond(Decision.ACCEPT) == (Action.TRAINED, 0.0)
-    nothing = {"revise": lambda model, rollouts, folder: None}
-    # Half of them where the spread is doubled; four standard errors of 100 are a fifth.
-    for options, expected in (({}, Action.SPREAD), (nothing, Action.NOTHING_FOUND)):
-        action, share = share_beyond(Decision.REVISE_MODEL, **options)
-        assert action == expected and share > 0.3
+def test_a_widened_posterior_has_draws_of_the_prior_among_its_domains(domains, posterior):
+    mixed = domains(Action.MIXED, spread=SPREAD, prior_share=0.3)
+    assert len(mixed["mass"]) == 50
+    expected = domains_at(posterior.prior, prior_draws(posterior, 15)).parameters
+    usual = domains(Action.TRAINED, spread=SPREAD, prior_share=0.3)
+    for name, values in expected.items():
+        assert torch.equal(mixed[name][35:], values)
+        assert not bool(torch.isin(values, usual[name]).any())

@@ -1,20 +1,16 @@
-"""Each decision is reached by a real posterior of a real recording, for the right reason."""
-
-from dataclasses import replace
+"""Each decision of `fit` is reached by the posterior of a recording, for its own reason."""
 
 import numpy as np
-import pyro
-import pyro.distributions as dist
 import pytest
 import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.arviz_module import from_netcdf, to_netcdf
 from npdr_ppl.inference.registry import backend
-from npdr_ppl.models.pendulum import Pendulum, pendulum
-from npdr_ppl.posterior.diagnostics import Decision, Thresholds
+from npdr_ppl.models.pendulum import pendulum
+from npdr_ppl.posterior.diagnostics import Decision
 from npdr_ppl.posterior.fit import fit
-from tests.helpers.pendulum_recordings import TRUTH, product, swinging
+from tests.helpers.pendulum_recordings import TRUTH, links, swinging, too_short, with_idle
 
 
 @pytest.fixture(scope="module")
@@ -29,15 +25,22 @@ def clean():
 
 
 @pytest.fixture(scope="module")
-def found(clean, quick):
-    """The posterior of a model that lacks nothing."""
-    return infer(pendulum, clean, quick)
+def accepted(clean, quick):
+    """Posterior and diagnosis of a model that lacks nothing."""
+    return fitted(pendulum, clean, quick)
 
 
-def infer(model, rollouts, quick, **options):
-    return npdr.infer(
-        model, rollouts, backend=quick, num_simulations=200, progress=False, **options
+@pytest.fixture(scope="module")
+def found(accepted):
+    return accepted[0]
+
+
+def fitted(model, rollouts, quick):
+    """Returns the posterior and the diagnosis of a fit."""
+    posterior, result = fit(
+        model, rollouts, backend=quick, rounds=1, num_simulations=200, progress=False
     )
+    return posterior, result["diagnosis"]
 
 
 def inside(posterior, name, value, mass=0.999):
@@ -48,13 +51,13 @@ def inside(posterior, name, value, mass=0.999):
 
 
 @pytest.mark.slow
-def test_defaults_find_the_truth_and_accept(found):
+def test_a_complete_model_is_accepted_at_the_true_parameters(accepted):
+    found, diagnosis = accepted
     for name, value in TRUTH.items():
         assert inside(found, name, value)
         # The simulator's own steps of 20 ms would bias both by several per cent.
         assert found.sample(500)[name].mean() == pytest.approx(value, rel=0.01)
-    diagnosis = npdr.diagnose(found.to_arviz())
-    assert diagnosis.decision is Decision.ACCEPT, diagnosis.reason
+    assert diagnosis["decision"] == Decision.ACCEPT, diagnosis["reason"]
     assert found.preparation.are_steps_coarse
     assert "uncertain initial states" in found.preparation.sentence()
 
@@ -69,17 +72,11 @@ def test_discovery_agrees_that_nothing_is_missing(clean, found):
 
 
 @pytest.mark.slow
-def test_a_prior_that_excludes_the_truth_is_named(clean, quick):
-    def narrow(inputs):
-        mass = pyro.sample("mass", dist.Uniform(0.3, 1.7))
-        length = pyro.sample("length", dist.Uniform(0.3, 0.8))
-        parameters = {"mass": mass, "length": length}
-        return npdr.simulate("trajectory", Pendulum(), parameters, inputs)
-
-    diagnosis = npdr.diagnose(infer(narrow, clean, quick).to_arviz())
-    assert diagnosis.decision is Decision.WIDEN
-    assert "length is at the upper end of its prior, Uniform(0.3, 0.8)" in diagnosis.reason
-    found = npdr.discover(narrow, clean)
+def test_a_prior_that_excludes_the_truth_is_to_be_widened(clean, quick):
+    _, diagnosis = fitted(too_short, clean, quick)
+    assert diagnosis["decision"] == Decision.WIDEN
+    assert "length is at the upper end of its prior, Uniform(0.3, 0.75)" in diagnosis["reason"]
+    found = npdr.discover(too_short, clean)
     assert found.effects == []
     assert found.reason.startswith("length is at the upper end")
     assert "with_wider_priors(revised_model, ['length'])" in found.source()
@@ -87,58 +84,44 @@ def test_a_prior_that_excludes_the_truth_is_named(clean, quick):
 
 @pytest.mark.slow
 def test_hidden_dry_friction_asks_for_another_model(quick):
-    rubbing = swinging(friction=0.15)
-    diagnosis = npdr.diagnose(infer(pendulum, rubbing, quick).to_arviz())
-    assert diagnosis.decision is Decision.REVISE_MODEL
-    assert diagnosis.model_p_value < 0.01
+    _, diagnosis = fitted(pendulum, swinging(friction=0.15), quick)
+    assert diagnosis["decision"] == Decision.REVISE_MODEL
+    assert diagnosis["model_p_value"] < 0.01
 
 
 @pytest.mark.slow
 def test_a_parameter_that_does_nothing_asks_for_another_rollout(clean, quick):
-    def with_idle(inputs):
-        pyro.sample("idle", dist.Uniform(0.0, 1.0))
-        return pendulum(inputs)
-
-    data = infer(with_idle, clean, quick).to_arviz()
-    diagnosis = npdr.diagnose(data)
-    assert diagnosis.decision is Decision.NEW_ROLLOUT
-    assert "nothing of idle" in diagnosis.reason
+    posterior, diagnosis = fitted(with_idle, clean, quick)
+    assert diagnosis["decision"] == Decision.NEW_ROLLOUT
+    assert "nothing of idle" in diagnosis["reason"]
     # Where nothing more can be recorded the others are used all the same.
-    assert npdr.diagnose(data, rollouts_left=0).decision is Decision.ACCEPT
+    last = npdr.diagnose(posterior.to_arviz(), rollouts_left=0)
+    assert last.decision is Decision.ACCEPT
+    assert last.reason.endswith("It does not determine idle.")
 
 
 @pytest.mark.slow
-def test_parameters_of_one_product_ask_for_another_excitation(clean, quick):
-    posterior = infer(product, clean, quick)
+def test_parameters_of_one_sum_ask_for_another_excitation(clean, quick):
+    posterior, diagnosis = fitted(links, clean, quick)
     draws = posterior.sample(500)
-    # A thin ridge: the product is known fifty times better than its factors.
-    assert (draws["density"] * draws["volume"]).log().std() < 0.02 * draws["density"].log().std()
-    diagnosis = npdr.diagnose(posterior.to_arviz(), Thresholds(contraction=0.4))
-    assert diagnosis.decision is Decision.OTHER_EXCITATION
-    assert "density and volume only in combination" in diagnosis.reason
+    masses = torch.stack([draws[f"link{k}"] for k in range(8)])
+    # The sum is known far better than its terms.
+    assert masses.sum(0).std() < 0.1 * masses.std(1).mean()
+    assert diagnosis["decision"] == Decision.OTHER_EXCITATION
+    assert "only in combination with other parameters" in diagnosis["reason"]
 
 
 @pytest.mark.slow
-def test_declared_noise_that_is_too_small_is_told(clean, quick):
+def test_declared_noise_that_is_too_small_asks_for_another_noise(clean, quick):
     model = npdr.with_noise(pendulum, {"angle": 0.001, "velocity": 0.005})
-    diagnosis = npdr.diagnose(infer(model, clean, quick).to_arviz())
-    assert diagnosis.decision is Decision.REVISE_MODEL
-    assert "times as large as the declared noise" in diagnosis.reason
+    posterior, diagnosis = fitted(model, clean, quick)
+    assert diagnosis["decision"] == Decision.REVISE_MODEL
+    assert "times as large as the declared noise" in diagnosis["reason"]
+    assert posterior.checks()["model"]["misfit"] == pytest.approx(2.0, rel=0.1)
 
 
 @pytest.mark.slow
-def test_a_fit_spends_the_rounds_that_it_has_left(clean, quick, monkeypatch):
-    from npdr_ppl.posterior import estimator_check
-    from npdr_ppl.preparation import importance_sampling as posterior_sampling
-
-    # Neither is given the draws that it takes to agree with the simulator.
-    few = replace(
-        posterior_sampling.IMPORTANCE_SAMPLING,
-        most_iterations=1, draws_per_iteration=8, draws_of_given=8,
-    )  # fmt: skip
-    monkeypatch.setattr(posterior_sampling, "IMPORTANCE_SAMPLING", few)
-    fewer = replace(estimator_check.ESTIMATOR_CHECK, num_draws=16)
-    monkeypatch.setattr(estimator_check, "ESTIMATOR_CHECK", fewer)
+def test_a_fit_spends_the_rounds_that_it_has_left(clean, quick, few_draws):
     posterior, result = fit(
         pendulum, clean, backend=quick, rounds=1, extra_rounds=1, num_simulations=100,
         progress=False,
@@ -166,13 +149,13 @@ def test_a_corrected_posterior_is_kept_on_disk(found, tmp_path):
 
 
 @pytest.mark.slow
-def test_nuts_integrates_initial_states_out(quick):
+def test_nuts_agrees_with_a_learnt_posterior_on_uncertain_initial_states(quick):
     short = swinging(rollouts=1, steps=100)
     exact = npdr.infer(
         pendulum, short, backend=backend("nuts", chains=1, num_samples=50, warmup=30),
         progress=False,
     )  # fmt: skip
-    other = infer(pendulum, short, quick)
+    other, _ = fitted(pendulum, short, quick)
     for name in TRUTH:
         one, two = exact.sample(50)[name], other.sample(2_000)[name]
         # Standard errors of both, and of 50 draws that are not independent.
