@@ -5,6 +5,7 @@ import pytest
 from hidden_rigs import make_case
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.models.effects import QuadraticDrag
 
 DISTURBANCE = 0.5
@@ -34,6 +35,13 @@ def proofs():
         npdr.discover(case.model, case.fit, holdout=holdout, options=options)
         for holdout in (case.holdout, disturbed(case.holdout))
     ]
+
+
+def test_the_closed_share_is_that_of_the_gap_above_the_noise_floor():
+    assert Gap(3.0, 1.5, 1.0).closed == pytest.approx(0.75)
+    assert Gap(3.0, 3.5, 1.0).closed == pytest.approx(-0.25)
+    # Nothing is left to close, or there is no floor.
+    assert Gap(1.0, 0.9, 1.0).closed is None and Gap(3.0, 1.0, None).closed is None
 
 
 @pytest.mark.slow
