@@ -14,12 +14,9 @@ Joints add armature · v̇ + damping · v + frictionloss · sign v. The sum over
 where τ is the applied forces plus other passive forces, e.g. of springs, which must be known.
 
 Reference: C. G. Atkeson, C. H. An, J. M. Hollerbach, Estimation of inertial parameters of
-manipulator loads and links, 1986, Eqs. 2–10; P. M. Wensing, S. Kim, J.-J. E. Slotine, Linear
-matrix inequalities for physically consistent inertial parameter identification, 2018 (pseudo-
-inertia).
+manipulator loads and links, 1986, Eqs. 2–10.
 """
 
-import copy
 import importlib
 from dataclasses import dataclass
 from os import PathLike
@@ -30,15 +27,7 @@ from numpy.typing import NDArray
 
 from npdr_ppl.errors import ModelError, ShapeError
 
-__all__ = [
-    "INERTIAL",
-    "JOINT",
-    "MujocoInverseDynamics",
-    "actuator_forces",
-    "is_physical",
-    "load_mjcf",
-    "with_parameters",
-]
+__all__ = ["INERTIAL", "JOINT", "MujocoInverseDynamics", "actuator_forces", "load_mjcf"]
 
 Array = NDArray[np.float64]
 
@@ -101,26 +90,12 @@ class MujocoInverseDynamics:
         """Numbers of the bodies that some joint moves."""
         return tuple(b for b in range(1, self.model.nbody) if self.model.body_weldid[b] != 0)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters π: ``<body>.<inertial>``, then ``<joint>.<parameter>``."""
-        names = [f"{self._body_name(b)}.{p}" for b in self.bodies for p in INERTIAL]
-        return (*names, *(f"{joint}.{p}" for joint in self.dof_names for p in JOINT))
-
-    @property
-    def dof_names(self) -> tuple[str, ...]:
-        """Names of the degrees of freedom; those of the same joint are numbered."""
-        names = []
-        for dof in range(self.model.nv):
-            joint = int(self.model.dof_jntid[dof])
-            name = self.model.joint(joint).name or f"joint_{joint}"
-            first = int(self.model.jnt_dofadr[joint])
-            alone = np.count_nonzero(self.model.dof_jntid == joint) == 1
-            names.append(name if alone else f"{name}[{dof - first}]")
-        return tuple(names)
-
     def nominal(self) -> Array:
-        """Returns π of the unchanged model, ``(P,)``."""
+        """Returns π of the model, ``(P,)``.
+
+        The ``INERTIAL`` parameters of every moving body come first, then the ``JOINT`` parameters
+        of every degree of freedom.
+        """
         model = self.model
         values = []
         for body in self.bodies:
@@ -171,7 +146,8 @@ class MujocoInverseDynamics:
         model, bodies = self.model, self.bodies
         self._check_shapes(positions, velocities, accelerations)
         data = mujoco.MjData(model)
-        rows = np.zeros((len(positions), model.nv, len(self.names)))
+        num = len(INERTIAL) * len(bodies) + len(JOINT) * model.nv
+        rows = np.zeros((len(positions), model.nv, num))
         passive = np.zeros((len(positions), model.nv))
         linear, angular = np.zeros((2, 3, model.nv))
         twist, acceleration = np.zeros((2, 6))
@@ -208,9 +184,6 @@ class MujocoInverseDynamics:
                     f"{name} must have shape ({len(arrays[0])}, {width}), got {array.shape}."
                 )
 
-    def _body_name(self, body: int) -> str:
-        return self.model.body(body).name or f"body_{body}"
-
 
 def actuator_forces(model: Any, positions: Array, velocities: Array, controls: Array) -> Array:
     """Returns the generalised forces of a model's actuators, ``(N, nv)``.
@@ -238,75 +211,6 @@ def actuator_forces(model: Any, positions: Array, velocities: Array, controls: A
         mujoco.mj_fwdActuation(model, data)
         forces[n] = data.qfrc_actuator
     return forces
-
-
-def is_physical(parameters: Array, num_bodies: int) -> NDArray[np.bool_]:
-    """Returns which parameter sets are physically possible.
-
-    A body is possible if its mass is positive and its pseudo-inertia, the 4 × 4 matrix of the
-    moments of its mass distribution, is positive definite. Its principal moments then also satisfy
-    the triangle inequality. Damping, dry friction and armature must not be negative.
-
-    Args:
-        parameters: Sets π, ``(n, P)``, in the order of :attr:`MujocoInverseDynamics.names`.
-        num_bodies: Number of moving bodies.
-
-    Returns:
-        Mask ``(n,)``.
-    """
-    inertial = parameters[:, : 10 * num_bodies].reshape(len(parameters), num_bodies, 10)
-    xx, yy, zz, xy, xz, yz = np.moveaxis(inertial[..., 4:], -1, 0)
-    pseudo = np.empty((*inertial.shape[:2], 4, 4))
-    half = 0.5 * (xx + yy + zz)
-    # Second moments: Σ = ½ tr(I) 1 − I.
-    for i, moment in enumerate((xx, yy, zz)):
-        pseudo[..., i, i] = half - moment
-    for (i, j), product in zip(((0, 1), (0, 2), (1, 2)), (xy, xz, yz), strict=True):
-        pseudo[..., i, j] = pseudo[..., j, i] = -product
-    pseudo[..., 3, :3] = pseudo[..., :3, 3] = inertial[..., 1:4]
-    pseudo[..., 3, 3] = inertial[..., 0]
-    finite = np.isfinite(parameters).all(-1)
-    pseudo[~finite] = -1.0
-    positive = (np.linalg.eigvalsh(pseudo) > 0.0).all(axis=(-2, -1))
-    brakes = (parameters[:, 10 * num_bodies :] >= 0.0).all(axis=-1)
-    return np.asarray(finite & positive & brakes)
-
-
-def with_parameters(model: Any, parameters: Array) -> Any:
-    """Returns a copy of a model with other parameters.
-
-    Args:
-        model: A ``mujoco.MjModel``.
-        parameters: One physical set π, ``(P,)``; see :func:`is_physical`.
-
-    Raises:
-        ModelError: The set is not physical.
-    """
-    mujoco: Any = importlib.import_module("mujoco")
-    dynamics = MujocoInverseDynamics(model)
-    bodies = dynamics.bodies
-    if not is_physical(parameters[None], len(bodies))[0]:
-        raise ModelError("A model cannot have these parameters; see is_physical.")
-    changed = copy.copy(model)
-    for body, (mass, *rest) in zip(
-        bodies, parameters[: 10 * len(bodies)].reshape(-1, 10), strict=True
-    ):
-        centre = np.array(rest[:3]) / mass
-        inertia = np.diag(rest[3:6])
-        for (i, j), product in zip(((0, 1), (0, 2), (1, 2)), rest[6:], strict=True):
-            inertia[i, j] = inertia[j, i] = product
-        inertia = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-        moments, axes = np.linalg.eigh(inertia)
-        # The axes must be right-handed; otherwise no rotation leads to them.
-        axes[:, 2] *= np.sign(np.linalg.det(axes))
-        changed.body_mass[body], changed.body_ipos[body] = mass, centre
-        changed.body_inertia[body] = moments
-        mujoco.mju_mat2Quat(changed.body_iquat[body], axes.flatten())
-    joints = parameters[10 * len(bodies) :].reshape(-1, len(JOINT))
-    for name, column in zip(JOINT, joints.T, strict=True):
-        getattr(changed, f"dof_{name}")[:] = column
-    mujoco.mj_setConst(changed, mujoco.MjData(changed))
-    return changed
 
 
 def _wrench(spin: Array, turn: Array, acceleration: Array) -> Array:
