@@ -1,10 +1,6 @@
-"""The only module that imports ArviZ; it hides the differences between ArviZ releases.
+"""The only module that imports ArviZ, release 0.23; all other modules use its functions.
 
-Up to 0.23 ArviZ keeps its groups in an ``InferenceData``, from 1.0 on in xarray's ``DataTree``.
-Function arguments and table columns differ too. The functions here have one signature and one
-meaning for both, and all other modules use only them. Results are named as in ArviZ 1. Defaults
-that differ between the releases (the kind and probability of intervals, the rounding of tables)
-are always given explicitly.
+ArviZ 1 has other containers, arguments and column names. Results here are named as in ArviZ 1.
 """
 
 import warnings
@@ -22,17 +18,15 @@ from numpy.typing import ArrayLike, NDArray
 with warnings.catch_warnings():
     # ArviZ 0.23 announces its next major release on every import.
     warnings.simplefilter("ignore", FutureWarning)
-    import arviz as az
+    import arviz
 
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.hdf5_checks import check_self_contained
 
 __all__ = [
-    "HAS_DATATREE",
     "Data",
     "Loo",
-    "az",
     "compare",
     "ess",
     "ess_of_array",
@@ -44,12 +38,8 @@ __all__ = [
     "loo",
     "pareto_smoothed",
     "rhat",
-    "summary",
     "to_netcdf",
 ]
-
-HAS_DATATREE: bool = int(az.__version__.split(".")[0]) >= 1
-"""Whether this ArviZ keeps groups in a ``DataTree``."""
 
 FEWEST_WEIGHTS = 25
 """Minimum number of weights for fitting a Pareto distribution: a fifth of them form its tail, and
@@ -59,14 +49,10 @@ EQUAL_LOG_WEIGHTS = 1e-6
 """Greatest difference between log weights that count as equal: rounding of a double-precision
 simulation. A Pareto distribution cannot be fitted to their tail."""
 
-# A type checker sees only the installed release and does not know the other release's names.
-_az: Any = az
+az: Any = arviz  # its annotations do not tell a dataset from an array
 
-Data = Any
-"""ArviZ's collection of groups: an ``InferenceData`` up to 0.23, a ``DataTree`` from 1.0 on."""
-
-_SUMMARY = ["mean", "sd", "hdi_lb", "hdi_ub"]
-_SUMMARY += ["mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
+Data = arviz.InferenceData
+"""ArviZ's collection of groups."""
 
 
 @dataclass(frozen=True)
@@ -108,28 +94,23 @@ def from_dict(
     """
     datasets = {}
     for name, values in groups.items():
-        arguments: dict[str, Any] = {
-            "coords": dict(coords or {}),
-            "dims": {k: list(v) for k, v in (dims or {}).items()},
-            "skip_event_dims": name == "log_likelihood",
-        }
-        if "data" in name:
-            arguments["sample_dims" if HAS_DATATREE else "default_dims"] = []
-        dataset = _az.dict_to_dataset(dict(values), **arguments)
+        dataset = az.dict_to_dataset(
+            dict(values),
+            coords=dict(coords or {}),
+            dims={k: list(v) for k, v in (dims or {}).items()},
+            default_dims=[] if "data" in name else None,
+            skip_event_dims=name == "log_likelihood",
+        )
         for variable, own in (variable_attrs or {}).get(name, {}).items():
             dataset[variable].attrs.update(own)
         datasets[name] = dataset
-    if HAS_DATATREE:
-        tree = xr.DataTree.from_dict(datasets)
-        tree.attrs = dict(attrs or {})
-        return tree
     with _any_group():
-        return _az.InferenceData(attrs=dict(attrs or {}), **datasets)
+        return az.InferenceData(attrs=dict(attrs or {}), **datasets)
 
 
 def group_names(data: Data) -> list[str]:
     """Returns the names of the groups."""
-    return list(data.children) if HAS_DATATREE else list(data.groups())
+    return list(data.groups())
 
 
 def group(data: Data, name: str) -> xr.Dataset:
@@ -140,21 +121,17 @@ def group(data: Data, name: str) -> xr.Dataset:
     """
     if name not in group_names(data):
         raise DataError(f"The ArviZ object has no group {name!r}; it has {group_names(data)}.")
-    return data[name].to_dataset() if HAS_DATATREE else data[name]
+    return data[name]
 
 
-def hdi(data: Data, prob: float, *, group_name: str = "posterior") -> xr.Dataset:
-    """Returns highest-density intervals, along the dimension ``ci_bound`` (lower, upper).
+def hdi(data: Data, prob: float) -> xr.Dataset:
+    """Returns the posterior's highest-density intervals along ``ci_bound`` (lower, upper).
 
     Args:
         data: An ArviZ object.
         prob: Probability of the intervals.
-        group_name: The group.
     """
-    samples = group(data, group_name)
-    if HAS_DATATREE:
-        return _az.hdi(samples, prob=prob)
-    intervals = _az.hdi(samples, hdi_prob=prob).rename(hdi="ci_bound")
+    intervals = az.hdi(group(data, "posterior"), hdi_prob=prob).rename(hdi="ci_bound")
     return intervals.assign_coords(ci_bound=["lower", "upper"])
 
 
@@ -163,37 +140,17 @@ def rhat(data: Data) -> xr.Dataset:
     samples = group(data, "posterior")
     if samples.sizes["chain"] < 2:
         return xr.full_like(samples.isel(chain=0, draw=0, drop=True), np.nan, dtype=float)
-    return _az.rhat(samples)
+    return az.rhat(samples)
 
 
-def ess(data: Data, *, method: Literal["bulk", "tail", "mean"] = "bulk") -> xr.Dataset:
-    """Returns the effective sample size of the posterior's variables."""
-    return _az.ess(group(data, "posterior"), method=method)
+def ess(data: Data) -> xr.Dataset:
+    """Returns the bulk effective sample size of the posterior's variables."""
+    return az.ess(group(data, "posterior"), method="bulk")
 
 
 def ess_of_array(chains: NDArray[np.floating[Any]], *, method: Literal["bulk", "mean"]) -> float:
     """Returns the effective sample size of one quantity, ``(chains, draws)``."""
-    return float(_az.ess(chains, method=method))
-
-
-def summary(data: Data, *, prob: float = 0.94) -> pd.DataFrame:
-    """Returns a table of the posterior's scalar parameters, unrounded.
-
-    Args:
-        data: An ArviZ object.
-        prob: Probability of the highest-density intervals.
-
-    Returns:
-        Columns mean, sd, hdi_lb, hdi_ub, mcse_mean, mcse_sd, ess_bulk, ess_tail, r_hat.
-    """
-    samples = group(data, "posterior")
-    if HAS_DATATREE:
-        table = _az.summary(samples, ci_prob=prob, ci_kind="hdi", round_to="none")
-    else:
-        table = _az.summary(samples, hdi_prob=prob, round_to="none")
-    bounds = [c for c in table.columns if str(c).startswith("hdi")]
-    table = table.rename(columns=dict(zip(bounds, ("hdi_lb", "hdi_ub"), strict=True)))
-    return pd.DataFrame({column: table[column].astype(float) for column in _SUMMARY})
+    return float(az.ess(chains, method=method))
 
 
 def loo(data: Data, *, var_name: str | None = None) -> Loo:
@@ -204,13 +161,11 @@ def loo(data: Data, *, var_name: str | None = None) -> Loo:
         var_name: Variable of that group; needed if it has several.
     """
     with _quiet_loo():
-        found = _az.loo(_judged_draws(data), pointwise=True, var_name=var_name)
-    names = ("elpd", "p", "elpd_i") if HAS_DATATREE else ("elpd_loo", "p_loo", "loo_i")
-    elpd, p, elpd_i = (getattr(found, name) for name in names)
-    elpd_i = np.asarray(elpd_i)
-    # ArviZ 1 divides by n - 1, ArviZ 0.x by n; the difference matters with few segments.
+        found = az.loo(_judged_draws(data), pointwise=True, var_name=var_name)
+    elpd_i = np.asarray(found.loo_i)
+    # ArviZ divides by n instead of n - 1; the difference matters with few segments.
     se = float(np.sqrt(elpd_i.size * elpd_i.var(ddof=1))) if elpd_i.size > 1 else float("nan")
-    return Loo(float(elpd), se, float(p), np.asarray(found.pareto_k), elpd_i)
+    return Loo(float(found.elpd_loo), se, float(found.p_loo), np.asarray(found.pareto_k), elpd_i)
 
 
 def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.DataFrame:
@@ -224,24 +179,16 @@ def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.Da
         Columns rank, elpd, p, elpd_diff (to the best, so at most 0), weight, se, dse, unrounded,
         and warning: whether a Pareto k is too large to trust the row.
     """
-    names: dict[str, Any] = {"var_name": var_name, "method": "stacking"}
     judged = {name: _judged_draws(data) for name, data in models.items()}
     with _quiet_loo():
-        # ArviZ 0.23 calls pandas in ways that pandas 3 deprecates.
+        # ArviZ calls pandas in ways that pandas 3 deprecates.
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="arviz")
-        if HAS_DATATREE:
-            table = _az.compare(judged, round_to="none", **names)
-            table["warning"] = table["diag_elpd"].fillna("").ne("")
-        else:
-            table = _az.compare(judged, ic="loo", scale="log", **names)
-            table = table.rename(columns={"elpd_loo": "elpd", "p_loo": "p"})
-            table["elpd_diff"] = 0.0 - table["elpd_diff"]
+        table = az.compare(judged, ic="loo", scale="log", method="stacking", var_name=var_name)
+    table = table.rename(columns={"elpd_loo": "elpd", "p_loo": "p"})
+    table["elpd_diff"] = 0.0 - table["elpd_diff"]
     n = loo(next(iter(models.values())), var_name=var_name).elpd_i.size
     for column in ("se", "dse"):  # as in loo
-        if n == 1:
-            table[column] = np.nan
-        elif not HAS_DATATREE:
-            table[column] *= np.sqrt(n / (n - 1))
+        table[column] *= np.sqrt(n / (n - 1)) if n > 1 else np.nan
     columns = ("rank", "elpd", "p", "elpd_diff", "weight", "se", "dse", "warning")
     return pd.DataFrame({column: table[column] for column in columns})
 
@@ -253,20 +200,16 @@ def _judged_draws(data: Data) -> Data:
     likelihoods. Draws without one would make ArviZ fit the tails of the weights to too few draws.
     """
     likelihood, posterior = group(data, "log_likelihood"), group(data, "posterior")
-    kept = {
-        "posterior": posterior.isel(draw=slice(0, likelihood.sizes["draw"])),
-        "log_likelihood": likelihood,
-    }
-    return xr.DataTree.from_dict(kept) if HAS_DATATREE else _az.InferenceData(**kept)
+    return az.InferenceData(
+        posterior=posterior.isel(draw=slice(0, likelihood.sizes["draw"])),
+        log_likelihood=likelihood,
+    )
 
 
 def to_netcdf(data: Data, path: str | PathLike[str]) -> None:
-    """Writes an ArviZ object as NetCDF; either release reads the other's files."""
-    if HAS_DATATREE:
-        tree = data
-    else:
-        tree = xr.DataTree.from_dict({name: data[name] for name in data.groups()})
-        tree.attrs = data.attrs
+    """Writes an ArviZ object as NetCDF."""
+    tree = xr.DataTree.from_dict({name: data[name] for name in data.groups()})
+    tree.attrs = data.attrs
     # HDF5 crashes if the disk is full while it writes to a file.
     content = tree.to_netcdf(engine="h5netcdf")
     with replacing(path) as temporary:
@@ -281,11 +224,8 @@ def from_netcdf(path: str | PathLike[str]) -> Data:
     """
     try:
         check_self_contained(path)
-        if HAS_DATATREE:
-            with xr.open_datatree(fspath(path), engine="h5netcdf") as tree:
-                return tree.load()
-        with _any_group(), _az.rc_context({"data.load": "eager"}):
-            return _az.from_netcdf(fspath(path), engine="h5netcdf")
+        with _any_group(), az.rc_context({"data.load": "eager"}):
+            return az.from_netcdf(fspath(path), engine="h5netcdf")
     except DataError as error:
         raise DataError(f"{fspath(path)}: {error}") from None
     # Decoders raise nearly any error for corrupt bytes.
@@ -297,7 +237,7 @@ def from_netcdf(path: str | PathLike[str]) -> Data:
 
 @contextmanager
 def _any_group() -> Iterator[None]:
-    """Permits groups that are not in ArviZ 0.x's scheme, such as ArviZ 1's ``prior_sbc``."""
+    """Permits groups that are not in ArviZ's scheme, such as ``prior_sbc``."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*not defined in the InferenceData scheme")
         yield
@@ -336,13 +276,8 @@ def pareto_smoothed(log_weights: ArrayLike) -> tuple[NDArray[np.float64], float]
         return result, float("inf")
     if is_used.all() and np.ptp(values) <= EQUAL_LOG_WEIGHTS:
         return np.full(values.shape, -np.log(values.size)), 0.0
-    if HAS_DATATREE:
-        from arviz_stats.base import array_stats  # pyright: ignore[reportMissingImports]
-
-        smoothed, k = array_stats.psislw(values[is_used])
-    else:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # k is returned, and the caller judges it
-            smoothed, k = _az.psislw(values[is_used])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # k is returned, and the caller judges it
+        smoothed, k = az.psislw(values[is_used])
     result[is_used] = np.asarray(smoothed, dtype=float)
     return result, float(np.asarray(k))
