@@ -23,27 +23,18 @@ absolute deviation, and bounded.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from time import perf_counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from npdr_ppl.errors import BackendError
-from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
+from npdr_ppl.inference.base import Backend, Density, Problem, Progress, State
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
-from npdr_ppl.inference.parts.training.simulation_checks import (
-    check_problem,
-    check_restored,
-    finite_rows,
-)
 
 __all__ = ["ABC", "ABCState", "KernelDensity"]
-
-MIN_SIMULATIONS = 10
-"""Minimum number of simulations: fewer do not determine a covariance."""
 
 RIDGE = 1e-3
 """Penalty of the regression on features of unit variance, relative to the sum of the weights."""
@@ -76,7 +67,7 @@ class ABCState(State):
 
 
 @dataclass(frozen=True)
-class ABC(Backend):
+class ABC(Backend[ABCState]):
     """Rejection ABC; see the module's text for the method.
 
     Args:
@@ -88,6 +79,8 @@ class ABC(Backend):
     name: ClassVar[str] = "abc"
     summary: ClassVar[str] = "rejection ABC with local-linear regression adjustment"
     amortises: ClassVar[bool] = True
+    state_class = ABCState
+    min_simulations: ClassVar[int] = 10  # fewer do not determine a covariance
 
     accept: float = 0.1
     min_accepted: int = 1000
@@ -101,10 +94,7 @@ class ABC(Backend):
         """
         if not 0 < self.accept <= 1:
             raise BackendError(f"{self.name}: accept must lie in (0, 1]; got {self.accept}.")
-        if self.min_accepted < 2:
-            raise BackendError(
-                f"{self.name}: min_accepted must be at least 2; got {self.min_accepted}."
-            )
+        self._check_at_least(2, "min_accepted")
 
     def init(self, problem: Problem) -> ABCState:
         """Returns the state before any simulation.
@@ -112,7 +102,6 @@ class ABC(Backend):
         Raises:
             BackendError: The problem needs a network trained on raw arrays.
         """
-        check_problem(problem)
         if problem.build_network is not None:
             raise BackendError(
                 f"{self.name} trains no network; choose an embedding with fixed features."
@@ -121,30 +110,11 @@ class ABC(Backend):
             0, torch.empty(0, problem.num_parameters), torch.empty(0, *problem.observation.shape)
         )
 
-    def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
-        """Draws parameters to simulate from the prior, ``(num_simulations, d)``."""
-        return problem.sample_prior(num_simulations)
-
-    def tell(
-        self,
-        problem: Problem,
-        state: State,
-        z: Tensor,
-        x: Tensor,
-        progress: Callable[[float, str], None] | None = None,
-    ) -> tuple[ABCState, RoundInfo]:
-        """Adds a round of simulations; see :meth:`Backend.tell`.
-
-        Raises:
-            ShapeError: The shapes do not fit the problem.
-            BackendError: Too few simulations succeeded.
-        """
-        start = perf_counter()
-        state = self._own(state)
-        num_simulations = len(z)
-        min_rows = MIN_SIMULATIONS if state.round == 0 else 1
-        z, x, num_failed = finite_rows(problem, z.detach().cpu(), x.detach().cpu(), min_rows)
-        state = ABCState(state.round + 1, torch.cat((state.z, z)), torch.cat((state.x, x)))
+    def learn(
+        self, problem: Problem, state: ABCState, z: Tensor, x: Tensor, progress: Progress
+    ) -> tuple[ABCState, dict[str, Any]]:
+        """Adds a round of simulations; see :meth:`Backend.learn`."""
+        state = replace(state, z=torch.cat((state.z, z)), x=torch.cat((state.x, x)))
         preconditioner = fit_preconditioner(state.z, state.x)
         rows, distance = self._nearest(problem, state, preconditioner)
         figures = {
@@ -152,15 +122,12 @@ class ABC(Backend):
             "largest_distance": distance.max().item(),
             "clipped_features": int(preconditioner.outside(problem.observation.cpu()).sum()),
         }
-        if progress is not None:
-            progress(1.0, f"accepted {len(rows)} of {len(state.z)} simulations")
-        return state, RoundInfo(num_simulations, num_failed, perf_counter() - start, figures)
+        progress(1.0, f"accepted {len(rows)} of {len(state.z)} simulations")
+        return state, figures
 
     def densities(self, problem: Problem, state: State) -> list[Density]:
         """Returns the one posterior."""
-        state = self._own(state)
-        if not len(state.z):
-            raise BackendError("There is no posterior yet: tell the backend simulations first.")
+        state = self._told(state)
         preconditioner = fit_preconditioner(state.z, state.x)
         rows, distance = self._nearest(problem, state, preconditioner)
         weight = 1 - (distance / distance.max().clamp(min=torch.finfo().tiny)) ** 2
@@ -182,28 +149,6 @@ class ABC(Backend):
         count = max(round(self.accept * len(distance)), self.min_accepted)
         nearest = distance.topk(min(count, len(distance)), largest=False)
         return nearest.indices, nearest.values
-
-    def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Splits a state into tensors and JSON-serialisable values."""
-        state = self._own(state)
-        return {"z": state.z, "x": state.x}, {"backend": self.name, "round": state.round}
-
-    def restore(
-        self, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
-    ) -> ABCState:
-        """Rebuilds a state from :meth:`tensors`; see :func:`check_restored` for errors."""
-        check_restored(self.name, problem, tensors, values)
-        return ABCState(int(values["round"]), tensors["z"], tensors["x"])
-
-    def _own(self, state: State) -> ABCState:
-        """Returns the state as this backend's.
-
-        Raises:
-            BackendError: It is not.
-        """
-        if not isinstance(state, ABCState):
-            raise BackendError(f"{self.name} cannot continue from a {type(state).__name__}.")
-        return state
 
 
 def _adjust(z: Tensor, offset: Tensor, weight: Tensor) -> Tensor:

@@ -17,19 +17,17 @@ manipulator loads and links, 1986; F. Muratore et al., Neural posterior domain r
 
 import logging
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from time import perf_counter
-from typing import Any, ClassVar, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from npdr_ppl.errors import BackendError
-from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
+from npdr_ppl.inference.base import Backend, Density, Problem, Progress, State
 from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.inference.parts.samplers.conjugate import StudentT, linear_posterior
-from npdr_ppl.inference.parts.training.simulation_checks import check_problem, finite_rows
 from npdr_ppl.rollouts.differentiation import Smoothing
 
 __all__ = ["BayesianLinearRegression", "LinearRegressionState", "RegressionDensity"]
@@ -66,7 +64,7 @@ class LinearRegressionState(State):
 
 
 @dataclass(frozen=True)
-class BayesianLinearRegression(Backend):
+class BayesianLinearRegression(Backend[LinearRegressionState]):
     """Conjugate regression of inverse dynamics; see the module's text for the method.
 
     Args:
@@ -83,6 +81,7 @@ class BayesianLinearRegression(Backend):
     name: ClassVar[str] = "bayesian-linear-regression"
     summary: ClassVar[str] = "conjugate regression of inverse dynamics, without simulations"
     uses_simulations: ClassVar[bool] = False
+    state_class = LinearRegressionState
 
     position_cutoff: float | None = None
     parallel_cutoff: float | None = None
@@ -90,11 +89,7 @@ class BayesianLinearRegression(Backend):
 
     def __post_init__(self) -> None:
         """Validates the options."""
-        if self.undetermined not in ("prior", "nominal"):
-            raise BackendError(
-                f"{self.name}: undetermined must be 'prior' or 'nominal'; "
-                f"got {self.undetermined!r}."
-            )
+        self._check_choice("undetermined", get_args(Undetermined))
         Smoothing(self.position_cutoff, self.parallel_cutoff)
 
     def init(self, problem: Problem) -> LinearRegressionState:
@@ -103,7 +98,6 @@ class BayesianLinearRegression(Backend):
         Raises:
             BackendError: The problem has no simulator with inverse dynamics.
         """
-        check_problem(problem)
         if problem.regression is None:
             raise BackendError(
                 f"{self.name} needs a model with one simulator that declares inverse_dynamics "
@@ -111,31 +105,23 @@ class BayesianLinearRegression(Backend):
             )
         return LinearRegressionState(round=0, posterior=None, plausible=math.nan)
 
-    def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
-        """Requests no simulations: returns ``(0, d)``."""
-        return torch.empty(0, problem.num_parameters)
-
-    def tell(
+    def learn(
         self,
         problem: Problem,
-        state: State,
+        state: LinearRegressionState,
         z: Tensor,
         x: Tensor,
-        progress: Callable[[float, str], None] | None = None,
-    ) -> tuple[LinearRegressionState, RoundInfo]:
-        """Does the regression; simulations are checked but not used.
+        progress: Progress,
+    ) -> tuple[LinearRegressionState, dict[str, Any]]:
+        """Does the regression; simulations are not used. See :meth:`Backend.learn`.
 
         The figures are ``implausible`` and ``draws``, the numbers of draws left out and tried,
         ``implausible_share``, and ``base``, the mean and standard deviation of every base
         parameter.
 
         Raises:
-            ShapeError: The shapes do not fit the problem.
             BackendError: No draw is plausible.
         """
-        start = perf_counter()
-        state = _own(state)
-        z, _, num_failed = finite_rows(problem, z.detach().cpu(), x.detach().cpu(), 0)
         regression = self._regression(problem)
         posterior = linear_posterior(
             regression.regressors,
@@ -167,38 +153,29 @@ class BayesianLinearRegression(Backend):
                 f"the prior's support and physical; the base parameters are {found}: widen the "
                 "prior, or attach the effect that is missing."
             )
-        if progress is not None:
-            progress(1.0, f"{len(regression.targets)} rows, {implausible} implausible draws")
-        info = RoundInfo(
-            num_simulations=len(z) + num_failed,
-            num_failed=num_failed,
-            seconds=perf_counter() - start,
-            losses={
-                "implausible": implausible,
-                "implausible_share": implausible / NUM_DRAWS,
-                "draws": NUM_DRAWS,
-                "rows": len(regression.targets),
-                "base": base,
-            },
-        )
+        progress(1.0, f"{len(regression.targets)} rows, {implausible} implausible draws")
+        figures = {
+            "implausible": implausible,
+            "implausible_share": implausible / NUM_DRAWS,
+            "draws": NUM_DRAWS,
+            "rows": len(regression.targets),
+            "base": base,
+        }
         plausible = 1.0 - implausible / NUM_DRAWS
-        return LinearRegressionState(state.round + 1, posterior, plausible), info
+        return replace(state, posterior=posterior, plausible=plausible), figures
 
     def densities(self, problem: Problem, state: State) -> list[Density]:
         """Returns the posterior, the only member."""
-        state = _own(state)
-        if state.posterior is None:
-            raise BackendError("There is no posterior yet: tell the backend a round first.")
-        regression = self._regression(problem)
+        state = self._told(state)
+        assert state.posterior is not None
+        regression, undetermined = self._regression(problem), self.undetermined
         return [
-            RegressionDensity(
-                problem, regression, state.posterior, state.plausible, self.undetermined
-            )
+            RegressionDensity(problem, regression, state.posterior, state.plausible, undetermined)
         ]
 
     def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Splits a state into tensors and JSON-serialisable values."""
-        state = _own(state)
+        state = self._own(state)
         tensors = {} if state.posterior is None else state.posterior.tensors()
         plausible = None if state.posterior is None else state.plausible
         return tensors, {"backend": self.name, "round": state.round, "plausible": plausible}
@@ -206,15 +183,8 @@ class BayesianLinearRegression(Backend):
     def restore(
         self, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
     ) -> LinearRegressionState:
-        """Rebuilds a state from :meth:`tensors`.
-
-        Raises:
-            BackendError: It is the state of another backend.
-        """
-        if values.get("backend") != self.name:
-            raise BackendError(
-                f"This state is of backend {values.get('backend')!r}, not {self.name}."
-            )
+        """Rebuilds a state from :meth:`tensors`; see :meth:`Backend.restore`."""
+        self._check_restored(problem, tensors, values)
         if not tensors:
             return LinearRegressionState(int(values["round"]), None, math.nan)
         return LinearRegressionState(
@@ -321,11 +291,3 @@ class RegressionDensity(Density):
             ahead, behind = (self.regression.from_reference(z + s) for s in (step, -step))
             columns.append((ahead - behind) / (2.0 * STEP))
         return torch.linalg.slogdet(torch.stack(columns, dim=-1))[1]
-
-
-def _own(state: State) -> LinearRegressionState:
-    if not isinstance(state, LinearRegressionState):
-        raise BackendError(
-            f"bayesian-linear-regression cannot continue from a {type(state).__name__}."
-        )
-    return state

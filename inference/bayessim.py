@@ -66,7 +66,7 @@ class BayesSim(MixtureBackend):
         super().__post_init__()
         self._check_choice("features", FEATURES)
         self._check_choice("kernel", tuple(KERNELS))
-        self._check_ranges(frequencies=(1, float("inf")))
+        self._check_at_least(1, "frequencies")
 
     def init(self, problem: Problem) -> NeuralState:
         """Returns the state before any simulation.

@@ -89,13 +89,8 @@ class FMPE(TruncatedBackend):
     def __post_init__(self) -> None:
         """Validates the options."""
         super().__post_init__()
-        self._check_ranges(
-            hidden=(1, float("inf")),
-            context=(1, float("inf")),
-            draws=(1, float("inf")),
-            sigma=(1e-4, 0.5),
-            steps=(1, float("inf")),
-        )
+        self._check_at_least(1, "hidden", "context", "draws", "steps")
+        self._check_ranges(sigma=(1e-4, 0.5))
 
     def densities(self, problem: Problem, state: State) -> list[Density]:
         """Returns the posterior of every ensemble member."""

@@ -88,9 +88,7 @@ class NLE(LikelihoodBackend):
         self._check_choice("flow", FLOWS)
         self._check_choice("coordinates", get_args(Coordinates))
         self._check_widths("hidden")
-        self._check_ranges(
-            transforms=(1, float("inf")), bins=(1, float("inf")), max_features=(1, float("inf"))
-        )
+        self._check_at_least(1, "transforms", "bins", "max_features")
 
     def init(self, problem: Problem) -> NeuralState:
         """Returns the state before any simulation.

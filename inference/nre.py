@@ -159,12 +159,9 @@ class NRE(LikelihoodBackend):
         """Validates the options."""
         super().__post_init__()
         self._check_widths("hidden")
-        self._check_ranges(
-            rank=(1, float("inf")),
-            units=(1, float("inf")),
-            num_atoms=(2, float("inf")),
-            gamma=(1e-9, float("inf")),
-        )
+        self._check_at_least(1, "rank", "units")
+        self._check_at_least(2, "num_atoms")
+        self._check_at_least(1e-9, "gamma")
 
     def init(self, problem: Problem) -> NeuralState:
         """Returns the state before any simulation.

@@ -7,9 +7,8 @@ that ArviZ's r-hat across members is that of the chains.
 """
 
 import logging
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from time import perf_counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -17,14 +16,13 @@ from pyro.infer import MCMC
 from pyro.infer import NUTS as PyroNUTS
 from torch import Tensor
 
-from npdr_ppl.errors import BackendError, ShapeError
-from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
+from npdr_ppl.errors import BackendError
+from npdr_ppl.inference.base import Backend, Density, Problem, Progress, State
 from npdr_ppl.inference.parts.samplers.tempering import (
     LogDensity,
     UnnormalisedDensity,
     tempered_particles,
 )
-from npdr_ppl.inference.parts.training.simulation_checks import check_problem, finite_rows
 
 __all__ = ["NUTS", "NUTSState"]
 
@@ -47,7 +45,7 @@ class NUTSState(State):
 
 
 @dataclass(frozen=True)
-class NUTS(Backend):
+class NUTS(Backend[NUTSState]):
     """The No-U-Turn sampler; see the module's text.
 
     Args:
@@ -60,6 +58,7 @@ class NUTS(Backend):
     name: ClassVar[str] = "nuts"
     summary: ClassVar[str] = "Pyro's No-U-Turn sampler, the reference for differentiable models"
     uses_simulations: ClassVar[bool] = False
+    state_class = NUTSState
 
     chains: int = 2
     num_samples: int = 1_000
@@ -68,11 +67,7 @@ class NUTS(Backend):
 
     def __post_init__(self) -> None:
         """Validates the options."""
-        for option in ("chains", "num_samples", "warmup", "max_tree_depth"):
-            if getattr(self, option) < 1:
-                raise BackendError(
-                    f"nuts: {option} must be at least 1; got {getattr(self, option)}."
-                )
+        self._check_at_least(1, "chains", "num_samples", "warmup", "max_tree_depth")
 
     def init(self, problem: Problem) -> NUTSState:
         """Returns the state before any draw.
@@ -80,26 +75,13 @@ class NUTS(Backend):
         Raises:
             BackendError: The recording has no differentiable density under the model.
         """
-        check_problem(problem)
         _density(problem)
-        return NUTSState(0, torch.empty(self.chains, 0, problem.num_parameters))
+        return NUTSState(0, torch.empty(0, 0, problem.num_parameters))
 
-    def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
-        """Returns no parameters, ``(0, d)``: the caller simulates nothing."""
-        return torch.empty(0, problem.num_parameters)
-
-    def tell(
-        self,
-        problem: Problem,
-        state: State,
-        z: Tensor,
-        x: Tensor,
-        progress: Callable[[float, str], None] | None = None,
-    ) -> tuple[NUTSState, RoundInfo]:
-        """Runs the chains anew; simulations are ignored. See :meth:`Backend.tell`."""
-        start = perf_counter()
-        finite_rows(problem, z, x, 0)
-        state = _own(state)
+    def learn(
+        self, problem: Problem, state: NUTSState, z: Tensor, x: Tensor, progress: Progress
+    ) -> tuple[NUTSState, dict[str, Any]]:
+        """Runs the chains anew; simulations are ignored. See :meth:`Backend.learn`."""
         log_likelihood = _density(problem)
 
         def potential(values: Mapping[str, Tensor]) -> Tensor:
@@ -113,8 +95,7 @@ class NUTS(Backend):
         def report(*_: object) -> None:
             nonlocal done
             done += 1
-            if progress is not None:
-                progress(done / total, f"chain {len(draws) + 1}, step {done} of {total}")
+            progress(done / total, f"chain {len(draws) + 1}, step {done} of {total}")
 
         for chain in range(self.chains):
             kernel = PyroNUTS(
@@ -133,40 +114,13 @@ class NUTS(Backend):
             num_divergent += len(sampler.diagnostics()["divergences"]["chain 0"])
         if num_divergent:
             logger.warning("nuts: %d of %d draws diverged.", num_divergent, total)
-        info = RoundInfo(len(z), 0, perf_counter() - start, {"divergent": num_divergent})
-        return NUTSState(state.round + 1, torch.stack(draws)), info
+        return replace(state, draws=torch.stack(draws)), {"divergent": num_divergent}
 
     def densities(self, problem: Problem, state: State) -> list[Density]:
         """Returns the posterior of every chain."""
-        state = _own(state)
-        if not state.draws.shape[1]:
-            raise BackendError("There is no posterior yet: tell the backend simulations first.")
+        draws = self._told(state).draws
         log_likelihood = _density(problem)
-        return [UnnormalisedDensity(problem, log_likelihood, chain) for chain in state.draws]
-
-    def tensors(self, state: State) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Splits a state into tensors and JSON-serialisable values."""
-        state = _own(state)
-        return {"draws": state.draws}, {"backend": self.name, "round": state.round}
-
-    def restore(
-        self, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
-    ) -> NUTSState:
-        """Rebuilds a state from :meth:`tensors`.
-
-        Raises:
-            ShapeError: It is the state of another problem.
-            BackendError: It is the state of another backend.
-        """
-        if values.get("backend") != self.name:
-            raise BackendError(f"This state is of backend {values.get('backend')!r}, not nuts.")
-        draws = tensors["draws"]
-        if draws.shape[-1] != problem.num_parameters:
-            raise ShapeError(
-                f"The state holds draws of {draws.shape[-1]} parameters; the problem has "
-                f"{problem.num_parameters}."
-            )
-        return NUTSState(int(values["round"]), draws)
+        return [UnnormalisedDensity(problem, log_likelihood, chain) for chain in draws]
 
 
 def _density(problem: Problem) -> LogDensity:
@@ -182,9 +136,3 @@ def _differentiable_log_prior(problem: Problem, z: Tensor) -> Tensor:
     if problem.is_prior_standard_normal:
         return -0.5 * z.square().sum(-1)
     return problem.log_prior(z)
-
-
-def _own(state: State) -> NUTSState:
-    if not isinstance(state, NUTSState):
-        raise BackendError(f"nuts cannot continue from a {type(state).__name__}.")
-    return state

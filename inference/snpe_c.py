@@ -109,11 +109,8 @@ class SNPEC(TruncatedBackend):
         self._check_choice("flow", FLOWS)
         self._check_choice("proposals", PROPOSALS)
         self._check_widths("hidden")
-        self._check_ranges(
-            transforms=(1, float("inf")),
-            bins=(1, float("inf")),
-            num_atoms=(2, float("inf")),
-        )
+        self._check_at_least(1, "transforms", "bins")
+        self._check_at_least(2, "num_atoms")
 
     def ask(self, problem: Problem, state: State, num_simulations: int) -> Tensor:
         """Proposes parameters to simulate, ``(num_simulations, d)``."""

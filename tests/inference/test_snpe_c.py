@@ -177,7 +177,7 @@ def test_says_which_features_of_the_observation_it_clipped(caplog):
 def test_state_of_another_problem_is_refused():
     problem = make_problem(2, torch.zeros(3))
     tensors, values = SNPEC().tensors(SNPEC().init(problem))
-    with pytest.raises(ShapeError, match="the problem has 1 parameters"):
+    with pytest.raises(ShapeError, match="its z has shape"):
         SNPEC().restore(make_problem(1, torch.zeros(3)), tensors, values)
     with pytest.raises(BackendError, match="not snpe-c"):
         SNPEC().restore(problem, tensors, values | {"backend": "other"})

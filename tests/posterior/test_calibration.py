@@ -14,7 +14,7 @@ import torch
 import npdr_ppl as npdr
 from npdr_ppl.arviz_module import group
 from npdr_ppl.errors import BackendError, DataError, SimulationError
-from npdr_ppl.inference.base import Backend, Density, RoundInfo, State
+from npdr_ppl.inference.base import Backend, Density, State
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.posterior.calibration.calibration_result import Calibration
 
@@ -53,6 +53,7 @@ class Exact(Backend):
     name: ClassVar[str] = "exact"
     summary: ClassVar[str] = "for tests"
     amortises: ClassVar[bool] = True
+    state_class = State
 
     scale: float = 1.0
     shift: float = 0.0
@@ -62,11 +63,8 @@ class Exact(Backend):
     def init(self, problem):
         return State(0)
 
-    def ask(self, problem, state, num_simulations):
-        return problem.sample_prior(num_simulations)
-
-    def tell(self, problem, state, z, x, progress=None):
-        return State(state.round + 1), RoundInfo(len(z), 0, 0.0)
+    def learn(self, problem, state, z, x, progress):
+        return state, {}
 
     def densities(self, problem, state):
         if self.is_prior:
@@ -75,12 +73,6 @@ class Exact(Backend):
         mean = covariance @ GAIN.T @ problem.observation / NOISE**2
         mean = mean + self.shift * covariance.diagonal().sqrt()
         return [Gaussian(mean, self.scale**2 * covariance) for _ in range(self.members)]
-
-    def tensors(self, state):
-        return {}, {}
-
-    def restore(self, problem, tensors, values):
-        return State(0)
 
 
 class NotAmortised(Exact):

@@ -15,7 +15,7 @@ import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.errors import BackendError, DataError
-from npdr_ppl.inference.base import Backend, Density, RoundInfo, State
+from npdr_ppl.inference.base import Backend, Density, State
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.memory import STATM, sampled_memory
 from npdr_ppl.models.pendulum import pendulum
@@ -49,17 +49,15 @@ class Fixed(Backend):
 
     name: ClassVar[str] = "fixed"
     summary: ClassVar[str] = "a posterior known beforehand"
+    state_class = State
     mean: float = 0.0
     sd: float = 0.1
 
     def init(self, problem):
         return State(0)
 
-    def ask(self, problem, state, num_simulations):
-        return problem.sample_prior(num_simulations)
-
-    def tell(self, problem, state, z, x, progress=None):
-        return State(state.round + 1), RoundInfo(len(z), 0, 0.0)
+    def learn(self, problem, state, z, x, progress):
+        return state, {}
 
     def densities(self, problem, state):
         return [Gaussian(self.mean, self.sd, problem.num_parameters)] * 2
@@ -80,7 +78,7 @@ class AtOnce(Fixed):
 class Failing(Fixed):
     """Fails when it is told simulations."""
 
-    def tell(self, problem, state, z, x, progress=None):
+    def learn(self, problem, state, z, x, progress):
         raise BackendError("It does not like these simulations.")
 
 

@@ -15,7 +15,7 @@ posterior. Second, they fit the last round only. We also use the earlier rounds,
 where the last proposal has no draws, above all between the modes of a mixture.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Literal
 
@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from npdr_ppl.errors import BackendError
-from npdr_ppl.inference.base import Density, Problem, RoundInfo, State
+from npdr_ppl.inference.base import Density, Problem, Progress, State
 from npdr_ppl.inference.parts.bases.neural_backend import (
     MIN_SIMULATIONS,
     NeuralBackend,
@@ -95,7 +95,7 @@ class MixtureBackend(NeuralBackend):
     def __post_init__(self) -> None:
         """Validates the common options; a method adds its own."""
         super().__post_init__()
-        self._check_ranges(components=(1, float("inf")))
+        self._check_at_least(1, "components")
         self._check_widths("hidden")
         self._check_choice("proposals", PROPOSALS)
 
@@ -114,26 +114,15 @@ class MixtureBackend(NeuralBackend):
             return problem.sample_prior(num_simulations)
         return self._proposal(problem, state).sample(num_simulations)
 
-    def tell(
-        self,
-        problem: Problem,
-        state: State,
-        z: Tensor,
-        x: Tensor,
-        progress: Callable[[float, str], None] | None = None,
-    ) -> tuple[NeuralState, RoundInfo]:
-        """Trains the ensemble anew on the simulations so far; see :meth:`Backend.tell`.
-
-        Raises:
-            ShapeError: The shapes do not fit the problem.
-            BackendError: Too few simulations succeeded.
-        """
-        state = self._own(state)
+    def learn(
+        self, problem: Problem, state: NeuralState, z: Tensor, x: Tensor, progress: Progress
+    ) -> tuple[NeuralState, dict[str, Any]]:
+        """Trains the ensemble anew on the simulations so far; see :meth:`Backend.learn`."""
         if state.round:
             seen = self._seen(state)
             proposals = (*seen.proposals, self._proposal(problem, state))
             state = replace(state, simulations=replace(seen, proposals=proposals))
-        return super().tell(problem, state, z, x, progress)
+        return super().learn(problem, state, z, x, progress)
 
     def densities(self, problem: Problem, state: State) -> list[Density]:
         """Returns the posterior of every ensemble member."""

@@ -6,16 +6,15 @@ rest. Every round trains anew on the simulations so far.
 
 import logging
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from time import perf_counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from npdr_ppl.errors import BackendError
-from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
+from npdr_ppl.inference.base import Backend, Problem, Progress, State
 from npdr_ppl.inference.parts.training.ensemble_training import (
     Evaluator,
     Loss,
@@ -25,11 +24,6 @@ from npdr_ppl.inference.parts.training.ensemble_training import (
     vectorised,
 )
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
-from npdr_ppl.inference.parts.training.simulation_checks import (
-    check_problem,
-    check_restored,
-    finite_rows,
-)
 
 __all__ = ["NeuralBackend", "NeuralState", "Simulations"]
 
@@ -84,7 +78,7 @@ class NeuralState(State):
 
 
 @dataclass(frozen=True)
-class NeuralBackend(Backend):
+class NeuralBackend(Backend[NeuralState]):
     """A backend that trains an ensemble of networks on preconditioned simulations.
 
     Args:
@@ -97,6 +91,9 @@ class NeuralBackend(Backend):
         validation_fraction: Fraction of the simulations each member holds out.
         patience: Number of epochs without improvement after which training stops.
     """
+
+    state_class = NeuralState
+    min_simulations: ClassVar[int] = MIN_SIMULATIONS
 
     objective: ClassVar[str] = "validation_log_prob"
     """Name of the figure that training maximises."""
@@ -118,41 +115,10 @@ class NeuralBackend(Backend):
 
     def __post_init__(self) -> None:
         """Validates the common options; a method adds its own."""
-        self._check_ranges(
-            members=(1, float("inf")),
-            epochs=(1, float("inf")),
-            batch_size=(1, float("inf")),
-            patience=(1, float("inf")),
-            learning_rate=(1e-12, float("inf")),
-            weight_decay=(0.0, float("inf")),
-            averaging=(0.0, 1 - 1e-9),
-            validation_fraction=(1e-9, 0.9),
-        )
-
-    def _check_ranges(self, **ranges: tuple[float, float]) -> None:
-        """Checks that options lie in closed ranges.
-
-        Raises:
-            BackendError: One does not.
-        """
-        for option, (low, high) in ranges.items():
-            if not low <= getattr(self, option) <= high:
-                raise BackendError(
-                    f"{self.name}: {option} must lie between {low} and {high}; "
-                    f"got {getattr(self, option)}."
-                )
-
-    def _check_choice(self, option: str, allowed: Sequence[str]) -> None:
-        """Checks that an option is one of the allowed words.
-
-        Raises:
-            BackendError: It is not.
-        """
-        if getattr(self, option) not in allowed:
-            raise BackendError(
-                f"{self.name}: {option} must be one of {', '.join(allowed)}; "
-                f"got {getattr(self, option)!r}."
-            )
+        self._check_at_least(1, "members", "epochs", "batch_size", "patience")
+        self._check_at_least(1e-12, "learning_rate")
+        self._check_at_least(0.0, "weight_decay")
+        self._check_ranges(averaging=(0.0, 1 - 1e-9), validation_fraction=(1e-9, 0.9))
 
     def _check_widths(self, option: str) -> None:
         """Makes an option a tuple and checks that it holds widths of hidden layers.
@@ -232,7 +198,6 @@ class NeuralBackend(Backend):
 
     def init(self, problem: Problem) -> NeuralState:
         """Returns the state before any simulation."""
-        check_problem(problem)
         none = Simulations(
             torch.empty(0, problem.num_parameters),
             torch.empty(0, *problem.observation.shape),
@@ -240,25 +205,10 @@ class NeuralBackend(Backend):
         )
         return NeuralState(0, none, {}, None)
 
-    def tell(
-        self,
-        problem: Problem,
-        state: State,
-        z: Tensor,
-        x: Tensor,
-        progress: Callable[[float, str], None] | None = None,
-    ) -> tuple[NeuralState, RoundInfo]:
-        """Trains the ensemble anew on the simulations so far; see :meth:`Backend.tell`.
-
-        Raises:
-            ShapeError: The shapes do not fit the problem.
-            BackendError: Too few simulations succeeded.
-        """
-        start = perf_counter()
-        state = self._own(state)
-        num_simulations = len(z)
-        min_rows = MIN_SIMULATIONS if state.round == 0 else 1
-        z, x, num_failed = finite_rows(problem, z.detach().cpu(), x.detach().cpu(), min_rows)
+    def learn(
+        self, problem: Problem, state: NeuralState, z: Tensor, x: Tensor, progress: Progress
+    ) -> tuple[NeuralState, dict[str, Any]]:
+        """Trains the ensemble anew on the simulations so far; see :meth:`Backend.learn`."""
         simulations = state.simulations.followed_by(z, x, state.round)
         used = torch.ones(len(simulations), dtype=torch.bool)
         used[: len(state.simulations)] = self._training_rows(problem, state)
@@ -287,19 +237,17 @@ class NeuralBackend(Backend):
         )
         weights = {name: value.cpu() for name, value in fit.weights.items()}
         weights |= self._calibration(problem, preconditioner, rows, weights, fit.held_out.cpu())
-        info = RoundInfo(
-            num_simulations,
-            num_failed,
-            perf_counter() - start,
-            {
-                self.objective: self._objective(fit.validation.cpu(), preconditioner).tolist(),
-                "best_epoch": fit.best_epochs.tolist(),
-                "epochs": fit.epochs,
-                "trained_on": len(rows),
-                "clipped_features": clipped,
-            },
+        figures = {
+            self.objective: self._objective(fit.validation.cpu(), preconditioner).tolist(),
+            "best_epoch": fit.best_epochs.tolist(),
+            "epochs": fit.epochs,
+            "trained_on": len(rows),
+            "clipped_features": clipped,
+        }
+        state = replace(
+            state, simulations=simulations, weights=weights, preconditioner=preconditioner
         )
-        return NeuralState(state.round + 1, simulations, weights, preconditioner), info
+        return state, figures
 
     def _objective(self, validation: Tensor, preconditioner: Preconditioner) -> Tensor:
         """Returns the validation objective in the units of the reference coordinates."""
@@ -336,8 +284,8 @@ class NeuralBackend(Backend):
     def restore(
         self, problem: Problem, tensors: Mapping[str, Tensor], values: Mapping[str, Any]
     ) -> NeuralState:
-        """Rebuilds a state from :meth:`tensors`; see :func:`check_restored` for errors."""
-        check_restored(self.name, problem, tensors, values)
+        """Rebuilds a state from :meth:`tensors`; see :meth:`Backend.restore`."""
+        self._check_restored(problem, tensors, values)
         z, x = tensors["z"], tensors["x"]
         parts = {
             prefix: {
@@ -355,23 +303,12 @@ class NeuralBackend(Backend):
             preconditioner=self.preconditioner_type.from_tensors(fitted) if fitted else None,
         )
 
-    def _own(self, state: State) -> NeuralState:
-        """Returns the state as this backend's.
-
-        Raises:
-            BackendError: It is not.
-        """
-        if not isinstance(state, NeuralState):
-            raise BackendError(f"{self.name} cannot continue from a {type(state).__name__}.")
-        return state
-
     def _trained(self, state: State) -> tuple[NeuralState, Preconditioner]:
         """Returns a state with simulations, and its preconditioner.
 
         Raises:
             BackendError: The state has no simulations.
         """
-        state = self._own(state)
-        if state.preconditioner is None:
-            raise BackendError("There is no posterior yet: tell the backend simulations first.")
+        state = self._told(state)
+        assert state.preconditioner is not None
         return state, state.preconditioner
