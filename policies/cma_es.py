@@ -4,7 +4,6 @@ Hansen (2016), *The CMA evolution strategy: a tutorial*, as implemented by the p
 It uses only the ranks of the returns, so their scale does not matter.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -13,15 +12,8 @@ import torch
 from cmaes import CMA
 from torch import Tensor
 
-from npdr_ppl.errors import ModelError
-from npdr_ppl.policies.policy_search import (
-    PolicySearch,
-    SearchSpace,
-    SearchState,
-    checked,
-    counted,
-    per_parameter,
-)
+from npdr_ppl.errors import ShapeError
+from npdr_ppl.policies.policy_search import GaussianSearch, SearchSpace, SearchState
 
 __all__ = ["CMAES", "CMAESState"]
 
@@ -48,7 +40,7 @@ class CMAESState(SearchState):
 
 
 @dataclass(frozen=True)
-class CMAES(PolicySearch[CMAESState]):
+class CMAES(GaussianSearch[CMAESState]):
     """CMA-ES with bounds; see the module's text. It deploys the mean of its distribution.
 
     On the Furuta pendulum it is behind PoWER for about ten iterations and equal after forty.
@@ -63,31 +55,16 @@ class CMAES(PolicySearch[CMAESState]):
     name: ClassVar[str] = "cma-es"
     summary: ClassVar[str] = "CMA-ES: covariance matrix adaptation by ranks, with bounds"
     state_class = CMAESState
+    smallest_population: ClassVar[int] = 5
 
-    population: int = 50
-    exploration: float | Sequence[float] = 2.0
-
-    def __post_init__(self) -> None:
-        """Validates the options.
-
-        Raises:
-            ModelError: One is out of range.
-        """
-        if self.population < 5:
-            raise ModelError(f"{self.name}: population must be at least 5; got {self.population}.")
-
-    def begin(self, space: SearchSpace, start: Tensor) -> CMAESState:
-        """Returns the state before any return is told; see :meth:`PolicySearch.begin`."""
-        return CMAESState(
-            space=space,
-            iteration=0,
-            best=start,
-            best_return=start.new_tensor(-torch.inf),
-            start=start,
-            exploration=per_parameter("exploration", self.exploration, space),
-            candidates=start.new_empty(0, self.population, len(start)),
-            returns=start.new_empty(0, self.population),
-        )
+    def begin(self, space: SearchSpace, start: Tensor) -> dict[str, Tensor]:
+        """Returns the tensors of a new state; see :meth:`PolicySearch.begin`."""
+        return {
+            "start": start,
+            "exploration": self._per_parameter("exploration", space),
+            "candidates": start.new_empty(0, self.population, len(start)),
+            "returns": start.new_empty(0, self.population),
+        }
 
     def ask(self, state: CMAESState, generator: torch.Generator) -> Tensor:
         """Draws candidates, anew if they are out of bounds; see :meth:`PolicySearch.ask`."""
@@ -96,14 +73,19 @@ class CMAES(PolicySearch[CMAESState]):
         rows = [optimiser.ask() for _ in range(state.returns.shape[1])]
         return torch.from_numpy(np.stack(rows))
 
-    def tell(self, state: CMAESState, candidates: Tensor, returns: Tensor) -> CMAESState:
-        """Adds a generation; see :meth:`PolicySearch.tell`.
+    def learn(self, state: CMAESState, candidates: Tensor, returns: Tensor) -> CMAESState:
+        """Adds a generation; see :meth:`PolicySearch.learn`.
 
         A generation with equal returns is left out, because its ranks would be the order of the
         rows.
+
+        Raises:
+            ShapeError: There are more or fewer candidates than in other generations.
         """
-        candidates, returns = checked(state, candidates, returns, state.returns.shape[1])
-        state = counted(state, candidates, returns)
+        if len(returns) != state.returns.shape[1]:
+            raise ShapeError(
+                f"Candidates of a generation must be {state.returns.shape[1]}, got {len(returns)}."
+            )
         if returns.max() == returns.min():
             return state
         return replace(

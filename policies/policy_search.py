@@ -7,7 +7,7 @@ the domains, the initial states and checkpoints.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar, final
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torch import Tensor
 from npdr_ppl.errors import ModelError, ShapeError
 from npdr_ppl.policies.base import Policy
 
-__all__ = ["PolicySearch", "SearchSpace", "SearchState", "checked", "counted", "per_parameter"]
+__all__ = ["GaussianSearch", "PolicySearch", "SearchSpace", "SearchState"]
 
 
 @dataclass(frozen=True)
@@ -109,19 +109,18 @@ class PolicySearch(ABC, Generic[S]):
                 f"A search must begin within the bounds; {', '.join(wrong)} of "
                 f"{type(policy).__name__} are not."
             )
-        return self.begin(space, space.clamp(start.double()))
-
-    def forget(self, state: S) -> S:
-        """Returns a new search that begins at :meth:`parameters`, for other domains.
-
-        Exploration is as wide as at the beginning. The earlier returns are dropped, because
-        returns in other domains are not comparable.
-        """
-        return self.begin(state.space, self.parameters(state))
+        start = space.clamp(start.double())
+        return self.state_class(
+            space=space,
+            iteration=0,
+            best=start,
+            best_return=start.new_tensor(-torch.inf),
+            **self.begin(space, start),
+        )
 
     @abstractmethod
-    def begin(self, space: SearchSpace, start: Tensor) -> S:
-        """Returns the state before any return is told.
+    def begin(self, space: SearchSpace, start: Tensor) -> dict[str, Tensor]:
+        """Returns the tensors that the search's own states add, before any return is told.
 
         Args:
             space: Names and bounds of the parameters.
@@ -137,7 +136,7 @@ class PolicySearch(ABC, Generic[S]):
             generator: Source of all randomness, on the CPU.
         """
 
-    @abstractmethod
+    @final
     def tell(self, state: S, candidates: Tensor, returns: Tensor) -> S:
         """Learns from an iteration.
 
@@ -150,6 +149,35 @@ class PolicySearch(ABC, Generic[S]):
         Raises:
             ShapeError: The shapes do not fit.
             ModelError: Candidates are not finite.
+        """
+        expected = (max(1, len(candidates)), len(state.space.names))
+        if tuple(candidates.shape) != expected:
+            raise ShapeError(
+                f"Candidates must have shape {expected}, got {tuple(candidates.shape)}."
+            )
+        if tuple(returns.shape) != expected[:1]:
+            raise ShapeError(
+                f"Returns must have shape {expected[:1]}, got {tuple(returns.shape)}."
+            )
+        if not candidates.isfinite().all():
+            raise ModelError("Candidates must be finite; some are NaN or infinite.")
+        candidates, returns = candidates.detach().cpu().double(), returns.detach().cpu().double()
+        returns = returns.where(returns.isfinite(), -torch.inf)
+        state = replace(state, iteration=state.iteration + 1)
+        index = returns.argmax()
+        if returns[index] > state.best_return:
+            best, best_return = candidates[index].clone(), returns[index].clone()
+            state = replace(state, best=best, best_return=best_return)
+        return self.learn(state, candidates, returns)
+
+    @abstractmethod
+    def learn(self, state: S, candidates: Tensor, returns: Tensor) -> S:
+        """Learns from an iteration; :meth:`tell` calls it.
+
+        Args:
+            state: The state that was asked, its iteration and best candidate already updated.
+            candidates: Parameters tried, ``(population, P)``, in float64 on the CPU.
+            returns: Their returns, ``(population,)``; −∞ for failures.
         """
 
     @abstractmethod
@@ -202,68 +230,59 @@ class PolicySearch(ABC, Generic[S]):
         return [name for name in names if name not in ("space", "iteration")]
 
 
-def checked(
-    state: SearchState, candidates: Tensor, returns: Tensor, num_candidates: int | None = None
-) -> tuple[Tensor, Tensor]:
-    """Checks the arguments of :meth:`PolicySearch.tell`.
+@dataclass(frozen=True)
+class GaussianSearch(PolicySearch[S]):
+    """A search that draws candidates from a normal distribution.
 
     Args:
-        state: The current state.
-        candidates: Parameters tried, ``(population, P)``.
-        returns: Their returns, ``(population,)``.
-        num_candidates: The population; ``None`` if any number will do.
-
-    Returns:
-        Both in float64 on the CPU, returns −∞ where they are not finite.
-
-    Raises:
-        ShapeError: The shapes do not fit.
-        ModelError: Candidates are not finite.
+        population: Number of candidates per iteration.
+        exploration: Initial standard deviations, one number or one per parameter.
     """
-    expected = (num_candidates or max(1, len(candidates)), len(state.space.names))
-    if tuple(candidates.shape) != expected:
-        raise ShapeError(f"Candidates must have shape {expected}, got {tuple(candidates.shape)}.")
-    if tuple(returns.shape) != expected[:1]:
-        raise ShapeError(f"Returns must have shape {expected[:1]}, got {tuple(returns.shape)}.")
-    if not candidates.isfinite().all():
-        raise ModelError("Candidates must be finite; some are NaN or infinite.")
-    returns = returns.detach().cpu().double()
-    return candidates.detach().cpu().double(), returns.where(returns.isfinite(), -torch.inf)
 
+    smallest_population: ClassVar[int] = 1
 
-def counted(state: S, candidates: Tensor, returns: Tensor) -> S:
-    """Returns the state of the next iteration, with the best candidate updated.
+    population: int = 50
+    exploration: float | Sequence[float] = 2.0
 
-    Args:
-        state: The previous state.
-        candidates: Parameters tried, ``(population, P)``.
-        returns: Their returns as :func:`checked` returned them, ``(population,)``.
-    """
-    state = replace(state, iteration=state.iteration + 1)
-    index = returns.argmax()
-    if returns[index] > state.best_return:
-        state = replace(state, best=candidates[index].clone(), best_return=returns[index].clone())
-    return state
+    def __post_init__(self) -> None:
+        """Validates the options.
 
+        Raises:
+            ModelError: The population is too small.
+        """
+        if self.population < self.smallest_population:
+            raise ModelError(
+                f"{self.name}: population must be at least {self.smallest_population}; "
+                f"got {self.population}."
+            )
 
-def per_parameter(option: str, value: float | Sequence[float], space: SearchSpace) -> Tensor:
-    """Returns an option, given as one number or one per parameter, as ``(P,)``.
+    def _perturbed(
+        self, state: S, mean: Tensor, factor: Tensor, generator: torch.Generator
+    ) -> Tensor:
+        """Returns the mean and ``population`` draws of N(mean, F Fᵀ), moved into the bounds.
 
-    Args:
-        option: Its name.
-        value: Its value.
-        space: Names of the parameters.
+        Args:
+            state: The current state.
+            mean: Mean, ``(P,)``.
+            factor: F, ``(P, P)``.
+            generator: Source of all randomness.
+        """
+        noise = torch.randn(self.population, len(mean), generator=generator, dtype=torch.float64)
+        return state.space.clamp(torch.cat((mean[None], mean + noise @ factor.T)))
 
-    Raises:
-        ShapeError: There are more or fewer values than parameters.
-        ModelError: A value is not positive and finite.
-    """
-    values = torch.as_tensor(value, dtype=torch.float64)
-    if values.ndim and values.shape != (len(space.names),):
-        raise ShapeError(
-            f"{option} is one number or one for each of {', '.join(space.names)}; got "
-            f"{tuple(values.shape)}."
-        )
-    if not ((values > 0) & values.isfinite()).all():
-        raise ModelError(f"{option} must be positive and finite, got {value}.")
-    return values.expand(len(space.names)).clone()
+    def _per_parameter(self, option: str, space: SearchSpace) -> Tensor:
+        """Returns an option, given as one number or one per parameter, as ``(P,)``.
+
+        Raises:
+            ShapeError: There are more or fewer values than parameters.
+            ModelError: A value is not positive and finite.
+        """
+        values = torch.as_tensor(getattr(self, option), dtype=torch.float64)
+        if values.ndim and values.shape != (len(space.names),):
+            raise ShapeError(
+                f"{option} is one number or one for each of {', '.join(space.names)}; got "
+                f"{tuple(values.shape)}."
+            )
+        if not ((values > 0) & values.isfinite()).all():
+            raise ModelError(f"{option} must be positive and finite, got {getattr(self, option)}.")
+        return values.expand(len(space.names)).clone()

@@ -24,14 +24,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import ModelError
-from npdr_ppl.policies.policy_search import (
-    PolicySearch,
-    SearchSpace,
-    SearchState,
-    checked,
-    counted,
-    per_parameter,
-)
+from npdr_ppl.policies.policy_search import GaussianSearch, SearchSpace, SearchState
 
 __all__ = ["PoWER", "PoWERState"]
 
@@ -56,10 +49,10 @@ class PoWERState(SearchState):
 
 
 @dataclass(frozen=True)
-class PoWER(PolicySearch[PoWERState]):
+class PoWER(GaussianSearch[PoWERState]):
     """PoWER; see the module's text for the method. It deploys the mean.
 
-    Candidates in the memory keep their returns. If the domains change, call :meth:`forget`.
+    Candidates in the memory keep their returns. If the domains change, begin a new search.
     Otherwise candidates with high returns in the previous domains slow the search down.
 
     Args:
@@ -74,9 +67,7 @@ class PoWER(PolicySearch[PoWERState]):
     summary: ClassVar[str] = "PoWER: exploration weighted with the returns, with a memory"
     state_class = PoWERState
 
-    population: int = 50
     memory: int = 10
-    exploration: float | Sequence[float] = 2.0
     floor: float | Sequence[float] = 0.02
 
     def __post_init__(self) -> None:
@@ -85,44 +76,31 @@ class PoWER(PolicySearch[PoWERState]):
         Raises:
             ModelError: One is out of range.
         """
-        if self.population < 1 or self.memory < 1:
-            raise ModelError(
-                f"{self.name}: population and memory must be at least 1; got {self.population} "
-                f"and {self.memory}."
-            )
+        super().__post_init__()
+        if self.memory < 1:
+            raise ModelError(f"{self.name}: memory must be at least 1; got {self.memory}.")
 
-    def begin(self, space: SearchSpace, start: Tensor) -> PoWERState:
-        """Returns the state before any return is told; see :meth:`PolicySearch.begin`."""
-        exploration = per_parameter("exploration", self.exploration, space)
-        return PoWERState(
-            space=space,
-            iteration=0,
-            best=start,
-            best_return=start.new_tensor(-torch.inf),
-            mean=start,
-            covariance=exploration.square().diag(),
-            floor=per_parameter("floor", self.floor, space),
-            memory=start.new_empty(0, len(start)),
-            memory_returns=start.new_empty(0),
-        )
+    def begin(self, space: SearchSpace, start: Tensor) -> dict[str, Tensor]:
+        """Returns the tensors of a new state; see :meth:`PolicySearch.begin`."""
+        return {
+            "mean": start,
+            "covariance": self._per_parameter("exploration", space).square().diag(),
+            "floor": self._per_parameter("floor", space),
+            "memory": start.new_empty(0, len(start)),
+            "memory_returns": start.new_empty(0),
+        }
 
     def ask(self, state: PoWERState, generator: torch.Generator) -> Tensor:
         """Perturbs the mean, which is the first row; see :meth:`PolicySearch.ask`."""
-        noise = torch.randn(
-            self.population, len(state.mean), generator=generator, dtype=torch.float64
-        )
         factor = torch.linalg.cholesky(state.covariance)
-        candidates = torch.cat((state.mean[None], state.mean + noise @ factor.T))
-        return state.space.clamp(candidates)
+        return self._perturbed(state, state.mean, factor, generator)
 
-    def tell(self, state: PoWERState, candidates: Tensor, returns: Tensor) -> PoWERState:
-        """Moves mean and covariance; see :meth:`PolicySearch.tell`.
+    def learn(self, state: PoWERState, candidates: Tensor, returns: Tensor) -> PoWERState:
+        """Moves mean and covariance; see :meth:`PolicySearch.learn`.
 
         Accepts any number of candidates, also ones that :meth:`ask` did not propose. Failed ones
         are left out. If all returns are equal, only the memory changes.
         """
-        candidates, returns = checked(state, candidates, returns)
-        state = counted(state, candidates, returns)
         succeeded = returns > -torch.inf
         if not succeeded.any():
             return state

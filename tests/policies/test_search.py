@@ -137,16 +137,6 @@ def test_does_not_restore_what_is_not_its_own(search):
         search.restore(Dial(), tensors | {"upper": tensors["upper"] + 1.0}, values)
 
 
-def test_forgets_returns_and_explores_anew_from_the_same_policy(search):
-    state = searched(search, search.init(Dial()), 5, seeded(5))
-    anew = search.forget(state)
-    assert torch.equal(search.parameters(anew), search.parameters(state))
-    policy = Dial().with_parameters(search.parameters(state))
-    assert_same(search, anew, search.init(policy))
-    worse = searched(search, anew, 1, seeded(6), lambda x: quadratic(x) - 1e4)
-    assert worse.best_return < -1e4
-
-
 def test_failures_are_the_worst(search):
     def half_fails(x):
         return quadratic(x).where(x[:, 0] < 1.0, math.nan)
