@@ -7,6 +7,7 @@ from typing import Any
 import typer
 
 from npdr_ppl.cli import compare, demo, discover, fit, listings, report, reproduce, train
+from npdr_ppl.cli.manners import Stopped, stop_on_signals
 from npdr_ppl.errors import NpdrError
 
 __all__ = ["app", "main"]
@@ -43,8 +44,12 @@ def main() -> None:
     # when torch is first imported, which happens after this line.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
-        # Without arguments, typer prints the help text itself.
-        sys.exit(app(standalone_mode=len(sys.argv) < 2) or 0)
+        with stop_on_signals():
+            # Without arguments, typer prints the help text itself.
+            sys.exit(app(standalone_mode=len(sys.argv) < 2) or 0)
+    except Stopped as stop:
+        typer.echo("npdr: interrupted.", err=True)
+        sys.exit(stop.exit_code)
     except _UsageError as error:
         where = error.ctx.command_path if error.ctx else "npdr"
         _refuse(f"{_sentence(error.format_message())} See {where} --help.")

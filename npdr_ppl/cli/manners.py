@@ -1,16 +1,60 @@
-"""Options that the commands share (--quiet, --json, --verbose), and the handling of Ctrl-C."""
+"""Options that the commands share (--quiet, --json, --verbose); Ctrl-C and the like."""
 
 import logging
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-__all__ = ["INTERRUPTED", "AsJson", "Quiet", "Verbose", "resumable"]
+__all__ = [
+    "INTERRUPTED",
+    "AsJson",
+    "Quiet",
+    "Stopped",
+    "Verbose",
+    "resumable",
+    "stop_on_signals",
+]
+
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, the same as in shells."""
+
+
+class Stopped(BaseException):
+    """SIGTERM, or SIGHUP from a closed terminal, came; it is handled like Ctrl-C.
+
+    Attributes:
+        exit_code: Exit code, the same as in shells: 128 plus the signal's number.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.exit_code = 128 + number
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[None]:
+    """Lets SIGTERM and SIGHUP raise :class:`Stopped` inside the block, unless they are ignored."""
+    replaced = {}
+    if threading.current_thread() is threading.main_thread():  # others may not handle signals
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # Windows has no SIGHUP
+            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+                replaced[number] = signal.signal(number, _stop)
+    try:
+        yield
+    finally:
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
+
+
+def _stop(number: int, frame: Any) -> None:
+    signal.signal(number, signal.SIG_DFL)  # a second signal ends the process at once
+    raise Stopped(number)
 
 
 def _log(is_wanted: bool) -> None:
@@ -34,13 +78,14 @@ Verbose = Annotated[
 
 @contextmanager
 def resumable(how: str) -> Iterator[None]:
-    """On Ctrl-C inside the block, prints how to continue the run and exits with the shells' code.
+    """When the block is interrupted, prints how to continue and exits with the shells' code.
 
     Args:
         how: How to continue the run; printed after "interrupted; ".
     """
     try:
         yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Stopped) as error:
         typer.echo(f"npdr: interrupted; {how}", err=True)
-        raise typer.Exit(INTERRUPTED) from None
+        code = error.exit_code if isinstance(error, Stopped) else INTERRUPTED
+        raise typer.Exit(code) from None

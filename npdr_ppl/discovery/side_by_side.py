@@ -6,6 +6,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import TypeVar, cast
 
 from npdr_ppl.engines.pooled.pool_simulator import PooledSimulator
+from npdr_ppl.engines.workers.lifetime import loky_settings
 from npdr_ppl.engines.workers.safe_path import safe_path
 from npdr_ppl.engines.workers.session import num_local_processes
 from npdr_ppl.errors import NpdrError
@@ -40,12 +41,13 @@ def side_by_side(
     done = 0
     if number > 1 and len(items) > 1:
         # Not at the top: joblib takes a quarter of a second to import.
-        from joblib import Parallel, delayed
+        from joblib import Parallel, delayed, parallel_config
 
         # A process whose memory has grown is replaced by a fresh one, and no result is lost. The
         # filter stays, because a thread of the executor may warn at any time.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
-        parallel = Parallel(number, backend="loky", return_as="generator", max_nbytes=None)
+        with parallel_config(n_jobs=number, **loky_settings()):
+            parallel = Parallel(return_as="generator", max_nbytes=None)
         with safe_path():
             results = cast(
                 Generator[Result, None, None], parallel(delayed(function)(item) for item in items)

@@ -2,6 +2,8 @@
 
 import logging
 import os
+import signal
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -9,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from npdr_ppl.engines.workers.crew import Crew, run_chunk
+from npdr_ppl.engines.workers.lifetime import loky_settings
 from npdr_ppl.engines.workers.options import WorkerOptions
 from npdr_ppl.engines.workers.safe_path import safe_path
 from npdr_ppl.engines.workers.supervisor import Chunk, ChunkResult
@@ -57,8 +60,7 @@ class _Joblib(ChunkExecutor):
 
     Args:
         num_workers: Number of workers; ``None`` for all available ones.
-        backend: joblib's name of the backend.
-        settings: Further arguments of joblib's backend.
+        settings: joblib's name of the backend, and the backend's arguments.
         stack: Resources to close after joblib's backend.
         crew: Supervisors if workers are threads of this process.
         is_streaming: Whether the backend can return results while other chunks are running.
@@ -67,7 +69,6 @@ class _Joblib(ChunkExecutor):
     def __init__(
         self,
         num_workers: int | None,
-        backend: str,
         settings: dict[str, Any],
         stack: ExitStack,
         *,
@@ -78,7 +79,7 @@ class _Joblib(ChunkExecutor):
 
         # Only joblib's configuration accepts the names of clusters, and it applies to objects that
         # are created inside this block.
-        with parallel_config(backend=backend, n_jobs=num_workers or -1, **settings):
+        with parallel_config(n_jobs=num_workers or -1, **settings):
             self.num_workers = max(1, effective_n_jobs(num_workers or -1))
             # Chunks are batches already, and small enough to be sent as they are.
             parallel: Any = Parallel(
@@ -122,16 +123,17 @@ def open_executor(options: WorkerOptions) -> ChunkExecutor:
     with ExitStack() as stack:
         stack.enter_context(safe_path())
         if options.executor == "threads":
-            executor = _Joblib(number, "threading", {}, stack, crew=Crew())
+            executor = _Joblib(number, {"backend": "threading"}, stack, crew=Crew())
         elif options.executor == "dask":
             client = _dask_client(options, stack)
-            executor = _Joblib(number, "dask", {"client": client}, stack)
+            executor = _Joblib(number, {"backend": "dask", "client": client}, stack)
         elif options.executor == "ray":
             _connect_to_ray(options, stack)
             # Ray's pool cannot stream, so results arrive wave by wave.
-            executor = _Joblib(number, "ray", {}, stack, is_streaming=False)
+            executor = _Joblib(number, {"backend": "ray"}, stack, is_streaming=False)
         else:
-            executor = _Joblib(number, "loky", {"inner_max_num_threads": 1}, stack)
+            settings = {**loky_settings(), "inner_max_num_threads": 1}
+            executor = _Joblib(number, settings, stack)
         executor.keep(stack.pop_all())
         return executor
 
@@ -177,6 +179,7 @@ def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
         stack.enter_context(_set_attribute(ray_constants, "ENABLE_RAY_CLUSTER", False))
     # Ray would put the current folder on the module search path of its workers.
     empty = stack.enter_context(TemporaryDirectory(prefix="npdr-ray-"))
+    handler = signal.getsignal(signal.SIGTERM)  # which Ray replaces
     try:
         ray.init(
             address="local" if is_local else options.address,
@@ -188,6 +191,9 @@ def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
         )
     except (OSError, ValueError, RuntimeError) as error:
         raise _unreachable(options, error) from error
+    finally:
+        if handler is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, handler)
     stack.callback(ray.shutdown)
 
 

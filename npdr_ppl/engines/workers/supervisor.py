@@ -296,9 +296,9 @@ class _Template:
             self._process.kill()
             self._process.wait()
         if self._process.returncode != 0 and self._child is not None:
-            # The template was killed and could not stop its child.
-            with suppress(ProcessLookupError):
-                os.kill(self._child, signal.SIGKILL)
+            # The template was killed and could not stop its child and what that one started.
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._child, signal.SIGKILL)
 
     def _answer(self) -> Any:
         if not self._control.poll(SET_UP_SECONDS):

@@ -6,6 +6,9 @@ time is lost. The template itself never simulates and has only one thread, which
 
 The :class:`~npdr_ppl.engines.workers.supervisor.Supervisor` sends commands through a socket. When
 its end of the socket closes for any reason, the template stops its child and itself.
+
+A simulation may start programs of its own. They belong to the child's process group, which is
+killed as a whole. On Linux, the template also adopts and kills programs that left the group.
 """
 
 import ctypes
@@ -15,8 +18,10 @@ import signal
 import socket
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
+from contextlib import suppress
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,6 +39,9 @@ keep running for days after a run."""
 PR_SET_PDEATHSIG = 1
 """Linux's prctl option for the signal that a process gets when its parent ends."""
 
+PR_SET_CHILD_SUBREAPER = 36
+"""Linux's prctl option that makes a process the parent of its descendants without parents."""
+
 
 def main(control_fd: int) -> None:
     """Executes the commands of a supervisor until the supervisor ends.
@@ -43,10 +51,12 @@ def main(control_fd: int) -> None:
     """
     # The supervisor handles Ctrl-C and then closes its end of the socket.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _set_process_option(PR_SET_CHILD_SUBREAPER, 1)
     channel = socket.socket(fileno=control_fd)
     control = Connection(os.dup(control_fd))
     task: Task | None = None
     child: int | None = None
+    own: set[int] = set()  # processes that libraries started in the template itself
     is_resting = False
     try:
         while not is_resting or control.poll(IDLE_SECONDS):
@@ -57,17 +67,20 @@ def main(control_fd: int) -> None:
                 control.send(reply)
             elif command == "spawn":
                 _, (fd,), _, _ = socket.recv_fds(channel, 1, 1)
-                template = os.getpid()
+                template, own = os.getpid(), _children()
                 child = os.fork()
                 if child == 0:
+                    os.setpgid(0, 0)
                     _end_with(template)
                     control.close()
                     channel.close()
                     _simulate(task, Connection(fd))
                 os.close(fd)
+                with suppress(OSError):  # the child was faster, or has ended
+                    os.setpgid(child, child)
                 control.send(child)
             elif command == "end":
-                control.send(_end(child))
+                control.send(_end(child, own))
                 child = None
             elif command == "rest":
                 is_resting = True
@@ -76,7 +89,7 @@ def main(control_fd: int) -> None:
     except (EOFError, OSError):
         pass
     finally:
-        _end(child)
+        _end(child, own)
         os._exit(0)  # immediately, because the regular clean-up of torch is slow
 
 
@@ -95,21 +108,45 @@ def _end_with(parent: int) -> None:
     A killed template cannot stop its child, and a child does not notice this during a draw. On
     systems without prctl, the child therefore continues until its draw is done.
     """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    _set_process_option(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # the parent has ended already
         os._exit(0)
 
 
-def _end(child: int | None) -> int:
-    """Kills the child and returns its exit code, negative for a signal."""
+def _set_process_option(option: int, value: int) -> None:
+    """Calls Linux's prctl; does nothing on other systems."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(option, value)
+
+
+def _end(child: int | None, own: Set[int]) -> int:
+    """Kills the child and all that it started; returns its exit code, negative for a signal.
+
+    Args:
+        child: The child.
+        own: Processes that are no descendants of the child.
+    """
     if child is None:
         return 0
-    done, status = os.waitpid(child, os.WNOHANG)
-    if not done:
-        os.kill(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
+    with suppress(ProcessLookupError, PermissionError):  # macOS permits no signal to a zombie
+        os.killpg(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    while adopted := _children() - own:
+        for process in adopted:
+            os.kill(process, signal.SIGKILL)
+            os.waitpid(process, 0)
     return os.waitstatus_to_exitcode(status)
+
+
+def _children() -> set[int]:
+    """Returns the children of this process, which has one thread; empty on other systems."""
+    try:
+        return {
+            int(word)
+            for word in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+        }
+    except OSError:
+        return set()
 
 
 def _simulate(task: Task | None, data: Connection) -> None:
