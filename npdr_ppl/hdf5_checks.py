@@ -1,53 +1,171 @@
-"""Checks that an HDF5 file contains all of its data itself.
+"""Checks that an HDF5 file contains all of its data itself, and what they take in memory.
 
 HDF5 can take data from other files: by external and soft links, external storage, and virtual
 data sets. A recording could then show any file that the user may read, or wait for a pipe.
 NetCDF4 uses none of these.
+
+A small file can also describe much data: by shapes whose chunks are not stored, by chunks that
+inflate to more than they should, by texts that many elements share, and by groups that contain
+each other. All of this is refused before anything is loaded.
 """
 
+import math
+import os
+import zlib
+from collections.abc import Iterator
 from os import PathLike
 from typing import Any
 
+import numpy as np
+
 from npdr_ppl.errors import DataError
+from npdr_ppl.reading_limits import LIMITS, check_expansion
 
 __all__ = ["check_self_contained"]
 
-MAX_OBJECTS = 10_000
-"""Greatest number of groups and data sets in a file; recordings have tens, posteriors hundreds."""
+MAX_SHARED_TEXTS = 64
+"""Largest number of texts in one attribute; each can be as long as the file."""
+
+_FILTERS = (1, 2, 3)
+"""Filters that NetCDF uses: deflate, shuffle and checksum. Others would load a plug-in."""
+
+_DEFLATE = 1
 
 
 def check_self_contained(path: str | PathLike[str]) -> None:
     """Checks an HDF5 file before any of its data are read.
 
     Raises:
-        DataError: The file refers to another file, or has too many parts.
+        DataError: The file refers to another file, has too many parts, or describes more data
+            than may be read from a file of its size.
         OSError: It is not an HDF5 file.
     """
     import h5py
 
+    size = os.stat(path).st_size
+    needed = text = 0.0
     with h5py.File(path, "r") as file:
-        groups: list[Any] = [file["/"]]
-        seen = {groups[0].id}  # equal for the same object, whatever its name
-        while groups:
-            group = groups.pop()
-            for name in group:
-                if type(group.get(name, getlink=True)) is not h5py.HardLink:
-                    raise DataError(f"{_shown(name)} is a link, which is not read.")
-                entry = group[name]
-                if entry.id in seen:
-                    continue
-                seen.add(entry.id)
-                if len(seen) > MAX_OBJECTS:
-                    raise DataError(f"it has more than {MAX_OBJECTS} parts.")
-                if isinstance(entry, h5py.Dataset):
-                    _check_storage(entry, name)
-                elif isinstance(entry, h5py.Group):
-                    groups.append(entry)
+        for name, entry in _entries(file["/"]):
+            text += _attribute_bytes(entry, name, size)
+            if text > LIMITS.text_bytes:
+                raise DataError(f"its attributes take more than {LIMITS.text_bytes} bytes.")
+            if isinstance(entry, h5py.Dataset):
+                if entry.is_virtual or entry.external:
+                    raise DataError(
+                        f"{_shown(name)} takes its data from another file, which is not read."
+                    )
+                needed += _described_bytes(entry)
+                check_expansion(needed, size)
+                _check_chunks(entry, name)
+                if _varies(entry.id.get_type()):
+                    text += _text_bytes(entry, name)
 
 
-def _check_storage(entry: Any, name: str) -> None:
-    if entry.is_virtual or entry.external:
-        raise DataError(f"{_shown(name)} takes its data from another file, which is not read.")
+def _entries(root: Any) -> Iterator[tuple[str, Any]]:
+    """Yields all groups and data sets with their names; each may occur once, behind no link."""
+    import h5py
+
+    yield "/", root
+    groups = [(root, 0)]
+    seen = {root.id}  # equal for the same object, whatever its name
+    while groups:
+        group, depth = groups.pop()
+        if len(group) > LIMITS.parts:
+            raise DataError(f"it has more than {LIMITS.parts} parts.")
+        for name in group:
+            if type(group.get(name, getlink=True)) is not h5py.HardLink:
+                raise DataError(f"{_shown(name)} is a link, which is not read.")
+            entry = group[name]
+            if entry.id in seen:
+                raise DataError(f"{_shown(name)} is a second name of another part.")
+            seen.add(entry.id)
+            if len(seen) > LIMITS.parts:
+                raise DataError(f"it has more than {LIMITS.parts} parts.")
+            yield name, entry
+            if isinstance(entry, h5py.Group):
+                if depth >= LIMITS.depth:
+                    raise DataError(f"its groups are nested more than {LIMITS.depth} deep.")
+                groups.append((entry, depth + 1))
+
+
+def _described_bytes(entry: Any) -> float:
+    """Returns the bytes of a data set in memory, where numbers of fewer bytes become float64."""
+    return math.prod(float(n) for n in entry.shape or ()) * max(8, entry.dtype.itemsize)
+
+
+def _attribute_bytes(entry: Any, name: str, size: int) -> float:
+    """Returns the bytes of an entry's attributes, after checking that each may be read."""
+    if len(entry.attrs) > LIMITS.parts:
+        raise DataError(f"{_shown(name)} has more than {LIMITS.parts} attributes.")
+    total = 0.0
+    for key in entry.attrs:
+        attribute = entry.attrs.get_id(key)
+        count = math.prod(float(n) for n in attribute.shape or ())
+        if not _varies(attribute.get_type()):
+            total += count * attribute.dtype.itemsize
+        elif count > MAX_SHARED_TEXTS:
+            raise DataError(f"the attribute {_shown(key)} holds {count:.0f} texts.")
+        elif count * size > LIMITS.text_bytes:
+            # Only then can they be too long.
+            total += _lengths(entry.attrs[key])
+        if total > LIMITS.text_bytes:
+            break
+    return total
+
+
+def _check_chunks(entry: Any, name: str) -> None:
+    """Checks that chunks, which are decompressed as a whole, have the size that they should."""
+    if entry.chunks is None:
+        return
+    creation = entry.id.get_create_plist()
+    filters = [creation.get_filter(index)[0] for index in range(creation.get_nfilters())]
+    if not set(filters) <= set(_FILTERS) or len(set(filters)) < len(filters):
+        raise DataError(f"{_shown(name)} is compressed in a way that NetCDF does not use.")
+    expected = math.prod(entry.chunks) * entry.dtype.itemsize
+    check_expansion(expected, 0)
+    count = entry.id.get_num_chunks()
+    if count > LIMITS.parts:
+        raise DataError(f"{_shown(name)} is stored in more than {LIMITS.parts} chunks.")
+    if _DEFLATE not in filters:
+        return
+    for index in range(count):
+        chunk = entry.id.get_chunk_info(index)
+        _, stored = entry.id.read_direct_chunk(chunk.chunk_offset)
+        if chunk.filter_mask & 1 << filters.index(_DEFLATE):
+            continue
+        # HDF5 would inflate any number of bytes. Four more are the checksum.
+        if len(zlib.decompressobj().decompress(stored, expected + 5)) > expected + 4:
+            raise DataError(f"{_shown(name)} decompresses to more than its shape says.")
+
+
+def _text_bytes(entry: Any, name: str) -> float:
+    """Returns the length of a data set's texts, read one by one since they may be the same one."""
+    if entry.size > LIMITS.parts:
+        raise DataError(f"{_shown(name)} has more than {LIMITS.parts} texts.")
+    total = 0.0
+    for position in range(entry.size):
+        total += _lengths(entry[np.unravel_index(position, entry.shape)])
+        if total > LIMITS.text_bytes:
+            raise DataError(
+                f"the texts of {_shown(name)} take more than {LIMITS.text_bytes} bytes."
+            )
+    return total
+
+
+def _varies(kind: Any) -> bool:
+    """Returns whether values of an HDF5 type have any length, and may share their bytes."""
+    from h5py import h5t
+
+    if isinstance(kind, h5t.TypeCompoundID):
+        return any(_varies(kind.get_member_type(i)) for i in range(kind.get_nmembers()))
+    if isinstance(kind, h5t.TypeArrayID):
+        return _varies(kind.get_super())
+    is_text = isinstance(kind, h5t.TypeStringID)
+    return isinstance(kind, h5t.TypeVlenID) or (is_text and kind.is_variable_str())
+
+
+def _lengths(value: Any) -> float:
+    return float(sum(map(len, value)) if hasattr(value, "shape") else len(value))
 
 
 def _shown(name: str) -> str:

@@ -58,10 +58,11 @@ def test_a_file_that_takes_data_from_elsewhere_is_refused(elsewhere, write, read
         read(path)
 
 
-def test_groups_that_contain_each_other_are_checked_once(tmp_path):
+def test_groups_that_contain_each_other_are_refused(tmp_path):
     with h5py.File(tmp_path / "circle.nc", "w") as file:
         file.create_group("a")["b"] = file
-    check_self_contained(tmp_path / "circle.nc")
+    with pytest.raises(DataError, match="'b' is a second name of another part"):
+        check_self_contained(tmp_path / "circle.nc")
 
 
 def test_a_damaged_posterior_gets_one_sentence(tmp_path):

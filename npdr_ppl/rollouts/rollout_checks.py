@@ -1,6 +1,7 @@
 """Checks of names, values, time stamps and files; each failure is one sentence."""
 
 import re
+import reprlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.reading_limits import LIMITS
 
 __all__ = [
     "RESERVED_NAMES",
@@ -19,15 +21,13 @@ __all__ = [
     "check_finite",
     "check_names",
     "check_time",
+    "check_units",
     "named",
     "shown",
 ]
 
 RESERVED_NAMES = ("rollout", "time", "reward", "step")
 """Names that have a fixed meaning in every file format."""
-
-MAX_FILE_BYTES = 2**30
-"""Largest file that is read, in bytes; an hour at 1 kHz with ten channels takes less."""
 
 MAX_MAGNITUDE = 1e100
 """Largest magnitude of a value. No measurement in SI units is larger, and the square of this
@@ -43,12 +43,20 @@ clock."""
 
 _FORBIDDEN_IN_NAMES = re.compile(r"[,;\"'/\\]")
 _MAX_NAME_LENGTH = 100
+_MAX_UNIT_LENGTH = 30
+
+_ABRIDGED = reprlib.Repr()
+_ABRIDGED.maxtuple = _ABRIDGED.maxlist = _ABRIDGED.maxdict = 10
+_ABRIDGED.maxlevel = 2
 
 
 def shown(value: object, limit: int = 40) -> str:
-    """Returns a printable, shortened form of any value, for messages."""
+    """Returns a printable, shortened form of any value, for messages.
+
+    The time it takes is bounded for any value, also for one that contains itself many times.
+    """
     is_text = isinstance(value, str | bytes)
-    shown_whole = repr(value) if is_text else str(value)
+    shown_whole = repr(value[: limit + 1]) if is_text else _ABRIDGED.repr(value)
     if not shown_whole.isprintable():
         shown_whole = ascii(shown_whole)
     if len(shown_whole) <= limit:
@@ -89,10 +97,10 @@ def check_file(path: str | PathLike[str]) -> Path:
             raise DataError("is not a regular file.")
         if status.st_size == 0:
             raise DataError("the file is empty.")
-        if status.st_size > MAX_FILE_BYTES:
+        if status.st_size > LIMITS.file_bytes:
             raise DataError(
                 f"the file has {status.st_size / 2**30:.1f} GiB, more than the "
-                f"{MAX_FILE_BYTES / 2**30:.0f} GiB that are read."
+                f"{LIMITS.file_bytes / 2**30:.0f} GiB that are read."
             )
     return path
 
@@ -136,6 +144,20 @@ def check_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
             raise DataError(f"the {kind} {shown(name)} appears twice.")
         seen.add(name)
     return tuple(names)
+
+
+def check_units(units: Sequence[str], names: Sequence[str]) -> None:
+    """Checks that units are short, printable text; there is one for each name, or none at all.
+
+    Raises:
+        DataError: A unit is longer than any unit, or has characters that cannot be printed.
+    """
+    for name, unit in zip(names, units, strict=False):
+        if not isinstance(unit, str) or len(unit) > _MAX_UNIT_LENGTH or not unit.isprintable():
+            raise DataError(
+                f"the unit of {name} is {shown(unit)}, but units have at most {_MAX_UNIT_LENGTH} "
+                "printable characters."
+            )
 
 
 def check_finite(values: NDArray[np.float64], names: Sequence[str], where: str) -> None:

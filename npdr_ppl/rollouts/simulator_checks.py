@@ -15,6 +15,10 @@ __all__ = ["OTHER_UNITS", "check_channels", "check_duplicates", "check_units"]
 OTHER_UNITS = {"rad": ("degrees", 180 / math.pi), "m": ("millimetres", 1000.0)}
 """Common units other than SI: by SI unit, the other unit's name and how many equal one SI unit."""
 
+SMALLEST_SHARE = 1e-5
+"""A channel that moves, but never beyond this share of its bound, is in another unit: the encoders
+and sensors of robots do not resolve so little."""
+
 
 def check_duplicates(rollouts: Recording) -> None:
     """Raises a DataError if two rollouts are identical to the last bit.
@@ -83,9 +87,9 @@ def check_channels(
 def check_units(rollouts: Recording, channels: Sequence[Channel]) -> None:
     """Checks the units and signs of columns, e.g. finds degrees or millimetres instead of SI.
 
-    Two symptoms show another unit. A range exceeds the declared bounds by the factor between the
-    units, or a position's derivative differs from the measured rate by this factor. If the data
-    have units, these are compared with the declared ones.
+    Three symptoms show another unit. A range exceeds the declared bounds by the factor between the
+    units, it is a tiny share of them, or a position's derivative differs from the measured rate by
+    this factor. If the data have units, these are compared with the declared ones.
 
     Args:
         rollouts: The data.
@@ -128,6 +132,11 @@ def _check_range(rollouts: Recording, channel: Channel) -> None:
         raise DataError(
             f"{channel.name} reaches {largest:.4g} {channel.unit}, far beyond its bound of "
             f"{bound:.4g} {channel.unit}; {reason}"
+        )
+    if math.isfinite(bound) and 0 < largest < SMALLEST_SHARE * bound:
+        raise DataError(
+            f"{channel.name} never exceeds {largest:.4g} {channel.unit}, far below its bound of "
+            f"{bound:.4g} {channel.unit}; check the unit."
         )
 
 

@@ -4,6 +4,7 @@ import csv
 import io
 import math
 import re
+from array import array
 from collections.abc import Sequence
 from os import PathLike
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.errors import DataError
+from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.io.tables import from_table, to_table
 from npdr_ppl.rollouts.recording import Recording
@@ -23,6 +25,9 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NUMBER_CHARACTERS = frozenset("0123456789+-.eE")
 
 _UNIT_IN_NAME = re.compile(r"\s*[\[(].*[\])]$")
+
+CELLS_PER_BLOCK = 100_000
+"""Number of cells that are kept as text before they are converted; they take about 7 MB."""
 
 NOT_A_NUMBER = frozenset({"nan", "na", "n/a", "null", "none"})
 """Words that programs write for a missing measurement, in lower case."""
@@ -42,10 +47,8 @@ def read_csv(path: str | PathLike[str], actions: Sequence[str] | None) -> Record
             data = path.read_bytes()
         except OSError as error:
             raise DataError(f"cannot be read ({error.strerror}).") from None
-        header, rows, lines = _parse(_decode(data))
-        columns = {}
-        for index, name in enumerate(header):
-            columns[name] = _numbers(name, [row[index] for row in rows], lines)
+        _check_encoding(data)
+        columns, lines = _parse(data)
         return from_table(columns, actions, lines=lines)
 
 
@@ -61,31 +64,38 @@ def write_csv(rollouts: Recording, path: str | PathLike[str]) -> None:
         file.write("\n".join([",".join(columns), *rows, ""]))
 
 
-def _decode(data: bytes) -> str:
+def _check_encoding(data: bytes) -> None:
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise DataError("the text is encoded as UTF-16, but UTF-8 is needed.")
     if b"\0" in data:
         raise DataError("the file contains NUL bytes, so it is not a text file.")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise DataError(
-            f"line {line} is not UTF-8 text (byte 0x{data[error.start]:02x})."
-        ) from None
 
 
-def _parse(text: str) -> tuple[list[str], list[list[str]], list[int]]:
-    """Returns the header, the rows that are not blank, and each row's line number."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    header: list[str] | None = None
+def _parse(data: bytes) -> tuple[dict[str, NDArray[np.float64]], "array[int]"]:
+    """Returns the columns by name, and the line number of each row that is not blank.
+
+    Cells are converted in blocks of rows, because as text they take several times the memory.
+    """
+    source = _Lines(data)
+    reader = csv.reader(source, strict=True)
+    header: list[str] = []
     rows: list[list[str]] = []
-    lines: list[int] = []
+    lines = array("q")
+    blocks: list[list[NDArray[np.float64]]] = []
+
+    def convert() -> None:
+        numbers = lines[len(lines) - len(rows) :]
+        cells = [[row[index] for row in rows] for index in range(len(header))]
+        columns = zip(header, cells, strict=True)
+        blocks.append([_numbers(name, column, numbers) for name, column in columns])
+        rows.clear()
+
     try:
         for row in reader:
+            source.row_length = 0
             if not row or (len(row) == 1 and not row[0].strip()):
                 continue
-            if header is None:
+            if not header:
                 header = _checked_header(row)
                 continue
             if len(row) != len(header):
@@ -95,11 +105,59 @@ def _parse(text: str) -> tuple[list[str], list[list[str]], list[int]]:
                 )
             rows.append(row)
             lines.append(reader.line_num)
+            if len(lines) * len(header) > LIMITS.numbers:
+                raise DataError(f"it has more than {LIMITS.numbers:.0e} numbers.")
+            if len(rows) * len(header) >= CELLS_PER_BLOCK:
+                convert()
     except csv.Error as error:
         raise DataError(f"line {reader.line_num} is not valid CSV ({error}).") from None
-    if header is None:
+    except UnicodeDecodeError:
+        raise DataError(_undecodable(data)) from None
+    if not header:
         raise DataError("the file has no header line.")
-    return header, rows, lines
+    convert()
+    return {
+        name: np.concatenate(parts) for name, *parts in zip(header, *blocks, strict=True)
+    }, lines
+
+
+class _Lines:
+    """The lines of a text, decoded block by block; no row may be longer than a limit.
+
+    Attributes:
+        number: Number of the present line, from 1.
+        row_length: Characters since the last row ended; a quoted cell may hold several lines.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._file = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig", newline="")
+        self.number = 0
+        self.row_length = 0
+
+    def __iter__(self) -> "_Lines":
+        return self
+
+    def __next__(self) -> str:
+        line = self._file.readline(LIMITS.line_length + 1)
+        if not line:
+            raise StopIteration
+        self.number += 1
+        self.row_length += len(line)
+        if self.row_length > LIMITS.line_length:
+            raise DataError(
+                f"the row in line {self.number} has more than {LIMITS.line_length} characters."
+            )
+        return line
+
+
+def _undecodable(data: bytes) -> str:
+    """Returns a sentence about the first byte that is not UTF-8."""
+    try:
+        data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        return f"line {line} is not UTF-8 text (byte 0x{data[error.start]:02x})."
+    return "the file is not UTF-8 text."
 
 
 def _checked_header(row: list[str]) -> list[str]:
@@ -110,6 +168,8 @@ def _checked_header(row: list[str]) -> list[str]:
                 raise DataError(f"cells are separated by {word}, but commas are needed.")
     if all(_NUMBER.fullmatch(cell) for cell in header):
         raise DataError("the first line holds numbers, but it should name the columns.")
+    if len(header) > LIMITS.columns:
+        raise DataError(f"it has {len(header)} columns, more than {LIMITS.columns}.")
     rollout_checks.check_names(header, "column")
     for required in ("rollout", "time"):
         if required not in header:
@@ -122,7 +182,7 @@ def _checked_header(row: list[str]) -> list[str]:
     return header
 
 
-def _numbers(name: str, cells: list[str], lines: list[int]) -> NDArray[np.float64]:
+def _numbers(name: str, cells: list[str], lines: Sequence[int]) -> NDArray[np.float64]:
     """Converts a column, NaN for empty cells."""
     cells = [cell.strip() for cell in cells]
     if _NUMBER_CHARACTERS.issuperset("".join(cells)):

@@ -1,7 +1,6 @@
 """Reads and writes Parquet, NPZ, NetCDF and xarray: exact, with units and without pickles."""
 
 import json
-import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,15 +8,19 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.hdf5_checks import check_self_contained
+from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.collection import stacked
 from npdr_ppl.rollouts.io.csv_files import read_csv
+from npdr_ppl.rollouts.io.npz_arrays import read_arrays
+from npdr_ppl.rollouts.io.parquet_sizes import check_footer, check_parquet
 from npdr_ppl.rollouts.io.tables import from_table, to_table
 from npdr_ppl.rollouts.recording import Recording
 
@@ -39,6 +42,15 @@ __all__ = [
 AnyPath = str | PathLike[str]
 
 _METADATA_KEY = b"npdr_ppl"
+
+
+class _TableMetadata(msgspec.Struct):
+    """What a Parquet file says beside the table; the exact time step differs from its stamps."""
+
+    units: dict[str, str] = {}
+    time_step: float | None = None
+
+
 _NPZ_ARRAYS = {  # name of each array and its number of dimensions
     "readings": 3,
     "actions": 3,
@@ -105,34 +117,27 @@ def write_parquet(rollouts: Recording, path: AnyPath) -> None:
 
 def read_parquet(path: AnyPath, actions: Sequence[str] | None) -> Recording:
     """Reads a table; see :meth:`Rollouts.from_parquet`."""
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     path = rollout_checks.check_file(path)
     with rollout_checks.named(path):
-        columns: dict[str, NDArray[np.float64]] = {}
         with _refusing("Parquet"):
             # A file object, because pyarrow may take a path for a data set of many files.
             with path.open("rb") as file:
-                table = pq.ParquetFile(file).read()
-            rollout_checks.check_names(table.column_names, "column")
-            for name, column in zip(table.column_names, table.columns, strict=True):
-                kind = column.type
-                if not (pa.types.is_floating(kind) or pa.types.is_integer(kind)):
-                    raise DataError(f"{name} is of type {kind}, but numbers are needed.")
-                columns[name] = np.asarray(column.to_numpy(), dtype=np.float64)
-            metadata = json.loads((table.schema.metadata or {}).get(_METADATA_KEY, b"{}"))
-            units = {str(key): str(unit) for key, unit in metadata.get("units", {}).items()}
-            time_step = metadata.get("time_step")
-        rollouts = from_table(columns, actions, units=units)
-        return rollouts if time_step is None else _with_time_step(rollouts, time_step)
-
-
-def _with_time_step(rollouts: Recording, time_step: Any) -> Recording:
-    """Restores the exact time step, which cannot be computed from rounded time stamps."""
-    if not isinstance(time_step, float):
-        raise DataError("the time step in the file's metadata is not a number.")
-    return replace(rollouts, time_step=time_step)
+                check_footer(file)
+                parquet = pq.ParquetFile(file)
+                check_parquet(parquet, file)
+                # A thread for each column would decompress all of them at once.
+                table = parquet.read(use_threads=False)
+            columns = {
+                name: np.asarray(column.to_numpy(), dtype=np.float64)
+                for name, column in zip(table.column_names, table.columns, strict=True)
+            }
+            metadata = (table.schema.metadata or {}).get(_METADATA_KEY, b"{}")
+            about = msgspec.json.decode(metadata, type=_TableMetadata)
+        rollouts = from_table(columns, actions, units=about.units)
+        step = about.time_step
+        return rollouts if step is None else replace(rollouts, time_step=step)
 
 
 # -- NPZ -------------------------------------------------------------------------------------
@@ -161,77 +166,29 @@ def write_npz(rollouts: Recording, path: AnyPath) -> None:
 def read_npz(path: AnyPath) -> Recording:
     """Reads padded arrays; see :meth:`Rollouts.from_npz`."""
     path = rollout_checks.check_file(path)
-    with rollout_checks.named(path):
-        with _refusing("NPZ"):
-            arrays = _npz_arrays(path)
-            lengths = arrays["lengths"].tolist()
-            for name, dimensions in _NPZ_ARRAYS.items():
-                if arrays[name].ndim != dimensions:
-                    raise DataError(
-                        f"the array {name} has {arrays[name].ndim} dimensions, but {dimensions} "
-                        "are needed."
-                    )
-            if any(not 1 <= n < arrays["readings"].shape[1] for n in lengths):
-                raise DataError("the array lengths does not fit the array readings.")
+    with rollout_checks.named(path), _refusing("NPZ"):
+        arrays = read_arrays(path, _NPZ_ARRAYS, {"rewards": 2})
+        lengths = arrays["lengths"].tolist()
+        if any(not 1 <= n < arrays["readings"].shape[1] for n in lengths):
+            raise DataError("the array lengths does not fit the array readings.")
 
-            def cut(name: str, extra: int) -> list[NDArray[Any]]:
-                return [
-                    values[: n + extra] for values, n in zip(arrays[name], lengths, strict=True)
-                ]
+        def cut(name: str, extra: int) -> list[NDArray[Any]]:
+            return [values[: n + extra] for values, n in zip(arrays[name], lengths, strict=True)]
 
-            def words(name: str) -> list[str]:
-                return [str(word) for word in arrays[name].tolist()]
+        def words(name: str) -> list[str]:
+            return [str(word) for word in arrays[name].tolist()]
 
-            parts = {name: cut(name, extra) for name, extra in (("readings", 1), ("time", 1))}
-            commands = cut("actions", 0)
-            rewards = cut("rewards", 0) if "rewards" in arrays else None
-            names = {name: words(name) for name in arrays if name.endswith(("_names", "_units"))}
         return Recording.from_arrays(
-            parts["readings"],
-            commands,
-            channel_names=names["channel_names"],
-            action_names=names["action_names"],
+            cut("readings", 1),
+            cut("actions", 0),
+            channel_names=words("channel_names"),
+            action_names=words("action_names"),
             time_step=float(arrays["time_step"]),
-            rewards=rewards,
-            time=parts["time"],
-            channel_units=names["channel_units"],
-            action_units=names["action_units"],
+            rewards=cut("rewards", 0) if "rewards" in arrays else None,
+            time=cut("time", 1),
+            channel_units=words("channel_units"),
+            action_units=words("action_units"),
         )
-
-
-def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Returns the arrays of an NPZ file after checking their uncompressed sizes."""
-    with zipfile.ZipFile(path) as archive:
-        total = sum(member.file_size for member in archive.infolist())
-        if total > rollout_checks.MAX_FILE_BYTES:
-            raise DataError(
-                f"the arrays take {total / 2**30:.1f} GiB, more than the "
-                f"{rollout_checks.MAX_FILE_BYTES / 2**30:.0f} GiB that are read."
-            )
-        present = {member.filename.removesuffix(".npy") for member in archive.infolist()}
-        missing = [name for name in _NPZ_ARRAYS if name not in present]
-        if missing:
-            raise DataError(f"there is no array {missing[0]}, which to_npz would have written.")
-        wanted = [name for name in (*_NPZ_ARRAYS, "rewards") if name in present]
-        arrays = {}
-        for name in wanted:
-            size = archive.getinfo(f"{name}.npy").file_size
-            with archive.open(f"{name}.npy") as file:
-                # The header states the size that the reader would allocate before it reads data.
-                version = np.lib.format.read_magic(file)
-                reader = {
-                    (1, 0): np.lib.format.read_array_header_1_0,
-                    (2, 0): np.lib.format.read_array_header_2_0,
-                }[version]
-                shape, _, dtype = reader(file)
-                if dtype.hasobject or dtype.kind not in "fiuU":
-                    raise DataError(f"the array {name} is of type {dtype}.")
-                needed = int(np.prod([float(n) for n in shape])) * dtype.itemsize
-                if needed > size:
-                    raise DataError(f"the array {name} is shorter than its header says.")
-            with archive.open(f"{name}.npy") as file:
-                arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
-        return arrays
 
 
 # -- xarray and NetCDF -----------------------------------------------------------------------
@@ -277,7 +234,13 @@ def from_xarray(dataset: "xr.Dataset") -> Recording:
     for name in ("num_steps", "time"):
         if name not in dataset.variables:
             raise DataError(f"the data set has no variable {name}.")
-    lengths = np.asarray(dataset["num_steps"].values).astype(int).ravel().tolist()
+    lengths = np.asarray(dataset["num_steps"].values)
+    if lengths.dtype.kind not in "iu" or not 0 < lengths.size <= LIMITS.rollouts:
+        raise DataError(
+            f"num_steps should hold up to {LIMITS.rollouts} integers, but it holds "
+            f"{lengths.size} of type {lengths.dtype}."
+        )
+    lengths = lengths.ravel().tolist()
     columns: dict[str, list[tuple[int, str]]] = {"channel": [], "action": [], "reward": []}
     arrays: dict[str, NDArray[np.float64]] = {}
     for name, variable in dataset.variables.items():
@@ -286,9 +249,14 @@ def from_xarray(dataset: "xr.Dataset") -> Recording:
         if kind not in columns and name != "time":
             continue
         if variable.dims != ("rollout", "step"):
-            raise DataError(f"{name} has the dimensions {variable.dims}, not (rollout, step).")
+            raise DataError(
+                f"{rollout_checks.shown(name)} has the dimensions "
+                f"{rollout_checks.shown(variable.dims)}, not (rollout, step)."
+            )
         if variable.dtype.kind not in "fiu":
-            raise DataError(f"{name} is of type {variable.dtype}, but numbers are needed.")
+            raise DataError(
+                f"{rollout_checks.shown(name)} is of type {variable.dtype}, not of numbers."
+            )
         arrays[name] = np.asarray(variable.values, dtype=np.float64)
         if kind in columns:
             columns[kind].append((int(variable.attrs.get("position", 0)), name))
@@ -344,8 +312,6 @@ def read_netcdf(path: AnyPath) -> Recording:
         with xr.open_dataset(
             path, engine="h5netcdf", decode_times=False, decode_timedelta=False
         ) as dataset:
-            if dataset.nbytes > rollout_checks.MAX_FILE_BYTES:
-                raise DataError("the variables are too large to be read.")
             loaded = dataset.load()
         return from_xarray(loaded)
 

@@ -5,6 +5,9 @@ the instructions that build numbers, text, containers, arrays and records, and i
 function of the pickle. A class is only a name, and an instance becomes a :class:`Record`. The few
 functions that pickled arrays need are recognised by name and implemented here. Everything else is
 refused.
+
+Instructions may refer to an object again. Entries that are visited again count as instructions,
+and bytes that are copied again as memory; both are limited, so that a small pickle costs little.
 """
 
 import io
@@ -20,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.reading_limits import LIMITS, check_expansion
 from npdr_ppl.rollouts.rollout_checks import shown
 
 __all__ = ["Record", "read_pickle"]
@@ -43,7 +47,7 @@ _FUNCTIONS = frozenset(
 _DTYPES = frozenset(("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"))
 _LABEL_DTYPES = frozenset(("O", "O8"))  # accepted for arrays of text only
 _MAX_DIMENSIONS = 8
-_MAX_INSTRUCTIONS = 5_000_000
+_MAX_LABEL_LENGTH = 200
 
 
 @dataclass
@@ -127,6 +131,34 @@ def read_pickle(data: bytes, records: Collection[str]) -> Any:
         raise DataError(f"the pickle is damaged or incomplete ({type(error).__name__}).") from None
 
 
+class _Costs:
+    """Work and memory that a pickle has taken so far.
+
+    Args:
+        size: Bytes of the file.
+
+    Attributes:
+        work: Instructions, and entries that they visited again.
+        copied: Bytes of text that were copied.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.work = 0
+        self.copied = 0
+
+    def spend(self, work: int) -> None:
+        """Adds work; raises a DataError if it is more than any rollout needs."""
+        self.work += work
+        if self.work > LIMITS.instructions:
+            raise DataError("the pickle takes more instructions and copies than a rollout.")
+
+    def copy(self, num_bytes: int) -> None:
+        """Adds memory; raises a DataError if it is much more than the file has."""
+        self.copied += num_bytes
+        check_expansion(self.copied, self.size)
+
+
 class _Machine:
     """One run of the stack machine.
 
@@ -137,10 +169,17 @@ class _Machine:
         is_nested: Whether this pickle lies inside another one.
         stack: Operands.
         memo: Objects that later instructions refer to by number.
+        costs: What the whole pickle has cost so far.
     """
 
     def __init__(
-        self, file: io.BytesIO, size: int, records: frozenset[str], *, is_nested: bool = False
+        self,
+        file: io.BytesIO,
+        size: int,
+        records: frozenset[str],
+        costs: "_Costs | None" = None,
+        *,
+        is_nested: bool = False,
     ) -> None:
         self.file = file
         self.size = size
@@ -148,6 +187,7 @@ class _Machine:
         self.is_nested = is_nested
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
+        self.costs = costs or _Costs(size)
 
     def run(self) -> Any:
         constants = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
@@ -159,10 +199,9 @@ class _Machine:
         }
         # genops decodes one instruction at a time and leaves the file position right after it.
         # joblib writes the raw bytes of an array there.
-        for count, (opcode, operand, _) in enumerate(pickletools.genops(self.file)):
+        for opcode, operand, _ in pickletools.genops(self.file):
             argument: Any = operand
-            if count > _MAX_INSTRUCTIONS:
-                raise DataError("the pickle has too many instructions for a rollout.")
+            self.costs.spend(1)
             name = opcode.name
             if name in ("PROTO", "FRAME"):
                 continue
@@ -266,6 +305,7 @@ class _Machine:
             self.stack.append(_array(content, (), dtype, "C")[()])
         elif member == "encode":
             text, encoding = arguments
+            self.costs.copy(len(text))
             if encoding not in ("latin1", "latin-1"):
                 raise DataError("the pickle encodes text in an unexpected way.")
             self.stack.append(text.encode("latin-1"))
@@ -276,7 +316,9 @@ class _Machine:
 
     def build(self) -> None:
         """Sets the state of the topmost object; the data of a joblib array follow in the file."""
-        state, target = self.stack.pop(), self.stack[-1]
+        state: Any = self.stack.pop()
+        target = self.stack[-1]
+        self.costs.spend(_num_entries(state))
         if isinstance(target, _PickledDtype):
             if (
                 state[1] not in ("<", ">", "|", "=")
@@ -307,7 +349,8 @@ class _Machine:
             # to it, and it must not contain another one.
             if self.is_nested:
                 raise TypeError
-            return _Machine(self.file, self.size, self.records, is_nested=True).run()
+            arguments = self.file, self.size, self.records, self.costs
+            return _Machine(*arguments, is_nested=True).run()
         if fields.get("numpy_array_alignment_bytes") is not None:
             self.file.seek(self.file.read(1)[0], io.SEEK_CUR)
         num_bytes = _num_bytes(shape, dtype)
@@ -355,10 +398,18 @@ def _plain(value: Any) -> Any:
     return value.values if isinstance(value, _PickledArray) else value
 
 
+def _num_entries(state: Any) -> int:
+    """Returns the number of entries that a BUILD instruction visits."""
+    parts = state if isinstance(state, tuple) else (state,)
+    return sum(len(part) for part in parts if isinstance(part, list | dict))
+
+
 def _num_bytes(shape: Any, dtype: Any) -> int:
     if not isinstance(dtype, _PickledDtype) or not isinstance(shape, tuple):
         raise TypeError
-    if len(shape) > _MAX_DIMENSIONS or not all(type(n) is int and n >= 0 for n in shape):
+    if len(shape) > _MAX_DIMENSIONS or not all(
+        type(n) is int and 0 <= n <= LIMITS.numbers for n in shape
+    ):
         raise DataError(f"the pickle has an array of the impossible shape {shown(shape)}.")
     return math.prod(shape) * np.dtype(dtype.code).itemsize
 
@@ -369,6 +420,9 @@ def _array(content: Any, shape: Any, dtype: Any, order: Any) -> NDArray[Any]:
         is_text = isinstance(content, list) and all(isinstance(entry, str) for entry in content)
         if not is_text or shape != (len(content),):
             raise DataError("the pickle has an array of objects that are not text.")
+        # Each entry takes as much memory as the longest one.
+        if len(content) > LIMITS.columns or max(map(len, content), default=0) > _MAX_LABEL_LENGTH:
+            raise DataError("the pickle has more or longer labels than a rollout.")
         return np.array(content, dtype=np.str_)
     num_bytes = _num_bytes(shape, dtype)
     if not isinstance(content, bytes) or order not in ("C", "F"):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.reading_limits import LIMITS, check_expansion
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.collection import joined
 from npdr_ppl.rollouts.io.inert_pickle import Record, read_pickle
@@ -34,8 +35,16 @@ def read_simurlacra(
         episodes = content if isinstance(content, list) else [content]
         if not episodes or not all(_is(episode, _ROLLOUT) for episode in episodes):
             raise DataError("the pickle holds no SimuRLacra rollout.")
+        if len(episodes) > LIMITS.rollouts:
+            raise DataError(f"it has {len(episodes)} rollouts, more than {LIMITS.rollouts}.")
+        # The same array may occur many times, and numbers of fewer bytes become float64.
+        check_expansion(8.0 * sum(_numbers(episode.fields) for episode in episodes), len(data))
         parts = [_rollout(episode.fields, names or {}) for episode in episodes]
         return joined(parts)
+
+
+def _numbers(fields: Mapping[str, Any]) -> int:
+    return sum(values.size for values in fields.values() if isinstance(values, np.ndarray))
 
 
 def _rollout(fields: Mapping[str, Any], names: Mapping[str, str]) -> Recording:

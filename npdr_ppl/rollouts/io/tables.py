@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.recording import Recording
 
@@ -117,6 +118,8 @@ def _rollout_bounds(rollout: Array, at: _Location) -> NDArray[np.int64]:
         value = "empty" if np.isnan(rollout[row]) else f"{rollout[row]:.9g}"
         raise DataError(f"rollout is {value}{at(row)}, but it must count from 0.")
     starts = np.concatenate([[0], np.flatnonzero(np.diff(rollout)) + 1])
+    if len(starts) > LIMITS.rollouts:
+        raise DataError(f"it has {len(starts)} rollouts, more than {LIMITS.rollouts}.")
     seen: set[float] = set()
     for start in starts.tolist():
         identifier = float(rollout[start])
