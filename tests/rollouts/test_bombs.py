@@ -1,0 +1,55 @@
+"""Small files that describe much: each is read or refused with one sentence, at little cost."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import cost_server, table_bombs, tree_bombs
+
+BOMBS = table_bombs.BOMBS | tree_bombs.BOMBS
+CASES = [(kind, name) for kind, bombs in BOMBS.items() for name in bombs]
+
+MAX_SECONDS = 2.0
+MAX_MEGABYTES = 500.0
+
+
+@pytest.fixture(scope="module")
+def cost():
+    """Returns a function that reads a file in a process of its own and returns the cost."""
+    root = Path(__file__).resolve().parents[2]
+    process = subprocess.Popen(
+        [sys.executable, cost_server.__file__],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"},
+    )
+
+    def ask(kind, path):
+        process.stdin.write(json.dumps([kind, str(path)]) + "\n")
+        process.stdin.flush()
+        return json.loads(process.stdout.readline())
+
+    assert process.stdout.readline() == "ready\n"
+    yield ask
+    process.stdin.close()
+    process.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "name"), CASES)
+def test_bombs_cost_little(kind, name, cost, tmp_path):
+    path = tmp_path / f"bomb.{kind}"
+    BOMBS[kind][name](path)
+    answer = cost(kind, path)
+    assert answer["outcome"] in ("read", "refused"), answer
+    assert answer["seconds"] < MAX_SECONDS, answer
+    assert answer["megabytes"] < MAX_MEGABYTES, answer
+
+
+def test_there_are_at_least_eight_of_each_format():
+    assert all(len(bombs) >= 8 for bombs in BOMBS.values())
