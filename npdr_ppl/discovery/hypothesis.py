@@ -22,7 +22,7 @@ from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["Hypothesis", "fit_hypothesis", "with_effects"]
+__all__ = ["Hypothesis", "extended", "fit_hypothesis", "fit_segment_model", "with_effects"]
 
 
 Model = Callable[..., Any]
@@ -91,9 +91,9 @@ class Hypothesis:
             )
         return self._linearised
 
-    def estimated_starts(self, rollouts: Rollouts) -> InitialStates | None:
+    def estimated_starts(self) -> InitialStates | None:
         """Estimates the segments' initial states and their errors along the fitted motion."""
-        return self.segments.estimated_starts(self.fit.z, self.fit.scale, rollouts)
+        return self.segments.estimated_starts(self.fit.z, self.fit.scale)
 
     @cached_property
     def parameters(self) -> dict[str, Tensor]:
@@ -170,6 +170,23 @@ def with_effects(model: Model, effects: Sequence[Effect]) -> Model:
     return model
 
 
+def extended(
+    base: SegmentModel, effects: Sequence[Effect], starts: InitialStates | None
+) -> SegmentModel:
+    """Returns a model with effects along the segments of the model without them.
+
+    Args:
+        base: The model without effects, along the recording.
+        effects: The effects.
+        starts: The segments' initial states; ``None`` for those of the smoother.
+
+    Raises:
+        ModelError: An effect cannot be attached to the model.
+    """
+    segments = base.starting_from(starts)
+    return segments.with_model(with_effects(base.model, effects)) if effects else segments
+
+
 def fit_hypothesis(
     model: Model,
     rollouts: Rollouts,
@@ -177,13 +194,10 @@ def fit_hypothesis(
     *,
     effects: tuple[Effect, ...] = (),
     start: Mapping[str, Tensor] | None = None,
-    offsets: Tensor | None = None,
-    starts: InitialStates | None = None,
-    held: Mapping[str, float] | None = None,
     max_steps: int = 12,
     is_rough: bool = False,
 ) -> Hypothesis:
-    """Fits a model with effects to a recording.
+    """Cuts a recording into segments and fits a model with effects to them.
 
     Args:
         model: The original model.
@@ -191,17 +205,42 @@ def fit_hypothesis(
         options: How it is cut into segments.
         effects: Effects to add.
         start: Initial guess by site; other parameters begin in the middle of their priors.
-        offsets: Initial guess of the offsets of the initial states, ``(S, m)``.
-        starts: The segments' initial states, if better known than from the smoother.
-        held: Reference coordinates of sites that are not fitted.
         max_steps: Greatest number of steps of the fit.
         is_rough: Whether to take rough steps only.
 
     Raises:
         DataError: The simulation fails at the initial guess, or the data do not fit the model.
     """
-    model = with_effects(model, effects)
-    segments = SegmentModel(model, rollouts, options, starts)
+    segments = SegmentModel(with_effects(model, effects), rollouts, options)
+    return fit_segment_model(
+        segments, effects=effects, start=start, max_steps=max_steps, is_rough=is_rough
+    )
+
+
+def fit_segment_model(
+    segments: SegmentModel,
+    *,
+    effects: tuple[Effect, ...] = (),
+    start: Mapping[str, Tensor] | None = None,
+    offsets: Tensor | None = None,
+    held: Mapping[str, float] | None = None,
+    max_steps: int = 12,
+    is_rough: bool = False,
+) -> Hypothesis:
+    """Fits a model along the segments of a recording.
+
+    Args:
+        segments: The model, effects included, and the recording.
+        effects: Those of its effects that the original model lacks.
+        start: Initial guess by site; other parameters begin in the middle of their priors.
+        offsets: Initial guess of the offsets of the initial states, ``(S, m)``.
+        held: Reference coordinates of sites that are not fitted.
+        max_steps: Greatest number of steps of the fit.
+        is_rough: Whether to take rough steps only.
+
+    Raises:
+        DataError: The simulation fails at the initial guess.
+    """
     z = segments.place_of(start or {})
     stays = torch.zeros(z.shape, dtype=torch.bool)
     for site in segments.prior.sites:
@@ -210,4 +249,4 @@ def fit_hypothesis(
     fit = fit_segments(
         segments, z, offsets=offsets, held=stays, max_steps=max_steps, is_rough=is_rough
     )
-    return Hypothesis(model, effects, segments, fit)
+    return Hypothesis(segments.model, effects, segments, fit)

@@ -111,18 +111,12 @@ def infer(
             options = replace(options, noise="model")
         preparation = prepare(model, data, options, seed=seed)
     if preparation is not None:
-        model, options = preparation.model, preparation.options
-    elif options.embedding == "score":
-        options = replace(options, embedding=PLAIN_FEATURES)
-    prepared = preparation if preparation is None or preparation.hypothesis else None
-    bound = bind(
-        model,
-        data,
-        options,
-        device,
-        starts=None if prepared is None else prepared.starts,
-        likelihood=None if prepared is None else prepared.likelihood,
-    )
+        bound = preparation.bound(device)
+    else:
+        if options.embedding == "score":
+            options = replace(options, embedding=PLAIN_FEATURES)
+        bound = bind(model, data, options, device)
+    prepared = None if preparation is None or preparation.hypothesis is None else preparation
     problem = problem_of(bound, device)
     states = [method.init(problem)]
     infos: list[RoundInfo] = []

@@ -8,7 +8,7 @@ features.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.alarm import Alarm
-from npdr_ppl.discovery.search.base_fit import BaseFit, fit_base, in_finer_steps
+from npdr_ppl.discovery.search.base_fit import BaseFit
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
 from npdr_ppl.embeddings import Embedding
@@ -26,10 +26,9 @@ from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
-from npdr_ppl.preparation.binding import Data, bind
+from npdr_ppl.preparation.binding import BoundModel, bind
 from npdr_ppl.preparation.closest_fit import ClosestFit, closest_fit
 from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS, PLAIN_FEATURES, DataOptions
-from npdr_ppl.preparation.evaluation import declares_noise
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
@@ -38,7 +37,7 @@ from npdr_ppl.progress import Step
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["Preparation", "can_be_prepared", "held_out", "prepare", "score_embedding"]
+__all__ = ["Preparation", "has_closest_fit", "held_out", "prepare", "score_embedding"]
 
 NEGLIGIBLE = 1e-9
 """Standard deviation of a channel that was not measured; it is negligible in every unit."""
@@ -83,6 +82,31 @@ class Preparation:
     ends: tuple[PriorEnd, ...] = ()
     searcher: Searcher | None = None
     closest: ClosestFit | None = None
+    _bound: dict[str, BoundModel] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def bound(self, device: str | torch.device = "cpu") -> BoundModel:
+        """Returns the model bound to the recording, the input of every backend.
+
+        Every later call with the same device returns the same object.
+
+        Args:
+            device: Where trajectories are simulated.
+
+        Raises:
+            DataError: The recording does not fit the model.
+        """
+        if str(device) not in self._bound:
+            self._bound[str(device)] = bind(
+                self.model,
+                self.rollouts,
+                self.options,
+                device,
+                starts=self.starts,
+                likelihood=self.likelihood,
+            )
+        return self._bound[str(device)]
 
     @property
     def starts(self) -> InitialStates | None:
@@ -162,15 +186,15 @@ class Preparation:
         return f"Prepared: {cut}, {starts}, {noise}{steps}."
 
 
-def can_be_prepared(model: Callable[..., Any], data: Data, options: DataOptions) -> bool:
-    """Returns whether a model has a closest fit: one deterministic simulator, and rollouts.
+def has_closest_fit(prior: Prior) -> bool:
+    """Returns whether a model has a closest fit: it has one deterministic simulator.
 
     A simulator inside plates has several sets of parameters along the same recording.
+
+    Args:
+        prior: The model's prior along the recording.
     """
-    if not isinstance(data, Rollouts):
-        return False
-    inputs = options.with_certain_start().inputs(data)
-    boxes = [*Prior(model, (inputs,)).black_boxes.values()]
+    boxes = [*prior.black_boxes.values()]
     return (
         len(boxes) == 1
         and isinstance(boxes[0], SimulatorBlackBox)
@@ -201,27 +225,29 @@ def prepare(
     Raises:
         DataError: No parameters can be simulated along the recording, or the data do not fit.
     """
-    is_declared = declares_noise(model, rollouts, options)
-    if options.initial_state != "uncertain" or not can_be_prepared(model, rollouts, options):
+    prior = Prior(model, (options.with_certain_start().inputs(rollouts),))
+    is_declared = any(box.noise is not None for box in prior.black_boxes.values())
+    if options.initial_state != "uncertain" or not has_closest_fit(prior):
         return _with_certain_starts(
             model, rollouts, options, is_declared or options.noise == "model", seed, progress
         )
     length = options.steps(rollouts) or max(rollouts.lengths)
     binding = replace(options, embedding=None, segment_length=length)
-    simulator = SegmentModel(model, rollouts, binding).simulator
-    # Wrong units are reported here; the search would only find that nothing fits.
-    rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
-    _try_out(model, rollouts, options)
     searcher = Searcher(
         model,
         rollouts,
         DiscoveryOptions(precision=options.precision, seed=seed),
         binding=binding,
     )
-    given = fit_base(model, rollouts, binding, near=near, seed=seed, progress=progress)
-    base = in_finer_steps(given, model, rollouts, binding)
-    searcher.model, searcher.are_steps_coarse = base.model, base.are_steps_coarse
-    wider = searcher.with_wider_priors(base.hypothesis)
+    simulator = searcher.base.simulator
+    # Wrong units are reported here; the search would only find that nothing fits.
+    rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
+    with seeded(0, "try out"):
+        # Run as inference will run it, so that the model's own mistakes are reported first.
+        prior.execute(prior.sample(2))
+    closest = searcher.with_finer_steps(searcher.fit_base(near=near, progress=progress))
+    base = BaseFit(searcher.base, closest, searcher.are_steps_coarse)
+    wider = searcher.with_wider_priors(closest)
     ends = ()
     if searcher.are_priors_widened:
         ends = beyond(base.hypothesis.segments.prior.distributions, wider)
@@ -232,9 +258,10 @@ def prepare(
         segments = base.hypothesis.segments
         estimated = dict(zip(segments.channel_names, scale.tolist(), strict=True))
         every = {name: estimated.get(name, NEGLIGIBLE) for name in segments.sensor_names}
+    model = base.segments.model
     found = Preparation(
-        base.model if every is None else with_noise(base.model, every),
-        base.model,
+        model if every is None else with_noise(model, every),
+        model,
         rollouts,
         replace(options, segment_length=length),
         estimated,
@@ -247,14 +274,6 @@ def prepare(
         searcher,
     )
     return found.with_features(options.embedding)
-
-
-def _try_out(model: Callable[..., Any], rollouts: Rollouts, options: DataOptions) -> None:
-    """Runs a model twice, as inference will, so that its own mistakes are reported first."""
-    options = replace(options.with_certain_start(), embedding=PLAIN_FEATURES)
-    bound = bind(model, rollouts, options)
-    with seeded(0, "try out"):
-        bound.prior.execute(bound.prior.sample(2))
 
 
 def held_out(prepared: Preparation, rollouts: Rollouts) -> SegmentLikelihood | None:
@@ -276,9 +295,9 @@ def held_out(prepared: Preparation, rollouts: Rollouts) -> SegmentLikelihood | N
     z, scale = fitted.fit.z, fitted.fit.scale
     binding = replace(prepared.options, embedding=None, precision="float64")
     segments = SegmentModel(prepared.plain_model, rollouts, binding)
-    starts = segments.estimated_starts(z, scale, rollouts)
+    starts = segments.estimated_starts(z, scale)
     if starts is not None:
-        segments = SegmentModel(prepared.plain_model, rollouts, binding, starts)
+        segments = segments.starting_from(starts)
     shape = segments.inputs.num_segments, segments.num_offsets
     fit = SegmentFit(z, torch.zeros(shape, dtype=torch.float64), scale * fitted.variance**0.5)
     now = segments.linearise(z, fit.offsets, fit.scale)
@@ -335,7 +354,7 @@ def _declared_scale(base: BaseFit) -> Tensor | None:
     ``None`` where the noise is a distribution of another kind than independent normal errors.
     """
     segments, z = base.hypothesis.segments, base.hypothesis.fit.z
-    boxes = Prior(base.model, (segments.inputs,)).black_boxes_at(z[None])
+    boxes = Prior(base.segments.model, (segments.inputs,)).black_boxes_at(z[None])
     noise = next(iter(boxes.values())).noise
     if noise is None or callable(noise):
         return None

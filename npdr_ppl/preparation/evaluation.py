@@ -18,7 +18,6 @@ from npdr_ppl.rollouts import Rollouts, stitch
 
 __all__ = [
     "Replay",
-    "declares_noise",
     "nominal_parameters",
     "replay",
     "score",
@@ -124,9 +123,3 @@ def nominal_parameters(model: Callable[..., Any], inputs: Inputs) -> dict[str, T
     if missing:
         raise DataError(f"The simulator has no nominal value for {', '.join(missing)}.")
     return {site.name: nominal[site.name].expand(site.shape) for site in prior.sites}
-
-
-def declares_noise(model: Callable[..., Any], rollouts: Rollouts, options: DataOptions) -> bool:
-    """Returns whether a model declares measurement noise."""
-    inputs = options.with_certain_start().inputs(rollouts)
-    return any(box.noise is not None for box in Prior(model, (inputs,)).black_boxes.values())

@@ -116,6 +116,8 @@ class SegmentModel:
         starts: Initial states of the segments, if known better than by the smoother.
 
     Attributes:
+        model: The model.
+        rollouts: The recording.
         prior: The model's prior.
         inputs: The segments.
         sensor_names: The channels that the simulator reports.
@@ -127,6 +129,7 @@ class SegmentModel:
     """
 
     steps_per_average = 1
+    channel_names: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -135,46 +138,52 @@ class SegmentModel:
         options: DataOptions,
         starts: InitialStates | None = None,
     ) -> None:
-        self.inputs = options.inputs(rollouts)
-        self.prior = Prior(with_noise(model, None), (self.inputs,))
-        boxes = self.prior.black_boxes
-        if len(boxes) != 1:
-            raise DataError(f"The model has {len(boxes)} black-box sites; expected one.")
-        self._site, box = next(iter(boxes.items()))
-        if not isinstance(box, SimulatorBlackBox):
-            raise DataError(f"Site {self._site!r} is a plain function and has no trajectory.")
-        self.sensor_names = names = tuple(sensor.name for sensor in box.simulator.sensors)
-        self.measured = tuple(s for s in box.simulator.sensors if s.name in rollouts.channel_names)
-        self.channel_names = tuple(sensor.name for sensor in self.measured)
-        if not self.measured:
-            raise DataError(
-                f"None of the recording's columns {', '.join(rollouts.channel_names)} is a sensor "
-                f"of the model, {', '.join(names)}; rename them."
-            )
-        self._columns = [names.index(name) for name in self.channel_names]
-        self.observed = rollouts.observation(self.inputs, channels=self.channel_names)
-        self._smoothed = _with_lagging_rates(self.inputs, rollouts, box.simulator.rate_lag)
+        self.rollouts = rollouts
+        self._cut = options.inputs(rollouts)
+        self._trace(model)
         self._start_from(starts)
 
-    def estimated_starts(
-        self, z: Tensor, scale: Tensor, rollouts: Rollouts
-    ) -> InitialStates | None:
+    def with_model(self, model: Callable[..., Any]) -> "SegmentModel":
+        """Returns another model along the same segments, with the same initial states.
+
+        The recording is neither cut nor smoothed again, and both share its measurements.
+
+        Args:
+            model: The other Pyro model.
+
+        Raises:
+            DataError: The recording does not fit the model.
+        """
+        other = copy.copy(self)
+        other._trace(model)
+        other._start_from(self.starts)
+        return other
+
+    def starting_from(self, starts: InitialStates | None) -> "SegmentModel":
+        """Returns the model with other initial states of the segments.
+
+        Args:
+            starts: The initial states; ``None`` for those of the smoother.
+        """
+        other = copy.copy(self)
+        other._start_from(starts)
+        return other
+
+    def estimated_starts(self, z: Tensor, scale: Tensor) -> InitialStates | None:
         """Estimates the initial states of the segments, with their errors, along a fitted motion.
 
         Args:
             z: Parameters, ``(d,)``.
             scale: Standard deviation of each channel's residuals, ``(C,)``.
-            rollouts: The recording.
 
         Returns:
             The initial states; ``None`` if they are certain, or if simulations from the estimate
             fail.
         """
-        starts = estimate_starts(self.black_box(z[None]), self._smoothed, rollouts)
+        starts = estimate_starts(self.black_box(z[None]), self._smoothed, self.rollouts)
         if starts is None:
             return None
-        segments = copy.copy(self)
-        segments._start_from(starts)
+        segments = self.starting_from(starts)
         unmoved = torch.zeros(self.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
         now = segments.linearise(z, unmoved, scale, is_rough=True)
         if not now.is_finite:
@@ -190,6 +199,7 @@ class SegmentModel:
         part = copy.copy(self)
         part.__dict__.pop("least_scale", None)
         part.observed = self.observed[index]
+        part._cut = self._cut.segments(index)
         part._smoothed = self._smoothed.segments(index)
         part._start_from(None if self.starts is None else self.starts.segments(index))
         return part
@@ -209,6 +219,31 @@ class SegmentModel:
         part = copy.copy(self)
         part.steps_per_average = min(-(-readings // most), self.inputs.num_steps // fewest)
         return part if part.steps_per_average > 1 else self
+
+    def _trace(self, model: Callable[..., Any]) -> None:
+        """Runs the model once, to find its priors, its simulator and the measured channels."""
+        self.model = model
+        self.prior = Prior(with_noise(model, None), (self._cut,))
+        boxes = self.prior.black_boxes
+        if len(boxes) != 1:
+            raise DataError(f"The model has {len(boxes)} black-box sites; expected one.")
+        self._site, box = next(iter(boxes.items()))
+        if not isinstance(box, SimulatorBlackBox):
+            raise DataError(f"Site {self._site!r} is a plain function and has no trajectory.")
+        rollouts, sensors = self.rollouts, box.simulator.sensors
+        self.sensor_names = names = tuple(sensor.name for sensor in sensors)
+        self.measured = tuple(s for s in sensors if s.name in rollouts.channel_names)
+        if not self.measured:
+            raise DataError(
+                f"None of the recording's columns {', '.join(rollouts.channel_names)} is a sensor "
+                f"of the model, {', '.join(names)}; rename them."
+            )
+        before, self.channel_names = self.channel_names, tuple(s.name for s in self.measured)
+        self._columns = [names.index(name) for name in self.channel_names]
+        if self.channel_names != before:
+            self.observed = rollouts.observation(self._cut, channels=self.channel_names)
+            self.__dict__.pop("least_scale", None)
+        self._smoothed = _with_lagging_rates(self._cut, rollouts, box.simulator.rate_lag)
 
     def _start_from(self, starts: InitialStates | None) -> None:
         self.starts = starts

@@ -7,7 +7,6 @@ import pytest
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.models.effects import (
     Bias,
     Cogging,
@@ -30,7 +29,7 @@ def test_candidates_far_behind_the_best_one_are_not_fitted(dragged):
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=effects))
     ranking = searcher.look(base).ranking
     gains = {candidate.name: candidate.gain for candidate in ranking}
-    tried = Trials(case.model, case.fit, searcher.binding).extended(base, ranking)
+    tried = searcher.trials.extended(base, ranking)
     assert list(tried)[:2] == [candidate.name for candidate in ranking[:2]]
     assert next(iter(tried)) == "hinge.quadratic_drag"
     missed = gains.keys() - tried.keys()

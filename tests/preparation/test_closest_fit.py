@@ -158,8 +158,8 @@ def test_a_fit_at_the_end_of_a_prior_is_made_once_more_from_inside(rollouts):
     end = {"mass": torch.tensor(1.6999), "length": torch.tensor(0.85)}
     stuck = fit_hypothesis(model, rollouts, binding, start=end, max_steps=0)
     assert float(stuck.fit.z.abs().max()) > HYPOTHESIS.implausible_coordinate
-    freed = off_the_ends(stuck, model, rollouts, binding)
+    freed = off_the_ends(stuck)
     assert float(freed.fit.z.abs().max()) < HYPOTHESIS.implausible_coordinate
     assert float(freed.parameters["mass"]) == pytest.approx(MASS, rel=0.02)
     # A fit that is not at an end is left as it is.
-    assert off_the_ends(freed, model, rollouts, binding) is freed
+    assert off_the_ends(freed) is freed

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import (
     Hypothesis,
-    Model,
-    fit_hypothesis,
-    with_effects,
+    extended,
+    fit_segment_model,
 )
 from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.settings import BASE_FIT
@@ -25,11 +24,9 @@ from npdr_ppl.discovery.settings import HYPOTHESIS
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import with_finer_steps
 from npdr_ppl.preparation.closest_fit import search_prior
-from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
-from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["BaseFit", "fit_base", "in_finer_steps", "off_the_ends"]
 
@@ -39,20 +36,18 @@ class BaseFit:
     """A model fitted to a recording.
 
     Attributes:
-        model: The model, with finer steps if its own are too coarse.
+        segments: The model along the recording, with finer steps if its own are too coarse.
         hypothesis: Its closest fit.
         are_steps_coarse: Whether its own steps are too coarse for the recording.
     """
 
-    model: Model
+    segments: SegmentModel
     hypothesis: Hypothesis
     are_steps_coarse: bool
 
 
 def fit_base(
-    model: Model,
-    rollouts: Rollouts,
-    binding: DataOptions,
+    segments: SegmentModel,
     *,
     near: Mapping[str, Tensor] | None = None,
     seed: int = 0,
@@ -61,40 +56,33 @@ def fit_base(
     """Fits a model to a recording, without adding effects.
 
     Args:
-        model: The model.
-        rollouts: The recording.
-        binding: How it is cut into segments.
+        segments: The model along the recording.
         near: Parameters near which the fit is known to be; by default they are searched for.
         seed: Seed of the search.
         progress: Called with the fraction of the search done and a short status.
 
     Raises:
-        DataError: No parameters can be simulated along the recording, simulations fail close to
-            the fit, or the data do not match the model.
+        DataError: No parameters can be simulated along the recording, or simulations fail close
+            to the fit.
     """
     begun: list[Hypothesis] = []
     failure: DataError | None = None
-    for start in _starts(model, rollouts, binding, near, seed, progress):
+    for start in _starts(segments, near, seed, progress):
         try:
-            begun.append(fit_hypothesis(model, rollouts, binding, start=start, is_rough=True))
+            begun.append(fit_segment_model(segments, start=start, is_rough=True))
         except DataError as error:
             failure = error
     if not begun:
         assert failure is not None
         raise failure
     best = closest(begun)
-    fitted = fit_hypothesis(
-        model, rollouts, binding, start=best.parameters, offsets=best.fit.offsets
-    )
-    fitted = off_the_ends(fitted, model, rollouts, binding)
-    found = Trials(model, rollouts, binding).with_own_starts(fitted)
+    fitted = fit_segment_model(segments, start=best.parameters, offsets=best.fit.offsets)
+    found = Trials(segments).with_own_starts(off_the_ends(fitted))
     _ = found.linearisation  # computed now, because all later steps need it
     return found
 
 
-def off_the_ends(
-    fitted: Hypothesis, model: Model, rollouts: Rollouts, binding: DataOptions
-) -> Hypothesis:
+def off_the_ends(fitted: Hypothesis) -> Hypothesis:
     """Refits a model if parameters that the recording does not determine are at a prior's end.
 
     Along a flat direction, a fit can step anywhere. At a prior's end, a parameter hardly changes
@@ -103,9 +91,6 @@ def off_the_ends(
 
     Args:
         fitted: The fit.
-        model: The model without the effects of the fit.
-        rollouts: The recording.
-        binding: How it is cut into segments.
     """
     for _ in range(BASE_FIT.most_refits):
         z = fitted.fit.z
@@ -115,14 +100,11 @@ def off_the_ends(
         inside = torch.where(is_at_end, z.sign(), z)
         start = fitted.segments.prior.to_parameters(inside[None])
         try:
-            other = fit_hypothesis(
-                model,
-                rollouts,
-                binding,
+            other = fit_segment_model(
+                fitted.segments,
                 effects=fitted.effects,
                 start={name: value[0] for name, value in start.items()},
                 offsets=fitted.fit.offsets,
-                starts=fitted.segments.starts,
             )
         except DataError:
             break
@@ -139,9 +121,7 @@ def _loss(hypothesis: Hypothesis, scale: Tensor) -> float:
 
 def in_finer_steps(
     current: Hypothesis,
-    model: Model,
-    rollouts: Rollouts,
-    binding: DataOptions,
+    base: SegmentModel,
     *,
     report: Callable[[str], None] = lambda _: None,
 ) -> BaseFit:
@@ -152,35 +132,32 @@ def in_finer_steps(
 
     Args:
         current: A fitted hypothesis of the model.
-        model: The model without the effects of the hypothesis.
-        rollouts: The recording.
-        binding: How it is cut into segments.
+        base: The model without the effects of the hypothesis, along the recording.
         report: Called with a sentence when steps are refined.
     """
     is_coarse = False
     while current.simulator.with_finer_steps() is not None:
-        finer_model = with_finer_steps(model)
-        trials = Trials(finer_model, rollouts, binding)
+        finer_base = base.with_model(with_finer_steps(base.model))
+        segments = extended(finer_base, current.effects, current.segments.starts)
+        trials = Trials(finer_base)
         finer = None
-        if _step_error(current, finer_model, rollouts, binding) > BASE_FIT.noticeable_change:
-            finer = trials.refitted(current)
+        if _step_error(current, segments) > BASE_FIT.noticeable_change:
+            finer = trials.refitted_along(segments, current, current.effects)
             if finer is not None:
-                finer = off_the_ends(finer, finer_model, rollouts, binding)
+                finer = off_the_ends(finer)
         if (
             finer is None
             or weigh([current, finer], [0.0, 0.0], seed=0)[0] > BASE_FIT.coarse_probability
         ):
             break
         report("the model's integration steps are too coarse for this recording; refining them")
-        is_coarse, model = True, finer_model
+        is_coarse, base = True, finer_base
         current = trials.with_own_starts(finer)
-    return BaseFit(model, current, is_coarse)
+    return BaseFit(base, current, is_coarse)
 
 
 def _starts(
-    model: Model,
-    rollouts: Rollouts,
-    binding: DataOptions,
+    segments: SegmentModel,
     near: Mapping[str, Tensor] | None,
     seed: int,
     progress: Step | None,
@@ -188,7 +165,6 @@ def _starts(
     """Returns initial guesses: the prior's middle and a search's result, or known parameters."""
     if near:
         return [near]
-    segments = SegmentModel(model, rollouts, binding)
     z = search_prior(
         segments, iterations=PRIOR_SEARCH.iterations_before_steps, seed=seed, progress=progress
     )
@@ -196,17 +172,12 @@ def _starts(
     return [{}, {name: value[0] for name, value in found.items()}]
 
 
-def _step_error(
-    current: Hypothesis, model: Model, rollouts: Rollouts, binding: DataOptions
-) -> float:
+def _step_error(current: Hypothesis, finer: SegmentModel) -> float:
     """Returns the distance between two simulations, in units of the hypothesis's residuals.
 
-    The simulations are those of the hypothesis and of the model with its effects.
+    The simulations are those of the hypothesis and of the same model with finer steps.
     """
     fit = current.fit
-    finer = SegmentModel(
-        with_effects(model, current.effects), rollouts, binding, current.segments.starts
-    )
     here = fit.z[None], fit.offsets[None]
     difference = finer.simulate(*here) - current.segments.simulate(*here)
     return float(finer.whitened(difference[0], fit.scale).norm().nan_to_num(math.inf))

@@ -1,9 +1,9 @@
 """The search: add the effect that explains most, screen again, remove effects no longer needed."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 from torch import Tensor
 
@@ -32,6 +32,8 @@ from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.memory import release_freed_memory
 from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.progress import Step
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Round", "Search", "Searcher", "explained"]
@@ -93,7 +95,9 @@ class Searcher:
         binding: How the recording is cut into segments; as in the options by default.
 
     Attributes:
-        model: The original model, with finer steps once its own were found to be too coarse.
+        rollouts: The recording.
+        options: Options of the search.
+        binding: How the recording is cut into segments.
         are_steps_coarse: Whether its own integration steps are too coarse.
         are_priors_widened: Whether some of its priors were too narrow and were widened.
     """
@@ -107,7 +111,7 @@ class Searcher:
         *,
         binding: DataOptions | None = None,
     ) -> None:
-        self.model = model
+        self._model = model
         self.rollouts = rollouts
         self.options = options
         self.binding: DataOptions = binding or options.binding(rollouts)
@@ -116,15 +120,29 @@ class Searcher:
         self._last: Round | None = None
         self._report = report
 
+    @cached_property
+    def base(self) -> SegmentModel:
+        """The original model along the recording, to which every hypothesis adds effects.
+
+        It has finer steps once its own were found to be too coarse, and wider priors once its own
+        were found to be too narrow.
+
+        Raises:
+            DataError: The recording does not fit the model.
+        """
+        return SegmentModel(self._model, self.rollouts, self.binding)
+
     @property
     def trials(self) -> Trials:
-        """Fits of the model with its current integration steps."""
-        return Trials(self.model, self.rollouts, self.binding)
+        """Fits of the model with its current integration steps and priors."""
+        return Trials(self.base)
 
-    def fit_base(self) -> Hypothesis:
+    def fit_base(
+        self, *, near: Mapping[str, Tensor] | None = None, progress: Step | None = None
+    ) -> Hypothesis:
         """Fits the original model; see :func:`~npdr_ppl.discovery.search.base_fit.fit_base`."""
         self._report("fitting the original model")
-        return fit_base(self.model, self.rollouts, self.binding, seed=self.options.seed)
+        return fit_base(self.base, near=near, seed=self.options.seed, progress=progress)
 
     def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
         """Returns a hypothesis with finer steps if its own are too coarse; else unchanged.
@@ -134,10 +152,8 @@ class Searcher:
         Args:
             current: A fitted hypothesis.
         """
-        found = in_finer_steps(
-            current, self.model, self.rollouts, self.binding, report=self._report
-        )
-        self.model = found.model
+        found = in_finer_steps(current, self.base, report=self._report)
+        self.base = found.segments
         self.are_steps_coarse = self.are_steps_coarse or found.are_steps_coarse
         return found.hypothesis
 
@@ -150,11 +166,11 @@ class Searcher:
         Args:
             current: A fitted hypothesis.
         """
-        found = widen_where_it_helps(self.model, current, self.rollouts, self.binding)
+        found = widen_where_it_helps(self.base, current)
         if found is None:
             return current
         self._report(f"{found.ends[0]}")
-        self.model, self.are_priors_widened = found.model, True
+        self.base, self.are_priors_widened = found.segments, True
         # The misfit caused by the narrow prior can hide that the steps are too coarse.
         return self.with_finer_steps(found.hypothesis)
 

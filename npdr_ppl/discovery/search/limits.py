@@ -42,7 +42,7 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
     """
     if not effect.strength:
         return ()
-    if effect.wave and not _is_seen_through(current, effect, trials.rollouts):
+    if effect.wave and not _is_seen_through(current, effect, current.segments.rollouts):
         return (effect.wave,)
     priors = effect.priors(current.simulator.port(effect.port))
     shapes = {

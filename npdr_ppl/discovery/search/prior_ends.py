@@ -13,13 +13,12 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from npdr_ppl.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
+from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
 from npdr_ppl.discovery.search.settings import PRIOR_ENDS
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.wider_priors import described_prior, widened, with_wider_priors
-from npdr_ppl.preparation.data_options import DataOptions
-from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.preparation.segment_model import SegmentModel
 
 __all__ = ["PriorEnd", "Widened", "beyond", "widen_where_it_helps"]
 
@@ -52,26 +51,22 @@ class Widened:
     """The result of widening priors.
 
     Attributes:
-        model: The model with wider priors.
+        segments: The model with wider priors, along the recording.
         hypothesis: Its closest fit.
         ends: The parameters that are outside their original priors.
     """
 
-    model: Model
+    segments: SegmentModel
     hypothesis: Hypothesis
     ends: tuple[PriorEnd, ...]
 
 
-def widen_where_it_helps(
-    model: Model, current: Hypothesis, rollouts: Rollouts, binding: DataOptions
-) -> Widened | None:
+def widen_where_it_helps(base: SegmentModel, current: Hypothesis) -> Widened | None:
     """Widens the priors that have the fit at an end, if the model then fits better.
 
     Args:
-        model: The model without the effects of the hypothesis.
+        base: The model without the effects of the hypothesis, along the recording.
         current: Its closest fit.
-        rollouts: The recording.
-        binding: How it is cut into segments.
 
     Returns:
         The result, or ``None`` if no prior is too narrow.
@@ -82,24 +77,20 @@ def widen_where_it_helps(
         names = [name for name in _at_end(current) if widened(priors[name]) is not None]
         if not names:
             break
-        wider = with_wider_priors(model, names)
         try:
-            fitted = fit_hypothesis(
-                wider,
-                rollouts,
-                binding,
+            wider = base.with_model(with_wider_priors(base.model, names))
+            fitted = fit_segment_model(
+                wider.starting_from(current.segments.starts),
                 start=current.parameters,
                 offsets=current.fit.offsets,
-                starts=current.segments.starts,
             )
         except NpdrError:
             break
         threshold = 0.5 * float(stats.chi2.isf(PRIOR_ENDS.false_alarm_rate, len(names)))
         if _gain(current, fitted) < threshold:
             break
-        fitted = Trials(wider, rollouts, binding).with_own_starts(fitted)
-        model, current = wider, fitted
-        result = Widened(model, current, beyond(priors, current))
+        base, current = wider, Trials(wider).with_own_starts(fitted)
+        result = Widened(base, current, beyond(priors, current))
     return result if result is not None and result.ends else None
 
 

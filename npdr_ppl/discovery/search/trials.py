@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
 
-from npdr_ppl.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
+from npdr_ppl.discovery.hypothesis import Hypothesis, extended, fit_segment_model
 from npdr_ppl.discovery.screening.repetition import keeps_in_step
 from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.search.evidence import closest
@@ -16,9 +15,9 @@ from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.simulator import Simulator
-from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.initial_states import InitialStates
-from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.preparation.segment_fit import SegmentFit
+from npdr_ppl.preparation.segment_model import SegmentModel
 
 __all__ = ["Trials"]
 
@@ -28,18 +27,18 @@ class _Fit:
     """The arguments of a fit.
 
     Attributes:
-        effects: The effects to add to the model.
+        segments: The model, effects included, and the recording.
+        effects: The effects that were added to the original model.
         start: Initial guess of the parameters, by site.
         offsets: Initial guess of the offsets of the initial states, ``(S, m)``.
-        starts: The segments' initial states.
         is_trial: Whether a short fit with rough steps is enough.
         held: Reference coordinates of sites that are not fitted.
     """
 
+    segments: SegmentModel
     effects: tuple[Effect, ...]
     start: Mapping[str, Tensor]
     offsets: Tensor
-    starts: InitialStates | None
     is_trial: bool = False
     held: Mapping[str, float] | None = None
 
@@ -49,14 +48,10 @@ class Trials:
     """Fits a model with effects.
 
     Attributes:
-        model: The original model.
-        rollouts: The recording.
-        binding: How it is cut into segments.
+        base: The original model along the recording, whose segments all fits share.
     """
 
-    model: Model
-    rollouts: Rollouts
-    binding: DataOptions
+    base: SegmentModel
 
     def extended(
         self,
@@ -81,16 +76,7 @@ class Trials:
                 waiting[: TRIALS.candidates_per_decision],
                 waiting[TRIALS.candidates_per_decision :],
             )
-            asked = [
-                _Fit(
-                    (*current.effects, candidate.variant.effect),
-                    current.parameters | candidate.variant.parameters(candidate.sizes),
-                    current.fit.offsets,
-                    current.segments.starts,
-                    is_trial=True,
-                )
-                for candidate in tried
-            ]
+            asked = [self._trial(current, candidate) for candidate in tried]
             for candidate, found in zip(tried, self._fits(asked, current.simulator), strict=True):
                 if found is not None:
                     trials[candidate.name] = found
@@ -122,7 +108,7 @@ class Trials:
             <= least + max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))
         ]
         asked = [
-            _Fit(trial.effects, trial.parameters, trial.fit.offsets, trial.segments.starts)
+            _Fit(trial.segments, trial.effects, trial.parameters, trial.fit.offsets)
             for trial in (trials[name] for name in contenders)
         ]
         result = dict(trials)
@@ -144,11 +130,25 @@ class Trials:
             ``None`` if the model cannot be simulated with them.
         """
         chosen = current.effects if effects is None else effects
-        kept = {name for effect in chosen for name in effect.parameter_names}
+        segments = self._along(chosen, current.segments.starts)
+        return None if segments is None else self.refitted_along(segments, current, chosen)
+
+    def refitted_along(
+        self, segments: SegmentModel, current: Hypothesis, effects: tuple[Effect, ...]
+    ) -> Hypothesis | None:
+        """Fits a model that is bound to the recording; see :meth:`refitted`.
+
+        Args:
+            segments: The model, effects included, and the recording.
+            current: The hypothesis from whose parameters the fit begins.
+            effects: The model's effects.
+        """
+        kept = {name for effect in effects for name in effect.parameter_names}
         gone = {name for effect in current.effects for name in effect.parameter_names} - kept
         start = {name: value for name, value in current.parameters.items() if name not in gone}
-        asked = _Fit(chosen, start, current.fit.offsets, current.segments.starts)
-        (found,) = self._fits([asked], current.simulator)
+        (found,) = self._fits(
+            [_Fit(segments, effects, start, current.fit.offsets)], current.simulator
+        )
         return found
 
     def with_own_starts(self, current: Hypothesis) -> Hypothesis:
@@ -160,12 +160,13 @@ class Trials:
         Args:
             current: The hypothesis.
         """
-        starts = current.estimated_starts(self.rollouts)
+        starts = current.estimated_starts()
         if starts is None:
             return current
+        segments = current.segments.starting_from(starts)
         unmoved = torch.zeros_like(current.fit.offsets)
         (found,) = self._fits(
-            [_Fit(current.effects, current.parameters, unmoved, starts)], current.simulator
+            [_Fit(segments, current.effects, current.parameters, unmoved)], current.simulator
         )
         # If initial states are estimated badly, simulations close to them may fail.
         return current if found is None or not found.can_be_linearised else found
@@ -182,9 +183,8 @@ class Trials:
         Returns:
             ``None`` in place of those that cannot be simulated.
         """
-        effects, start = current.effects, current.parameters
-        offsets, starts = current.fit.offsets, current.segments.starts
-        asked = [_Fit(effects, start, offsets, starts, held=places) for places in held]
+        effects, start, offsets = current.effects, current.parameters, current.fit.offsets
+        asked = [_Fit(current.segments, effects, start, offsets, held=places) for places in held]
         return list(self._fits(asked, current.simulator))
 
     def apart_from_waves_in_step(self, tried: Mapping[str, Hypothesis]) -> dict[str, Hypothesis]:
@@ -192,37 +192,66 @@ class Trials:
         return {
             name: trial
             for name, trial in tried.items()
-            if not keeps_in_step(trial, trial.effects[-1], self.rollouts)
+            if not keeps_in_step(trial, trial.effects[-1], self.base.rollouts)
         }
 
     def without(self, current: Hypothesis, effect: Effect) -> Hypothesis | None:
         """Refits a hypothesis without one of its effects; see :meth:`refitted`."""
         return self.refitted(current, tuple(e for e in current.effects if e.name != effect.name))
 
-    def _fits(self, asked: Sequence[_Fit], simulator: Simulator) -> Iterator[Hypothesis | None]:
-        """Yields the model with the effects of each fit, ``None`` where it cannot be simulated."""
-        return side_by_side(partial(_fitted, self), asked, num_processes(simulator))
+    def _trial(self, current: Hypothesis, candidate: Screened) -> _Fit | None:
+        """Returns the short fit of a hypothesis with a candidate, from its linear estimate."""
+        effects = (*current.effects, candidate.variant.effect)
+        segments = self._along(effects, current.segments.starts)
+        if segments is None:
+            return None
+        start = current.parameters | candidate.variant.parameters(candidate.sizes)
+        return _Fit(segments, effects, start, current.fit.offsets, is_trial=True)
+
+    def _along(
+        self, effects: tuple[Effect, ...], starts: InitialStates | None
+    ) -> SegmentModel | None:
+        """Returns the model with effects along the recording, ``None`` if it cannot have them."""
+        try:
+            return extended(self.base, effects, starts)
+        except NpdrError:
+            return None
+
+    def _fits(
+        self, asked: Sequence[_Fit | None], simulator: Simulator
+    ) -> Iterator[Hypothesis | None]:
+        """Yields the hypothesis of each fit, ``None`` where the model cannot be simulated."""
+        possible = [fit for fit in asked if fit is not None]
+        found = side_by_side(_fitted, possible, num_processes(simulator))
+        for fit in asked:
+            result = None if fit is None else next(found)
+            if fit is None or result is None:
+                yield None
+                continue
+            hypothesis = Hypothesis(fit.segments.model, fit.effects, fit.segments, result[0])
+            hypothesis.__dict__["difference"] = result[1]  # else it would be simulated again
+            yield hypothesis
 
 
-def _fitted(trials: Trials, asked: _Fit) -> Hypothesis | None:
-    """Fits a model; returns ``None`` if it cannot be simulated."""
+def _fitted(asked: _Fit) -> tuple[SegmentFit, Tensor] | None:
+    """Fits a model; returns ``None`` if it cannot be simulated.
+
+    A parallel process sends only the fit and the difference from the recording, because the
+    asking process has the segments.
+    """
     try:
-        found = fit_hypothesis(
-            trials.model,
-            trials.rollouts,
-            trials.binding,
+        found = fit_segment_model(
+            asked.segments,
             effects=asked.effects,
             start=asked.start,
             offsets=asked.offsets,
-            starts=asked.starts,
             held=asked.held,
             max_steps=TRIALS.first_steps if asked.is_trial else TRIALS.most_steps,
             is_rough=asked.is_trial,
         )
     except NpdrError:
         return None
-    _ = found.difference  # computed in the parallel process, and sent back with the fit
-    return found
+    return found.fit, found.difference
 
 
 def _far_behind(current: Hypothesis, best: Hypothesis) -> float:
