@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import npdr_ppl as npdr
-from npdr_ppl.engines.mujoco import MujocoSimulator, Scale
+from npdr_ppl.engines.mujoco import MujocoSimulator, Scale, batches
 from npdr_ppl.engines.mujoco import open_loop as mujoco_open_loop
 from npdr_ppl.errors import DataError, ModelError, ShapeError
 from npdr_ppl.language.channels import Parameter
@@ -23,6 +23,7 @@ from npdr_ppl.models.effects import (
     InputDelay,
     ViscousFriction,
 )
+from npdr_ppl.models.two_link_arm import TwoLinkArm
 from tests.helpers.mujoco_files import (
     ARM,
     GYMNASIUM,
@@ -262,6 +263,43 @@ def test_batch_equals_a_loop(monkeypatch):
     assert torch.equal(simulator.simulate(parameters, inputs), batch)
     simulator.num_threads = 2
     assert torch.equal(simulator.simulate(parameters, inputs), batch)
+
+
+def test_without_constraints_their_solver_is_skipped_and_values_stay(monkeypatch):
+    friction = "shoulder.coulomb_friction.magnitude"
+
+    def simulated(*effects, **parameters):
+        simulator = TwoLinkArm().with_effects(*effects)
+        trajectory = simulator.simulate(parameters, random_inputs(simulator))
+        (model,) = simulator.prepared_models.values()
+        return trajectory, bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+
+    masses = {"lower_mass": torch.tensor([0.5, 1.0]).double()}
+    skipped, is_skipped = simulated(**masses)
+    assert is_skipped
+    rubbing, is_skipped = simulated(
+        CoulombFriction("shoulder"), **masses, **{friction: value(0.5)}
+    )
+    assert not is_skipped
+    assert not torch.allclose(rubbing, skipped)
+    monkeypatch.setattr(batches, "has_constraints", lambda model: True)
+    solved, is_skipped = simulated(**masses)
+    assert not is_skipped
+    assert torch.equal(solved, skipped)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '<joint axis="0 1 0" limited="true" range="-1 1"/>',
+        '<joint axis="0 1 0" frictionloss="0.1"/>',
+        '<joint axis="0 1 0"/><geom size="0.1"/>',
+    ],
+)
+def test_limits_friction_and_geometries_are_constraints(text):
+    body = f'<body><inertial pos="0 0 1" mass="1" diaginertia="1 1 1"/>{text}</body>'
+    xml = f"<mujoco><worldbody>{body}</worldbody></mujoco>"
+    assert batches.has_constraints(mujoco.MjModel.from_xml_string(xml))
 
 
 def test_steps_that_do_not_exist_are_zero():

