@@ -124,7 +124,8 @@ class Preparation:
             return None
         if self.widest.segments.inputs.num_segments < FEWEST_SEGMENTS:
             return None
-        return self.searcher.look(self.widest).alarm
+        # One look costs a few seconds; to start processes would cost more.
+        return self.searcher.look(self.widest, number=1).alarm
 
     @property
     def misfit(self) -> float:

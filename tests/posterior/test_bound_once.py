@@ -88,6 +88,18 @@ def test_a_preparation_is_bound_once_however_often_it_is_used(case, calls):
     assert _number(calls, "traces") == before + 1
 
 
+def test_a_fit_starts_no_processes_to_look_at_a_recording_once(case, monkeypatch):
+    prepared = prepare_module.prepare(case.model, case.fit[:1], DataOptions())
+
+    def refuse(*_):
+        raise AssertionError("A process was started.")
+
+    with npdr.workers("loky", 2):
+        monkeypatch.setattr("npdr_ppl.discovery.screening.candidate_effects.side_by_side", refuse)
+        alarm = prepared.alarm
+    assert alarm.fired
+
+
 def test_refits_of_a_model_do_not_run_the_program_again(case, calls):
     effects = QuadraticDrag("hinge"), CoulombFriction("hinge"), Bias("hinge")
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=effects))

@@ -37,7 +37,11 @@ def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Ef
 
 
 def variants_of(
-    candidates: tuple[Effect, ...], projection: Projection, found: Responses
+    candidates: tuple[Effect, ...],
+    projection: Projection,
+    found: Responses,
+    *,
+    number: int | None = None,
 ) -> Iterator[Variant]:
     """Yields the candidates in all shapes and sizes, and waves also at the strongest frequency.
 
@@ -45,6 +49,7 @@ def variants_of(
         candidates: The effects.
         projection: The fitted hypothesis that they would be added to.
         found: The responses to pulses of force at the joints.
+        number: Number of parallel processes; by default that of the enclosing ``workers`` block.
     """
     hypothesis = projection.hypothesis
     hints = {
@@ -52,7 +57,7 @@ def variants_of(
         for effect in candidates
         if effect.wave and effect.port in found.by_port
     }
-    number = num_processes(hypothesis.simulator)
+    number = number or num_processes(hypothesis.simulator)
     if number == 1:
         yield from sensitivities(hypothesis, candidates, hints)
         return

@@ -214,8 +214,14 @@ class Searcher:
             rounds.append(self.look(current))  # an effect was replaced, so residuals differ
         return Search(rounds, current, added, removed, trials)
 
-    def look(self, hypothesis: Hypothesis) -> Round:
-        """Screens all candidates at a fitted hypothesis; the last result is cached."""
+    def look(self, hypothesis: Hypothesis, *, number: int | None = None) -> Round:
+        """Screens all candidates at a fitted hypothesis; the last result is cached.
+
+        Args:
+            hypothesis: The fitted hypothesis.
+            number: Number of parallel processes; by default that of the enclosing ``workers``
+                block. The result does not depend on it.
+        """
         if self._last is not None and self._last.hypothesis is hypothesis:
             return self._last
         release_freed_memory()
@@ -223,7 +229,7 @@ class Searcher:
         projection = Projection(averaged)
         found = responses(averaged)
         candidates = candidates_at(hypothesis, self.options)
-        variants = variants_of(candidates, projection, found)
+        variants = variants_of(candidates, projection, found, number=number)
         sensors = hypothesis.simulator.sensors
         looks = len(hypothesis.effects)
         alarm, ranking = sound_alarm(projection, variants, found, sensors, self.options, looks)
