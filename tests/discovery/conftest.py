@@ -5,6 +5,7 @@ from hidden_rigs import make_case
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.models.effects import QuadraticDrag
 
 
 @pytest.fixture(scope="session")
@@ -22,3 +23,13 @@ def dragged():
     case = make_case("pendulum", "one", (place,), strength=0.3, seed=2001)
     binding = npdr.DiscoveryOptions().binding(case.fit)
     return case, fit_hypothesis(case.model, case.fit, binding)
+
+
+@pytest.fixture(scope="session")
+def proven():
+    """A search that finds a hidden drag, with held-out rollouts: the case, options, result."""
+    place = ("hinge", "quadratic_drag")
+    case = make_case("pendulum", "one", (place,), strength=1.0, seed=2001)
+    options = npdr.DiscoveryOptions(effects=(QuadraticDrag("hinge"),), max_effects=1)
+    found = npdr.discover(case.model, case.fit, holdout=case.holdout, options=options)
+    return case, options, found

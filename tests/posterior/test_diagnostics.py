@@ -181,6 +181,9 @@ def test_predictions_that_miss_in_all_segments_or_in_one_are_a_misfit():
     loose = Thresholds(coverage_shortfall=1.0, segment_p_value=0.0)
     found = npdr.diagnose(everywhere)
     assert found.decision is Decision.REVISE_MODEL and found.coverage_90 < 0.7
+    # Either of the two figures is enough; without both the posterior is accepted.
+    by_coverage = npdr.diagnose(everywhere, Thresholds(segment_p_value=0.0))
+    assert by_coverage.decision is Decision.REVISE_MODEL
     assert npdr.diagnose(everywhere, loose).decision is Decision.ACCEPT
     # One segment of four misses; the band still holds more than 70 % of the recording.
     one = exported(sd=0.02, misfit=0.2)

@@ -1,0 +1,84 @@
+"""The verdict of a search, which is changed in one figure at a time."""
+
+from dataclasses import replace
+
+import pytest
+
+from npdr_ppl.discovery.investigation import _judge
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def judge(proven):
+    """Returns verdict and reason of the search that found the drag, with figures changed."""
+    _, options, found = proven
+
+    def verdict(*, effects=None, problems=(), unexplained=0.0, **alarm):
+        search = found.search
+        last = search.rounds[-1]
+        last = replace(last, alarm=replace(last.alarm, **{"p_value": 0.5, "gain": 0.0, **alarm}))
+        search = replace(search, rounds=[*search.rounds[:-1], last])
+        return _judge(
+            search, found.effects if effects is None else effects, problems, unexplained, options
+        )
+
+    return verdict
+
+
+@pytest.fixture
+def drag(proven):
+    (finding,) = proven[2].effects
+    return finding
+
+
+def test_a_certain_effect_that_explains_everything_is_named(judge, drag):
+    assert drag.probability > 0.9
+    assert judge() == ("named", "Missing: hinge.quadratic_drag.")
+
+
+def test_a_problem_of_the_recording_comes_before_any_effect(judge):
+    assert judge(problems=("Degrees.",)) == ("unknown", "The recording has a problem: Degrees.")
+
+
+def test_without_effects_only_the_alarm_decides(judge):
+    assert judge(effects=[], fired=False)[0] == "none"
+    verdict, reason = judge(effects=[], fired=True)
+    assert verdict == "unknown" and "no effect explains it" in reason
+
+
+@pytest.mark.parametrize(
+    ("unexplained", "p_value", "gain", "verdict"),
+    [
+        (0.02, 1e-3, 0.0, "unknown"),  # detected, and more than one per cent
+        (0.005, 1e-3, 0.0, "named"),  # detected, but negligible
+        (0.02, 0.5, 0.0, "named"),  # not detected
+        (0.02, 0.5, 1e6, "named"),  # not detected; certain, but at most five per cent
+        (0.06, 0.5, 1e6, "unknown"),  # not detected, but certain and large
+        (0.06, 0.5, 0.0, "named"),  # large, but neither detected nor certain
+    ],
+)
+def test_a_remainder_makes_the_verdict_unknown_if_it_is_real_and_large(
+    judge, unexplained, p_value, gain, verdict
+):
+    found, reason = judge(unexplained=unexplained, p_value=p_value, gain=gain)
+    assert found == verdict
+    assert ("unexplained" in reason) == (verdict == "unknown")
+
+
+def test_an_implausible_value_makes_the_verdict_unknown_unless_the_effect_is_minor(judge, drag):
+    strained = replace(drag, at_edge=("drag",))
+    verdict, reason = judge(effects=[strained])
+    assert verdict == "unknown" and "implausible value of drag" in reason
+    minor = replace(strained, share=0.05 * drag.share)
+    assert judge(effects=[drag, minor])[0] == "named"
+
+
+def test_an_uncertain_effect_makes_the_verdict_ambiguous_unless_it_is_minor(judge, drag):
+    names = {"hinge.quadratic_drag": 0.6, "hinge.wind": 0.37, "hinge.bias": 0.03}
+    unsure = replace(drag, probability=0.6, alternatives=names)
+    verdict, reason = judge(effects=[unsure])
+    assert verdict == "ambiguous"
+    assert reason.endswith("which effect is missing: hinge.quadratic_drag or hinge.wind.")
+    minor = replace(unsure, share=0.05 * drag.share)
+    assert judge(effects=[drag, minor]) == ("named", "Missing: hinge.quadratic_drag.")
