@@ -29,9 +29,11 @@ class ReadingLimits:
         text_bytes: Longest text beside the data, such as attributes, names and footers, in bytes;
             ours have less than a tenth of it.
         json_bytes: Largest JSON file of a run in bytes; policies with many parameters take 2 MB.
-        parts: Largest count of parts of a file, such as data sets, elements of XML, or files in
-            an archive; posteriors have hundreds of data sets, robots hundreds of elements.
-        depth: Deepest nesting of parts; ours are nested three times, robots' bodies thirty times.
+        parts: Largest count of parts of a file, such as data sets or chunks; posteriors
+            have hundreds of data sets.
+        robot_parts: Largest count of elements of a robot's description, with all repetitions;
+            large robots have a thousand.
+        depth: Deepest nesting of parts; our files are nested three times, robots' bodies thirty.
         instructions: Largest count of instructions of a pickle; a rollout has a thousand.
     """
 
@@ -45,13 +47,24 @@ class ReadingLimits:
     text_bytes: int = 2**20
     json_bytes: int = 2**24
     parts: int = 10_000
-    depth: int = 64
+    robot_parts: int = 4_000
+    depth: int = 200
     instructions: int = 1_000_000
 
     def __post_init__(self) -> None:
         check_range(self, 1, 2**40, "file_bytes", "free_bytes", "line_length", "text_bytes")
         check_range(self, 1, 2**30, "json_bytes")
-        check_range(self, 1, 10**10, "numbers", "columns", "rollouts", "parts", "instructions")
+        check_range(
+            self,
+            1,
+            10**10,
+            "numbers",
+            "columns",
+            "rollouts",
+            "parts",
+            "robot_parts",
+            "instructions",
+        )
         check_range(self, 1, 1_000, "expansion", "depth")
 
 

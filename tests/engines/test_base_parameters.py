@@ -106,7 +106,7 @@ def test_forces_of_actuators_have_their_gears():
 
 
 def test_bad_models_and_shapes_are_refused(tmp_path):
-    (tmp_path / "bad.xml").write_text("<mujoco><worldbody>")
+    (tmp_path / "bad.xml").write_text("<mujoco><robot/></mujoco>")
     with pytest.raises(ModelError, match="not a readable MJCF file"):
         load_mjcf(tmp_path / "bad.xml")
     (tmp_path / "still.xml").write_text("<mujoco/>")

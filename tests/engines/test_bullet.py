@@ -268,7 +268,7 @@ def test_mistakes_are_one_sentence(urdf, changed, words):
 def test_files_and_targets_that_do_not_exist_are_one_sentence(tmp_path):
     with pytest.raises(ModelError, match="does not exist"):
         BulletSimulator(tmp_path / "none.urdf", sensors=SENSORS)
-    (tmp_path / "bad.urdf").write_text("<robot>")
+    (tmp_path / "bad.urdf").write_text("<robot/>")
     with pytest.raises(ModelError, match="not a URDF file"):
         BulletSimulator(tmp_path / "bad.urdf", sensors=SENSORS)
     with pytest.raises(ModelError, match="joint <name> torque"):

@@ -6,11 +6,13 @@ import json
 import mujoco
 import pyro
 import pyro.distributions as dist
+import pytest
 import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.engines.bullet import BulletSimulator, Sensor
-from npdr_ppl.engines.common.source_files import recorded_files
+from npdr_ppl.engines.common.source_files import OUTSIDE, recorded_files
+from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.rollouts import Rollouts
@@ -112,4 +114,37 @@ def test_urdf_files_and_absent_assets(tmp_path):
     file.write_text('<robot><mesh filename="gone.stl"/></robot>')
     assert recorded_files(file)["assets"] == {"gone.stl": None}
     file.write_text("no XML & neither closed")
-    assert recorded_files(file)["text"] == {"arm.urdf": "no XML & neither closed"}
+    with pytest.raises(ModelError, match=r"arm\.urdf is not well-formed XML"):
+        recorded_files(file)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '<mujoco><include file="{}"/></mujoco>',
+        '<mujoco><asset><model name="m" file="{}"/></asset></mujoco>',
+        '<mujoco><worldbody><include xmlns="x" file="{}"/></worldbody></mujoco>',
+    ],
+)
+@pytest.mark.parametrize("place", ["../secret.xml", "absolute", "link.xml"])
+def test_files_outside_of_the_folder_are_not_included(text, place, tmp_path):
+    (tmp_path / "secret.xml").write_text("<mujoco/>")
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot" / "link.xml").symlink_to(tmp_path / "secret.xml")
+    file = tmp_path / "robot" / "robot.xml"
+    file.write_text(text.format(tmp_path / "secret.xml" if place == "absolute" else place))
+    for read in (npdr.MujocoSimulator, recorded_files):
+        with pytest.raises(ModelError, match=r"which is outside of its folder; copy it"):
+            read(file)
+
+
+def test_includes_of_urdf_and_meshes_elsewhere_are_not_recorded(tmp_path):
+    (tmp_path / "secret.stl").write_text("solid secret")
+    (tmp_path / "robot").mkdir()
+    file = tmp_path / "robot" / "robot.urdf"
+    file.write_text(
+        '<robot name="r"><include file="../secret.stl"/><mesh filename="../secret.stl"/></robot>'
+    )
+    recorded = recorded_files(file)
+    assert set(recorded["text"]) == {"robot.urdf"}
+    assert recorded["assets"] == {"../secret.stl": OUTSIDE}

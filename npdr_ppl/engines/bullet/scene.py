@@ -16,6 +16,7 @@ from npdr_ppl.engines.bullet.channels import (
     Sensor,
 )
 from npdr_ppl.engines.bullet.settings import BulletSettings
+from npdr_ppl.engines.common.robot_files import read_robot
 from npdr_ppl.errors import ModelError
 
 __all__ = ["Builder", "Scene", "Urdf"]
@@ -48,6 +49,7 @@ class Urdf:
         path = Path(self.path)
         if not path.is_file():
             raise ModelError(f"{path} does not exist.")
+        read_robot(path)
         try:
             body = client.loadURDF(
                 str(path),

@@ -2,15 +2,19 @@
 
 import hashlib
 import importlib
-from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
+from npdr_ppl.engines.common.robot_files import is_inside, read_robot, references
+from npdr_ppl.reading_limits import LIMITS
+
 __all__ = ["recorded_files", "recorded_mjcf"]
+
+OUTSIDE = "not recorded: outside of the folder of the description"
+"""What is recorded of an asset that is neither in the robot's folder nor below it."""
 
 # Attributes of MJCF's compiler element that name folders of further files.
 _FOLDERS = ("assetdir", "meshdir", "texturedir")
@@ -24,18 +28,20 @@ def recorded_files(source: str | PathLike[str]) -> dict[str, Any]:
 
     Returns:
         ``file``: its name; ``text``: texts of this file and included files, by path relative to
-        its folder; ``assets``: SHA-256 of other files such as meshes, ``None`` if not found.
+        its folder; ``assets``: SHA-256 of other files such as meshes, :data:`OUTSIDE` for those
+        elsewhere, ``None`` if not found.
+
+    Raises:
+        ModelError: A file outside of the folder is included; see :func:`read_robot`.
     """
-    path = Path(source)
-    texts: dict[str, str] = {}
-    _read(path.parent, path.name, texts)
-    trees = [tree for text in texts.values() if (tree := _parsed(text)) is not None]
-    folders = [path.parent]
-    for tree in trees:
+    files = read_robot(source)
+    folders = [""]
+    for tree in files.trees.values():
         for compiler in tree.iter("compiler"):
-            folders += [path.parent / compiler.get(name, "") for name in _FOLDERS]
-    assets = {name: _digest(name, folders) for tree in trees for name in _references(tree)}
-    return {"file": path.name, "text": texts, "assets": dict(sorted(assets.items()))}
+            folders += [compiler.get(name, "") for name in _FOLDERS]
+    names = {name for tree in files.trees.values() for name in references(tree)}
+    assets = {name: _digest(files.folder, name, folders) for name in sorted(names)}
+    return {"file": Path(source).name, "text": files.texts, "assets": assets}
 
 
 def recorded_mjcf(source: Any) -> dict[str, Any]:
@@ -54,38 +60,13 @@ def recorded_mjcf(source: Any) -> dict[str, Any]:
     return {"file": None, "model_sha256": hashlib.sha256(compiled.tobytes()).hexdigest()}
 
 
-def _read(folder: Path, name: str, texts: dict[str, str]) -> None:
-    """Adds the text of a file, then those of the files that it includes."""
-    path = folder / name
-    if name in texts or not path.is_file():
-        return
-    texts[name] = path.read_text(errors="replace")
-    tree = _parsed(texts[name])
-    if tree is not None:
-        for include in tree.iter("include"):
-            # MuJoCo searches for all of them in the folder of the first file.
-            _read(folder, include.get("file", ""), texts)
-
-
-def _parsed(text: str) -> ElementTree.Element | None:
-    """Returns the XML of a text, or ``None``: an engine may accept text that is not valid XML."""
-    try:
-        return ElementTree.fromstring(text)
-    except ElementTree.ParseError:
-        return None
-
-
-def _references(tree: ElementTree.Element) -> Iterator[str]:
-    """Yields the names of referenced files other than included ones."""
-    for element in tree.iter():
-        name = element.get("file") or element.get("filename")
-        if name and element.tag != "include":
-            yield name
-
-
-def _digest(name: str, folders: list[Path]) -> str | None:
-    for folder in folders:
-        file = folder / name
-        if file.is_file():
-            return hashlib.sha256(file.read_bytes()).hexdigest()
+def _digest(folder: Path, name: str, places: list[str]) -> str | None:
+    for place in places:
+        file = folder / place / name
+        if not file.is_file() or file.stat().st_size > LIMITS.file_bytes:
+            continue
+        if not is_inside(folder, str(Path(place) / name)):
+            return OUTSIDE
+        with file.open("rb") as content:
+            return hashlib.file_digest(content, "sha256").hexdigest()
     return None

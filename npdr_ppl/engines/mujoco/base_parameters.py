@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from npdr_ppl.engines.common.robot_files import read_robot
 from npdr_ppl.errors import ModelError, ShapeError
 
 __all__ = ["INERTIAL", "JOINT", "MujocoInverseDynamics", "actuator_forces", "load_mjcf"]
@@ -38,6 +39,10 @@ JOINT = ("damping", "frictionloss", "armature")
 """Parameters of a degree of freedom."""
 
 
+MAX_REASON = 300
+"""Longest part of MuJoCo's own message that is shown, in characters."""
+
+
 def load_mjcf(source: Any) -> Any:
     """Returns the ``mujoco.MjModel`` of an MJCF file, or the given one.
 
@@ -45,15 +50,18 @@ def load_mjcf(source: Any) -> Any:
         source: Path of an MJCF file, or a ``mujoco.MjModel``.
 
     Raises:
-        ModelError: The file is not MJCF.
+        ModelError: The file is not MJCF, includes a file outside of its folder, or describes far
+            more than a robot.
     """
     mujoco: Any = importlib.import_module("mujoco")
     if not isinstance(source, str | PathLike):
         return source
+    read_robot(source)
     try:
         return mujoco.MjModel.from_xml_path(str(source))
-    except ValueError as error:
-        raise ModelError(f"{source} is not a readable MJCF file: {error}") from error
+    except (ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:MAX_REASON].rstrip(".")
+        raise ModelError(f"{source} is not a readable MJCF file: {reason}.") from error
 
 
 @dataclass(frozen=True)

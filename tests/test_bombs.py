@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers import cost_server, table_bombs, tree_bombs
+from tests.helpers import cost_server, robot_bombs, table_bombs, tree_bombs
 
-BOMBS = table_bombs.BOMBS | tree_bombs.BOMBS
+BOMBS = table_bombs.BOMBS | tree_bombs.BOMBS | robot_bombs.BOMBS
 CASES = [(kind, name) for kind, bombs in BOMBS.items() for name in bombs]
 
 MAX_SECONDS = 2.0
@@ -20,24 +20,22 @@ MAX_MEGABYTES = 500.0
 @pytest.fixture(scope="module")
 def cost():
     """Returns a function that reads a file in a process of its own and returns the cost."""
-    root = Path(__file__).resolve().parents[2]
-    process = subprocess.Popen(
+    root = Path(__file__).resolve().parents[1]
+    with subprocess.Popen(
         [sys.executable, cost_server.__file__],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
         env=os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"},
-    )
+    ) as process:
 
-    def ask(kind, path):
-        process.stdin.write(json.dumps([kind, str(path)]) + "\n")
-        process.stdin.flush()
-        return json.loads(process.stdout.readline())
+        def ask(kind, path):
+            process.stdin.write(json.dumps([kind, str(path)]) + "\n")
+            process.stdin.flush()
+            return json.loads(process.stdout.readline())
 
-    assert process.stdout.readline() == "ready\n"
-    yield ask
-    process.stdin.close()
-    process.wait()
+        assert process.stdout.readline() == "ready\n"
+        yield ask
 
 
 @pytest.mark.slow

@@ -1,0 +1,254 @@
+"""Reads the text of an MJCF or URDF file and of those it includes, and checks what they describe.
+
+Engines build what a file says: a few bytes can ask for a billion bodies or a height field of many
+gigabytes, and an MJCF file can include any file that the user may read. Both are refused before an
+engine gets the file.
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from npdr_ppl.errors import ModelError
+from npdr_ppl.reading_limits import LIMITS
+
+__all__ = ["RobotFiles", "is_inside", "read_robot", "references"]
+
+_ROOTS = ("mujoco", "mujocoinclude")
+
+_COUNTS = {"actdim": 1_000, "dim": 1_000, "nsample": 10_000, "nkey": 10_000, "nuserdata": 10**6}
+"""Largest values of attributes of MJCF that state how many numbers an element has."""
+
+_STACKS = ("njmax", "nconmax", "nstack", "memory")
+"""Attributes of MJCF that reserve memory, which an engine does not touch before it needs it."""
+
+_MAX_STACK = 2**32
+_MAX_USER_NUMBERS = 1_000
+
+_NUMBER = re.compile(r"([0-9]{1,20})([kmgtpe]?)", re.ASCII | re.IGNORECASE)
+_FACTORS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40, "p": 2**50, "e": 2**60}
+
+_BLOCK = 2**16
+"""Characters that are parsed at a time."""
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True)
+class RobotFiles:
+    """The files of a robot that are text.
+
+    Attributes:
+        folder: Folder of the first file.
+        texts: Texts by path relative to the folder; the first file comes first.
+        trees: Their XML.
+    """
+
+    folder: Path
+    texts: dict[str, str] = field(default_factory=dict)
+    trees: dict[str, ElementTree.Element] = field(default_factory=dict)
+
+
+def read_robot(path: str | PathLike[str]) -> RobotFiles:
+    """Reads a file and those that it includes, and checks that they describe a robot's size.
+
+    Args:
+        path: An MJCF or URDF file.
+
+    Raises:
+        ModelError: A file is not XML, includes one outside of the first one's folder, or describes
+            far more than a robot has.
+    """
+    first = Path(path)
+    files = RobotFiles(first.parent)
+    _read(files, first.name, first.name)
+    parts = _parts(files, first.name, {})
+    if parts > LIMITS.robot_parts:
+        raise ModelError(
+            f"{first.name} describes {parts:.4g} parts, more than the {LIMITS.robot_parts} that "
+            "a robot may have."
+        )
+    return files
+
+
+def is_inside(folder: Path, name: str) -> bool:
+    """Returns whether a path relative to a folder, with its links followed, is inside it."""
+    try:
+        return (folder / name).resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):
+        return False
+
+
+def _read(files: RobotFiles, name: str, includer: str) -> None:
+    """Adds the text of a file, then those of the files that it includes."""
+    if name in files.texts:
+        return
+    # The first file may be a link; only the files that it names must be beside it.
+    if name != includer and not is_inside(files.folder, name):
+        raise ModelError(
+            f"{includer} includes {ascii(name[:80])}, which is outside of its folder; copy it "
+            "into the folder."
+        )
+    path = files.folder / name
+    if not path.is_file():
+        return  # the engine says so
+    if path.stat().st_size + sum(map(len, files.texts.values())) > LIMITS.json_bytes:
+        raise ModelError(f"{name} has more than {LIMITS.json_bytes} bytes of text.")
+    files.texts[name] = path.read_text(errors="replace")
+    tree = files.trees[name] = _parsed(files.texts[name], name)
+    _check(files, tree, name)
+    for included in _included(tree):
+        _read(files, included, name)
+
+
+def _parsed(text: str, name: str) -> ElementTree.Element:
+    """Returns the XML of a text, without name spaces, as the engines understand it.
+
+    Raises:
+        ModelError: It is not well-formed, or has more parts or deeper ones than a robot. Engines
+            accept some texts that are not well-formed, but may see other elements in them.
+    """
+    if "<!DOCTYPE" in text:
+        raise ModelError(f"{name} has a DOCTYPE, which engines do not understand; remove it.")
+    parser = ElementTree.XMLPullParser(("start", "end"))
+    elements: list[ElementTree.Element] = []
+    depth = 0
+    try:
+        for start in range(0, len(text), _BLOCK):
+            parser.feed(text[start : start + _BLOCK])
+            events: Any = parser.read_events()
+            for event, element in events:
+                depth += 1 if event == "start" else -1
+                if event == "start":
+                    element.tag = element.tag.rpartition("}")[2]
+                    elements.append(element)
+                if depth > LIMITS.depth or len(elements) > LIMITS.robot_parts:
+                    raise ModelError(
+                        f"{name} has more than {LIMITS.robot_parts} parts, or is nested more than "
+                        f"{LIMITS.depth} deep."
+                    )
+        parser.close()
+    except ElementTree.ParseError as error:
+        raise ModelError(f"{name} is not well-formed XML ({error}).") from None
+    return elements[0]
+
+
+def _included(tree: ElementTree.Element) -> list[str]:
+    """Returns the names of the files whose elements become part of an MJCF model."""
+    if tree.tag not in _ROOTS:
+        return []  # URDF has no includes
+    # MuJoCo searches for all of them in the folder of the first file.
+    elements = [*tree.iter("include"), *tree.iterfind("asset/model")]
+    return [name for element in elements if (name := element.get("file"))]
+
+
+def _parts(files: RobotFiles, name: str, known: dict[str, float]) -> float:
+    """Returns the number of elements that a file describes, with all repetitions.
+
+    Args:
+        files: The files.
+        name: The file.
+        known: The numbers of other files; NaN for those that are being counted.
+    """
+    if name not in files.trees:
+        return 1.0
+    if name in known:
+        if math.isnan(known[name]):
+            raise ModelError(f"{name} includes itself.")
+        return known[name]
+    known[name] = math.nan
+    tree = files.trees[name]
+    models = [model.get("file", "") for model in tree.iterfind("asset/model")]
+
+    def parts(element: ElementTree.Element) -> float:
+        children = sum(map(parts, element))
+        if element.tag == "replicate":
+            return 1.0 + _number(element.get("count")) * children
+        if element.tag in ("composite", "flexcomp"):
+            return 1.0 + children + math.prod(map(_number, element.get("count", "").split()))
+        if element.tag == "include":
+            return _parts(files, element.get("file", ""), known)
+        if element.tag == "attach":
+            return sum(_parts(files, model, known) for model in models)
+        return 1.0 + children
+
+    known[name] = parts(tree) if tree.tag in _ROOTS else float(sum(1 for _ in tree.iter()))
+    return known[name]
+
+
+def _check(files: RobotFiles, tree: ElementTree.Element, name: str) -> None:
+    """Checks the sizes that an MJCF file states."""
+    for reference in references(tree):
+        _check_mesh(files.folder / reference.removeprefix("package://"))
+    if tree.tag not in _ROOTS:
+        return
+    folders = [files.folder / compiler.get("texturedir", "") for compiler in tree.iter("compiler")]
+    for element in tree.iter():
+        for word, value in element.items():
+            limit = _COUNTS.get(word, _MAX_STACK if word in _STACKS else None)
+            if element.tag == "size" and limit is None:
+                limit = _MAX_USER_NUMBERS
+            if limit is not None and _number(value) > limit:
+                raise ModelError(
+                    f"{name} has {word}={ascii(value[:30])}, more than the {limit} of a robot."
+                )
+        width, height = _number(element.get("width")), _number(element.get("height"))
+        if element.tag == "texture" and element.get("type", "cube") != "2d":
+            height = max(height, 6 * width)  # a face for each side of the cube
+        pixels = max(width * height, _number(element.get("nrow")) * _number(element.get("ncol")))
+        if picture := element.get("file", ""):
+            pixels = max(pixels, *(_pixels(f / picture) for f in (files.folder, *folders)))
+        if 4 * pixels > LIMITS.free_bytes:
+            raise ModelError(
+                f"{name} has a picture or height field of {pixels:.4g} points, more than "
+                f"{LIMITS.free_bytes // 4}."
+            )
+
+
+def references(tree: ElementTree.Element) -> Iterator[str]:
+    """Yields the names of referenced files other than included ones."""
+    for element in tree.iter():
+        name = element.get("file") or element.get("filename")
+        if name and element.tag != "include":
+            yield name
+
+
+def _check_mesh(path: Path) -> None:
+    """Checks a file that an engine reads as a whole; Bullet believes the size that STL states."""
+    try:
+        if not path.is_file():
+            return
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(84)
+    except (OSError, ValueError):
+        return  # the engine says so
+    if size > LIMITS.free_bytes:
+        raise ModelError(f"{path.name} has more than {LIMITS.free_bytes} bytes.")
+    is_binary_stl = path.suffix.lower() == ".stl" and not head.startswith(b"solid")
+    if is_binary_stl and size != 84 + 50 * int.from_bytes(head[80:], "little"):
+        raise ModelError(f"{path.name} has more or fewer faces than it says.")
+
+
+def _pixels(path: Path) -> float:
+    """Returns the number of pixels of a PNG file; 0 for any other file."""
+    try:
+        if not path.is_file():
+            return 0.0
+        with path.open("rb") as file:
+            head = file.read(24)
+    except (OSError, ValueError):
+        return 0.0
+    is_png = len(head) == 24 and head.startswith(_PNG)
+    return float(int.from_bytes(head[16:20]) * int.from_bytes(head[20:24])) if is_png else 0.0
+
+
+def _number(text: str | None) -> float:
+    """Returns a whole number, with a unit of memory if it has one; 0 for any other text."""
+    found = _NUMBER.fullmatch((text or "").strip())
+    return float(found[1]) * _FACTORS[found[2].lower()] if found else 0.0
