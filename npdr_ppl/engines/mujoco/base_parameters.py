@@ -58,10 +58,13 @@ def load_mjcf(source: Any) -> Any:
         return source
     read_robot(source)
     try:
-        return mujoco.MjModel.from_xml_path(str(source))
-    except (ValueError, RuntimeError) as error:
+        model = mujoco.MjModel.from_xml_path(str(source))
+        # A model may compile although the memory that it reserves is too small for it.
+        mujoco.mj_forward(model, mujoco.MjData(model))
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())[:MAX_REASON].rstrip(".")
         raise ModelError(f"{source} is not a readable MJCF file: {reason}.") from error
+    return model
 
 
 @dataclass(frozen=True)
