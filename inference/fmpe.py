@@ -32,7 +32,6 @@ Sequential rounds use truncated proposals, see :mod:`npdr_ppl.inference.parts.ba
 """
 
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 import torch
@@ -41,7 +40,6 @@ from torch import Tensor
 from npdr_ppl.inference.base import Density, Problem, State
 from npdr_ppl.inference.parts.bases.neural_backend import Simulations
 from npdr_ppl.inference.parts.bases.truncated import TruncatedBackend
-from npdr_ppl.inference.parts.flows.flows import load_member
 from npdr_ppl.inference.parts.flows.velocity import VelocityDensity, VelocityNetwork, end_angle
 from npdr_ppl.inference.parts.training.embedding_network import build_embedding
 from npdr_ppl.inference.parts.training.ensemble_training import LogProb, Loss
@@ -97,16 +95,9 @@ class FMPE(TruncatedBackend):
         state, preconditioner = self._trained(state)
         preconditioner = preconditioner.to(problem.device)
         observation = problem.observation.to(problem.device, torch.float32)
-        build = partial(self._networks, problem)
         return [
-            VelocityDensity(
-                load_member(build, state.weights, k).to(problem.device),
-                preconditioner,
-                observation,
-                self.sigma,
-                self.steps,
-            )
-            for k in range(self.members)
+            VelocityDensity(network, preconditioner, observation, self.sigma, self.steps)
+            for network in self._trained_networks(problem, state.weights)
         ]
 
     def _networks(self, problem: Problem) -> list[VelocityNetwork]:

@@ -28,13 +28,12 @@ from npdr_ppl.inference.parts.bases.likelihood_backend import (
     LearnedLogLikelihood,
     LikelihoodBackend,
 )
-from npdr_ppl.inference.parts.bases.neural_backend import NeuralState, Simulations
+from npdr_ppl.inference.parts.bases.neural_backend import Simulations
 from npdr_ppl.inference.parts.flows.flows import (
     FLOWS,
     Flow,
     FlowNetwork,
     build_networks,
-    load_member,
 )
 from npdr_ppl.inference.parts.training.ensemble_training import Loss
 from npdr_ppl.inference.parts.training.likelihood_preconditioning import (
@@ -90,30 +89,18 @@ class NLE(LikelihoodBackend):
         self._check_widths("hidden")
         self._check_at_least(1, "transforms", "bins", "max_features")
 
-    def init(self, problem: Problem) -> NeuralState:
-        """Returns the state before any simulation.
-
-        Raises:
-            BackendError: The features come from a network that is trained jointly.
-        """
-        self._check_fixed_features(problem)
-        return super().init(problem)
-
     def log_likelihoods(self, problem: Problem, state: State) -> list[LearnedLogLikelihood]:
         """Returns log q(x | z) of every ensemble member."""
         state, fitted = self._trained(state)
         assert isinstance(fitted, LikelihoodPreconditioner)
         preconditioner = fitted.to(problem.device)
-        build = partial(self._networks, problem)
 
         def log_likelihood(network: FlowNetwork, z: Tensor, x: Tensor) -> Tensor:
             f = preconditioner.features(z.to(problem.device, torch.float32))
             u = preconditioner.whiten(preconditioner.statistics(x.to(problem.device)), f)
             return (network(u, f) + preconditioner.log_det).to(z)
 
-        networks = [
-            load_member(build, state.weights, k).to(problem.device) for k in range(self.members)
-        ]
+        networks = self._trained_networks(problem, state.weights)
         return [partial(log_likelihood, network) for network in networks]
 
     def _precondition(self, problem: Problem, simulations: Simulations) -> Preconditioner:

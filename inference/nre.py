@@ -37,10 +37,9 @@ from npdr_ppl.inference.parts.bases.likelihood_backend import (
     LearnedLogLikelihood,
     LikelihoodBackend,
 )
-from npdr_ppl.inference.parts.bases.neural_backend import NeuralState, Simulations
+from npdr_ppl.inference.parts.bases.neural_backend import Simulations
 from npdr_ppl.inference.parts.training.ensemble_training import LogProb, Loss
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
-from npdr_ppl.randomness import seeded
 
 __all__ = ["NRE", "RatioNetwork", "RatioPreconditioner", "contrastive_loss"]
 
@@ -163,15 +162,6 @@ class NRE(LikelihoodBackend):
         self._check_at_least(2, "num_atoms")
         self._check_at_least(1e-9, "gamma")
 
-    def init(self, problem: Problem) -> NeuralState:
-        """Returns the state before any simulation.
-
-        Raises:
-            BackendError: The features come from a network that is trained jointly.
-        """
-        self._check_fixed_features(problem)
-        return super().init(problem)
-
     def log_likelihoods(self, problem: Problem, state: State) -> list[LearnedLogLikelihood]:
         """Returns h(z, x) of every ensemble member."""
         state, fitted = self._trained(state)
@@ -185,14 +175,8 @@ class NRE(LikelihoodBackend):
             correction = network(v[:, None], f[:, None])[:, 0, 0]
             return (preconditioner.log_ratio(v, u) + correction).to(z)
 
-        members = []
-        for k in range(self.members):
-            with seeded(0, "untrained networks"):  # leaves the caller's random stream unchanged
-                network = self._networks(problem)[k]
-            network.load_state_dict({name: value[k] for name, value in state.weights.items()})
-            network = network.to(problem.device).requires_grad_(False).eval()
-            members.append(partial(log_likelihood, network))
-        return members
+        networks = self._trained_networks(problem, state.weights)
+        return [partial(log_likelihood, network) for network in networks]
 
     def _precondition(self, problem: Problem, simulations: Simulations) -> Preconditioner:
         conditional = fit_preconditioner(simulations.z, simulations.x)

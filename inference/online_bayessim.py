@@ -58,4 +58,5 @@ class OnlineBayesSim(BayesSim):
         """Returns the networks of the previous round."""
         if state.round == 0:
             return super()._starting_networks(problem, state, preconditioner, simulations)
-        return self._trained_networks(problem, state)
+        networks = self._trained_networks(problem, state.weights)
+        return [network.requires_grad_(True) for network in networks]

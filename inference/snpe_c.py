@@ -52,7 +52,6 @@ from npdr_ppl.inference.parts.flows.flows import (
     FlowDensity,
     FlowNetwork,
     build_networks,
-    load_member,
 )
 from npdr_ppl.inference.parts.flows.stacked_flow import stacked_log_prob
 from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
@@ -128,18 +127,12 @@ class SNPEC(TruncatedBackend):
         """Yields the members' posteriors by observation; see :meth:`Backend.densities_given`."""
         state, preconditioner = self._trained(state)
         preconditioner = preconditioner.to(problem.device)
-        networks = self._members(problem, state.weights)
+        networks = self._trained_networks(problem, state.weights)
         base = FlowBase()
         if SCALE in state.weights:
             base = FlowBase(float(state.weights[SCALE][0]), float(state.weights[FREEDOM][0]))
         for x in observations.to(problem.device, torch.float32):
             yield [FlowDensity(network, preconditioner, x, base) for network in networks]
-
-    def _members(self, problem: Problem, weights: Mapping[str, Tensor]) -> list[FlowNetwork]:
-        """Returns the trained networks on the problem's device."""
-        build = partial(self._networks, problem)
-        own = {name: value for name, value in weights.items() if name not in (SCALE, FREEDOM)}
-        return [load_member(build, own, k).to(problem.device) for k in range(self.members)]
 
     def _training_rows(self, problem: Problem, state: NeuralState) -> Tensor:
         """Returns which simulations to train on, ``(n,)``; the atomic loss can use all."""
@@ -191,7 +184,7 @@ class SNPEC(TruncatedBackend):
         u, f = self._training_data(problem, preconditioner.to(problem.device), simulations)
         u, f = u[numbers.to(u.device)], f[numbers.to(f.device)]
         squares, log_dets = [], []
-        for network in self._members(problem, weights):
+        for network in self._trained_networks(problem, weights):
             with torch.no_grad():
                 base, log_det = network.transform(network.context(f)).call_and_ladj(u)
             squares.append((base**2).sum(-1))

@@ -18,7 +18,6 @@ from npdr_ppl.inference.parts.mixtures.proposal_correction import (
     correct_regression,
     proposal_of,
     tilt_forms,
-    tilted,
     whiten_forms,
 )
 from npdr_ppl.inference.parts.training.preconditioning import fit_preconditioner
@@ -47,6 +46,21 @@ PROPOSALS = {
         ),
     ),
 }
+
+
+def tilted(density, forms):
+    """Returns the mixture proportional to q(z) t(z), of K J components."""
+    d = density.means.shape[1]
+    factors = density.precision_factors
+    rows = torch.cat((factors, -factors @ density.means[..., None]), -1)
+    joint = (rows.mT @ rows)[:, None] + forms
+    lower = torch.linalg.cholesky(joint[..., :-1, :-1])
+    means = torch.cholesky_solve(-joint[..., :-1, -1:], lower)[..., 0]
+    left_over = joint[..., -1, -1] + (joint[..., -1, :-1] * means).sum(-1)
+    log_det = factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)[:, None]
+    log_det = log_det - lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    log_weights = density.log_weights[:, None] + log_det - 0.5 * left_over
+    return GaussianMixture(log_weights.flatten(), means.view(-1, d), lower.mT.reshape(-1, d, d))
 
 
 def exact_posterior(prior, x=OBSERVATION):

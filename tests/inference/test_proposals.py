@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from npdr_ppl.inference.base import Density, Problem
-from npdr_ppl.inference.parts.bases.proposals import sample_truncated_prior
+from npdr_ppl.inference.parts.bases.truncated import sample_truncated_prior
 from npdr_ppl.randomness import seeded
 
 OUTSIDE = 0.05

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density, Problem, State
-from npdr_ppl.inference.parts.bases.neural_backend import NeuralBackend
+from npdr_ppl.inference.parts.bases.neural_backend import NeuralBackend, NeuralState
 from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 from npdr_ppl.inference.parts.samplers.tempering import UnnormalisedDensity
 
@@ -31,6 +31,19 @@ class LikelihoodBackend(NeuralBackend):
     """A backend that learns log L(z; x); options are those of the parent class."""
 
     amortises: ClassVar[bool] = True
+
+    def init(self, problem: Problem) -> NeuralState:
+        """Returns the state before any simulation.
+
+        Raises:
+            BackendError: The features come from a network that is trained jointly.
+        """
+        if problem.build_network is not None:
+            raise BackendError(
+                f"{self.name} learns the density of features, so they must be fixed; choose an "
+                "embedding that is not trained, e.g. 'bayessim' or 'all/50'."
+            )
+        return super().init(problem)
 
     @abstractmethod
     def log_likelihoods(self, problem: Problem, state: State) -> list[LearnedLogLikelihood]:
@@ -57,15 +70,3 @@ class LikelihoodBackend(NeuralBackend):
             UnnormalisedDensity(problem, at_observation(member))
             for member in self.log_likelihoods(problem, state)
         ]
-
-    def _check_fixed_features(self, problem: Problem) -> None:
-        """Raises an error if the embedding is trained jointly.
-
-        Raises:
-            BackendError: The problem's features come from a network to be trained.
-        """
-        if problem.build_network is not None:
-            raise BackendError(
-                f"{self.name} learns the density of features, so they must be fixed; choose an "
-                "embedding that is not trained, e.g. 'bayessim' or 'all/50'."
-            )

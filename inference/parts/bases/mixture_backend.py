@@ -46,7 +46,6 @@ from npdr_ppl.inference.parts.mixtures.proposal_correction import (
 from npdr_ppl.inference.parts.training.embedding_network import build_embedding
 from npdr_ppl.inference.parts.training.ensemble_training import Loss
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, refit_regression
-from npdr_ppl.randomness import seeded
 
 __all__ = ["MixtureBackend", "ProposedSimulations"]
 
@@ -174,25 +173,14 @@ class MixtureBackend(NeuralBackend):
             raise BackendError(f"{self.name} cannot continue from another backend's state.")
         return state.simulations
 
-    def _trained_networks(
-        self, problem: Problem, state: NeuralState
-    ) -> list[MixtureDensityNetwork]:
-        """Returns the ensemble with a state's weights."""
-        with seeded(0, "untrained networks"):  # leaves the caller's random stream unchanged
-            networks = self._networks(problem)
-        for k, network in enumerate(networks):
-            network.load_state_dict({name: value[k] for name, value in state.weights.items()})
-        return networks
-
     def _posteriors(self, problem: Problem, state: State) -> list[GaussianMixture]:
         """Returns the posterior of every ensemble member."""
         state, preconditioner = self._trained(state)
         preconditioner = preconditioner.to(problem.device)
         observation = problem.observation.to(problem.device, torch.float32)
-        networks = self._trained_networks(problem, state)
         return [
-            mixture_at(network.eval().to(problem.device), preconditioner, observation)
-            for network in networks
+            mixture_at(network, preconditioner, observation)
+            for network in self._trained_networks(problem, state.weights)
         ]
 
     def _proposal(self, problem: Problem, state: State) -> GaussianMixture:

@@ -24,6 +24,7 @@ from npdr_ppl.inference.parts.training.ensemble_training import (
     vectorised,
 )
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
+from npdr_ppl.randomness import seeded
 
 __all__ = ["NeuralBackend", "NeuralState", "Simulations"]
 
@@ -151,6 +152,15 @@ class NeuralBackend(Backend[NeuralState]):
             simulations: Simulations on which the round trains.
         """
         return self._networks(problem)
+
+    def _trained_networks(self, problem: Problem, weights: Mapping[str, Tensor]) -> Sequence[Any]:
+        """Returns the ensemble with trained weights on the problem's device, for evaluation."""
+        with seeded(0, "untrained networks"):  # leaves the caller's random stream unchanged
+            networks = self._networks(problem)
+        for k, network in enumerate(networks):
+            network.load_state_dict({name: weights[name][k] for name in network.state_dict()})
+            network.requires_grad_(False).eval().to(problem.device)
+        return networks
 
     def _evaluator(self, problem: Problem) -> Evaluator:
         """Returns the joint evaluation of all networks; embedding networks run one by one."""

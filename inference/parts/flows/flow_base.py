@@ -12,12 +12,22 @@ flows are right, they stay at one and infinity.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-__all__ = ["FlowBase", "fit_base"]
+from npdr_ppl.errors import BackendError
+
+__all__ = ["CHUNK", "FlowBase", "finite_samples", "fit_base"]
+
+CHUNK = 4_096
+"""Rows sampled or evaluated in one batch. With many more, intermediate values do not fit into the
+cache, which takes three times as long as the arithmetic."""
+
+MAX_REDRAWS = 100
+"""Maximum number of attempts to replace samples that are not finite; then an error is raised."""
 
 SCALES = tuple(math.exp(0.02 * k) for k in range(-15, 41))
 """Scales tried, in steps of 2 %."""
@@ -87,3 +97,29 @@ def fit_base(square: Tensor, log_det: Tensor, d: int) -> FlowBase:
         if value > best_value + MIN_GAIN:
             best, best_value = tried[values.index(value)], value
     return best
+
+
+def finite_samples(draw: Callable[[int], Tensor], num_samples: int, d: int) -> Tensor:
+    """Draws finite samples ``(num_samples, d)`` in batches; they are returned on the CPU.
+
+    Args:
+        draw: Returns n samples, ``(n, d)``; those that are not finite are replaced.
+        num_samples: Number of samples.
+        d: Dimension.
+
+    Raises:
+        BackendError: Too many samples are not finite.
+    """
+    chunks: list[Tensor] = []
+    drawn, redraws = 0, 0
+    while drawn < num_samples:
+        n = min(CHUNK, num_samples - drawn)
+        with torch.no_grad():
+            z = draw(n)
+        z = z[z.isfinite().all(-1)]
+        redraws += len(z) < n
+        if redraws > MAX_REDRAWS:
+            raise BackendError("The flow keeps returning samples that are not finite.")
+        chunks.append(z.cpu())
+        drawn += len(z)
+    return torch.cat(chunks) if chunks else torch.empty(0, d)

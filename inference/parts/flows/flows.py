@@ -5,8 +5,8 @@ stack of weights; each gives a :class:`FlowDensity`.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -16,13 +16,11 @@ from zuko.lazy import LazyComposedTransform
 from zuko.nn import Linear
 from zuko.transforms import MonotonicAffineTransform, MonotonicRQSTransform
 
-from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.parts.flows.conditioned_flow import conditioned
-from npdr_ppl.inference.parts.flows.flow_base import FlowBase
+from npdr_ppl.inference.parts.flows.flow_base import CHUNK, FlowBase, finite_samples
 from npdr_ppl.inference.parts.training.embedding_network import build_embedding
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
-from npdr_ppl.randomness import seeded
 
 __all__ = [
     "FLOWS",
@@ -30,27 +28,17 @@ __all__ = [
     "FlowDensity",
     "FlowNetwork",
     "build_networks",
-    "load_member",
 ]
 
 Flow = Literal["nsf", "maf", "affine-nsf"]
 FLOWS = ("nsf", "maf", "affine-nsf")
 """Kinds of flows, see :class:`FlowNetwork`."""
 
-Network = TypeVar("Network", bound=nn.Module)
-
 INITIAL_SCALE = 0.01
 """Factor on the last layer's initial weights. A flow therefore starts near the identity, that is,
 at the preconditioner's linear-Gaussian posterior, and training never ends at a worse one."""
 
 STANDARD_NORMAL = FlowBase()
-
-CHUNK = 4_096
-"""Rows sampled or evaluated in one batch. With many more, intermediate values do not fit into the
-cache, which takes three times as long as the arithmetic."""
-
-MAX_REDRAWS = 100
-"""Maximum number of attempts to replace samples that are not finite; then an error is raised."""
 
 
 class Spline(MonotonicRQSTransform):
@@ -214,22 +202,6 @@ def build_networks(
     return networks
 
 
-def load_member(
-    build: Callable[[], Sequence[Network]], weights: Mapping[str, Tensor], member: int
-) -> Network:
-    """Builds a network and loads one member of a stack of weights, ready for evaluation.
-
-    Args:
-        build: Function that makes a list of untrained networks; the member's is used.
-        weights: Parameters and buffers by name, each ``(members, ...)``.
-        member: Index of the member.
-    """
-    with seeded(0, "untrained networks"):  # leaves the caller's random stream unchanged
-        network = build()[member]
-    network.load_state_dict({name: value[member] for name, value in weights.items()})
-    return network.requires_grad_(False).eval()
-
-
 class FlowDensity(Density):
     """The posterior of one ensemble member given the observation.
 
@@ -258,22 +230,14 @@ class FlowDensity(Density):
 
     def sample(self, num_samples: int) -> Tensor:
         """Draws ``(num_samples, d)`` from torch's global stream."""
-        device, d = self._features.device, len(self._preconditioner.offset)
-        chunks: list[Tensor] = []
-        drawn, redraws = 0, 0
-        while drawn < num_samples:
-            base = self._base.sample(min(CHUNK, num_samples - drawn), d).to(device)
-            with torch.no_grad():
-                u = self._transform.inv(base)
-                z = self._preconditioner.unwhiten(u, self._features)
+        d = len(self._preconditioner.offset)
+
+        def draw(n: int) -> Tensor:
             # Rounding can make the quadratic that inverts a spline unsolvable at a knot.
-            z = z[z.isfinite().all(-1)]
-            redraws += len(z) < len(base)
-            if redraws > MAX_REDRAWS:
-                raise BackendError("The flow keeps returning samples that are not finite.")
-            chunks.append(z.cpu())
-            drawn += len(z)
-        return torch.cat(chunks) if chunks else torch.empty(0, d)
+            u = self._transform.inv(self._base.sample(n, d).to(self._features.device))
+            return self._preconditioner.unwhiten(u, self._features)
+
+        return finite_samples(draw, num_samples, d)
 
     def log_prob(self, z: Tensor) -> Tensor:
         """Returns the log density at ``(n, d)``, shape ``(n,)``; differentiable in z."""

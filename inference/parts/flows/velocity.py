@@ -6,8 +6,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Density
+from npdr_ppl.inference.parts.flows.flow_base import CHUNK, finite_samples
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner
 
 __all__ = ["VelocityDensity", "VelocityNetwork", "end_angle"]
@@ -16,14 +16,8 @@ INITIAL_SCALE = 0.01
 """Factor on the last layer's initial weights: the network starts near zero velocity, that is, at
 the preconditioner's linear-Gaussian posterior."""
 
-CHUNK = 4096
-"""Rows integrated in one batch; keeps the working set within the processor's cache."""
-
 NOISE_SPACING = 0.3
 """Factor kappa of the spacing of the solver's steps; larger values give more steps at the end."""
-
-MAX_REDRAWS = 100
-"""Maximum number of attempts to replace samples that are not finite; then an error is raised."""
 
 NUM_TIME_FEATURES = 7
 
@@ -194,22 +188,15 @@ class VelocityDensity(Density):
 
     def sample(self, num_samples: int) -> Tensor:
         """Draws ``(num_samples, d)`` from torch's global stream."""
-        d, device = len(self._preconditioner.offset), self._features.device
-        chunks: list[Tensor] = []
-        drawn, redraws = 0, 0
-        while drawn < num_samples:
-            y = torch.randn(min(CHUNK, num_samples - drawn), d).to(device)
-            with torch.no_grad():
-                for step in range(self._num_steps):
-                    y = self._advance(self._network.velocity, y, step, 1)
-                z = self._preconditioner.unwhiten(self._scale * y, self._features)
-            z = z[z.isfinite().all(-1)]
-            redraws += len(z) < len(y)
-            if redraws > MAX_REDRAWS:
-                raise BackendError("The flow keeps returning samples that are not finite.")
-            chunks.append(z.cpu())
-            drawn += len(z)
-        return torch.cat(chunks) if chunks else torch.empty(0, d)
+        d = len(self._preconditioner.offset)
+
+        def draw(n: int) -> Tensor:
+            y = torch.randn(n, d).to(self._features.device)
+            for step in range(self._num_steps):
+                y = self._advance(self._network.velocity, y, step, 1)
+            return self._preconditioner.unwhiten(self._scale * y, self._features)
+
+        return finite_samples(draw, num_samples, d)
 
     def log_prob(self, z: Tensor) -> Tensor:
         """Returns the log density at ``(n, d)``, shape ``(n,)``; differentiable in z."""

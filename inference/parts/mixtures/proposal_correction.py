@@ -31,7 +31,6 @@ __all__ = [
     "correct_regression",
     "proposal_of",
     "tilt_forms",
-    "tilted",
     "whiten_forms",
 ]
 
@@ -75,28 +74,6 @@ def tilt_forms(proposal: GaussianMixture) -> Tensor:
     forms[:, :-1, -1] = forms[:, -1, :-1] = -linear
     forms[:, -1, -1] = (white**2).sum(-1) - 2 * log_det - 2 * proposal.log_weights
     return forms
-
-
-def tilted(density: GaussianMixture, forms: Tensor) -> GaussianMixture:
-    """Returns the mixture proportional to q(z) t(z), of K J components.
-
-    Args:
-        density: The mixture q of K components.
-        forms: Quadratic forms of t, ``(J, d + 1, d + 1)``. Those of :func:`tilt_forms` turn a
-            posterior into the proposal posterior. The negative of a single one turns a proposal
-            posterior back into the posterior, if that exists.
-    """
-    d = density.means.shape[1]
-    factors = density.precision_factors
-    rows = torch.cat((factors, -factors @ density.means[..., None]), -1)
-    joint = (rows.mT @ rows)[:, None] + forms
-    lower = torch.linalg.cholesky(joint[..., :-1, :-1])
-    means = torch.cholesky_solve(-joint[..., :-1, -1:], lower)[..., 0]
-    left_over = joint[..., -1, -1] + (joint[..., -1, :-1] * means).sum(-1)
-    log_det = factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)[:, None]
-    log_det = log_det - lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    log_weights = density.log_weights[:, None] + log_det - 0.5 * left_over
-    return GaussianMixture(log_weights.flatten(), means.view(-1, d), lower.mT.reshape(-1, d, d))
 
 
 def whiten_forms(forms: Tensor, factor: Tensor, shift: Tensor) -> Tensor:
