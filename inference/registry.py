@@ -4,7 +4,6 @@ Other packages add theirs by an entry point of group ``npdr_ppl.backends``: its 
 backend, its value is a subclass of :class:`~npdr_ppl.inference.base.Backend`.
 """
 
-from importlib.metadata import entry_points
 from typing import Any
 
 from npdr_ppl.errors import BackendError
@@ -32,12 +31,7 @@ BUILT_IN = {
 """Backends of this package by name; each is imported on first use."""
 
 
-def _locations() -> dict[str, str]:
-    """Returns ``module:class`` of every backend by name; built-in names cannot be taken."""
-    return {entry.name: entry.value for entry in entry_points(group=GROUP)} | BUILT_IN
-
-
-_REGISTRY = Registry("backend", Backend, BackendError, _locations)
+_REGISTRY = Registry("backend", Backend, BackendError, GROUP, BUILT_IN)
 
 
 def backend_class(name: str) -> type[Backend]:
@@ -67,4 +61,4 @@ def backend(name: str, **options: Any) -> Backend:
 
 def backends() -> dict[str, str]:
     """Returns every backend's one-line summary by name, in alphabetical order."""
-    return {name: backend_class(name).summary for name in sorted(_locations())}
+    return _REGISTRY.summaries()

@@ -1,7 +1,6 @@
 """Furuta pendulums in MuJoCo as target domains: presets and random rigs."""
 
 import re
-from difflib import get_close_matches
 
 import numpy as np
 import torch
@@ -11,6 +10,7 @@ from npdr_ppl.models.furuta import Furuta, initial_states
 from npdr_ppl.models.furuta_hidden_rigs import HIDDEN, Hidden, hidden_rig
 from npdr_ppl.models.furuta_mujoco import FurutaRig
 from npdr_ppl.randomness import derived_seed
+from npdr_ppl.registry import hint
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.targets.base import Controller, TargetDomain, end_episode
 
@@ -75,9 +75,7 @@ def furuta_target(name: str) -> FurutaTarget:
         return FurutaTarget(name, hidden_rig(kind, int(found.group(2))))
     if name not in _PRESETS:
         known = [*_PRESETS, "furuta-random-<seed>", *(f"furuta-{kind}-<seed>" for kind in HIDDEN)]
-        close = get_close_matches(name, known, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}."
-        raise ModelError(f"There is no Furuta pendulum {name!r}; {hint}")
+        raise ModelError(f"There is no Furuta pendulum {name!r}; {hint(name, known)}")
     return FurutaTarget(name, _PRESETS[name])
 
 

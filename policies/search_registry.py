@@ -4,7 +4,6 @@ Other packages add theirs by an entry point of group ``npdr_ppl.policy_searches`
 the search, its value is a subclass of :class:`~npdr_ppl.policies.policy_search.PolicySearch`.
 """
 
-from importlib.metadata import entry_points
 from typing import Any
 
 from npdr_ppl.errors import ModelError
@@ -23,12 +22,7 @@ BUILT_IN = {
 """Searches of this package by name; each is imported on first use."""
 
 
-def _locations() -> dict[str, str]:
-    """Returns ``module:class`` of every search by name; built-in names cannot be taken."""
-    return {entry.name: entry.value for entry in entry_points(group=GROUP)} | BUILT_IN
-
-
-_REGISTRY = Registry("policy search", PolicySearch, ModelError, _locations)
+_REGISTRY = Registry("policy search", PolicySearch, ModelError, GROUP, BUILT_IN)
 
 
 def policy_search_class(name: str) -> type[PolicySearch[Any]]:
@@ -58,4 +52,4 @@ def policy_search(name: str, **options: Any) -> PolicySearch[Any]:
 
 def policy_searches() -> dict[str, str]:
     """Returns every search's one-line summary by name, in alphabetical order."""
-    return {name: policy_search_class(name).summary for name in sorted(_locations())}
+    return _REGISTRY.summaries()

@@ -4,8 +4,7 @@ Other packages add theirs by an entry point of group ``npdr_ppl.effects``: its n
 id, its value a subclass of :class:`~npdr_ppl.language.effects.Effect`.
 """
 
-from dataclasses import replace
-from importlib.metadata import entry_points
+from collections.abc import Mapping
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
@@ -55,13 +54,7 @@ BUILT_IN = {
 """Effects of this package by id."""
 
 
-def _locations() -> dict[str, str]:
-    """Returns ``module:class`` of every effect by id; built-in ids cannot be taken."""
-    added = {entry.name: entry.value for entry in entry_points(group=GROUP)}
-    return BUILT_IN | {name: value for name, value in added.items() if name not in BUILT_IN}
-
-
-_REGISTRY = Registry("effect", Effect, ModelError, _locations)
+_REGISTRY = Registry("effect", Effect, ModelError, GROUP, BUILT_IN)
 
 
 def effect_class(name: str) -> type[Effect]:
@@ -73,7 +66,7 @@ def effect_class(name: str) -> type[Effect]:
     Raises:
         ModelError: There is no such effect, it cannot be loaded, or its id differs from the name.
     """
-    return _found(_REGISTRY, name)
+    return _found(name)
 
 
 def effects() -> dict[str, type[Effect]]:
@@ -83,15 +76,14 @@ def effects() -> dict[str, type[Effect]]:
         >>> effects()["coulomb_friction"]("arm")
         CoulombFriction(port='arm')
     """
-    locations = _locations()
     # Which packages are installed is read once, not for every effect.
-    registry = replace(_REGISTRY, locations=lambda: locations)
-    return {name: _found(registry, name) for name in locations}
+    locations = _REGISTRY.locations()
+    return {name: _found(name, locations) for name in locations}
 
 
-def _found(registry: Registry[Effect], name: str) -> type[Effect]:
+def _found(name: str, locations: Mapping[str, str] | None = None) -> type[Effect]:
     """Returns the class of an effect, see :func:`effect_class`."""
-    effect = registry.find(name)
+    effect = _REGISTRY.find(name, locations)
     if effect.id != name:
         raise ModelError(
             f"The entry point {name!r} of group {GROUP} names an effect whose id is "

@@ -41,7 +41,7 @@ def test_finds_backends_of_other_packages(monkeypatch):
         EntryPoint("wrong", "npdr_ppl.errors:NpdrError", registry.GROUP),
         EntryPoint("snpe-c", "npdr_ppl.errors:NpdrError", registry.GROUP),
     ]
-    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    monkeypatch.setattr("npdr_ppl.registry.entry_points", lambda group: points)
     assert isinstance(registry.backend("mine"), SNPEC)
     assert isinstance(registry.backend("snpe-c"), SNPEC)
     with pytest.raises(BackendError, match="cannot be loaded"):

@@ -112,8 +112,9 @@ def test_other_packages_add_effects_by_an_entry_point(monkeypatch):
         EntryPoint("magnet", f"{home}:Bias", GROUP),
         EntryPoint("nothing", "elsewhere:Nothing", GROUP),
     ]
-    registry = import_module("npdr_ppl.models.effects.registry")
-    monkeypatch.setattr(registry, "entry_points", lambda group: added if group == GROUP else [])
+    monkeypatch.setattr(
+        "npdr_ppl.registry.entry_points", lambda group: added if group == GROUP else []
+    )
     assert effect_class("spring") is Spring
     with pytest.raises(ModelError, match="'magnet' .* whose id is 'bias'"):
         effect_class("magnet")

@@ -249,7 +249,7 @@ def test_registry_finds_searches_and_suggests(monkeypatch):
         EntryPoint("mine", "npdr_ppl.policies.power:PoWER", search_registry.GROUP),
         EntryPoint("wrong", "npdr_ppl.errors:NpdrError", search_registry.GROUP),
     ]
-    monkeypatch.setattr(search_registry, "entry_points", lambda group: points)
+    monkeypatch.setattr("npdr_ppl.registry.entry_points", lambda group: points)
     assert isinstance(policy_search("mine"), PoWER)
     with pytest.raises(ModelError, match="not a subclass of PolicySearch"):
         policy_search("wrong")

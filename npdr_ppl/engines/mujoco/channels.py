@@ -9,12 +9,12 @@ from typing import Any
 from npdr_ppl.engines.mujoco.fields import (
     actuated_joint,
     actuator_names,
-    did_you_mean,
     element_names,
     joint_units,
 )
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
+from npdr_ppl.registry import hint
 
 __all__ = [
     "Component",
@@ -133,7 +133,7 @@ def choose(
     result = []
     for new, old in pairs.items():
         if old not in known:
-            raise ModelError(f"There is no {what} {old!r}; {did_you_mean(old, known)}")
+            raise ModelError(f"There is no {what} {old!r}; {hint(old, known)}")
         channel = known[old].channel
         rate_of = channel.rate_of and new_names.get(channel.rate_of)
         result.append(replace(known[old], channel=replace(channel, name=new, rate_of=rate_of)))

@@ -5,9 +5,7 @@ name may be a pattern (``"geom * friction sliding"``). Options have no name (``"
 the vector's magnitude).
 """
 
-import difflib
 import importlib
-from collections.abc import Iterable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
@@ -15,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from npdr_ppl.errors import ModelError
+from npdr_ppl.registry import hint
 
 __all__ = [
     "Entry",
     "Field",
     "actuated_joint",
     "actuator_names",
-    "did_you_mean",
     "element_names",
     "find_field",
     "joint_units",
@@ -146,15 +144,6 @@ _COUNTS = {
 }
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Returns the end of a message about an unknown word: the nearest known word, or all."""
-    known = list(known)
-    close = difflib.get_close_matches(word, known, n=1)
-    if close:
-        return f"did you mean {close[0]!r}?"
-    return f"there {'is' if len(known) == 1 else 'are'} {', '.join(known) or 'none'}."
-
-
 def element_names(model: Any, kind: str) -> list[str]:
     """Returns names of a model's elements of a kind, ``<kind>_<number>`` for unnamed ones."""
     count = int(getattr(model, _COUNTS[kind]))
@@ -197,7 +186,7 @@ def find_field(model: Any, text: str) -> Field:
     if not words or words[0] not in _QUANTITIES:
         raise ModelError(
             f"A field is called 'element name quantity', e.g. 'body hand mass'; got {text!r}: "
-            + did_you_mean(words[0] if words else "", _QUANTITIES)
+            + hint(words[0] if words else "", _QUANTITIES)
         )
     kind, rest = words[0], words[1:]
     name, quantity, component = _split(kind, rest, text)
@@ -207,7 +196,7 @@ def find_field(model: Any, text: str) -> Field:
     chosen = [i for i, n in enumerate(names) if n == name]
     chosen = chosen or [i for i, n in enumerate(names) if fnmatchcase(n, name)]
     if not chosen:
-        raise ModelError(f"{text!r}: no {kind} is called {name!r}; {did_you_mean(name, names)}")
+        raise ModelError(f"{text!r}: no {kind} is called {name!r}; {hint(name, names)}")
     info = _QUANTITIES[kind][quantity]
     unit = _UNITS.get((kind, quantity, component), info.unit)
     units = {unit.format(**_joint_units_of(model, kind, i)) for i in chosen}
@@ -259,12 +248,11 @@ def _split(kind: str, rest: list[str], text: str) -> tuple[str, str, str]:
             if component and component not in known:
                 raise ModelError(
                     f"{text!r}: {tail[0]} has no component {component!r}; "
-                    + did_you_mean(component, known)
+                    + hint(component, known)
                 )
             return name, tail[0], component
     raise ModelError(
-        f"{text!r}: a {kind} has no such quantity; "
-        + did_you_mean(rest[-1] if rest else "", quantities)
+        f"{text!r}: a {kind} has no such quantity; " + hint(rest[-1] if rest else "", quantities)
     )
 
 

@@ -27,12 +27,13 @@ from npdr_ppl.engines.mujoco.channels import (
     state_components,
 )
 from npdr_ppl.engines.mujoco.environment import environment_ports, with_environment
-from npdr_ppl.engines.mujoco.fields import did_you_mean, element_names
+from npdr_ppl.engines.mujoco.fields import element_names
 from npdr_ppl.engines.mujoco.parameters import Binding, Bindings, Derivation
 from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.effects import ForceEffect, ParameterEffect
+from npdr_ppl.registry import hint
 
 __all__ = ["MujocoMechanism"]
 
@@ -222,9 +223,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         all_names = [*taken, *(action.name for action in self.actions)]
         for name in (*units, *bounds):
             if name not in all_names:
-                raise ModelError(
-                    f"{self.name} has no channel {name!r}; {did_you_mean(name, all_names)}"
-                )
+                raise ModelError(f"{self.name} has no channel {name!r}; {hint(name, all_names)}")
 
     def _initial_positions(self, keyframe: str | None) -> Any:
         """Returns the qpos of components that are not states."""
@@ -232,7 +231,5 @@ class MujocoMechanism(ClosedLoopSimulator):
             return np.array(self.model.qpos0)
         names = element_names(self.model, "key")
         if keyframe not in names:
-            raise ModelError(
-                f"{self.name} has no keyframe {keyframe!r}; {did_you_mean(keyframe, names)}"
-            )
+            raise ModelError(f"{self.name} has no keyframe {keyframe!r}; {hint(keyframe, names)}")
         return np.array(self.model.key_qpos[names.index(keyframe)])

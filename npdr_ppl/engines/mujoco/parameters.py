@@ -7,9 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.mujoco.fields import Field, did_you_mean, find_field
+from npdr_ppl.engines.mujoco.fields import Field, find_field
 from npdr_ppl.errors import ModelError, ShapeError
 from npdr_ppl.language.channels import Parameter
+from npdr_ppl.registry import hint
 
 __all__ = ["Assignments", "Binding", "Bindings", "Derivation", "Scale"]
 
@@ -131,7 +132,7 @@ class Bindings:
             except KeyError as error:
                 raise ModelError(
                     f"The derivation of {field.text!r} asks for a parameter that does not exist: "
-                    f"no parameter {error}; {did_you_mean(str(error), parameters)}"
+                    f"no parameter {error}; {hint(str(error), parameters)}"
                 ) from error
             if value.ndim > 1 or value.numel() not in sizes:
                 raise ShapeError(
