@@ -20,86 +20,67 @@ class ZooEntry:
     """A model of the zoo; its module is imported on first use.
 
     Attributes:
-        name: Name on the command line.
+        name: Name on the command line, and of the Pyro model function in its module.
         summary: One line for tables.
-        module: Module that holds the model.
-        model_name: Name of the Pyro model function in the module.
-        simulator_name: Name of the simulator class in the module.
+        location: The simulator's ``module:class``; the module holds the model, too.
     """
 
     name: str
     summary: str
-    module: str
-    model_name: str
-    simulator_name: str
+    location: str
 
     @property
     def model(self) -> Callable[..., Tensor]:
         """The Pyro model, a function of the inputs."""
-        return getattr(importlib.import_module(self.module), self.model_name)
+        return getattr(importlib.import_module(self.location.partition(":")[0]), self.name)
 
     @property
     def simulator(self) -> type[Simulator]:
         """The simulator's class."""
-        return getattr(importlib.import_module(self.module), self.simulator_name)
+        module, _, simulator = self.location.partition(":")
+        return getattr(importlib.import_module(module), simulator)
 
 
 _ENTRIES = (
     ZooEntry(
         "pendulum",
         "Pendulum with unknown mass and length, torque at the hinge",
-        "npdr_ppl.models.pendulum",
-        "pendulum",
-        "Pendulum",
+        "npdr_ppl.models.pendulum:Pendulum",
     ),
     ZooEntry(
         "furuta",
         "Furuta pendulum (Quanser Qube), nine parameters, plausible damping priors",
-        "npdr_ppl.models.furuta",
-        "furuta",
-        "Furuta",
+        "npdr_ppl.models.furuta:Furuta",
     ),
     ZooEntry(
         "furuta_paper",
         "Furuta pendulum with the prior of the NPDR paper",
-        "npdr_ppl.models.furuta",
-        "furuta_paper",
-        "Furuta",
+        "npdr_ppl.models.furuta:Furuta",
     ),
     ZooEntry(
         "cart_pole",
         "Pole on a cart pushed by a force, with unknown masses, length and dampings",
-        "npdr_ppl.models.cart_pole",
-        "cart_pole",
-        "CartPole",
+        "npdr_ppl.models.cart_pole:CartPole",
     ),
     ZooEntry(
         "emps",
         "Positioning drive (EMPS benchmark) with unknown mass and viscous friction",
-        "npdr_ppl.models.emps",
-        "emps",
-        "Emps",
+        "npdr_ppl.models.emps:Emps",
     ),
     ZooEntry(
         "two_link_arm",
         "Planar arm of two driven links in MuJoCo, with unknown masses and dampings",
-        "npdr_ppl.models.two_link_arm",
-        "two_link_arm",
-        "TwoLinkArm",
+        "npdr_ppl.models.two_link_arm:TwoLinkArm",
     ),
     ZooEntry(
         "mini_golf",
         "Robot arm strikes a ball past two obstacles; ten parameters of the NPDR paper",
-        "npdr_ppl.models.mini_golf",
-        "mini_golf",
-        "MiniGolf",
+        "npdr_ppl.models.mini_golf:MiniGolf",
     ),
     ZooEntry(
         "mini_golf_two_restitutions",
         "The same strike, rebounds off the club apart from those off obstacles",
-        "npdr_ppl.models.mini_golf",
-        "mini_golf_two_restitutions",
-        "MiniGolf",
+        "npdr_ppl.models.mini_golf:MiniGolf",
     ),
 )
 
@@ -121,22 +102,18 @@ class TargetEntry:
     Attributes:
         name: Name on the command line.
         summary: One line for tables.
-        module: Module that holds the constructor.
-        function_name: Name of the constructor in the module, a function of the name.
     """
 
     name: str
     summary: str
-    module: str
-    function_name: str
 
     def make(self) -> TargetDomain:
         """Returns a new target domain."""
-        return getattr(importlib.import_module(self.module), self.function_name)(self.name)
+        return importlib.import_module("npdr_ppl.models.furuta_targets").furuta_target(self.name)
 
 
 _TARGETS = tuple(
-    TargetEntry(name, summary, "npdr_ppl.models.furuta_targets", "furuta_target")
+    TargetEntry(name, summary)
     for name, summary in (
         ("furuta-easy", "Furuta pendulum in MuJoCo, nominal but for its sensors and damping"),
         ("furuta-medium", "Furuta pendulum in MuJoCo, up to 8 % off, with some dry friction"),

@@ -100,10 +100,6 @@ class Emps(ODESimulator):
     default_integrator = "semi-implicit-euler"
     inverse_dynamics = EmpsInverseDynamics()
 
-    def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Returns the payload."""
-        return {"payload": 0.0}
-
     def constants(
         self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]
     ) -> dict[str, Tensor]:

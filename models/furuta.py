@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import pyro
@@ -16,7 +17,6 @@ from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.noise import Noise
 from npdr_ppl.language.sites import simulate
 from npdr_ppl.models.furuta_inverse_dynamics import FurutaInverseDynamics
-from npdr_ppl.models.gravity import downward
 
 __all__ = ["Furuta", "SwingUpReward", "furuta", "furuta_paper", "initial_states"]
 
@@ -103,10 +103,6 @@ class Furuta(ODESimulator):
     default_integrator = "constant-acceleration"
     inverse_dynamics = FurutaInverseDynamics()
 
-    def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Returns the gravity vector and the payload."""
-        return {"gravity": downward(parameters["gravity"]), "payload": 0.0}
-
     def constants(
         self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]
     ) -> FurutaConstants:
@@ -192,6 +188,7 @@ class Furuta(ODESimulator):
         return (arm, cross), (cross, k.inverse_c3 - pole_per_arm * cross)
 
 
+@dataclass(frozen=True)
 class SwingUpReward:
     """exp(−(eᵀQe + r V²)), where e is the error from upright, its pole angle wrapped to ±π.
 
@@ -203,32 +200,22 @@ class SwingUpReward:
         voltage_weight: r, on the commanded voltage before it is limited.
     """
 
-    def __init__(
-        self,
-        arm_angle_weight: float = 0.3,
-        pole_angle_weight: float = 1.0,
-        arm_velocity_weight: float = 0.02,
-        pole_velocity_weight: float = 0.005,
-        voltage_weight: float = 0.004,
-    ) -> None:
-        self.weights = (
-            arm_angle_weight,
-            pole_angle_weight,
-            arm_velocity_weight,
-            pole_velocity_weight,
-        )
-        self.voltage_weight = voltage_weight
+    arm_angle_weight: float = 0.3
+    pole_angle_weight: float = 1.0
+    arm_velocity_weight: float = 0.02
+    pole_velocity_weight: float = 0.005
+    voltage_weight: float = 0.004
 
     def __call__(
         self, positions: Components, velocities: Components, commands: Components
     ) -> Tensor:
         """Returns the reward of a step, at most 1, from its initial state and its command."""
-        arm, pole, arm_rate, pole_rate = self.weights
         error = positions[1] - math.pi
         error = error - 2.0 * math.pi * torch.round(error * (0.5 / math.pi))
-        cost = arm * positions[0] * positions[0] + pole * error * error
-        cost = cost + arm_rate * velocities[0] * velocities[0]
-        cost = cost + pole_rate * velocities[1] * velocities[1]
+        cost = self.arm_angle_weight * positions[0] * positions[0]
+        cost = cost + self.pole_angle_weight * error * error
+        cost = cost + self.arm_velocity_weight * velocities[0] * velocities[0]
+        cost = cost + self.pole_velocity_weight * velocities[1] * velocities[1]
         return torch.exp(-(cost + self.voltage_weight * commands[0] * commands[0]))
 
 

@@ -16,7 +16,6 @@ from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.linear_dynamics import BaseParameter, InverseDynamics, Motion
 from npdr_ppl.language.noise import Noise
 from npdr_ppl.language.sites import simulate
-from npdr_ppl.models.gravity import downward
 
 __all__ = ["Pendulum", "PendulumInverseDynamics", "pendulum"]
 
@@ -99,10 +98,6 @@ class Pendulum(ODESimulator):
     time_step = 0.02
     default_integrator = "semi-implicit-euler"
     inverse_dynamics = PendulumInverseDynamics()
-
-    def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Returns the gravity vector and the payload."""
-        return {"gravity": downward(parameters["gravity"]), "payload": 0.0}
 
     def constants(
         self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]

@@ -132,7 +132,6 @@ class EffectChain(ABC):
     ) -> Components:
         """Returns the true value of every sensor channel, ``(N,)`` each."""
 
-    @abstractmethod
     def accelerations(
         self, positions: Components, velocities: Components, actions: Components, tables: Tables
     ) -> Components:
@@ -143,7 +142,12 @@ class EffectChain(ABC):
             velocities: Velocities among the states, ``(N,)`` each.
             actions: Actions after all effects, ``(N,)`` each.
             tables: Constants of the simulation.
+
+        Raises:
+            NotImplementedError: The chain has no access to the engine's accelerations; effects
+                that need them cannot be attached.
         """
+        raise NotImplementedError
 
     @abstractmethod
     def move(

@@ -143,12 +143,6 @@ class _SignalChain(EffectChain):
         """Returns the true values at the start, which ``tables.constants`` contains."""
         return tables.constants
 
-    def accelerations(
-        self, positions: Components, velocities: Components, actions: Components, tables: Tables
-    ) -> Components:
-        """Not available from the engine; effects that need accelerations cannot be attached."""
-        raise NotImplementedError
-
     def move(
         self, state: State, actions: Components, tables: Tables, moments: Moments = ()
     ) -> State:

@@ -3,16 +3,21 @@
 import copy
 import importlib
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Self
 
+import torch
 from torch import Tensor
 
+from npdr_ppl.engines.common.batching import flatten
 from npdr_ppl.engines.common.episodes import EpisodeRequest, Episodes
-from npdr_ppl.engines.mujoco.closed_loop import roll_out
+from npdr_ppl.engines.common.policy_loop import LoopBody, begin, run_eagerly
+from npdr_ppl.engines.mujoco.batches import quiet
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.mujoco_linear_dynamics import bound_inverse_dynamics
 from npdr_ppl.engines.mujoco.open_loop import replay
+from npdr_ppl.engines.mujoco.stepper import MujocoStepper
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.linear_dynamics import InverseDynamics
 
@@ -93,4 +98,19 @@ class MujocoSimulator(MujocoMechanism):
 
         The arguments for compilation have no effect, because the engine is compiled already.
         """
-        return roll_out(self, request)
+        num_steps, step = request.num_steps, request.time_step
+        given = {n: torch.as_tensor(x).detach().double() for n, x in request.parameters.items()}
+        request = replace(request, parameters=given)
+        policy, domain, shape = request.batch(self, torch.float64, torch.device("cpu"))
+        flat = flatten(given, shape)
+        constants = flatten(policy.constants(request.believed(domain)), shape)
+        states = flatten(request.initial_states.double().unbind(-1), shape, expand=True)
+        with quiet():
+            middle = torch.tensor(0.5 * num_steps * step, dtype=torch.float64)
+            batch, tables = self.make_batch(flat, shape.numel(), step, middle)
+            stepper = MujocoStepper(self, batch, step, self.histories(flat, step))
+            stepper.place(states)
+            stepper.begin()
+            body = LoopBody(stepper, policy, request.reward)
+            loop = begin(body, states, tables)
+            return run_eagerly(body, loop, tables, constants, num_steps, shape, request.record)

@@ -82,8 +82,19 @@ class MechanicalSystem(ClosedLoopSimulator):
         """
 
     def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
-        """Returns the quantities of the environment ports, by port name."""
-        return {}
+        """Returns the quantities of the environment ports, by port name.
+
+        By default a port in m/s² is the vector (x, y, z) of gravity on a level base, with the
+        magnitude of the parameter of that name, and a port in kg is a payload of zero. A component
+        that is the number 0.0 needs no computation.
+        """
+        environment: dict[str, Any] = {}
+        for port in self.ports:
+            if port.kind == "environment" and port.unit == "m/s²":
+                environment[port.name] = (0.0, 0.0, -parameters[port.name])
+            elif port.kind == "environment" and port.unit == "kg":
+                environment[port.name] = 0.0
+        return environment
 
     def constants(self, parameters: Mapping[str, Tensor], environment: Mapping[str, Any]) -> Any:
         """Returns the constants for :meth:`accelerations`, computed once per simulation.

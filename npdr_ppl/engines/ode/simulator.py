@@ -4,13 +4,17 @@ import copy
 from collections.abc import Mapping
 from typing import Self
 
+import torch
 from torch import Tensor
 
+from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.compilation import is_worthwhile, steps_per_call, with_fallback
 from npdr_ppl.engines.common.episodes import EpisodeRequest, Episodes
 from npdr_ppl.engines.common.integrators import integrator
+from npdr_ppl.engines.common.policy_loop import LoopBody, begin, run_compiled, run_eagerly
 from npdr_ppl.engines.ode.mechanical_system import Forces, MechanicalSystem
-from npdr_ppl.engines.ode.policy_episodes import roll_out
 from npdr_ppl.engines.ode.recorded_actions import replay
+from npdr_ppl.engines.ode.stepping import Stepper
 from npdr_ppl.language.inputs import Inputs
 
 __all__ = ["Forces", "ODESimulator"]
@@ -43,4 +47,33 @@ class ODESimulator(MechanicalSystem):
 
     def run_episodes(self, request: EpisodeRequest) -> Episodes:
         """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`."""
-        return roll_out(self, request)
+        reward, num_steps, step = request.reward, request.num_steps, request.time_step
+        initial_states = request.initial_states
+        dtype = self.common_dtype(request.parameters, initial_states)
+        dtype = torch.promote_types(dtype, request.policy.parameters.dtype)
+        device = initial_states.device
+        policy, domain, shape = request.batch(self, dtype, device)
+        mode = request.compile or self.compile
+        size = {
+            "num_steps": num_steps,
+            "batch_size": shape.numel(),
+            "expected_calls": request.expected_calls,
+        }
+        is_compiled = not request.record and is_worthwhile(mode, device, **size)
+
+        def run(is_compiled: bool) -> Episodes:
+            middle = torch.tensor(0.5 * num_steps * step, dtype=dtype, device=device)
+            present = self.changed(domain, middle)
+            tables, histories = self.tables(present, shape, step, expand=is_compiled)
+            constants = flatten(
+                policy.constants(request.believed(domain)), shape, expand=is_compiled
+            )
+            stepper = Stepper(self, step, histories)
+            body = LoopBody(stepper, policy, reward, steps_per_call(**size))
+            states = flatten(initial_states.to(dtype).unbind(-1), shape, expand=True)
+            loop = begin(body, states, tables)
+            if not is_compiled:
+                return run_eagerly(body, loop, tables, constants, num_steps, shape, request.record)
+            return run_compiled(body, loop, tables, constants, num_steps, shape)
+
+        return with_fallback(mode, is_compiled, run)

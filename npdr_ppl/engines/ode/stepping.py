@@ -7,7 +7,6 @@ from torch import Tensor
 
 from npdr_ppl.engines.common.effect_chain import EffectChain, Moments, State, Tables
 from npdr_ppl.engines.common.integrators import Components
-from npdr_ppl.engines.ode.drive import drive_forces, inverse_inertia
 from npdr_ppl.engines.ode.dry_friction import (
     DryFriction,
     dry_friction_over_step,
@@ -97,7 +96,7 @@ class Stepper(EffectChain):
         bounds = self.dry_friction_bounds(state, tables)
         friction: DryFriction | None = None
         if any(bound is not None for bound in bounds):
-            inertia = inverse_inertia(simulator, *start, actions, forces, constants, first)
+            inertia = _inverse_inertia(simulator, *start, actions, forces, constants, first)
             given = state.velocities, first, inertia, self._substep
             if simulator.integrator.order == 1:
                 friction = stopping_friction(bounds, *given)
@@ -143,8 +142,8 @@ class Stepper(EffectChain):
         q, v = state.positions, state.velocities
         forces = self._forces(q, v, state, tables, (0.0,) * len(q), before_step=True)
         acceleration = simulator.accelerations(q, v, actions, forces, constants)
-        inertia = inverse_inertia(simulator, q, v, actions, forces, constants, acceleration)
-        drive = drive_forces(simulator, q, v, actions, forces, constants, acceleration, inertia)
+        inertia = _inverse_inertia(simulator, q, v, actions, forces, constants, acceleration)
+        drive = _drive_forces(simulator, q, v, actions, forces, constants, acceleration, inertia)
         return tuple(
             Joint(q[i], v[i], acceleration[i], inertia[i][i], drive[i], self._takes_moments)
             for i in range(len(q))
@@ -172,3 +171,51 @@ def _shifted(values: tuple[Any, ...], moments: Moments) -> tuple[Any, ...]:
     if not moments:
         return values
     return tuple(v if m is None else v + m for v, m in zip(values, moments, strict=True))
+
+
+def _inverse_inertia(
+    simulator: MechanicalSystem,
+    positions: Components,
+    velocities: Components,
+    actions: Components,
+    forces: tuple[Any, ...],
+    constants: Any,
+    accelerations: Components,
+) -> tuple[Components, ...]:
+    """Returns the rows of W = ∂a/∂f, as declared, or else computed with unit forces."""
+    declared = simulator.inverse_inertia(positions, velocities, constants)
+    if declared:
+        return declared
+    columns = []
+    for joint in range(len(positions)):
+        pushed = tuple(f + 1.0 if i == joint else f for i, f in enumerate(forces))
+        moved = simulator.accelerations(positions, velocities, actions, pushed, constants)
+        columns.append(tuple(b - a for a, b in zip(accelerations, moved, strict=True)))
+    return tuple(zip(*columns, strict=True))
+
+
+def _drive_forces(
+    simulator: MechanicalSystem,
+    positions: Components,
+    velocities: Components,
+    actions: Components,
+    forces: tuple[Any, ...],
+    constants: Any,
+    accelerations: Components,
+    inertia: tuple[Components, ...],
+) -> Components:
+    """Returns the generalised forces τ of the actions: W τ = a(u) − a(0)."""
+    still = tuple(torch.zeros_like(action) for action in actions)
+    without = simulator.accelerations(positions, velocities, still, forces, constants)
+    gained = tuple(a - b for a, b in zip(accelerations, without, strict=True))
+    if len(gained) == 1:
+        return (gained[0] / inertia[0][0],)
+    if len(gained) == 2:
+        (a, b), (c, d) = inertia
+        determinant = a * d - b * c
+        first = (d * gained[0] - b * gained[1]) / determinant
+        return first, (a * gained[1] - c * gained[0]) / determinant
+    size = gained[0].shape
+    rows = [torch.stack([entry.expand(size) for entry in row], dim=-1) for row in inertia]
+    matrix = torch.stack(rows, dim=-2)
+    return torch.linalg.solve(matrix, torch.stack(gained, dim=-1)).unbind(-1)

@@ -174,12 +174,6 @@ class _OneStepper(EffectChain):
         """Returns the true value of every sensor channel."""
         return self._values
 
-    def accelerations(
-        self, positions: Components, velocities: Components, actions: Components, tables: Tables
-    ) -> Components:
-        """Not available from the engine; effects that need accelerations cannot be attached."""
-        raise NotImplementedError
-
     def move(
         self, state: State, actions: Components, tables: Tables, moments: Moments = ()
     ) -> State:
