@@ -49,7 +49,22 @@ class Playback(Policy):
         return row[0].unbind(-1), memory
 
 
-class Sinusoid(Policy):
+class _OneChannel(Policy):
+    """A function of time on one channel.
+
+    Args:
+        action: Name of the channel.
+        parameters: See the subclass.
+    """
+
+    observations = ()
+
+    def __init__(self, action: str, parameters: Tensor | None = None) -> None:
+        super().__init__(parameters)
+        self.actions = (action,)
+
+
+class Sinusoid(_OneChannel):
     """A sin(2π f t + φ) on one channel.
 
     Args:
@@ -58,16 +73,11 @@ class Sinusoid(Policy):
             ``(..., 3)``.
     """
 
-    observations = ()
     parameter_info = (
         PolicyParameter("amplitude", 1.0, 0.0),
         PolicyParameter("frequency", 1.0, 0.0),
         PolicyParameter("phase", 0.0, -math.pi, math.pi),
     )
-
-    def __init__(self, action: str, parameters: Tensor | None = None) -> None:
-        super().__init__(parameters)
-        self.actions = (action,)
 
     def act(
         self,
@@ -82,7 +92,7 @@ class Sinusoid(Policy):
         return (k["amplitude"] * torch.sin(angle),), memory
 
 
-class Chirp(Policy):
+class Chirp(_OneChannel):
     """A sine whose frequency changes linearly from f₀ to f₁ in a given time, then stays constant.
 
     A sin(2π (f₀ t + (f₁ − f₀) t²/(2 T))) + c with amplitude A, duration T and offset c.
@@ -92,7 +102,6 @@ class Chirp(Policy):
         parameters: A and c in the channel's unit, f₀ and f₁ in Hz, T in s, shape ``(..., 5)``.
     """
 
-    observations = ()
     parameter_info = (
         PolicyParameter("amplitude", 1.0, 0.0),
         PolicyParameter("first_frequency", 0.1, 0.0),
@@ -100,10 +109,6 @@ class Chirp(Policy):
         PolicyParameter("duration", 5.0, _SHORTEST),
         PolicyParameter("offset", 0.0),
     )
-
-    def __init__(self, action: str, parameters: Tensor | None = None) -> None:
-        super().__init__(parameters)
-        self.actions = (action,)
 
     def act(
         self,

@@ -5,7 +5,7 @@ May import: language. Start reading at ``base.py``, then ``score.py``, the defau
 
 from npdr_ppl.embeddings.base import Embedding
 from npdr_ppl.embeddings.networks import Convolutional, Linear, Recurrent
-from npdr_ppl.embeddings.registry import embedding_by_name, embedding_names
+from npdr_ppl.embeddings.registry import embedding_by_name
 from npdr_ppl.embeddings.score import Score
 from npdr_ppl.embeddings.statistics import AllSteps, BayesSimStatistic, Differences, LastStep
 from npdr_ppl.embeddings.wrappers import Averaged, Masked, Strided
@@ -24,5 +24,4 @@ __all__ = [
     "Score",
     "Strided",
     "embedding_by_name",
-    "embedding_names",
 ]

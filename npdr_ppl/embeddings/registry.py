@@ -10,7 +10,7 @@ from npdr_ppl.embeddings.statistics import AllSteps, BayesSimStatistic, Differen
 from npdr_ppl.embeddings.wrappers import Averaged, Masked, Strided
 from npdr_ppl.errors import ModelError
 
-__all__ = ["embedding_by_name", "embedding_names"]
+__all__ = ["embedding_by_name"]
 
 _EMBEDDINGS: dict[str, Callable[[], Embedding]] = {
     "bayessim": BayesSimStatistic,
@@ -28,16 +28,11 @@ _WORD = re.compile(
 )
 
 
-def embedding_names() -> tuple[str, ...]:
-    """Returns the names that :func:`embedding_by_name` knows."""
-    return tuple(_EMBEDDINGS)
-
-
 def embedding_by_name(word: str) -> Embedding:
     """Returns the embedding that a word describes: ``name[channel,channel]/stride``.
 
     Args:
-        word: A name of :func:`embedding_names`, optionally with the channels to embed, and a
+        word: A name, optionally with the channels to embed, and a
             stride in steps after ``/`` or the length of blocks to average after ``~``, e.g.
             ``"bayessim"``, ``"all/10"``, ``"all~10"`` or ``"all[ball_x,ball_y]/2"``.
 

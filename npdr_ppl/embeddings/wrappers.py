@@ -13,7 +13,23 @@ __all__ = ["Averaged", "Masked", "Strided"]
 
 
 @dataclass(frozen=True)
-class Strided(Embedding):
+class _Wrapper(Embedding):
+    """Passes a reduced trajectory to another embedding, ``inner``."""
+
+    inner: Embedding
+
+    @property
+    def is_trained(self) -> bool:  # type: ignore[override]
+        """Whether the inner embedding is trained."""
+        return self.inner.is_trained
+
+    def network(self, feature_shape: torch.Size) -> nn.Module | None:
+        """Returns the inner embedding's network."""
+        return self.inner.network(feature_shape)
+
+
+@dataclass(frozen=True)
+class Strided(_Wrapper):
     """Passes every k-th measurement to another embedding.
 
     Measurements after steps k, 2k, … of a segment are kept, each with the action of the first of
@@ -24,18 +40,12 @@ class Strided(Embedding):
         stride: k.
     """
 
-    inner: Embedding
     stride: int
 
     def __post_init__(self) -> None:
         """Checks the stride."""
         if self.stride < 1:
             raise ModelError(f"a stride is at least 1, got {self.stride}.")
-
-    @property
-    def is_trained(self) -> bool:  # type: ignore[override]
-        """Whether the inner embedding is trained."""
-        return self.inner.is_trained
 
     def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
         """Returns the inner embedding's features of the thinned trajectory."""
@@ -55,13 +65,9 @@ class Strided(Embedding):
         )
         return self.inner.features(trajectory[:, :, k - 1 :: k], thinned)
 
-    def network(self, feature_shape: torch.Size) -> nn.Module | None:
-        """Returns the inner embedding's network."""
-        return self.inner.network(feature_shape)
-
 
 @dataclass(frozen=True)
-class Averaged(Embedding):
+class Averaged(_Wrapper):
     """Passes the means of blocks of k measurements to another embedding.
 
     If the measurements are noisy and the motion hardly changes within k steps, the means use every
@@ -74,18 +80,12 @@ class Averaged(Embedding):
         block: k.
     """
 
-    inner: Embedding
     block: int
 
     def __post_init__(self) -> None:
         """Checks the block's length."""
         if self.block < 1:
             raise ModelError(f"a block has at least one step, got {self.block}.")
-
-    @property
-    def is_trained(self) -> bool:  # type: ignore[override]
-        """Whether the inner embedding is trained."""
-        return self.inner.is_trained
 
     def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
         """Returns the inner embedding's features of the averaged trajectory."""
@@ -98,10 +98,6 @@ class Averaged(Embedding):
             time_step=inputs.time_step * self.block,
         )
         return self.inner.features(self._means(trajectory, mask), averaged)
-
-    def network(self, feature_shape: torch.Size) -> nn.Module | None:
-        """Returns the inner embedding's network."""
-        return self.inner.network(feature_shape)
 
     def _means(self, values: Tensor, mask: Tensor) -> Tensor:
         """Averages ``(..., S, K, C)`` over blocks of the steps that exist."""
@@ -117,7 +113,7 @@ class Averaged(Embedding):
 
 
 @dataclass(frozen=True)
-class Masked(Embedding):
+class Masked(_Wrapper):
     """Passes selected channels and steps to another embedding.
 
     Attributes:
@@ -128,7 +124,6 @@ class Masked(Embedding):
             end.
     """
 
-    inner: Embedding
     channels: tuple[str, ...] | None = None
     first_step: int = 0
     last_step: int | None = None
@@ -144,11 +139,6 @@ class Masked(Embedding):
                 f"steps are chosen as 0 <= first < last, got {self.first_step} and "
                 f"{self.last_step}."
             )
-
-    @property
-    def is_trained(self) -> bool:  # type: ignore[override]
-        """Whether the inner embedding is trained."""
-        return self.inner.is_trained
 
     def features(self, trajectory: Tensor, inputs: Inputs) -> Tensor:
         """Returns the inner embedding's features of the selection."""
@@ -172,7 +162,3 @@ class Masked(Embedding):
                 f"no segment has steps from {self.first_step} on; they have {inputs.num_steps}."
             )
         return self.inner.features(trajectory, replace(inputs, mask=mask))
-
-    def network(self, feature_shape: torch.Size) -> nn.Module | None:
-        """Returns the inner embedding's network."""
-        return self.inner.network(feature_shape)

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from npdr_ppl.display.plots import plot_coverage, plot_ranks
-from npdr_ppl.display.plots.calibration import write_calibration_figures
+from npdr_ppl.display.plots import plot_coverage, plot_ranks, save_figure
 from npdr_ppl.posterior.calibration.calibration_result import Calibration
 from npdr_ppl.posterior.calibration.uniformity import simultaneous_band
 
@@ -48,5 +47,6 @@ def test_coverage_is_that_of_the_result():
 
 
 def test_figures_are_written(tmp_path):
-    for path in write_calibration_figures(FOUND, tmp_path):
+    for draw in (plot_ranks, plot_coverage):
+        path = save_figure(draw(FOUND), tmp_path / "figure.png")
         assert path.stat().st_size > 5_000

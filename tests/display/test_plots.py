@@ -16,7 +16,6 @@ from npdr_ppl.display.plots import (
     plot_marginals,
     plot_overlaid_marginals,
     plot_pair,
-    plot_rounds,
     plot_seconds,
     save_figure,
 )
@@ -112,8 +111,8 @@ def test_units_that_a_recording_lacks_are_the_simulators():
 
 
 def test_rounds_share_their_axes():
-    figure = plot_rounds(
-        {"round 1": PRIOR, "round 2": POSTERIORS["broad"]}, "mass", "length",
+    figure = plot_heatmaps(
+        {"": {"round 1": PRIOR, "round 2": POSTERIORS["broad"]}}, "mass", "length",
         ranges=((0, 1), (1, 2)), truth={"mass": 0.5, "length": 1.5}, units=("kg", "m"),
     )  # fmt: skip
     assert [axis.get_title() for axis in figure.axes] == ["round 1", "round 2"]

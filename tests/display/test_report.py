@@ -10,7 +10,7 @@ import pytest
 from npdr_ppl.display.reports import read_run, write_report
 from npdr_ppl.display.reports.content import DiffPart, FindingsPart
 from npdr_ppl.display.reports.meanings import findings
-from npdr_ppl.display.reports.page import MAX_BYTES
+from npdr_ppl.display.reports.run_report import MAX_BYTES
 from npdr_ppl.errors import DataError
 
 KINDS = ("fit", "compare", "train", "discover")

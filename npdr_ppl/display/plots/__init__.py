@@ -10,7 +10,7 @@ from npdr_ppl.display.plots.comparison_panels import (
     plot_overlaid_marginals,
     plot_seconds,
 )
-from npdr_ppl.display.plots.heatmap import plot_heatmaps, plot_rounds
+from npdr_ppl.display.plots.heatmap import plot_heatmaps
 from npdr_ppl.display.plots.marginals import plot_marginals
 from npdr_ppl.display.plots.pair import plot_pair
 from npdr_ppl.drawing.theme import save_figure
@@ -24,7 +24,6 @@ __all__ = [
     "plot_overlaid_marginals",
     "plot_pair",
     "plot_ranks",
-    "plot_rounds",
     "plot_seconds",
     "save_figure",
 ]

@@ -1,18 +1,17 @@
 """Figures of a calibration: rank distributions and coverage, each with its confidence band."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from npdr_ppl.display.plots.marginals import add_legend
-from npdr_ppl.drawing.theme import COLORS, save_figure, theme
+from npdr_ppl.drawing.theme import COLORS, theme
 from npdr_ppl.posterior.calibration.calibration_result import HIGHEST_DENSITY, TARP, Calibration
 from npdr_ppl.posterior.calibration.uniformity import Band, simultaneous_band
 
-__all__ = ["plot_coverage", "plot_ranks", "write_calibration_figures"]
+__all__ = ["plot_coverage", "plot_ranks"]
 
 MAX_COLUMNS = 4
 BAND = 0.95
@@ -75,14 +74,6 @@ def plot_coverage(
         axes[0].set_ylabel("expected coverage")
         add_legend(figure, loc="outside upper center", ncols=3)
     return figure
-
-
-def write_calibration_figures(calibration: Calibration, out: Path) -> list[Path]:
-    """Draws ``ranks.png`` and ``coverage.png`` to a folder and returns their paths."""
-    return [
-        save_figure(plot_ranks(calibration), out / "ranks.png"),
-        save_figure(plot_coverage(calibration), out / "coverage.png"),
-    ]
 
 
 def _draw_difference(axis: Axes, calibration: Calibration, name: str, band: Band) -> None:

@@ -41,7 +41,6 @@ def write_comparison_figures(
     rollouts: Rollouts,
     out: Path,
     *,
-    marks: dict[str, dict[str, float]] | None = None,
     seed: int = 0,
     progress: Step | None = None,
 ) -> list[Path]:
@@ -52,7 +51,6 @@ def write_comparison_figures(
         model: The model without measurement noise, to draw only the simulator's spread.
         rollouts: The first of these is drawn.
         out: Folder for ``marginals.png``, ``pairs.png``, ``bands.png`` and ``seconds.png``.
-        marks: Values to mark, by legend entry and parameter.
         seed: Seed of the draws.
         progress: Called with the fraction done and a short status.
     """
@@ -65,7 +63,7 @@ def write_comparison_figures(
     with seeded(seed, "figures"):
         prior = scalar_columns(some.prior.to_parameters(some.prior.sample(NUM_DRAWS)))
     units = parameter_units(some.prior)
-    figure = plot_overlaid_marginals(samples, prior, marks=marks, units=units)
+    figure = plot_overlaid_marginals(samples, prior, units=units)
     paths = [save_figure(figure, out / "marginals.png")]
     step(0.25, "pairs")
     if len(prior) > 1:
@@ -74,7 +72,6 @@ def write_comparison_figures(
         figure = plot_heatmaps(
             rows, x, y,
             ranges=(_range(x, samples, prior), _range(y, samples, prior)),
-            truth=next(iter((marks or {}).values()), None),
             units=(units.get(x, ""), units.get(y, "")),
             smoothing=SMOOTHING,
         )  # fmt: skip

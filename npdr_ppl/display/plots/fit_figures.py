@@ -33,7 +33,6 @@ def write_fit_figures(
     rollouts: Rollouts,
     out: Path,
     *,
-    marks: dict[str, dict[str, float]] | None = None,
     seed: int = 0,
     progress: Step | None = None,
 ) -> list[Path]:
@@ -44,7 +43,6 @@ def write_fit_figures(
         model: The model without measurement noise, to draw only the simulator's spread.
         rollouts: The first of these is drawn.
         out: Folder for ``marginals.png``, ``pairs.png`` and ``bands.png``.
-        marks: Values to mark, by legend entry and parameter.
         seed: Seed of the draws.
         progress: Called with the fraction done and a short status.
     """
@@ -56,7 +54,7 @@ def write_fit_figures(
     with seeded(seed, "figures"):
         prior_samples = scalar_columns(prior.to_parameters(prior.sample(NUM_DRAWS)))
     most_likely = posterior.most_likely(seed=seed)
-    marks = {"most likely": _values(most_likely)} | (marks or {})
+    marks = {"most likely": _values(most_likely)}
     paths = [
         save_figure(
             plot_marginals(

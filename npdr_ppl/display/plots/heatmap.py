@@ -10,34 +10,9 @@ from scipy.ndimage import gaussian_filter
 from npdr_ppl.display.plots.marginals import Samples
 from npdr_ppl.drawing.theme import COLORS, theme
 
-__all__ = ["plot_heatmaps", "plot_rounds"]
+__all__ = ["plot_heatmaps"]
 
 BINS = 80
-
-
-def plot_rounds(
-    rounds: Mapping[str, Samples],
-    x: str,
-    y: str,
-    *,
-    ranges: tuple[tuple[float, float], tuple[float, float]],
-    truth: Mapping[str, float] | None = None,
-    curve: NDArray[np.float64] | None = None,
-    units: Sequence[str] = ("", ""),
-) -> Figure:
-    """Draws the joint posterior of two parameters after several rounds, side by side.
-
-    Args:
-        rounds: Draws by title of the panel and by parameter.
-        x: Parameter on the horizontal axis.
-        y: Parameter on the vertical axis.
-        ranges: Limits of both axes.
-        truth: True values, marked with a cross.
-        curve: Points ``(k, 2)`` of a known ridge, drawn as a line.
-        units: Units of both parameters.
-    """
-    rows = {"": rounds}
-    return plot_heatmaps(rows, x, y, ranges=ranges, truth=truth, curve=curve, units=units)
 
 
 def plot_heatmaps(

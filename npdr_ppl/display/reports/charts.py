@@ -18,6 +18,7 @@ __all__ = [
     "bands_chart",
     "bars_chart",
     "intervals_chart",
+    "layout_of",
     "lines_chart",
     "marginals_chart",
     "matrix_chart",
@@ -58,18 +59,8 @@ def marginals_chart(
         grid = np.linspace(together.min(), together.max(), _GRID)
         for label, samples in (("prior", prior[name]), ("posterior", posterior[name])):
             shown = density(samples, grid) if samples.std() > 0 else np.full(_GRID, np.nan)
-            data.append(
-                {
-                    "type": "scatter",
-                    "mode": "lines",
-                    "name": label,
-                    "fill": "tozeroy",
-                    "x": rounded(grid),
-                    "y": rounded(shown),
-                    "line": {"color": COLORS[label]},
-                    "visible": index == 0,
-                }
-            )
+            look = {"fill": "tozeroy", "visible": index == 0}
+            data.append(_line(label, grid, shown, {"color": COLORS[label]}, **look))
     titles = [_with_unit(name, units.get(name, "")) for name in names]
     buttons = [
         {
@@ -82,15 +73,9 @@ def marginals_chart(
         }
         for index, name in enumerate(names)
     ]
-    menu: dict[str, Any] = {
-        "buttons": buttons,
-        "x": 0.0,
-        "xanchor": "left",
-        "y": 1.22,
-        "yanchor": "top",
-    }
-    menu |= {"bgcolor": "#8c959f", "font": {"color": "#000000"}}
-    layout = _layout(titles[0] if titles else "", "density")
+    menu: dict[str, Any] = {"buttons": buttons, "bgcolor": "#8c959f", "font": {"color": "#000000"}}
+    menu |= {"x": 0.0, "xanchor": "left", "y": 1.22, "yanchor": "top"}
+    layout = layout_of(titles[0] if titles else "", "density")
     layout["yaxis"] |= {"showticklabels": False, "rangemode": "tozero"}
     layout["margin"] |= {"t": 60, "b": 80}
     layout["legend"] |= {"y": -0.25, "yanchor": "top"}
@@ -125,7 +110,7 @@ def intervals_chart(
             },
         }
     ]
-    layout = _layout(title, "")
+    layout = layout_of(title, "")
     layout["yaxis"] |= {"automargin": True, "autorange": "reversed"}
     return ChartPart(name, caption, data, layout, 130 + 28 * len(labels))
 
@@ -146,7 +131,7 @@ def bars_chart(
         }
         for index, (series, values) in enumerate(bars.items())
     ]
-    layout = _layout(title, "")
+    layout = layout_of(title, "")
     layout["barmode"] = "stack"
     layout["yaxis"] |= {"automargin": True, "autorange": "reversed"}
     count = max((len(values) for values in bars.values()), default=0)
@@ -162,32 +147,16 @@ def lines_chart(
     diagonal: bool = False,
 ) -> ChartPart:
     """Draws lines with markers, ``label: (x, y)``, optionally with the diagonal."""
-    data: list[dict[str, Any]] = [
-        {
-            "type": "scatter",
-            "mode": "lines+markers" if len(x) <= MAX_MARKERS else "lines",
-            "name": label,
-            "x": rounded(x),
-            "y": rounded(np.array([np.nan if v is None else v for v in y], dtype=float)),
-            "line": {"color": SERIES[index % len(SERIES)]},
-            # Black is invisible on a dark page.
-            **({"meta": "ink"} if SERIES[index % len(SERIES)] == "#000000" else {}),
-        }
-        for index, (label, (x, y)) in enumerate(lines.items())
-    ]
+    data = []
+    for index, (label, (x, y)) in enumerate(lines.items()):
+        color = SERIES[index % len(SERIES)]
+        line = _line(label, x, [np.nan if v is None else v for v in y], {"color": color})
+        line["mode"] = "lines+markers" if len(x) <= MAX_MARKERS else "lines"
+        # Black is invisible on a dark page.
+        data.append(line | ({"meta": "ink"} if color == "#000000" else {}))
     if diagonal:
-        data.append(
-            {
-                "type": "scatter",
-                "mode": "lines",
-                "name": "as it should be",
-                "x": [0, 1],
-                "y": [0, 1],
-                "meta": "ink",
-                "line": {"dash": "dot", "width": 1},
-            }
-        )
-    return ChartPart(name, caption, data, _layout(*titles), 340)
+        data.append(_ideal((0, 1)))
+    return ChartPart(name, caption, data, layout_of(*titles), 340)
 
 
 def bands_chart(
@@ -204,38 +173,17 @@ def bands_chart(
     """
     stride = max(1, -(-len(time) // MAX_POINTS))
     kept = slice(None, None, stride)
-    x = rounded(time[kept])
     data: list[dict[str, Any]] = []
     for low, high, color in _BANDS:
         bounds = np.quantile(predictive[:, kept], [low, high], axis=0)
         for bound, fill in zip(bounds, ("none", "tonexty"), strict=True):
-            data.append(
-                {
-                    "type": "scatter",
-                    "mode": "lines",
-                    "x": x,
-                    "y": rounded(bound),
-                    "fill": fill,
-                    "fillcolor": color,
-                    "line": {"width": 0},
-                    "hoverinfo": "skip",
-                    "name": f"posterior {high - low:.0%}",
-                    "showlegend": fill == "tonexty",
-                }
-            )
-    data.append(
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "x": x,
-            "y": rounded(measured[kept]),
-            "name": "measured",
-            "meta": "ink",
-            "line": {"width": 1.5},
-        }
-    )
+            look = {"fill": fill, "fillcolor": color, "hoverinfo": "skip"}
+            look |= {"showlegend": fill == "tonexty"}
+            label = f"posterior {high - low:.0%}"
+            data.append(_line(label, time[kept], bound, {"width": 0}, **look))
+    data.append(_line("measured", time[kept], measured[kept], {"width": 1.5}, meta="ink"))
     caption = f"{titles[1]}: measurement over the prediction of the fitted model."
-    return ChartPart(name, caption, data, _layout(*titles), 300)
+    return ChartPart(name, caption, data, layout_of(*titles), 300)
 
 
 def pit_chart(pit: Array) -> ChartPart:
@@ -250,21 +198,13 @@ def pit_chart(pit: Array) -> ChartPart:
             "marker": {"color": COLORS["posterior"]},
             "showlegend": False,
         },
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "x": [0, 1],
-            "y": [1, 1],
-            "meta": "ink",
-            "line": {"dash": "dot", "width": 1},
-            "name": "as it should be",
-        },
+        _ideal((1, 1)),
     ]
     caption = (
         "Ranks of the measurements in the predictive distribution. Flat at 1 is ideal; a hill "
         "means too wide predictions, a valley too narrow ones, a slope a bias."
     )
-    layout = _layout("share of predictions below the measurement", "density") | {"bargap": 0.05}
+    layout = layout_of("share of predictions below the measurement", "density") | {"bargap": 0.05}
     return ChartPart("pit", caption, data, layout, 280)
 
 
@@ -287,7 +227,7 @@ def matrix_chart(samples: Mapping[str, Array]) -> ChartPart:
             "colorbar": {"thickness": 12},
         }
     ]
-    layout = _layout("", "")
+    layout = layout_of("", "")
     layout["xaxis"] |= {"automargin": True}
     layout["yaxis"] |= {"automargin": True, "autorange": "reversed"}
     caption = (
@@ -297,13 +237,25 @@ def matrix_chart(samples: Mapping[str, Array]) -> ChartPart:
     return ChartPart("correlations", caption, data, layout, 420)
 
 
-def _layout(x: str, y: str) -> dict[str, Any]:
+def layout_of(x: str, y: str) -> dict[str, Any]:
+    """Returns a layout with titles of the axes."""
     return {
         "margin": {"l": 55, "r": 15, "t": 20, "b": 50},
         "xaxis": {"title": {"text": x}},
         "yaxis": {"title": {"text": y}},
         "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"},
     }
+
+
+def _line(name: str, x: Any, y: Any, line: dict[str, Any], **look: Any) -> dict[str, Any]:
+    """Returns a line, with its colour, width or dashes and further properties of the trace."""
+    trace = {"type": "scatter", "mode": "lines", "name": name, "x": rounded(x), "y": rounded(y)}
+    return trace | {"line": line} | look
+
+
+def _ideal(y: tuple[float, float]) -> dict[str, Any]:
+    """Returns the line of a perfect result from 0 to 1."""
+    return _line("as it should be", (0, 1), y, {"dash": "dot", "width": 1}, meta="ink")
 
 
 def _with_unit(name: str, unit: str) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from npdr_ppl.display.reports.charts import ChartPart, bars_chart, rounded
+from npdr_ppl.display.reports.charts import ChartPart, bars_chart, layout_of, rounded
 from npdr_ppl.display.reports.content import (
     CodePart,
     DiffPart,
@@ -158,13 +158,7 @@ def _gap(gap: Mapping[str, Any]) -> list[Part]:
                 "y": rounded(list(shares.values())),
             }
         )
-    layout: dict[str, Any] = {
-        "barmode": "group",
-        "margin": {"l": 55, "r": 15, "t": 20, "b": 40},
-        "xaxis": {"title": {"text": ""}},
-        "yaxis": {"title": {"text": "relative to before"}},
-        "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"},
-    }
+    layout = layout_of("", "relative to before") | {"barmode": "group"}
     parts.append(ChartPart("gap", "Error on held-out rollouts, relative to before.", data, layout))
     return parts
 

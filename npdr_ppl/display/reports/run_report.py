@@ -1,19 +1,25 @@
-"""Detects the kind of run in a folder, and writes its report to a file."""
+"""Detects the kind of run in a folder, and writes its report as one HTML file.
+
+The file contains its style, its script and Plotly.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.display.reports.comparison_report import comparison_report
-from npdr_ppl.display.reports.content import Report
+from npdr_ppl.display.reports.content import ChartPart, Report
 from npdr_ppl.display.reports.demo_report import demo_report
 from npdr_ppl.display.reports.discovery_report import discovery_report
 from npdr_ppl.display.reports.fit_report import fit_report
-from npdr_ppl.display.reports.page import render
 from npdr_ppl.display.reports.training_report import training_report
 from npdr_ppl.errors import DataError
 
-__all__ = ["read_run", "write_report"]
+__all__ = ["MAX_BYTES", "read_run", "render", "write_report"]
+
+MAX_BYTES = 6_000_000
+"""Maximum size of a page in bytes, so that it can be sent by e-mail."""
 
 # A training run may contain a discovery in a subfolder, and every kind contains inference runs,
 # so the file at the top level decides.
@@ -72,3 +78,41 @@ def write_report(run: Path, out: Path | None = None) -> Path:
 
 def _is_begun(run: Path) -> bool:
     return any((run / name).exists() for name in ("loop.json", "run", "settings.json"))
+
+
+def render(report: Report) -> str:
+    """Returns the page as HTML.
+
+    The template engine escapes every text. Only the style, the script and Plotly, which come with
+    the packages, are inserted unchanged. The script gets its data as JSON.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+    from plotly.offline import get_plotlyjs
+
+    environment = Environment(
+        loader=PackageLoader("npdr_ppl.display.reports"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    charts: dict[str, Any] = {
+        part.name: {"data": part.data, "layout": part.layout}
+        for section in report.sections
+        for part in section.parts
+        if isinstance(part, ChartPart)
+    }
+    loader = environment.loader
+    if loader is None:  # for the type checker: it was given above
+        raise RuntimeError("The template engine has no loader.")
+    style, script = (
+        Markup(loader.get_source(environment, name)[0]) for name in ("report.css", "report.js")
+    )
+    return environment.get_template("report.html").render(
+        report=report,
+        charts=charts,
+        style=style,
+        script=script,
+        plotly=Markup(get_plotlyjs()) if charts else "",
+    )
