@@ -79,18 +79,14 @@ class NeuralState(State):
 
 
 @dataclass(frozen=True)
-class NeuralBackend(Backend[NeuralState]):
+class NeuralBackend(TrainingOptions, Backend[NeuralState]):
     """A backend that trains an ensemble of networks on preconditioned simulations.
 
     Args:
         members: Number of independently trained networks; the posterior is the mixture of theirs.
-        epochs: Maximum number of passes through the simulations.
-        batch_size: Maximum number of rows of a mini-batch; fewer with few simulations.
-        learning_rate: Peak of the one-cycle schedule.
-        weight_decay: Decoupled weight decay.
-        averaging: Decay of the running average of the weights.
-        validation_fraction: Fraction of the simulations each member holds out.
-        patience: Number of epochs without improvement after which training stops.
+
+    The other options are those of
+    :class:`~npdr_ppl.inference.parts.training.ensemble_training.TrainingOptions`.
     """
 
     state_class = NeuralState
@@ -102,17 +98,7 @@ class NeuralBackend(Backend[NeuralState]):
     preconditioner_type: ClassVar[type[Preconditioner]] = Preconditioner
     """Type of the result of :meth:`_precondition`."""
 
-    shares_held_out: ClassVar[bool] = False
-    """Whether all members hold out the same simulations; otherwise each holds out its own."""
-
     members: int = 2
-    epochs: int = 30
-    batch_size: int = 512
-    learning_rate: float = 1e-2
-    weight_decay: float = 0.0
-    averaging: float = 0.99
-    validation_fraction: float = 0.1
-    patience: int = 20
 
     def __post_init__(self) -> None:
         """Validates the common options; a method adds its own."""
@@ -230,16 +216,7 @@ class NeuralBackend(Backend[NeuralState]):
             self._starting_networks(problem, state, preconditioner, rows),
             self._loss(problem, preconditioner.to(device), rows),
             len(rows),
-            TrainingOptions(
-                epochs=self.epochs,
-                batch_size=self.batch_size,
-                learning_rate=self.learning_rate,
-                weight_decay=self.weight_decay,
-                averaging=self.averaging,
-                validation_fraction=self.validation_fraction,
-                patience=self.patience,
-                shares_held_out=self.shares_held_out,
-            ),
+            self,
             device,
             evaluator=self._evaluator(problem),
             progress=progress,

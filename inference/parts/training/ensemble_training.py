@@ -8,6 +8,7 @@ done once for all members.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -50,6 +51,8 @@ class TrainingOptions:
     """How to train.
 
     Attributes:
+        shares_held_out: Whether all members hold out the same rows; otherwise each holds out its
+            own.
         epochs: Maximum number of passes through the data.
         batch_size: Maximum number of rows of a mini-batch; fewer with few rows, see
             :data:`MIN_BATCHES`.
@@ -58,21 +61,20 @@ class TrainingOptions:
         averaging: Decay of the running average of the weights. The average is validated and kept;
             with 0 the last weights are kept instead.
         validation_fraction: Fraction of the rows held out.
-        shares_held_out: Whether all members hold out the same rows; otherwise each holds out its
-            own.
         patience: Number of epochs without improvement after which training stops. While the best
             epoch is an early one, the number is smaller, but at least :data:`MIN_PATIENCE`. This
             saves time where nothing is left to learn after preconditioning.
     """
 
-    epochs: int
-    batch_size: int
-    learning_rate: float
-    weight_decay: float
-    averaging: float
-    validation_fraction: float
-    patience: int
-    shares_held_out: bool = False
+    shares_held_out: ClassVar[bool] = False
+
+    epochs: int = 30
+    batch_size: int = 512
+    learning_rate: float = 1e-2
+    weight_decay: float = 0.0
+    averaging: float = 0.99
+    validation_fraction: float = 0.1
+    patience: int = 20
 
 
 @dataclass(frozen=True)
