@@ -38,6 +38,7 @@ from npdr_ppl.inference.parts.bases.likelihood_backend import (
     LikelihoodBackend,
 )
 from npdr_ppl.inference.parts.bases.neural_backend import Simulations
+from npdr_ppl.inference.parts.mixtures.mixture_density import perceptron
 from npdr_ppl.inference.parts.training.ensemble_training import LogProb, Loss
 from npdr_ppl.inference.parts.training.preconditioning import Preconditioner, fit_preconditioner
 
@@ -118,11 +119,7 @@ class RatioNetwork(nn.Module):
 
 
 def _perceptron(num_inputs: int, hidden: tuple[int, ...], num_outputs: int) -> nn.Sequential:
-    widths = (num_inputs, *hidden)
-    layers: list[nn.Module] = []
-    for before, after in zip(widths[:-1], widths[1:], strict=True):
-        layers += [nn.Linear(before, after), nn.SiLU()]
-    return nn.Sequential(*layers, nn.Linear(widths[-1], num_outputs))
+    return perceptron(num_inputs, hidden, nn.SiLU).append(nn.Linear(hidden[-1], num_outputs))
 
 
 @dataclass(frozen=True)

@@ -165,11 +165,13 @@ def _log_integral(forms: Tensor, rows: list[Tensor]) -> Tensor:
     return -0.5 * (torch.stack(pivots).log().sum(0) + left[0, 0])
 
 
-def perceptron(num_features: int, widths: tuple[int, ...]) -> nn.Sequential:
-    """Returns fully connected layers of given widths."""
+def perceptron(
+    num_features: int, widths: tuple[int, ...], activation: type[nn.Module] = nn.ReLU
+) -> nn.Sequential:
+    """Returns fully connected layers of given widths, each with its activation."""
     layers: list[nn.Module] = []
     for width in widths:
-        layers += [nn.Linear(num_features, width), nn.ReLU()]
+        layers += [nn.Linear(num_features, width), activation()]
         num_features = width
     return nn.Sequential(*layers)
 

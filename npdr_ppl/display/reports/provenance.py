@@ -10,8 +10,6 @@ from npdr_ppl.run_files import read_json
 
 __all__ = ["checksum", "data_files", "provenance_section", "run_description", "source_section"]
 
-_BLOCK = 1 << 20
-
 
 def run_description(folder: Path) -> dict[str, Any]:
     """Returns the content of a run's ``run.json`` or ``loop.json``; empty if there is neither."""
@@ -71,11 +69,8 @@ def provenance_section(description: Mapping[str, Any], folder: Path) -> Section:
 
 def checksum(path: Path) -> str:
     """Returns a file's SHA-256 as hexadecimal digits."""
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _words(value: Any) -> str:

@@ -80,17 +80,8 @@ class EpisodeBatch(NamedTuple):
 class EpisodeRequest:
     """Request to an engine to run episodes.
 
-    Attributes:
-        parameters: Domain and effect parameters; missing ones are nominal.
-        policy: The policies; ``policy.parameters`` has the shape ``(..., parameters)``.
-        initial_states: True states at the start, ``(..., states)``.
-        num_steps: Greatest number of steps.
-        reward: Reward of a step.
-        time_step: Seconds per step.
-        record: Whether to return measurements and commands.
-        compile: Replaces the simulator's choice.
-        expected_calls: Number of calls of this size to expect.
-        internal_model: Parameters of the policies' own model; ``None`` for those of each domain.
+    The attributes are the arguments of
+    :meth:`~npdr_ppl.engines.common.closed_loop_simulator.ClosedLoopSimulator.roll_out`.
     """
 
     parameters: Mapping[str, Tensor]

@@ -2,7 +2,7 @@
 
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ _CONTACT = {
 }
 
 
-class EnvironmentPort:
+class EnvironmentPort(NamedTuple):
     """An environment port, with the body that carries the payload if it is a payload port.
 
     Attributes:
@@ -34,9 +34,8 @@ class EnvironmentPort:
         body: Number of the body; ``None`` for gravity and contact.
     """
 
-    def __init__(self, port: Port, body: int | None = None) -> None:
-        self.port = port
-        self.body = body
+    port: Port
+    body: int | None = None
 
 
 def environment_ports(
