@@ -1,13 +1,28 @@
 """Files that are written completely or not at all."""
 
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 
-__all__ = ["replacing"]
+__all__ = ["remove_leftovers", "replacing"]
+
+LEFTOVER = re.compile(r"\..+\.[a-z0-9_]{8}\.tmp")
+"""Names of the temporary files of :func:`replacing`."""
+
+DEEPEST = 3
+"""Number of folders below that of a run in which it writes files."""
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes temporary files that a killed process has left in a folder that nobody else uses."""
+    for depth in range(DEEPEST + 1):
+        for file in folder.glob(f"{'*/' * depth}.*.tmp"):
+            if LEFTOVER.fullmatch(file.name):
+                file.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from npdr_ppl.atomic_files import replacing
+from npdr_ppl.atomic_files import remove_leftovers, replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps
 from npdr_ppl.language.prior import Prior
@@ -93,6 +93,7 @@ def claimed(path: Path | None) -> Iterator[None]:
         ) from None
     try:
         (path / LOCK).write_text(str(os.getpid()))
+        remove_leftovers(path)
         yield
     finally:
         lock.release()

@@ -4,12 +4,14 @@ import os
 import resource
 import subprocess
 import sys
+from contextlib import suppress
 
 import numpy as np
 import pytest
 import torch
 
 from npdr_ppl.arviz_module import from_dict, from_netcdf, to_netcdf
+from npdr_ppl.atomic_files import remove_leftovers, replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import claimed, load_tensors, read_json, save_tensors, write_json
@@ -57,6 +59,26 @@ def test_a_process_may_claim_a_folder_twice(tmp_path):
         pass
     with claimed(tmp_path):
         pass
+
+
+def test_temporary_files_of_a_killed_process_are_removed(tmp_path):
+    (tmp_path / "run").mkdir()
+    leftovers = [tmp_path / ".fit.json.a8_d2x1z.tmp", tmp_path / "run" / ".z.nc.abcdefgh.tmp"]
+    others = [tmp_path / "fit.json", tmp_path / ".notes.tmp", tmp_path / "run" / "a.abcdefgh.tmp"]
+    for file in leftovers + others:
+        file.touch()
+    with claimed(tmp_path):
+        assert not any(file.exists() for file in leftovers)
+        assert all(file.exists() for file in others)
+
+
+def test_leftovers_are_those_of_our_own_temporary_files(tmp_path):
+    with suppress(KeyboardInterrupt), replacing(tmp_path / "fit.json") as temporary:
+        name = temporary.name
+        raise KeyboardInterrupt
+    (tmp_path / name).touch()  # as if nobody had been there to remove it
+    remove_leftovers(tmp_path)
+    assert os.listdir(tmp_path) == []
 
 
 def write_rollouts(path, size):

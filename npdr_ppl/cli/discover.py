@@ -79,7 +79,7 @@ def discover(
     """Find effects that a model lacks, add them, and test the revised model on held-out data.
 
     Writes discovery.json, revised_model.py (a model for every other command) and figures. The
-    same command restarts an interrupted search, or shows the result of a finished one.
+    same command continues an interrupted search, or shows the result of a finished one.
 
     Example: npdr discover furuta --data measured.csv --holdout 3,4 --out discovery
     """
@@ -114,7 +114,8 @@ def discover(
         found = folder.finished(stage.value)
         if found is None:
             with (
-                resumable(f"the same command again restarts the search in {out}."),
+                resumable(f"the same command again continues the search in {out}."),
+                folder.kept(),
                 chosen_workers(executor, workers, address, time_limit),
             ):
                 with sentences(options, False if quiet else None) as report:

@@ -144,7 +144,7 @@ def _reproduce_missing_effect(
     if data is None:
         raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")
     swing_ups, chirps = load_recordings(data)
-    with resumable(f"the same command again restarts the search in {out}."), workers():
+    with resumable(f"the same command again continues the search in {out}."), workers():
         story, result = reproduce_missing_effect(
             swing_ups,
             chirps,

@@ -3,14 +3,17 @@
     run.json            model, options, seed, versions, a checksum of the recordings
     discovery.json      the results; written last, so a folder with this file is complete
     revised_model.py    the model with the effects that were missing
+    fits/               the fits that an unfinished discovery has finished
 
-A discovery that was killed leaves no ``discovery.json``, and starts over when it is run again. A
-complete one is not repeated.
+A discovery that was killed leaves no ``discovery.json``, and continues when it is run again: it
+reads its fits instead of repeating them. A complete one is not repeated.
 """
 
 import dataclasses
 import hashlib
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -18,6 +21,7 @@ from npdr_ppl.atomic_files import replacing
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery, describe_candidate
 from npdr_ppl.discovery.investigation import Investigation
+from npdr_ppl.discovery.kept_fits import keep_fits
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import (
     holds_this_run,
@@ -34,6 +38,9 @@ __all__ = ["STAGES", "DiscoveryFolder", "Stage", "findings_until"]
 Stage = Literal["check", "locate", "alarm", "name", "prove"]
 """The stages. Each includes those before it."""
 
+FITS = "fits"
+"""Name of the folder of fits."""
+
 STAGES: tuple[Stage, ...] = get_args(Stage)
 
 
@@ -46,6 +53,12 @@ class DiscoveryFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """Keeps the fits inside the block for the next run."""
+        with keep_fits(self.path / FITS):
+            yield
 
     def begin(
         self,
@@ -99,6 +112,8 @@ class DiscoveryFolder:
             with replacing(self.path / "revised_model.py") as temporary:
                 temporary.write_text(source, encoding="utf-8")
         write_json(self.path / "discovery.json", found)
+        if found["stage"] == STAGES[-1]:  # no later stage needs them
+            shutil.rmtree(self.path / FITS, ignore_errors=True)
 
 
 def findings_until(

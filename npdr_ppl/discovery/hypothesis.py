@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npdr_ppl.discovery.kept_fits import made_or_read
 from npdr_ppl.discovery.settings import HYPOTHESIS
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.effects import Effect
@@ -246,7 +247,12 @@ def fit_segment_model(
     for site in segments.prior.sites:
         if held and site.name in held:
             z[site.coordinates], stays[site.coordinates] = held[site.name], True
-    fit = fit_segments(
-        segments, z, offsets=offsets, held=stays, max_steps=max_steps, is_rough=is_rough
-    )
-    return Hypothesis(segments.model, effects, segments, fit)
+
+    def make() -> dict[str, Tensor]:
+        found = fit_segments(
+            segments, z, offsets=offsets, held=stays, max_steps=max_steps, is_rough=is_rough
+        )
+        return {"z": found.z, "offsets": found.offsets, "scale": found.scale}
+
+    fit = made_or_read(make, segments, z, offsets, stays, max_steps, is_rough)
+    return Hypothesis(segments.model, effects, segments, SegmentFit(**fit))

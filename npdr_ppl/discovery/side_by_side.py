@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import TypeVar, cast
 
+from npdr_ppl.discovery.kept_fits import keeping
 from npdr_ppl.engines.pooled.pool_simulator import PooledSimulator
 from npdr_ppl.engines.workers.lifetime import loky_settings
 from npdr_ppl.engines.workers.safe_path import safe_path
@@ -49,9 +50,8 @@ def side_by_side(
         with parallel_config(n_jobs=number, **loky_settings()):
             parallel = Parallel(return_as="generator", max_nbytes=None)
         with safe_path():
-            results = cast(
-                Generator[Result, None, None], parallel(delayed(function)(item) for item in items)
-            )
+            calls = (delayed(keeping(function))(item) for item in items)
+            results = cast(Generator[Result, None, None], parallel(calls))
         try:
             with safe_path():  # a process may be replaced at any time
                 for result in results:

@@ -92,7 +92,7 @@ def reproduce_missing_effect(
     Args:
         swing_ups: The paper's recordings, 500 Hz.
         chirps: The same rig under another excitation, or ``None``.
-        out: Folder for results; an interrupted search in it restarts, a finished one is read.
+        out: Folder for results; an interrupted search in it continues, a finished one is read.
         holdout: Swing-ups for the evaluation; the others are fitted.
         options: Options of the search.
         progress: Whether to show progress; ``None`` shows it on a terminal.
@@ -114,7 +114,7 @@ def reproduce_missing_effect(
         folder.begin(furuta, train, test, options)
         if file.exists():
             return None, read_json(file)
-        with sentences(options, progress) as report:
+        with sentences(options, progress) as report, folder.kept():
             investigation = Investigation(
                 furuta, train, holdout=test, options=options, report=report
             )

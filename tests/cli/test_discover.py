@@ -2,7 +2,10 @@
 
 import inspect
 import json
+import signal
+import subprocess
 import sys
+import time
 from io import StringIO
 from pathlib import Path
 
@@ -12,7 +15,8 @@ from rich.console import Console
 from npdr_ppl.cli import discover, show
 from npdr_ppl.cli import main as cli
 from npdr_ppl.cli.resolve import resolve_holdout, resolve_model
-from npdr_ppl.discovery import DiscoveryOptions, Investigation
+from npdr_ppl.discovery import DiscoveryOptions, Investigation, kept_fits
+from npdr_ppl.run_files import save_tensors
 from tests.helpers.discovery_recording import CANDIDATES, FRICTION, MISSING, pendulum_recording
 
 NAMES = {
@@ -135,6 +139,37 @@ def test_a_finished_discovery_is_not_repeated(finished, words, monkeypatch):
 
 
 @pytest.mark.slow
+def test_a_killed_discovery_continues_to_the_same_result(finished, words, tmp_path, monkeypatch):
+    out = tmp_path / "killed"
+    words = [*map(str, words[:-1]), str(out), "--quiet"]
+    process = subprocess.Popen([sys.executable, "-m", "npdr_ppl.cli", *words])
+    deadline = time.monotonic() + 300
+    while len(list(out.glob("fits/*.safetensors"))) < 4:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    kept = {file.name for file in out.glob("fits/*.safetensors")}
+    damaged = min(kept)
+    (out / "fits" / damaged).write_bytes(b"half")
+    made = []
+
+    def save(file, tensors):
+        made.append(file.name)
+        save_tensors(file, tensors)
+
+    monkeypatch.setattr(kept_fits, "save_tensors", save)
+    code, _, err = run(words)
+    assert code == 0, err
+    assert kept & set(made) == {damaged} and len(made) > 1
+    results = [json.loads((f / "discovery.json").read_text()) for f in (out, finished[0])]
+    for result in results:
+        del result["seconds"]
+    assert results[0] == results[1]
+    assert not (out / "fits").exists()  # a finished discovery needs them no more
+
+
+@pytest.mark.slow
 def test_stages_stop_where_they_are_told_and_an_unfinished_run_goes_on(words, tmp_path):
     words = [*words[:-1], tmp_path / "stages", "--stage"]
     folder = tmp_path / "stages"
@@ -154,7 +189,7 @@ def test_stages_stop_where_they_are_told_and_an_unfinished_run_goes_on(words, tm
         assert {file.stem for file in folder.glob("*.png")} == figures
         assert not (folder / "revised_model.py").exists()
     assert "alarm" in text
-    # As if killed before the end: nothing says that it is finished, so it begins anew.
+    # As if killed before the end: nothing says that it is finished, so it goes on.
     (folder / "discovery.json").unlink()
     assert run([*words, "check"])[0] == 0
     assert json.loads((folder / "discovery.json").read_text())["stage"] == "check"

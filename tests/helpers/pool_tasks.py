@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -106,3 +107,24 @@ class Parent(Task):
 
     def run(self, workspace, draw):
         return np.array([os.getppid()])
+
+
+class StartsPrograms(Task):
+    """Starts a program in its own process group and one in another, and ends as it is told."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def run(self, workspace, draw):
+        if draw.payload == "starts none":
+            return np.zeros(1)
+        for is_apart in (False, True):
+            program = subprocess.Popen(["sleep", "600"], start_new_session=is_apart)
+            (Path(self.folder) / str(program.pid)).touch()
+        if draw.payload == "hangs":
+            program.wait()
+        if draw.payload == "crashes":
+            os._exit(3)
+        if draw.payload == "raises":
+            raise ArithmeticError("no luck")
+        return np.zeros(1)

@@ -17,6 +17,7 @@ from npdr_ppl.discovery.hypothesis import (
     extended,
     fit_segment_model,
 )
+from npdr_ppl.discovery.kept_fits import made_or_read
 from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.settings import BASE_FIT
 from npdr_ppl.discovery.search.trials import Trials
@@ -165,9 +166,12 @@ def _starts(
     """Returns initial guesses: the prior's middle and a search's result, or known parameters."""
     if near:
         return [near]
-    z = search_prior(
-        segments, iterations=PRIOR_SEARCH.iterations_before_steps, seed=seed, progress=progress
-    )
+    iterations = PRIOR_SEARCH.iterations_before_steps
+
+    def search() -> dict[str, Tensor]:
+        return {"z": search_prior(segments, iterations=iterations, seed=seed, progress=progress)}
+
+    z = made_or_read(search, segments, "search", iterations, seed)["z"]
     found = segments.prior.to_parameters(z[None])
     return [{}, {name: value[0] for name, value in found.items()}]
 

@@ -2,8 +2,6 @@
 
 import logging
 import os
-import signal
-import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -166,6 +164,7 @@ def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
     try:
         import ray
         from ray._private import ray_constants
+        from ray._private import utils as ray_utils
         from ray.util.joblib import register_ray
     except ImportError as error:
         raise _missing("ray") from error
@@ -179,7 +178,8 @@ def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
         stack.enter_context(_set_attribute(ray_constants, "ENABLE_RAY_CLUSTER", False))
     # Ray would put the current folder on the module search path of its workers.
     empty = stack.enter_context(TemporaryDirectory(prefix="npdr-ray-"))
-    handler = signal.getsignal(signal.SIGTERM)  # which Ray replaces
+    # Ray would replace the caller's handler of SIGTERM.
+    stack.enter_context(_set_attribute(ray_utils, "set_sigterm_handler", lambda handler: None))
     try:
         ray.init(
             address="local" if is_local else options.address,
@@ -191,9 +191,6 @@ def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
         )
     except (OSError, ValueError, RuntimeError) as error:
         raise _unreachable(options, error) from error
-    finally:
-        if handler is not None and threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, handler)
     stack.callback(ray.shutdown)
 
 

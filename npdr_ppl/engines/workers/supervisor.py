@@ -290,6 +290,8 @@ class _Template:
         """Stops the template and its child."""
         self._control.close()
         self._channel.close()
+        if self._child is None:
+            self._process.kill()  # it may be loading for seconds, and there is no child to stop
         try:
             self._process.wait(5.0)
         except subprocess.TimeoutExpired:

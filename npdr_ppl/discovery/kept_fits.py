@@ -1,0 +1,105 @@
+"""Fits of an interrupted discovery, kept on disk so that the next run does not repeat them.
+
+Fits take most of a search's time, and are deterministic. Inside a block of :func:`keep_fits`, each
+finished fit is written to a file whose name is a checksum of all that the fit depends on. The same
+search then reads it, takes the same decisions, and gives the same result.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.run_files import load_tensors, make_folder, save_tensors, source_text, versions
+
+__all__ = ["keep_fits", "keeping", "made_or_read"]
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_FOLDER: ContextVar[Path | None] = ContextVar("kept_fits", default=None)
+
+
+@contextmanager
+def keep_fits(folder: Path | None) -> Iterator[None]:
+    """Writes each fit inside the block to a folder, and reads those that are there.
+
+    Args:
+        folder: The folder, which is created if there is none; nothing is kept if it is ``None``.
+    """
+    token = _FOLDER.set(folder)
+    try:
+        yield
+    finally:
+        _FOLDER.reset(token)
+
+
+def keeping(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
+    """Returns a function that keeps its fits as this process does, in whichever it runs."""
+    return partial(_kept, function, _FOLDER.get())
+
+
+def _kept(function: Callable[[Item], Result], folder: Path | None, item: Item) -> Result:
+    with keep_fits(folder):
+        return function(item)
+
+
+def made_or_read(
+    make: Callable[[], dict[str, Tensor]],
+    segments: SegmentModel,
+    *rest: Any,
+) -> dict[str, Tensor]:
+    """Returns tensors that were kept, or makes them and keeps them.
+
+    Args:
+        make: Makes the tensors, by name.
+        segments: The model and the recording.
+        rest: What else the tensors depend on: other tensors, or values with a ``repr``.
+
+    Raises:
+        OSError: The tensors cannot be written.
+    """
+    folder = _FOLDER.get()
+    if folder is None:
+        return make()
+    file = folder / f"{_checksum(segments, *rest)[:32]}.safetensors"
+    with suppress(DataError):  # there are none, or the file is damaged
+        return load_tensors(file)
+    made = make()
+    make_folder(folder)
+    save_tensors(file, made)
+    return made
+
+
+def _checksum(segments: SegmentModel, *rest: Any) -> str:
+    """Returns a checksum of all that tensors depend on."""
+    simulator, prior = segments.simulator, segments.prior
+    # The priors, by their values at some points: not every distribution can be printed.
+    points = torch.linspace(-2.0, 2.0, 5).double()[:, None].expand(-1, prior.num_parameters)
+    parameters = prior.to_parameters(points)
+    parts = [
+        versions(),
+        source_text(segments.model),
+        segments.channel_names,
+        type(simulator).__qualname__,
+        simulator.recorded_settings(),
+        *parameters,
+        *parameters.values(),
+        *(getattr(segments.inputs, field.name) for field in fields(segments.inputs)),
+        segments.observed,
+        *rest,
+    ]
+    digest = hashlib.sha256()
+    for part in parts:
+        is_tensor = isinstance(part, Tensor)
+        digest.update(part.contiguous().numpy().tobytes() if is_tensor else repr(part).encode())
+    return digest.hexdigest()

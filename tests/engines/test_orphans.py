@@ -1,0 +1,120 @@
+"""No process of a run outlives the run by more than ten seconds, however the run ends."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from npdr_ppl.cli.main import main
+from npdr_ppl.cli.manners import Stopped, resumable, stop_on_signals
+from npdr_ppl.engines.workers import Pool, WorkerOptions
+from tests.helpers.pool_tasks import StartsPrograms
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "tests" / "helpers" / "stop_runs.py"
+
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="needs /proc and prctl")
+
+
+def executor(name, package=None):
+    missing = package is not None and find_spec(package) is None
+    return pytest.param(
+        name, marks=pytest.mark.skipif(missing, reason=f"{package} is not installed")
+    )
+
+
+@on_linux
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        executor("serial"),
+        executor("loky"),
+        executor("dask", "distributed"),
+        executor("ray", "ray"),
+    ],
+)
+def test_a_stopped_fit_leaves_no_process(tmp_path, name):
+    # Forty seconds: several times as long as needed, for busy machines. Without a watch on its
+    # parent, a worker of loky lives for five minutes.
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), str(tmp_path), name, "2", "1", "40"],
+        env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [row["left"] for row in rows] == [[]] * 2
+    assert any(row["running"] > 2 for row in rows)  # there was something to leave
+    for row in rows:
+        assert row["was_alive"]
+        if row["signal"] == "SIGTERM":
+            assert row["exit_code"] == 128 + signal.SIGTERM
+            assert "npdr: interrupted" in row["errors"]
+
+
+def is_running(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@on_linux
+@pytest.mark.parametrize("ending", ["hangs", "crashes", "raises", "returns"])
+def test_programs_that_a_simulation_started_end_with_it(tmp_path, ending):
+    with Pool(WorkerOptions("serial", time_limit=2.0, retries=0)) as pool:
+        outcome = pool.run(StartsPrograms(str(tmp_path)), [ending, "starts none"])
+        programs = [int(file.name) for file in tmp_path.iterdir()]
+        assert len(programs) == 2
+        if ending == "returns":  # the simulation may use them again in its next draw
+            assert all(is_running(program) for program in programs)
+            assert not outcome.faults
+        else:
+            assert outcome.faults.lost == (0,)
+            assert not any(is_running(program) for program in programs)
+    assert not any(is_running(program) for program in programs)
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129)])
+def test_a_signal_stops_a_command_like_ctrl_c(capsys, name, code):
+    number = getattr(signal, name)
+    before = signal.signal(number, signal.SIG_DFL)
+    try:
+        with stop_on_signals(), pytest.raises(SystemExit) as stop:
+            try:
+                with resumable("do it again."):
+                    os.kill(os.getpid(), number)
+                    time.sleep(10.0)
+            except Exception as error:  # what typer does with it
+                sys.exit(error.exit_code)
+        assert signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
+    assert stop.value.code == code
+    assert capsys.readouterr().err == "npdr: interrupted; do it again.\n"
+
+
+def test_ignored_signals_stay_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        with stop_on_signals():
+            os.kill(os.getpid(), signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_signal_where_nothing_was_begun_gets_a_sentence(capsys, monkeypatch):
+    def stopped(**options):
+        raise Stopped(signal.SIGTERM)
+
+    monkeypatch.setattr("npdr_ppl.cli.main.app", stopped)
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 143
+    assert capsys.readouterr().err == "npdr: interrupted.\n"
