@@ -2,14 +2,16 @@
 
     python benchmarks/faults.py                          # a pendulum in Bullet, some minutes
     python benchmarks/faults.py --times 2                # faults that a retry does not cure
+    python benchmarks/faults.py --executor dask          # or ray, with their own clusters
     python benchmarks/faults.py --model file.py:model --data measured.csv
     python benchmarks/faults.py --strike strike_100hz_8s.csv     # mini golf, about ten minutes
 
-Faults are real: processes exit or segfault, sleep, sit in native code, and trajectories are NaN.
+Faults are real: processes exit or segfault, sleep, sit in native code or wait for a program that
+they have started, and trajectories are NaN.
 Three fits are made: clean, clean with another seed (the yardstick of Monte-Carlo error), and
 faulty. The exit code is 1 if a draw is lost that was not to be, if the counts are not those of the
-rates, or if the faulty posterior's moments are further from the clean one's than ``--tolerance``
-times the yardstick (floored at 5 % of a standard deviation).
+rates, if a program is left running, or if the faulty posterior's moments are further from the
+clean one's than ``--tolerance`` times the yardstick (floored at 5 % of a standard deviation).
 """
 
 import argparse
@@ -36,7 +38,7 @@ from npdr_ppl.rollouts import Rollouts
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.helpers.bullet_models import PendulumModel, pendulum_urdf  # noqa: E402
-from tests.helpers.faulty import FaultRates  # noqa: E402
+from tests.helpers.faulty import FaultRates, num_programs  # noqa: E402
 from tests.helpers.faulty_simulator import FaultMessenger  # noqa: E402
 
 FLOOR = 0.05
@@ -116,6 +118,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file to write.")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    programs_before = num_programs()
     rates = FaultRates(options.crash, options.hang, options.nan, options.times)
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -152,11 +155,14 @@ def main() -> None:
         clean, clean_seconds = fit(model, 0)
         other, _ = fit(model, 1)
         faulty, faulty_seconds = fit(FaultMessenger(rates, log)(model), 0)
+    programs_left = num_programs() - programs_before
     counts = faulty.provenance.faults
     yardstick = difference(moments(clean), moments(other))
     found = difference(moments(clean), moments(faulty))
     result = {
+        "executor": options.executor,
         "counts": counts,
+        "programs_left": programs_left,
         "moments": {"clean": moments(clean), "other": moments(other), "faulty": moments(faulty)},
         "difference": {"clean seeds": yardstick, "faulty": found},
         "seconds": {"clean": clean_seconds, "faulty": faulty_seconds},
@@ -165,6 +171,8 @@ def main() -> None:
     if options.out is not None:
         options.out.write_text(json.dumps(result, indent=2) + "\n")
     problems = judge(counts, rates, found, options.tolerance * max(yardstick, FLOOR))
+    if programs_left:
+        problems.append(f"{programs_left} programs were left running")
     if problems:
         raise SystemExit("; ".join(problems))
 

@@ -1,14 +1,17 @@
 """Fault injection: tasks that crash, hang and return NaN on purpose.
 
-Crashes are exits and segmentation faults, hangs sleep in Python or sit in a native call that holds
-the interpreter's lock; nothing is mocked.
+Crashes are exits and segmentation faults; hangs sleep in Python, sit in a native call that holds
+the interpreter's lock, or wait for a program of their own; nothing is mocked.
 """
 
 import ctypes
 import os
+import subprocess
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,12 +75,28 @@ def crash(number: int) -> None:
     ctypes.string_at(0)
 
 
+PROGRAM = "sleep", "86399"
+"""The program for which simulations wait."""
+
+
 def hang(number: int) -> None:
-    """Never returns: asleep in Python, or in a native call that holds the interpreter's lock."""
-    if number % 2:
+    """Never returns: asleep, in a native call that holds the interpreter's lock, or waiting."""
+    if number % 3 == 0:
+        subprocess.run(PROGRAM)
+    if number % 3 == 1:
         while True:
             time.sleep(1.0)
     ctypes.PyDLL(None).pause()
+
+
+def num_programs() -> int:
+    """Returns the number of such programs that are running."""
+    words = "\0".join(PROGRAM).encode() + b"\0"
+    found = 0
+    for file in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):  # it has ended in the meantime
+            found += file.read_bytes() == words
+    return found
 
 
 def fail(fault: Fault | None, number: int, run: Callable[[], np.ndarray]) -> np.ndarray:
