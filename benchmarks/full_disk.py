@@ -79,7 +79,7 @@ def start(data: Path, out: Path, before: Callable[[], None] = lambda: None) -> i
         sys.argv = [
             "npdr", "fit", "pendulum", "--data", str(data), "--out", str(out), "--quiet",
             "--backend", "abc", "--simulations", "20", "--segment-length", "25", "--embedding",
-            "all/10", "--extra-rounds", "0",
+            "all/10", "--extra-rounds", "0", "--executor", "serial",
         ]  # fmt: skip
         before()
         npdr_main()

@@ -32,12 +32,13 @@ def replacing(path: str | PathLike[str]) -> Iterator[Path]:
     Even if the program is killed, readers see either the old file or the complete new one.
     """
     target = Path(path)
-    handle, name = tempfile.mkstemp(
-        dir=target.parent, prefix=f".{target.name[:100]}.", suffix=".tmp"
-    )
-    os.close(handle)
-    temporary = Path(name)
+    temporary: Path | None = None
     try:
+        handle, name = tempfile.mkstemp(
+            dir=target.parent, prefix=f".{target.name[:100]}.", suffix=".tmp"
+        )
+        os.close(handle)
+        temporary = Path(name)
         # mkstemp makes private files; a data file should get the usual permissions.
         mask = os.umask(0)
         os.umask(mask)
@@ -50,4 +51,5 @@ def replacing(path: str | PathLike[str]) -> Iterator[Path]:
         error.filename = str(target)
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)

@@ -81,6 +81,12 @@ def test_leftovers_are_those_of_our_own_temporary_files(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+def test_an_error_names_the_file_that_was_to_be_written(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught:
+        write_json(tmp_path / "deleted" / "fit.json", {})
+    assert caught.value.filename == str(tmp_path / "deleted" / "fit.json")
+
+
 def write_rollouts(path, size):
     angle = np.random.default_rng(0).normal(size=(size, 1))
     rollouts = Rollouts.from_arrays(

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK
 from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
 from npdr_ppl.preparation.settings import SEGMENT_FIT
 from npdr_ppl.preparation.solving import solve_or_zero
@@ -274,8 +275,13 @@ def _squares(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) 
         scale: Standard deviation of each channel's residuals, ``(C,)``.
     """
     a, b = offsets.shape[:2]
-    residual = segments.residuals(z.repeat_interleave(b, 0), offsets.flatten(0, 1), scale)
-    return residual.square().unflatten(-1, (-1, len(scale))).sum(-2).unflatten(0, (a, b))
+    together = max(1, MAX_READINGS_PER_CHUNK // max(1, segments.observed.numel()))
+    points = z.repeat_interleave(b, 0).split(together)
+    squares = [
+        segments.residuals(point, starts, scale).square().unflatten(-1, (-1, len(scale))).sum(-2)
+        for point, starts in zip(points, offsets.flatten(0, 1).split(together), strict=True)
+    ]
+    return torch.cat(squares).unflatten(0, (a, b))
 
 
 def _step(

@@ -79,7 +79,8 @@ class SegmentLikelihood:
 
         Minus infinity where a simulation fails.
         """
-        return self.by_segment(z).sum(-1)
+        together = max(1, MAX_READINGS_PER_CHUNK // max(1, len(self.fit.offsets)))
+        return torch.cat([self.by_segment(part).sum(-1) for part in z.split(together)])
 
     def by_segment(self, z: Tensor) -> Tensor:
         """Returns log p(segment | z), ``(n, S)`` float64, at points ``(n, d)``."""

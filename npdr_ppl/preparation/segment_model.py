@@ -23,7 +23,7 @@ from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
-from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK, DataOptions
 from npdr_ppl.preparation.initial_states import (
     InitialStates,
     error_factors,
@@ -339,7 +339,13 @@ class SegmentModel:
             offsets: Offsets of the initial states, ``(n, S, m)``.
             scale: Standard deviation of each channel's residuals, ``(C,)``.
         """
-        return self.whitened(self.observed - self.simulate(z, offsets), scale)
+        num, readings = max(len(z), len(offsets)), max(1, self.observed.numel())
+        together = max(1, MAX_READINGS_PER_CHUNK // readings)
+        z, offsets = (part.expand(num, *part.shape[1:]) for part in (z, offsets))
+        if num <= together:
+            return self.whitened(self.observed - self.simulate(z, offsets), scale)
+        parts = zip(z.split(together), offsets.split(together), strict=True)
+        return torch.cat([self.residuals(*part, scale) for part in parts])
 
     def whitened(self, difference: Tensor, scale: Tensor) -> Tensor:
         """Returns a difference of readings ``(…, S, K, C)`` in scales, as :meth:`residuals`."""
