@@ -124,7 +124,7 @@ def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
     if not file.exists():
         return False
     present = read_json(file)
-    differing = [str(k) for k, value in plain(description).items() if present.get(k) != value]
+    differing = list(_differing(present, plain(description)))
     if not differing:
         return True
     inputs = {file, file.parent / LOCK, *file.parent.glob("data_*")}
@@ -134,6 +134,16 @@ def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
     raise DataError(
         f"{file.parent} holds a run that differs in {words}; choose another folder, or remove it."
     )
+
+
+def _differing(present: Mapping[str, Any], wanted: Mapping[str, Any]) -> Iterator[str]:
+    """Yields the keys whose values differ; those of the options in place of ``options``."""
+    for key, value in wanted.items():
+        known = present.get(key)
+        if key == "options" and isinstance(known, Mapping):
+            yield from (k for k in {**known, **value} if known.get(k) != value.get(k))
+        elif known != value:
+            yield key
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -1,19 +1,29 @@
 """`npdr compare`: compares several backends on one model and one recording."""
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
-from npdr_ppl.cli.fit import InitialState, Noise, Precision
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
-from npdr_ppl.cli.names import (
-    complete_backends,
-    complete_effect,
-    complete_embedding,
-    complete_model,
+from npdr_ppl.cli.options import (
+    BackendsOption,
+    DataOption,
+    DeviceOption,
+    EffectOption,
+    EmbeddingOption,
+    HoldoutOption,
+    InitialState,
+    InitialStateOption,
+    ModelArgument,
+    Noise,
+    NoiseOption,
+    OutOption,
+    Precision,
+    PrecisionOption,
+    RoundsOption,
+    SeedOption,
+    SegmentLengthOption,
+    SimulationsOption,
+    data_options,
 )
-from npdr_ppl.cli.segment_length import SegmentLengthOption, resolve_segment_length
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -26,50 +36,21 @@ __all__ = ["compare"]
 
 
 def compare(
-    model: Annotated[
-        str,
-        typer.Argument(
-            help="Zoo name, or path/to/file.py:function.", autocompletion=complete_model
-        ),
-    ],
-    data: Annotated[Path, typer.Option(help="Rollouts: CSV, Parquet, NPZ or NetCDF.")],
-    backends: Annotated[
-        str,
-        typer.Option(
-            help="Backends, e.g. 'snpe-c, small = snpe-c(flow=maf, members=1)'; see "
-            "npdr backends.",
-            autocompletion=complete_backends,
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder for results.")],
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds of simulating and training.")] = 2,
-    simulations: Annotated[int, typer.Option(min=10, help="Simulations per round.")] = 2_000,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
-    holdout: Annotated[str, typer.Option(help="Rollouts to evaluate on, e.g. 3,4.")] = "",
-    effect: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Effect to attach, port.effect; may be repeated.", autocompletion=complete_effect
-        ),
-    ] = None,
-    embedding: Annotated[
-        str,
-        typer.Option(
-            help="Trajectory features: score, all/50, gru/10, bayessim, ...",
-            autocompletion=complete_embedding,
-        ),
-    ] = "score",
+    model: ModelArgument,
+    data: DataOption,
+    backends: BackendsOption,
+    out: OutOption,
+    rounds: RoundsOption = 2,
+    simulations: SimulationsOption = 2_000,
+    seed: SeedOption = 0,
+    holdout: HoldoutOption = "",
+    effect: EffectOption = None,
+    embedding: EmbeddingOption = "score",
     segment_length: SegmentLengthOption = "auto",
-    initial_state: Annotated[
-        InitialState, typer.Option(help="State at a segment's start.")
-    ] = InitialState.UNCERTAIN,
-    precision: Annotated[
-        Precision, typer.Option(help="Floating-point type of the simulation.")
-    ] = Precision.FLOAT64,
-    noise: Annotated[
-        Noise, typer.Option(help="Measurement noise: auto estimates it, model keeps the model's.")
-    ] = Noise.AUTO,
-    device: Annotated[str, typer.Option(help="Where to train: cpu or cuda.")] = "cpu",
+    initial_state: InitialStateOption = InitialState.UNCERTAIN,
+    precision: PrecisionOption = Precision.FLOAT64,
+    noise: NoiseOption = Noise.AUTO,
+    device: DeviceOption = "cpu",
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     address: Address = None,
@@ -96,12 +77,12 @@ def compare(
     from npdr_ppl.display.plots.comparison_figures import write_comparison_figures
     from npdr_ppl.posterior.comparison.compare import compare as run_compare
     from npdr_ppl.posterior.comparison.compared_backends import candidates, split_candidates
-    from npdr_ppl.preparation.data_options import DataOptions
     from npdr_ppl.progress import reporter
 
     device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
     named = candidates(split_candidates(backends))
+    options = data_options(embedding, segment_length, initial_state, precision, noise)
     train, test = resolve_rollouts(data, holdout)
     with (
         resumable(f"the same command again continues the comparison in {out}."),
@@ -116,13 +97,7 @@ def compare(
             rounds=rounds,
             num_simulations=simulations,
             seed=seed,
-            options=DataOptions(
-                embedding,
-                resolve_segment_length(segment_length),
-                initial_state.value,
-                precision.value,
-                noise.value,
-            ),
+            options=options,
             device=device,
             out=out,
             progress=report,

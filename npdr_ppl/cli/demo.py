@@ -1,18 +1,18 @@
 """`npdr demo`: a policy fails on a rig; discovery repairs the model; a new policy succeeds."""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
+from npdr_ppl.cli.options import OutOption, SeedOption
 
 __all__ = ["demo"]
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("demo-output"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    out: OutOption = Path("demo-output"),
+    seed: SeedOption = 0,
     as_json: AsJson = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -21,6 +21,8 @@ def demo(
 
     The rig is a Furuta pendulum in MuJoCo, while the model uses another engine. The rig has dry
     friction and filtered velocities that the model lacks. Writes figures and a report.
+
+    To continue an interrupted run, give the same command again.
 
     Example: npdr demo --out demo-output
     """

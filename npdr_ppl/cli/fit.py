@@ -1,19 +1,31 @@
 """`npdr fit`: infers a posterior from measured rollouts."""
 
-from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
-from npdr_ppl.cli.names import (
-    complete_backend,
-    complete_effect,
-    complete_embedding,
-    complete_model,
+from npdr_ppl.cli.options import (
+    BackendOption,
+    DataOption,
+    DeviceOption,
+    EffectOption,
+    EmbeddingOption,
+    HoldoutOption,
+    InitialState,
+    InitialStateOption,
+    ModelArgument,
+    Noise,
+    NoiseOption,
+    OutOption,
+    Precision,
+    PrecisionOption,
+    RoundsOption,
+    SeedOption,
+    SegmentLengthOption,
+    SimulationsOption,
+    data_options,
 )
-from npdr_ppl.cli.segment_length import SegmentLengthOption, resolve_segment_length
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -22,77 +34,28 @@ from npdr_ppl.cli.worker_options import (
     chosen_workers,
 )
 
-__all__ = ["InitialState", "fit"]
-
-
-class InitialState(StrEnum):
-    """How the state at a segment's start is obtained."""
-
-    ESTIMATED = "estimated"
-    RECORDED = "recorded"
-    UNCERTAIN = "uncertain"
-
-
-class Precision(StrEnum):
-    """Floating-point type."""
-
-    FLOAT64 = "float64"
-    FLOAT32 = "float32"
-
-
-class Noise(StrEnum):
-    """Source of the measurement noise."""
-
-    AUTO = "auto"
-    MODEL = "model"
+__all__ = ["fit"]
 
 
 def fit(
-    model: Annotated[
-        str,
-        typer.Argument(
-            help="Zoo name, or path/to/file.py:function.", autocompletion=complete_model
-        ),
-    ],
-    data: Annotated[Path, typer.Option(help="Rollouts: CSV, Parquet, NPZ or NetCDF.")],
-    out: Annotated[Path, typer.Option(help="Folder for results.")],
-    backend: Annotated[
-        str,
-        typer.Option(
-            help="Inference backend; see npdr backends.", autocompletion=complete_backend
-        ),
-    ] = "snpe-c",
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds of simulating and training.")] = 1,
+    model: ModelArgument,
+    data: DataOption,
+    out: OutOption,
+    backend: BackendOption = "snpe-c",
+    rounds: RoundsOption = 1,
     extra_rounds: Annotated[
         int, typer.Option(min=0, help="Rounds to add if the estimator has not converged.")
     ] = 2,
-    simulations: Annotated[int, typer.Option(min=10, help="Simulations per round.")] = 1_000,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
-    holdout: Annotated[str, typer.Option(help="Rollouts to hold out, e.g. 3,4.")] = "",
-    effect: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Effect to attach, port.effect; may be repeated.", autocompletion=complete_effect
-        ),
-    ] = None,
-    embedding: Annotated[
-        str,
-        typer.Option(
-            help="Trajectory features: score, all/50, gru/10, bayessim, ...",
-            autocompletion=complete_embedding,
-        ),
-    ] = "score",
+    simulations: SimulationsOption = 1_000,
+    seed: SeedOption = 0,
+    holdout: HoldoutOption = "",
+    effect: EffectOption = None,
+    embedding: EmbeddingOption = "score",
     segment_length: SegmentLengthOption = "auto",
-    initial_state: Annotated[
-        InitialState, typer.Option(help="State at a segment's start.")
-    ] = InitialState.UNCERTAIN,
-    precision: Annotated[
-        Precision, typer.Option(help="Floating-point type of the simulation.")
-    ] = Precision.FLOAT64,
-    noise: Annotated[
-        Noise, typer.Option(help="Measurement noise: auto estimates it, model keeps the model's.")
-    ] = Noise.AUTO,
-    device: Annotated[str, typer.Option(help="Where to train: cpu or cuda.")] = "cpu",
+    initial_state: InitialStateOption = InitialState.UNCERTAIN,
+    precision: PrecisionOption = Precision.FLOAT64,
+    noise: NoiseOption = Noise.AUTO,
+    device: DeviceOption = "cpu",
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     address: Address = None,
@@ -108,6 +71,7 @@ def fit(
     Example: npdr fit furuta --data measured.csv --segment-length 200 --holdout 3,4 --out fit
     """
     from npdr_ppl.cli.resolve import (
+        resolve_backend,
         resolve_device,
         resolve_effects,
         resolve_model,
@@ -116,11 +80,12 @@ def fit(
     from npdr_ppl.cli.show import show_fit
     from npdr_ppl.display.plots.fit_figures import write_fit_figures
     from npdr_ppl.posterior.fit import fit as run_fit
-    from npdr_ppl.preparation.data_options import DataOptions
     from npdr_ppl.progress import reporter
 
     device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
+    method, features = resolve_backend(backend, embedding)
+    options = data_options(features, segment_length, initial_state, precision, noise)
     train, test = resolve_rollouts(data, holdout)
     with (
         resumable(f"the same command again continues the run in {out}."),
@@ -132,18 +97,12 @@ def fit(
             train,
             test,
             out=out,
-            backend=backend,
+            backend=method,
             rounds=rounds,
             extra_rounds=extra_rounds,
             num_simulations=simulations,
             seed=seed,
-            options=DataOptions(
-                embedding,
-                resolve_segment_length(segment_length),
-                initial_state.value,
-                precision.value,
-                noise.value,
-            ),
+            options=options,
             device=device,
             progress=report,
         )

@@ -13,8 +13,9 @@ __all__ = ["report"]
 
 def report(
     run: Annotated[Path, typer.Argument(help="Folder that was passed as --out.")],
-    out: Annotated[
-        Path | None, typer.Option(help="The file; report.html in the run's folder by default.")
+    file: Annotated[
+        Path | None,
+        typer.Option(help="File to write; report.html in the run's folder by default."),
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -25,11 +26,11 @@ def report(
     The report begins with the verdict and the key numbers. Charts, diagnostics in plain language,
     the model's source and the steps to reproduce the result follow.
 
-    Example: npdr report fit --out fit.html
+    Example: npdr report fit --file fit.html
     """
     from npdr_ppl.display.reports import write_report
 
-    path = write_report(run, out)
+    path = write_report(run, file)
     if as_json:
         typer.echo(json.dumps({"report": str(path)}))
     elif not quiet:

@@ -6,9 +6,17 @@ from typing import Annotated
 
 import typer
 
-from npdr_ppl.cli.fit import InitialState
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
-from npdr_ppl.cli.names import complete_backends
+from npdr_ppl.cli.options import (
+    BackendsOption,
+    InitialState,
+    InitialStateOption,
+    OptionalDataOption,
+    OptionalRoundsOption,
+    OptionalSimulationsOption,
+    OutOption,
+    SeedOption,
+)
 
 __all__ = ["reproduce"]
 
@@ -24,26 +32,10 @@ class Experiment(StrEnum):
 
 def reproduce(
     experiment: Annotated[Experiment, typer.Argument(help="Which table or figure.")],
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            help="The paper's recordings; needed for table2, mini-golf and missing-effect. "
-            "missing-effect also takes a folder with two recordings."
-        ),
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("reproduction"),
-    backends: Annotated[
-        str,
-        typer.Option(
-            "--backends",
-            "--backend",
-            help="Backends to run; all methods of the paper if not given.",
-            autocompletion=complete_backends,
-        ),
-    ] = "",
-    initial_state: Annotated[
-        InitialState, typer.Option(help="State at a segment's start; the paper used recorded.")
-    ] = InitialState.RECORDED,
+    data: OptionalDataOption = None,
+    out: OutOption = Path("reproduction"),
+    backends: BackendsOption = "",
+    initial_state: InitialStateOption = InitialState.RECORDED,
     returns: Annotated[
         int,
         typer.Option(
@@ -52,18 +44,19 @@ def reproduce(
             "in MuJoCo; each takes minutes. 0 leaves these rows out.",
         ),
     ] = 0,
-    rounds: Annotated[
-        int | None, typer.Option(min=1, help="mini-golf: rounds of inference.")
-    ] = None,
-    simulations: Annotated[
-        int | None, typer.Option(min=10, help="mini-golf: simulations of each round.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    rounds: OptionalRoundsOption = None,
+    simulations: OptionalSimulationsOption = None,
+    seed: SeedOption = 0,
     as_json: AsJson = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
     """Reproduce an experiment of the NPDR paper, and compare with its published numbers.
+
+    table2, mini-golf and missing-effect need the paper's recordings in --data; missing-effect also
+    takes a folder with two recordings. All methods of the paper run unless --backends chooses
+    some, with recorded initial states as in the paper. Only mini-golf has --rounds and
+    --simulations. To continue an interrupted experiment, give the same command again.
 
     Example: npdr reproduce table2 --data swing_up_500hz_5s.csv --out table2
     """

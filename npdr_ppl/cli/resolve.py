@@ -12,6 +12,7 @@ import cloudpickle
 from npdr_ppl.errors import BackendError, DataError, ModelError, NpdrError
 
 if TYPE_CHECKING:
+    from npdr_ppl.embeddings import Embedding
     from npdr_ppl.inference.base import Backend
     from npdr_ppl.language.effects import Effect
     from npdr_ppl.loop.control_task import ControlTask
@@ -282,17 +283,24 @@ def resolve_task(word: str, model: str) -> "ControlTask":
     return control_task(word)
 
 
-def resolve_backend(word: str) -> "str | Backend":
-    """Returns the backend that e.g. ``snpe-c`` or ``snpe-c(flow=maf)`` names.
+def resolve_backend(word: str, embedding: str) -> "tuple[str | Backend, str | Embedding | None]":
+    """Returns the backend that e.g. ``snpe-c(flow=maf)`` names, and its features.
 
-    Without options it returns the word itself, which is recorded with the run.
+    A backend without options is returned as the word itself, which is recorded with the run.
+
+    Args:
+        word: The value of ``--backend``.
+        embedding: The value of ``--embedding``; it counts unless the backend has features of its
+            own, as in ``snpe-c(embedding=gru/10)``.
 
     Raises:
         BackendError: There is no such backend or option.
     """
-    from npdr_ppl.inference.registry import backend
+    from npdr_ppl.posterior.comparison.compared_backends import candidate
 
-    return _method(word, backend)
+    found = candidate(word)
+    method = found.backend if "(" in word else found.backend.name
+    return method, found.embedding or embedding
 
 
 def resolve_search(word: str) -> "str | PolicySearch[Any]":
@@ -304,20 +312,14 @@ def resolve_search(word: str) -> "str | PolicySearch[Any]":
         ModelError: There is no such search or option.
     """
     from npdr_ppl.policies.search_registry import policy_search
-
-    return _method(word, policy_search)
-
-
-def _method(word: str, make: Callable[..., T]) -> str | T:
-    """Makes the method that a word names; without options in parentheses, only checks the name."""
     from npdr_ppl.posterior.comparison.compared_backends import name_and_options
 
     name, options = name_and_options(word)
     try:
-        method = make(name, **options)
+        search = policy_search(name, **options)
     except TypeError as error:
         raise ModelError(f"{word!r} has an option of the wrong type: {error}.") from error
-    return method if options else name
+    return search if options else name
 
 
 def _is_function(word: str) -> bool:

@@ -1,21 +1,29 @@
 """`npdr train`: trains a policy for a device that differs from its simulator."""
 
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from npdr_ppl.cli.fit import InitialState
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
-from npdr_ppl.cli.names import (
-    complete_backend,
-    complete_effect,
-    complete_embedding,
-    complete_model,
-    complete_search,
-    complete_target,
-    complete_task,
+from npdr_ppl.cli.names import complete_search, complete_target, complete_task
+from npdr_ppl.cli.options import (
+    BackendOption,
+    EffectOption,
+    EmbeddingOption,
+    InitialState,
+    InitialStateOption,
+    ModelArgument,
+    Noise,
+    NoiseOption,
+    OutOption,
+    Precision,
+    PrecisionOption,
+    RoundsOption,
+    SeedOption,
+    SegmentLengthOption,
+    SimulationsOption,
+    data_options,
 )
 from npdr_ppl.cli.worker_options import (
     Address,
@@ -36,12 +44,7 @@ class InternalModel(StrEnum):
 
 
 def train(
-    model: Annotated[
-        str,
-        typer.Argument(
-            help="Zoo name, or path/to/file.py:function.", autocompletion=complete_model
-        ),
-    ],
+    model: ModelArgument,
     target: Annotated[
         str,
         typer.Option(
@@ -50,7 +53,7 @@ def train(
             autocompletion=complete_target,
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the run and its results.")],
+    out: OutOption,
     task: Annotated[
         str,
         typer.Option(
@@ -59,13 +62,7 @@ def train(
             autocompletion=complete_task,
         ),
     ] = "",
-    backend: Annotated[
-        str,
-        typer.Option(
-            help="Inference backend, e.g. snpe-c(flow=maf); see npdr backends.",
-            autocompletion=complete_backend,
-        ),
-    ] = "snpe-c",
+    backend: BackendOption = "snpe-c",
     search: Annotated[
         str,
         typer.Option(
@@ -75,31 +72,15 @@ def train(
     ] = "power",
     iterations: Annotated[int, typer.Option(min=1, help="Iterations of the loop.")] = 5,
     rollouts: Annotated[int, typer.Option(min=1, help="Real rollouts per iteration.")] = 1,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds of simulating and training.")] = 3,
-    simulations: Annotated[int, typer.Option(min=10, help="Simulations per round.")] = 5_000,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
-    effect: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--effect",
-            "--effects",
-            help="Effect to attach, port.effect; repeat the option or separate by commas.",
-            autocompletion=complete_effect,
-        ),
-    ] = None,
-    embedding: Annotated[
-        str,
-        typer.Option(
-            help="Trajectory features: bayessim, score, all/50, gru/10, ...",
-            autocompletion=complete_embedding,
-        ),
-    ] = "score",
-    segment_length: Annotated[
-        int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for never.")
-    ] = 50,
-    initial_state: Annotated[
-        InitialState, typer.Option(help="State at a segment's start.")
-    ] = InitialState.UNCERTAIN,
+    rounds: RoundsOption = 3,
+    simulations: SimulationsOption = 5_000,
+    seed: SeedOption = 0,
+    effect: EffectOption = None,
+    embedding: EmbeddingOption = "score",
+    segment_length: SegmentLengthOption = "50",
+    initial_state: InitialStateOption = InitialState.UNCERTAIN,
+    precision: PrecisionOption = Precision.FLOAT32,
+    noise: NoiseOption = Noise.AUTO,
     search_iterations: Annotated[
         int, typer.Option(min=1, help="Iterations of each policy search.")
     ] = 20,
@@ -145,9 +126,6 @@ def train(
     stop_return: Annotated[
         float | None, typer.Option(help="Stop at this real return, if the posterior is accepted.")
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the run that the folder holds.")
-    ] = False,
     animate: Annotated[
         bool, typer.Option("--animate", help="Draw the last rollout as rollout.gif (Furuta only).")
     ] = False,
@@ -163,10 +141,12 @@ def train(
 
     Rollouts on the target give a posterior, and the policy is trained in simulators drawn from it.
     With --discover, effects that the model lacks are added. Before a policy runs on the target, it
-    is tested in simulators drawn from the posterior. --resume continues an interrupted run.
+    is tested in simulators drawn from the posterior.
 
-    Example: npdr train furuta --target furuta-hard --effects
-    arm.coulomb_friction,pole.coulomb_friction --iterations 3 --out run
+    To continue an interrupted run, give the same command again; you may add iterations.
+
+    Example: npdr train furuta --target furuta-hard --effect arm.coulomb_friction
+    --effect pole.coulomb_friction --iterations 3 --out run
     """
     from npdr_ppl.cli.resolve import (
         resolve_backend,
@@ -182,12 +162,11 @@ def train(
     from npdr_ppl.errors import DataError
     from npdr_ppl.loop.loop_options import LoopOptions
     from npdr_ppl.loop.npdr_loop import train as run_train
-    from npdr_ppl.preparation.data_options import DataOptions
     from npdr_ppl.progress import reporter
 
-    _check_folder(out, resume)
     chosen = resolve_effects(resolve_model(model), effect or [])
     chosen_task = resolve_task(task, model)
+    method, features = resolve_backend(backend, embedding)
     device = resolve_target(target)
     if device.num_episodes is not None and rollouts > device.num_episodes:
         raise DataError(
@@ -199,10 +178,10 @@ def train(
         iterations=iterations,
         rollouts=rollouts,
         extra_rollouts=extra_rollouts,
-        backend=resolve_backend(backend),
+        backend=method,
         rounds=rounds,
         num_simulations=simulations,
-        binding=DataOptions(embedding, segment_length or None, initial_state.value, "float32"),
+        binding=data_options(features, segment_length, initial_state, precision, noise),
         search=resolve_search(search),
         search_iterations=search_iterations,
         num_domains=domains,
@@ -216,7 +195,7 @@ def train(
         tail_share=tail_share,
         discovers="before inference" if discover else "never",
     )
-    with resumable(f"the same command with --resume continues the run in {out}."):
+    with resumable(f"the same command again continues the run in {out}."):
         with (
             reporter(False if quiet else None) as report,
             chosen_workers(executor, workers, address, time_limit),
@@ -235,16 +214,3 @@ def train(
         typer.echo((out / "train.json").read_text(), nl=False)
     elif not quiet:
         show_training(training.to_dict(), out)
-
-
-def _check_folder(out: Path, is_resumed: bool) -> None:
-    """Raises an error if --resume does not match the folder: a run exists, or none does."""
-    from npdr_ppl.errors import DataError
-
-    holds_run = (out / "loop.json").exists()
-    if holds_run and not is_resumed:
-        raise DataError(
-            f"{out} holds a run already: pass --resume to continue it, or choose another folder."
-        )
-    if is_resumed and not holds_run:
-        raise DataError(f"{out} holds no run to continue: omit --resume to start one.")

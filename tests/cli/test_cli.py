@@ -49,7 +49,8 @@ def test_fit_writes_what_the_documentation_promises(monkeypatch, capsys, tmp_pat
     out = tmp_path / "fit"
     words = [
         "fit", "pendulum", "--data", recording, "--holdout", 1, "--out", out, "--rounds", 1,
-        "--simulations", 200, "--segment-length", 25, "--embedding", "all/5",
+        "--simulations", 200, "--segment-length", 25, "--embedding", "all/5", "--backend",
+        "snpe-c(members=2)",
     ]  # fmt: skip
     code, text, _ = run(monkeypatch, capsys, *words)
     assert code == 0
@@ -75,7 +76,7 @@ def test_fit_writes_what_the_documentation_promises(monkeypatch, capsys, tmp_pat
 def test_report_writes_one_file(monkeypatch, capsys, tmp_path):
     (tmp_path / "discovery.json").write_text('{"verdict": "none"}')
     page = tmp_path / "page.html"
-    code, text, _ = run(monkeypatch, capsys, "report", tmp_path, "--out", page)
+    code, text, _ = run(monkeypatch, capsys, "report", tmp_path, "--file", page)
     assert code == 0
     assert str(page) in text
     assert "no effect is missing" in page.read_text()
@@ -170,6 +171,10 @@ def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "7"], "has 2"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "x"], "3,4"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--backend", "mcmc"], "mcmc"),
+        (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--backend", "snpe-c(flw=maf)"],
+         "did you mean 'flow'"),
+        (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--backend",
+          "snpe-c(embedding=some/5)"], "some/5"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--effect", "hinge.coulomb"],
          "did you mean 'coulomb_friction'"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--effect", "knee.bias"],

@@ -83,16 +83,17 @@ def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
     assert len(first["iterations"][0]["real_returns"]) == 2
     for name in ("learning_curve.png", "rollouts.png", "parameters.png", "rollout.gif"):
         assert (out / name).stat().st_size > 1_000
-    # A run is not continued by accident.
-    code, _, err = run(monkeypatch, capsys, *words)
-    assert code == 2 and "--resume" in err and len(err.strip().splitlines()) == 1
-    code, _, err = run(monkeypatch, capsys, *words, "--resume", "--seed", 1)
-    assert code == 2 and "differs in seed" in err
+    # A run is not continued with other settings.
+    for changed, sentence in {
+        ("--seed", 1): "differs in seed;",
+        ("--spread", 0.2): "differs in spread;",
+        ("--embedding", "all/20"): "differs in how the data are prepared;",
+    }.items():
+        code, _, err = run(monkeypatch, capsys, *words, *changed)
+        assert code == 2 and sentence in err and len(err.strip().splitlines()) == 1
     # More iterations continue it; figures are made anew.
     (out / "learning_curve.png").unlink()
-    code, text, _ = run(
-        monkeypatch, capsys, *words, "--resume", "--iterations", 2, "--json", "--quiet"
-    )
+    code, text, _ = run(monkeypatch, capsys, *words, "--iterations", 2, "--json", "--quiet")
     assert code == 0
     second = json.loads(text)
     assert second == json.loads((out / "train.json").read_text())
@@ -126,7 +127,8 @@ def test_ctrl_c_says_how_to_go_on(monkeypatch, capsys, tmp_path, rig):
         f"{rig}:short", "--out", out, *QUICK,
     )  # fmt: skip
     assert code not in (0, 2)
-    assert "--resume" in err and str(out) in err and "Traceback" not in err
+    assert f"the same command again continues the run in {out}" in err
+    assert "Traceback" not in err
     assert (out / "loop.json").exists()
 
 
@@ -146,8 +148,8 @@ def test_ctrl_c_says_how_to_go_on(monkeypatch, capsys, tmp_path, rig):
         (["--target", "furuta-easy", "--backend", "snpe-c(flw=maf)"], "did you mean 'flow'"),
         (["--target", "furuta-easy", "--search", "powre"], "did you mean 'power'"),
         (["--target", "furuta-easy", "--search", "power(population=many)"], "wrong type"),
-        (["--target", "furuta-easy", "--effects", "arm.coulomb"], "'coulomb_friction'"),
-        (["--target", "furuta-easy", "--resume"], "no run to continue"),
+        (["--target", "furuta-easy", "--effect", "arm.coulomb"], "'coulomb_friction'"),
+        (["--target", "furuta-easy", "--segment-length", "long"], "a number of steps, auto or 0"),
         (["--target", "DATA", "--rollouts", "3"], "has 2 rollouts, too few"),
         (["--target", "DATA", "--animate"], "no channel arm_angle, pole_angle"),
     ],
@@ -192,8 +194,9 @@ def test_tasks_go_with_models_of_the_zoo(rig):
 def test_methods_without_options_stay_words():
     assert resolve_search("power") == "power"
     assert resolve_search("power(population=7)").population == 7
-    assert resolve_backend("snpe-a") == "snpe-a"
-    assert resolve_backend("snpe-c(members=2)").members == 2
+    assert resolve_backend("snpe-a", "score") == ("snpe-a", "score")
+    method, embedding = resolve_backend("snpe-c(members=2, embedding=all/5)", "score")
+    assert (method.members, embedding) == (2, "all/5")
 
 
 def test_effects_are_split_at_the_commas_between_them():

@@ -346,7 +346,7 @@ def test_inference_may_start_from_the_last_posterior_or_the_closest_fit(tmp_path
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
     run(tmp_path)
-    with pytest.raises(DataError, match="differs in options"):
+    with pytest.raises(DataError, match="differs in the number of simulations"):
         run(tmp_path, small_options(iterations=1, num_simulations=50))
 
 

@@ -25,6 +25,7 @@ __all__ = [
     "Backends",
     "Candidate",
     "available",
+    "candidate",
     "candidates",
     "folder_name",
     "name_and_options",
@@ -63,20 +64,39 @@ def candidates(backends: Backends) -> dict[str, Candidate]:
     """
     found: dict[str, Candidate] = {}
     if isinstance(backends, Mapping):
-        pairs = [(str(label), _candidate(value)[1]) for label, value in backends.items()]
+        pairs = [(str(label), _labelled(value)[1]) for label, value in backends.items()]
     else:
-        pairs = [_candidate(value) for value in backends]
-    for label, candidate in pairs:
+        pairs = [_labelled(value) for value in backends]
+    for label, named in pairs:
         taken = {folder_name(known): known for known in found}
         if folder_name(label) in taken:
             raise BackendError(
                 f"The labels {taken[folder_name(label)]!r} and {label!r} cannot be told apart; "
                 "write a label in front, as in 'other = snpe-c(flow=maf)'."
             )
-        found[label] = candidate
+        found[label] = named
     if not found:
         raise BackendError("Name at least one backend to compare.")
     return found
+
+
+def candidate(text: str) -> Candidate:
+    """Returns the candidate that a text without a label describes, e.g. ``snpe-c(flow=maf)``.
+
+    Raises:
+        BackendError: The backend, its features or an option does not exist.
+    """
+    name, options = name_and_options(text)
+    embedding = options.pop("embedding", None)
+    if embedding not in (None, "score"):
+        embedding_by_name(embedding)  # says so now if there is none of this name
+    try:
+        method = backend_by_name(name, **options)
+    except TypeError as error:
+        raise BackendError(
+            f"{text.strip()!r} has an option of the wrong type: {error}."
+        ) from error
+    return Candidate(method, embedding)
 
 
 def split_candidates(text: str) -> list[str]:
@@ -133,23 +153,13 @@ def folder_name(label: str) -> str:
     return re.sub(r"[^\w.+=-]+", "_", label).strip("_.")
 
 
-def _candidate(value: str | Backend | Candidate) -> tuple[str, Candidate]:
+def _labelled(value: str | Backend | Candidate) -> tuple[str, Candidate]:
     if isinstance(value, Candidate):
         return value.backend.name, value
     if isinstance(value, Backend):
         return value.name, Candidate(value)
     label, _, rest = value.rpartition("=") if "(" not in value else _label(value)
-    name, options = name_and_options(rest)
-    embedding = options.pop("embedding", None)
-    if embedding not in (None, "score"):
-        embedding_by_name(embedding)  # says so now if there is none of this name
-    try:
-        method = backend_by_name(name, **options)
-    except TypeError as error:
-        raise BackendError(
-            f"{rest.strip()!r} has an option of the wrong type: {error}."
-        ) from error
-    return label.strip() or rest.strip(), Candidate(method, embedding)
+    return label.strip() or rest.strip(), candidate(rest)
 
 
 def _label(text: str) -> tuple[str, str, str]:
