@@ -36,6 +36,7 @@ from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
 from npdr_ppl.discovery.screening.candidate_effects import candidates_at
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.search.effect_search import Searcher
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
 from npdr_ppl.preparation.segment_model import SegmentModel
@@ -109,8 +110,10 @@ def judge(task: Task) -> dict[str, Any]:
                 f"{h.name}.{n}": float(v) for h in case.truth for n, v in h.parameters.items()
             },
         }
-        options = npdr.DiscoveryOptions(seed=task.seed, effects=_catalogue(task, case))
-        found = npdr.discover(case.model, case.fit, holdout=case.holdout, options=options)
+        search = npdr.DiscoveryOptions(effects=_catalogue(task, case))
+        found = npdr.discover(
+            case.model, case.fit, holdout=case.holdout, search=search, seed=task.seed
+        )
         row |= {
             "verdict": found.verdict,
             "problems": list(found.problems),
@@ -128,7 +131,7 @@ def judge(task: Task) -> dict[str, Any]:
     except Exception as error:  # a failure is a row with its message
         if task.condition == "bad_data" and isinstance(error, DataError):
             # Reported is what the refusal names, not that there is one.
-            segments = SegmentModel(case.model, case.fit, options.binding(case.fit))
+            segments = SegmentModel(case.model, case.fit, segment_options(case.fit))
             problems = recording_problems(segments.measured, case.fit)
             told = [problem for problem in problems if problem in str(error)]
             row |= {"verdict": "refused", "problems": told, "effects": [], "seconds": {}}
@@ -280,11 +283,10 @@ def true_model_errors(case: Case, found: npdr.Discovery) -> dict[str, float] | N
         return None
     truth = {f"{h.name}.{n}": torch.tensor(v) for h in case.truth for n, v in h.parameters.items()}
     truth |= {name: torch.tensor(value) for name, value in case.parameters.items()}
-    options = npdr.DiscoveryOptions()
     true = fit_hypothesis(
         given.model,
         case.fit,
-        options.binding(case.fit),
+        segment_options(case.fit),
         effects=tuple(known[name] for name in case.names),
         start={name: value.double() for name, value in truth.items()},
         max_steps=0,
@@ -293,10 +295,10 @@ def true_model_errors(case: Case, found: npdr.Discovery) -> dict[str, float] | N
         given,
         true,
         case.holdout,
-        options.binding(case.holdout),
-        draws_before=posterior_draws(given, seed=options.seed),
-        draws_after=posterior_draws(true, seed=options.seed),
-        seed=options.seed,
+        segment_options(case.holdout),
+        draws_before=posterior_draws(given, seed=0),
+        draws_after=posterior_draws(true, seed=0),
+        seed=0,
     )
     return {name: part.after for name, part in gap.items()}
 

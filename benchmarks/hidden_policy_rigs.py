@@ -27,6 +27,7 @@ from pathlib import Path
 import torch
 from policy_loop import DISCOVER, SUCCESS, changed
 
+from npdr_ppl.discovery import DiscoveryOptions
 from npdr_ppl.loop.control_task import control_task
 from npdr_ppl.loop.loop_options import LoopOptions
 from npdr_ppl.models.furuta_hidden_rigs import HIDDEN, hidden_rig
@@ -41,7 +42,7 @@ OPTIONS = DISCOVER | {
     "stop_return": SUCCESS,
     "stops": "measured return",
     # One effect is hidden, at two joints where it is friction: a search for more takes minutes.
-    "discovery.max_effects": 2,
+    "discovery": DiscoveryOptions(max_effects=2),
 }
 
 
@@ -70,13 +71,15 @@ def row_of(kind: str, rig: int, method: str, seed: int) -> dict:
     """Runs the loop on one rig and returns its row."""
     name = f"furuta-{kind}-{rig}"
     hidden = hidden_rig(kind, rig)
+    loop, options = changed(LoopOptions(), OPTIONS)
     started, spent = time.perf_counter(), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         outcome = run_method(
             METHODS[method],
             furuta_target(name),
             control_task("furuta-swing-up"),
-            changed(LoopOptions(), OPTIONS),
+            loop,
+            options=options,
             seed=seed,
             out=Path(folder) / "run",
             progress=False,

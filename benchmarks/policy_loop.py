@@ -20,7 +20,8 @@ from pathlib import Path
 
 import torch
 
-from npdr_ppl.loop.loop_options import LoopOptions
+from npdr_ppl.loop.loop_options import LOOP_DATA, LoopOptions
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.reproduction.rig_study import METHODS, study, summarise
 
 SUCCESS = 1_400.0
@@ -30,7 +31,7 @@ RANDOM = tuple(f"furuta-random-{seed}" for seed in range(10))
 
 ABLATION = {
     "as it is": {},
-    "recorded initial states": {"binding.initial_state": "recorded"},
+    "recorded initial states": {"data.initial_state": "recorded"},
     "decisions logged only": {"follows_decisions": False},
     "point estimate": {"domains": "most likely", "spread": 0.0, "num_domains": 1},
     "point estimate ± 10 %": {"domains": "most likely", "spread": 0.1},
@@ -41,7 +42,7 @@ ABLATION = {
     "latest rollout only": {"rollouts_used": "latest"},
     "started from the last posterior": {"start": "posterior"},
 }
-"""Changes of the loop's options; a dot goes into those of binding or discovery."""
+"""Changes of the loop's options; ``data.`` begins those that prepare rollouts."""
 
 DISCOVER = {
     "iterations": 2,
@@ -52,8 +53,6 @@ DISCOVER = {
     "num_domains": 30,
     "num_initial_states": 2,
     "starts_from_prior": False,
-    "discovery.segment_length": 50,
-    "discovery.precision": "float32",
 }
 """Two real rollouts, the first of the default gains: a policy trained on the prior knocks the arm
 of most rigs against its stop within a second, which leaves too little to tell effects by. With
@@ -62,15 +61,11 @@ half as many iterations of the search, policies balance in simulation and fail o
 COMPARED = "npdr with discovery,npdr"
 
 
-def changed(options: LoopOptions, changes: dict) -> LoopOptions:
-    """Returns the options with some changed."""
-    for name, value in changes.items():
-        group, _, option = name.rpartition(".")
-        if group:
-            value = replace(getattr(options, group), **{option: value})
-            name = group
-        options = replace(options, **{name: value})
-    return options
+def changed(loop: LoopOptions, changes: dict) -> tuple[LoopOptions, DataOptions]:
+    """Returns the loop's options with some changed, and how it prepares rollouts."""
+    data = {n.removeprefix("data."): v for n, v in changes.items() if n.startswith("data.")}
+    own = {name: value for name, value in changes.items() if not name.startswith("data.")}
+    return replace(loop, **own), replace(LOOP_DATA, **data)
 
 
 def main() -> None:
@@ -94,7 +89,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-    options = LoopOptions(
+    loop = LoopOptions(
         iterations=arguments.iterations,
         rounds=arguments.rounds,
         num_simulations=arguments.simulations,
@@ -115,7 +110,7 @@ def main() -> None:
     if arguments.ablation:
         methods = ["npdr with effects"]
     if arguments.discover:
-        options = changed(options, DISCOVER)
+        loop, _ = changed(loop, DISCOVER)
         methods = (arguments.methods or COMPARED).split(",")
         sets.pop("hard", None)
     result = {}
@@ -131,10 +126,18 @@ def main() -> None:
             print(f"{'':10}{', '.join(effects)}", flush=True)
 
     for variant, changes in variants.items():
+        chosen_loop, options = changed(loop, changes)
         folder = arguments.out / variant.replace(" ", "_").replace("%", "percent")
         for name, rigs in sets.items():
             found = study(
-                methods, rigs, seeds, changed(options, changes), folder, progress=False, note=note
+                methods,
+                rigs,
+                seeds,
+                chosen_loop,
+                folder,
+                options=options,
+                progress=False,
+                note=note,
             )
             for label, outcomes in found.items():
                 row = summarise(outcomes, SUCCESS)

@@ -7,7 +7,23 @@ from typing import Annotated
 import typer
 
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
-from npdr_ppl.cli.names import complete_effect, complete_model
+from npdr_ppl.cli.names import complete_effect
+from npdr_ppl.cli.options import (
+    DataOption,
+    EffectOption,
+    HoldoutOption,
+    InitialState,
+    InitialStateOption,
+    ModelArgument,
+    Noise,
+    NoiseOption,
+    OutOption,
+    Precision,
+    PrecisionOption,
+    SeedOption,
+    SegmentLengthOption,
+    data_options,
+)
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
@@ -30,36 +46,26 @@ class LastStage(StrEnum):
 
 
 def discover(
-    model: Annotated[
-        str,
-        typer.Argument(
-            help="Zoo name, or path/to/file.py:function.", autocompletion=complete_model
-        ),
-    ],
-    data: Annotated[Path, typer.Option(help="Rollouts: CSV, Parquet, NPZ or NetCDF.")],
-    out: Annotated[Path, typer.Option(help="Folder for results.")],
-    holdout: Annotated[str, typer.Option(help="Rollouts to test on, e.g. 3,4.")] = "",
+    model: ModelArgument,
+    data: DataOption,
+    out: OutOption,
+    holdout: HoldoutOption = "",
     holdout_data: Annotated[
         Path | None,
         typer.Option(help="File of held-out rollouts; best with another excitation."),
     ] = None,
-    segment_length: Annotated[
-        int, typer.Option(min=0, help="Steps between re-synchronisations; 0 for 0.2 s.")
-    ] = 0,
-    effect: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Effect that the model already has, port.effect; may be repeated.",
-            autocompletion=complete_effect,
-        ),
-    ] = None,
-    effects: Annotated[
+    effect: EffectOption = None,
+    candidates: Annotated[
         str,
         typer.Option(
             help="Effects to try, port.effect,port.effect; all if not given.",
             autocompletion=complete_effect,
         ),
     ] = "",
+    segment_length: SegmentLengthOption = "auto",
+    initial_state: InitialStateOption = InitialState.UNCERTAIN,
+    precision: PrecisionOption = Precision.FLOAT64,
+    noise: NoiseOption = Noise.AUTO,
     max_effects: Annotated[int, typer.Option(min=0, help="Maximum number of effects to add.")] = 5,
     false_alarm_rate: Annotated[
         float, typer.Option(help="Probability of an alarm if nothing is missing.")
@@ -67,7 +73,7 @@ def discover(
     stage: Annotated[
         LastStage, typer.Option(help="Stop after this stage and write the results so far.")
     ] = LastStage.PROVE,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    seed: SeedOption = 0,
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     address: Address = None,
@@ -77,6 +83,9 @@ def discover(
     verbose: Verbose = False,
 ) -> None:
     """Find effects that a model lacks, add them, and test the revised model on held-out data.
+
+    Discovery estimates initial states and noise, and tests short segments: it accepts only the
+    defaults of --initial-state and --noise, and no whole rollouts. It uses no features.
 
     Writes discovery.json, revised_model.py (a model for every other command) and figures. The
     same command continues an interrupted search, or shows the result of a finished one.
@@ -92,25 +101,24 @@ def discover(
     from npdr_ppl.cli.show import show_discovery
     from npdr_ppl.discovery import DiscoveryOptions, Investigation
     from npdr_ppl.discovery.discovery_folder import DiscoveryFolder, findings_until
-    from npdr_ppl.discovery.search_progress import sentences
     from npdr_ppl.display.plots.discovery_figures import (
         write_discovery_figures,
         write_stage_figures,
     )
+    from npdr_ppl.progress import reporter
     from npdr_ppl.run_files import claimed
 
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_holdout(data, holdout, holdout_data)
-    options = DiscoveryOptions(
-        segment_length=segment_length or None,
-        effects=tuple(named_effects([effects])) if effects else None,
+    options = data_options(None, segment_length, initial_state, precision, noise)
+    search = DiscoveryOptions(
+        effects=tuple(named_effects([candidates])) if candidates else None,
         max_effects=max_effects,
         false_alarm_rate=false_alarm_rate,
-        seed=seed,
     )
     folder = DiscoveryFolder(out)
     with claimed(out):
-        folder.begin(chosen, train, test, options)
+        folder.begin(chosen, train, test, options, search, seed=seed)
         found = folder.finished(stage.value)
         if found is None:
             with (
@@ -118,13 +126,15 @@ def discover(
                 folder.kept(),
                 chosen_workers(executor, workers, address, time_limit),
             ):
-                with sentences(options, False if quiet else None) as report:
+                with reporter(False if quiet else None) as report:
                     investigation = Investigation(
                         chosen,
                         train,
                         holdout=test if stage is LastStage.PROVE else None,
                         options=options,
-                        report=report,
+                        search=search,
+                        seed=seed,
+                        progress=report,
                     )
                     found, discovery = findings_until(investigation, stage.value)
                 if discovery is None:

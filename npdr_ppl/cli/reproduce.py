@@ -127,7 +127,6 @@ def _reproduce_missing_effect(
     data: Path | None, out: Path, seed: int, as_json: bool, quiet: bool
 ) -> None:
     from npdr_ppl.cli.show import show_missing_effect
-    from npdr_ppl.discovery import DiscoveryOptions
     from npdr_ppl.display.plots.missing_effect_figures import write_missing_effect_figures
     from npdr_ppl.engines.workers import workers
     from npdr_ppl.errors import DataError
@@ -142,7 +141,7 @@ def _reproduce_missing_effect(
             swing_ups,
             chirps,
             out,
-            options=DiscoveryOptions(seed=seed),
+            seed=seed,
             progress=False if quiet else None,
         )
         if story is not None:

@@ -174,14 +174,14 @@ def train(
         )
     if animate:
         check_animated([sensor.name for sensor in device.sensors])
-    options = LoopOptions(
+    options = data_options(features, segment_length, initial_state, precision, noise)
+    loop = LoopOptions(
         iterations=iterations,
         rollouts=rollouts,
         extra_rollouts=extra_rollouts,
         backend=method,
         rounds=rounds,
         num_simulations=simulations,
-        binding=data_options(features, segment_length, initial_state, precision, noise),
         search=resolve_search(search),
         search_iterations=search_iterations,
         num_domains=domains,
@@ -201,7 +201,14 @@ def train(
             chosen_workers(executor, workers, address, time_limit),
         ):
             training = run_train(
-                chosen, device, chosen_task, options, out=out, seed=seed, progress=report
+                chosen,
+                device,
+                chosen_task,
+                options=options,
+                loop=loop,
+                out=out,
+                seed=seed,
+                progress=report,
             )
             step = report.stage("draw figures")
             step(0.0, "returns, rollouts, parameters")

@@ -22,6 +22,7 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery, describe_candidate
 from npdr_ppl.discovery.investigation import Investigation
 from npdr_ppl.discovery.kept_fits import keep_fits
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import (
     holds_this_run,
@@ -65,16 +66,21 @@ class DiscoveryFolder:
         model: Callable[..., Any],
         rollouts: Rollouts,
         holdout: Rollouts | None,
-        options: DiscoveryOptions,
+        options: DataOptions,
+        search: DiscoveryOptions,
+        *,
+        seed: int,
     ) -> None:
         """Writes ``run.json``, or checks that the folder already holds the same discovery.
 
         Raises:
             DataError: The folder holds another discovery.
         """
-        settings = dataclasses.asdict(options)
-        settings["effects"] = options.effects and [repr(e) for e in options.effects]
-        seed = settings.pop("seed")
+        settings = dataclasses.asdict(search) | {
+            "effects": search.effects and [repr(effect) for effect in search.effects],
+            "segment_length": options.segment_length,
+            "precision": options.precision,
+        }
         description = plain(
             {
                 "command": "discover",
@@ -142,6 +148,7 @@ def findings_until(
             describe_candidate(candidate, first.alarm.p_values[candidate.name])
             for candidate in first.ranking
         ]
+    investigation.progress.finish()
     return found | {"seconds": investigation.seconds}, None
 
 

@@ -59,7 +59,8 @@ class Discovery:
         counts: Encoder resolution by channel, where there is one, and the share of the revised
             model's residual variance that rounding to it causes.
         search: The course of the search.
-        options: Settings of the search.
+        settings: Settings of the search.
+        seed: Seed of all random numbers.
         seconds: Time spent, by stage.
     """
 
@@ -83,7 +84,8 @@ class Discovery:
     draws: Draws
     counts: dict[str, Count]
     search: Search
-    options: DiscoveryOptions
+    settings: DiscoveryOptions
+    seed: int
     seconds: dict[str, float]
 
     def to_dict(self) -> dict[str, Any]:

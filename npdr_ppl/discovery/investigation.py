@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -29,10 +30,13 @@ from npdr_ppl.discovery.search.effect_search import Round, Search, Searcher, exp
 from npdr_ppl.discovery.search.limits import limits
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
+from npdr_ppl.discovery.search_progress import SearchProgress
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Investigation", "discover"]
@@ -54,14 +58,21 @@ class Investigation:
         rollouts: The recording that is used to find and fit effects.
         holdout: Rollouts that measure the improvement, best with another excitation. They are
             never used to choose or fit anything.
-        options: Settings of the search.
-        report: Called with a sentence at each step.
+        options: How the recording is prepared. Discovery estimates initial states and noise, and
+            compares trajectories themselves: ``initial_state`` and ``noise`` must have their
+            defaults, ``segment_length`` must not be ``None``, and ``embedding`` has no effect.
+        search: Settings of the search.
+        seed: Seed of everything random.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Attributes:
+        settings: The settings of the search.
         seconds: Time spent, by stage.
+        progress: The progress bar.
 
     Raises:
-        DataError: ``holdout`` is not a ``Rollouts``, or has other channels than the recording.
+        DataError: The recording is too short, discovery cannot use an option, or ``holdout`` is
+            not a ``Rollouts`` or has other channels than the recording.
     """
 
     def __init__(
@@ -70,8 +81,10 @@ class Investigation:
         rollouts: Rollouts,
         *,
         holdout: Rollouts | None = None,
-        options: DiscoveryOptions | None = None,
-        report: Callable[[str], None] = lambda _: None,
+        options: DataOptions | None = None,
+        search: DiscoveryOptions | None = None,
+        seed: int = 0,
+        progress: bool | Reporter | None = None,
     ) -> None:
         if holdout is not None and not isinstance(holdout, Rollouts):
             raise DataError(
@@ -82,16 +95,28 @@ class Investigation:
         self.model = model
         self.rollouts = rollouts
         self.holdout = holdout
-        self.options = options or DiscoveryOptions()
+        self.settings = search or DiscoveryOptions()
+        self.seed = seed
         self.seconds: dict[str, float] = {}
-        self._binding = self.options.binding(rollouts)
-        self._searcher = Searcher(model, rollouts, self.options, report)
+        self.progress = SearchProgress(self.settings, progress)
+        self._binding = segment_options(rollouts, options)
+        self._searcher = Searcher(
+            model, rollouts, self.settings, self.progress.say, binding=self._binding, seed=seed
+        )
         self._drawn: list[tuple[Hypothesis, Draws]] = []
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        """Shows progress inside the block, and records how long it takes."""
+        begin = time.monotonic()
+        with self.progress.shown():
+            yield
+        self.seconds[name] = time.monotonic() - begin
 
     @cached_property
     def given(self) -> Hypothesis:
         """The original model, fitted to the recording."""
-        with _timed(self.seconds, "fit"):
+        with self._stage("fit"):
             try:
                 fitted = self._searcher.fit_base()
             except DataError as error:
@@ -100,7 +125,7 @@ class Investigation:
                 if not problems:
                     raise
                 raise DataError(f"{error} {problems[0]}") from error
-        for effect in self.options.effects or ():
+        for effect in self.settings.effects or ():
             # Screening skips effects that the simulator cannot have; requested ones raise errors.
             fitted.simulator.with_effects(effect)
             if effect.is_noise:
@@ -119,7 +144,7 @@ class Investigation:
     def _start(self) -> tuple[Hypothesis, Mapping[str, Distribution]]:
         """The fit that the search begins with, and the model's original priors."""
         given = self.given
-        with _timed(self.seconds, "choose steps"):
+        with self._stage("choose steps"):
             found = self._searcher.with_finer_steps(given)
             priors = found.segments.prior.distributions
             return self._searcher.with_wider_priors(found), priors
@@ -136,7 +161,7 @@ class Investigation:
     def problems(self) -> tuple[str, ...]:
         """Problems of the recording itself."""
         start = self.start
-        with _timed(self.seconds, "check data"):
+        with self._stage("check data"):
             return tuple(data_problems(start, self.rollouts, self._binding))
 
     @cached_property
@@ -148,16 +173,16 @@ class Investigation:
     def first(self) -> Round:
         """Alarm and ranking before any effect is added."""
         start = self.start
-        with _timed(self.seconds, "screen"):
+        with self._stage("screen"):
             return self._searcher.look(start)
 
     @cached_property
     def search(self) -> Search:
         """The missing effects. A recording with problems is not searched."""
         problems, first = self.problems, self.first
-        with _timed(self.seconds, "search"):
+        with self._stage("search"):
             return self._searcher.run(
-                first, max_effects=0 if problems else self.options.max_effects
+                first, max_effects=0 if problems else self.settings.max_effects
             )
 
     @cached_property
@@ -166,7 +191,7 @@ class Investigation:
         search = self.search
         final, explains = search.final, sum(added.share for added in search.added)
         result = []
-        with _timed(self.seconds, "limits"):
+        with self._stage("limits"):
             for added in search.added:
                 names = list(final.at_edge(added.effect))
                 if added.share > VERDICT.minor_share * explains:
@@ -179,8 +204,8 @@ class Investigation:
         for known, draws in self._drawn:
             if known is hypothesis:
                 return draws
-        with _timed(self.seconds, f"posterior {len(self._drawn) + 1}"):
-            draws = posterior_draws(hypothesis, seed=self.options.seed)
+        with self._stage(f"posterior {len(self._drawn) + 1}"):
+            draws = posterior_draws(hypothesis, seed=self.seed)
         self._drawn.append((hypothesis, draws))
         return draws
 
@@ -191,7 +216,7 @@ class Investigation:
             return {}
         given, final = self.given, self.search.final
         draws_before, draws_after = self._draws(given), self._draws(final)
-        with _timed(self.seconds, "prove"):
+        with self._stage("prove"):
             binding = _like(self._binding, self.rollouts, self.holdout)
             return prove(
                 given,
@@ -200,7 +225,7 @@ class Investigation:
                 binding,
                 draws_before=draws_before,
                 draws_after=draws_after,
-                seed=self.options.seed,
+                seed=self.seed,
             )
 
     def _advice(self, name: str) -> NextExperiment | None:
@@ -230,16 +255,17 @@ class Investigation:
             _finding(added, search, every, at_edge)
             for added, at_edge in zip(search.added, self._at_edge, strict=True)
         ]
-        verdict, reason = _judge(search, effects, self.problems, unexplained, self.options)
+        verdict, reason = _judge(search, effects, self.problems, unexplained, self.settings)
         if self.narrow_priors and not self.problems:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"
         gap = self.gap
-        with _timed(self.seconds, "next experiment"):
+        with self._stage("next experiment"):
             advice = None
             if verdict == "ambiguous":
-                advice = self._advice(_most_doubtful(effects, self.options).effect.name)
+                advice = self._advice(_most_doubtful(effects, self.settings).effect.name)
+            self.progress.finish()
         return Discovery(
             verdict=verdict,
             reason=reason,
@@ -261,7 +287,8 @@ class Investigation:
             draws=self._draws(final),
             counts=counts(final, self.rollouts),
             search=search,
-            options=self.options,
+            settings=self.settings,
+            seed=self.seed,
             seconds=self.seconds,
         )
 
@@ -271,8 +298,10 @@ def discover(
     rollouts: Rollouts,
     *,
     holdout: Rollouts | None = None,
-    options: DiscoveryOptions | None = None,
-    report: Callable[[str], None] = lambda _: None,
+    options: DataOptions | None = None,
+    search: DiscoveryOptions | None = None,
+    seed: int = 0,
+    progress: bool | Reporter | None = None,
 ) -> Discovery:
     """Finds the effects that a model lacks, adds them and measures the improvement.
 
@@ -281,16 +310,28 @@ def discover(
         rollouts: The recording that is used to find and fit effects.
         holdout: Rollouts that measure the improvement, best with another excitation. They are
             never used to choose or fit anything.
-        options: Settings of the search.
-        report: Called with a sentence at each step.
+        options: How the recording is prepared. Discovery estimates initial states and noise, and
+            compares trajectories themselves: ``initial_state`` and ``noise`` must have their
+            defaults, ``segment_length`` must not be ``None``, and ``embedding`` has no effect.
+        search: Settings of the search.
+        seed: Seed of everything random.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Raises:
-        DataError: The recording is too short, or does not fit the model.
+        DataError: The recording is too short or does not fit the model, or discovery cannot use
+            an option.
         ModelError: The model cannot be inferred, or no fit can find a requested effect.
     """
-    return Investigation(
-        model, rollouts, holdout=holdout, options=options, report=report
-    ).conclude()
+    with reporter(progress) as report:
+        return Investigation(
+            model,
+            rollouts,
+            holdout=holdout,
+            options=options,
+            search=search,
+            seed=seed,
+            progress=report,
+        ).conclude()
 
 
 def _judge(
@@ -393,11 +434,4 @@ def _like(binding: DataOptions, rollouts: Rollouts, holdout: Rollouts) -> DataOp
     length = binding.steps(rollouts)
     assert length is not None
     steps = round(length * rollouts.time_step / holdout.time_step)
-    return DataOptions(None, max(2, steps), binding.initial_state, binding.precision)
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    begin = time.monotonic()
-    yield
-    seconds[stage] = time.monotonic() - begin
+    return replace(binding, segment_length=max(2, steps))

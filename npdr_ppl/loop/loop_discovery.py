@@ -6,7 +6,7 @@ saved before the loop continues, and a resumed run reads it instead of searching
 """
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,16 +19,14 @@ from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect, with_finer_steps
 from npdr_ppl.loop.loop_options import Model
 from npdr_ppl.models.effects.registry import effect_class
-from npdr_ppl.progress import Step
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.progress import Reporter
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import read_json
 
 __all__ = ["LoopDiscovery", "Revision", "effect_names"]
 
 _LOGGER = logging.getLogger(__name__)
-
-USUAL_REPORTS = 60
-"""Number of messages that a typical search reports; the progress bar is scaled by it."""
 
 
 @dataclass(frozen=True)
@@ -54,21 +52,34 @@ class LoopDiscovery:
 
     Args:
         model: The loop's original model.
-        options: Options of the search.
+        options: How the loop prepares rollouts. Discovery takes segment length and precision from
+            it; it estimates initial states and noise itself.
+        search: Settings of the search.
         seed: Seed of all random numbers.
     """
 
-    def __init__(self, model: Model, options: DiscoveryOptions, seed: int) -> None:
+    def __init__(
+        self, model: Model, options: DataOptions, search: DiscoveryOptions, *, seed: int
+    ) -> None:
         self.model = model
-        self.options = replace(options, seed=seed)
+        self.options = replace(
+            options,
+            segment_length=options.segment_length or "auto",
+            initial_state="uncertain",
+            noise="auto",
+        )
+        self.search = search
+        self.seed = seed
 
-    def look(self, rollouts: Rollouts, folder: Path, progress: Step | None = None) -> Revision:
+    def look(
+        self, rollouts: Rollouts, folder: Path, progress: bool | Reporter | None = False
+    ) -> Revision:
         """Returns the model with the effects found, from disk if they were searched already.
 
         Args:
             rollouts: All real rollouts so far.
             folder: Folder for ``discovery.json`` and ``revised_model.py``.
-            progress: Called with the fraction done and a short status.
+            progress: Whether to show progress, or where.
         """
         file = folder / "discovery.json"
         if not file.exists():
@@ -77,7 +88,9 @@ class LoopDiscovery:
                     self.model,
                     rollouts,
                     options=self.options,
-                    report=_reports(progress),
+                    search=self.search,
+                    seed=self.seed,
+                    progress=progress,
                 )
             except NpdrError as error:
                 # A rollout that ended early may be too short for a search.
@@ -88,7 +101,7 @@ class LoopDiscovery:
 
     def _read(self, result: Mapping[str, Any]) -> Revision:
         """Returns the revision that a saved discovery describes."""
-        own = {effect.name: effect for effect in self.options.effects or ()}
+        own = {effect.name: effect for effect in self.search.effects or ()}
         model = self.model
         for _ in range(result.get("finer_steps", 0)):
             model = with_finer_steps(model)
@@ -109,19 +122,3 @@ def effect_names(model: Model) -> list[str]:
 
 def _sentence(result: Mapping[str, Any]) -> str:
     return f"{result['reason']} (Alarm: p = {result['alarm']['p_value']:.2g}.)"
-
-
-def _reports(progress: Step | None) -> Callable[[str], None]:
-    """Returns a function that turns discovery's messages into progress.
-
-    The number of messages is not known in advance, so progress approaches 1 step by step.
-    """
-    count = 0
-
-    def report(sentence: str) -> None:
-        nonlocal count
-        count += 1
-        if progress is not None:
-            progress(1.0 - 0.5 ** (4.0 * count / USUAL_REPORTS), sentence[:60])
-
-    return report

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from npdr_ppl.loop.control_task import ControlTask
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.run_files import (
     holds_this_run,
     load_tensors,
@@ -63,7 +64,8 @@ class LoopFolder:
         model: Callable[..., Any],
         target: TargetDomain,
         task: ControlTask,
-        options: "LoopOptions",
+        options: DataOptions,
+        loop: "LoopOptions",
         *,
         seed: int,
     ) -> None:
@@ -80,7 +82,8 @@ class LoopFolder:
                 "target": repr(target),
                 "task": task.name,
                 "num_steps": task.num_steps,
-                "options": _words(options),
+                "binding": repr(options),
+                "options": _words(loop),
                 "seed": seed,
             }
         )

@@ -11,6 +11,7 @@ from npdr_ppl.loop.loop_options import LoopOptions, Model
 from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.posterior import Posterior
 from npdr_ppl.posterior.prepare import prepare
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.progress import Reporter
 from npdr_ppl.rollouts import Rollouts
 
@@ -20,6 +21,7 @@ __all__ = ["infer_posterior"]
 def infer_posterior(
     model: Model,
     rollouts: Rollouts,
+    data_options: DataOptions,
     options: LoopOptions,
     backend: Backend,
     *,
@@ -36,6 +38,7 @@ def infer_posterior(
     Args:
         model: The model.
         rollouts: The observed rollouts.
+        data_options: How the rollouts are prepared.
         options: Options of the loop.
         backend: The inference backend.
         rounds: Rounds of inference.
@@ -50,7 +53,7 @@ def infer_posterior(
     prepared = prepare(
         model,
         rollouts,
-        options.binding,
+        data_options,
         near=near,
         seed=seed,
         progress=report.stage("find the closest parameters"),

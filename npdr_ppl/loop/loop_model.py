@@ -65,8 +65,7 @@ class LoopModel:
         if self.revise is not None:
             found, finding = self.revise(self.model, rollouts, folder), ""
         else:
-            step = report.stage("look for a missing effect")
-            revision = self.discovery.look(rollouts, folder, step)
+            revision = self.discovery.look(rollouts, folder, report)
             found, finding, near = revision.model, revision.reason, revision.parameters
             proposal = proposed_excitation(revision.experiment, target.actions, target.time_step)
         if found is None:

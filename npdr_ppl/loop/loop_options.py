@@ -15,7 +15,11 @@ from npdr_ppl.posterior.diagnostics import Thresholds
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["NEW_ATTEMPTS", "SPREAD_WIDER", "Action", "LoopOptions", "Model", "Revise"]
+__all__ = ["LOOP_DATA", "NEW_ATTEMPTS", "SPREAD_WIDER", "Action", "LoopOptions", "Model", "Revise"]
+
+LOOP_DATA = DataOptions("score", 50, "uncertain", "float32")
+"""How the loop prepares rollouts by default: in segments of 50 steps and in float32, with which it
+was validated on hidden rigs."""
 
 Model = Callable[..., Any]
 
@@ -49,6 +53,9 @@ SPREAD_WIDER = (Action.SPREAD, Action.NOTHING_FOUND)
 class LoopOptions:
     """Options of Algorithm 1.
 
+    How rollouts are prepared is not among them; see
+    :class:`~npdr_ppl.preparation.data_options.DataOptions`.
+
     Attributes:
         iterations: Iterations of the loop.
         rollouts: Number H of real rollouts in each iteration.
@@ -60,7 +67,6 @@ class LoopOptions:
             sequential.
         extra_rounds: Further rounds that a diagnosis may ask for in each iteration.
         num_simulations: Simulations in each round.
-        binding: How rollouts are prepared for inference.
         start: Where inference starts: from the prior; in the neighbourhood of the closest fit,
             if initial states are uncertain; or in later iterations, as in the paper, from the
             last posterior. Backends that cannot start elsewhere start from the prior.
@@ -115,7 +121,7 @@ class LoopOptions:
             lacks: in each iteration before inference, or after the posterior of the present model
             has been diagnosed, whatever the diagnosis. Discovery's own alarm decides, because a
             model's noise, estimated at its closest fit, can hide an effect from every diagnosis.
-        discovery: Options of discovery; its seed is derived from the seed of the run.
+        discovery: Settings of discovery's search.
     """
 
     iterations: int = 5
@@ -126,9 +132,6 @@ class LoopOptions:
     rounds: int = 3
     extra_rounds: int = 2
     num_simulations: int = 5_000
-    binding: DataOptions = field(
-        default_factory=lambda: DataOptions("score", 50, "uncertain", "float32")
-    )
     start: Literal["prior", "closest fit", "posterior"] = "closest fit"
     search: str | PolicySearch[Any] = "power"
     search_iterations: int = 20

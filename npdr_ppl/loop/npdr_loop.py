@@ -53,7 +53,14 @@ from npdr_ppl.loop.loop_discovery import LoopDiscovery, effect_names
 from npdr_ppl.loop.loop_folder import LoopFolder
 from npdr_ppl.loop.loop_inference import infer_posterior
 from npdr_ppl.loop.loop_model import LoopModel
-from npdr_ppl.loop.loop_options import NEW_ATTEMPTS, Action, LoopOptions, Model, Revise
+from npdr_ppl.loop.loop_options import (
+    LOOP_DATA,
+    NEW_ATTEMPTS,
+    Action,
+    LoopOptions,
+    Model,
+    Revise,
+)
 from npdr_ppl.loop.loop_result import Training, Tried, best_measured
 from npdr_ppl.loop.next_excitation import chosen_excitation
 from npdr_ppl.loop.policy_optimisation import optimise_policy
@@ -65,6 +72,7 @@ from npdr_ppl.policies.search_registry import policy_search
 from npdr_ppl.posterior.diagnostics import Decision, diagnose
 from npdr_ppl.posterior.fit import describe
 from npdr_ppl.posterior.posterior import Posterior
+from npdr_ppl.preparation.data_options import DataOptions, checked_options
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.randomness import derived_seed, seeded
 from npdr_ppl.run_files import claimed, plain
@@ -86,8 +94,9 @@ def train(
     model: Model,
     target: TargetDomain,
     task: ControlTask,
-    options: LoopOptions | None = None,
     *,
+    options: DataOptions | None = None,
+    loop: LoopOptions | None = None,
     out: str | PathLike[str] | None = None,
     revise: Revise | None = None,
     seed: int = 0,
@@ -99,7 +108,9 @@ def train(
         model: A Pyro model of the target with one black-box site.
         target: The target domain; its parameters stay unknown.
         task: The task of the policy.
-        options: Options of the loop.
+        options: How rollouts are prepared for inference and discovery; ``LOOP_DATA`` if ``None``.
+            Discovery always estimates initial states and noise, and never takes whole rollouts.
+        loop: Options of the loop.
         out: Folder for the run and its ``train.json``. If a run was killed there, it continues.
         revise: Function that searches for a missing effect if a diagnosis asks for it.
         seed: Seed of all random numbers.
@@ -110,15 +121,15 @@ def train(
         ModelError: Policies cannot be trained on the model; see
             :func:`npdr_ppl.loop.domains.simulator_of`.
     """
-    options = options or LoopOptions()
+    options, loop = checked_options(options, LOOP_DATA), loop or LoopOptions()
     with reporter(progress) as report, ExitStack() as stack:
         path = out or stack.enter_context(TemporaryDirectory(prefix="npdr-"))
         folder = LoopFolder(Path(path))
-        loop = _Loop(model, target, task, options, folder, revise, seed, report)
+        run = _Loop(model, target, task, options, loop, folder, revise, seed, report)
         # Made after the checks, so that a model or target that does not match leaves no folder.
         stack.enter_context(claimed(folder.path))
-        folder.begin(model, target, task, options, seed=seed)
-        return loop.run()
+        folder.begin(model, target, task, options, loop, seed=seed)
+        return run.run()
 
 
 class _Loop:
@@ -129,6 +140,7 @@ class _Loop:
         model: Model,
         target: TargetDomain,
         task: ControlTask,
+        data_options: DataOptions,
         options: LoopOptions,
         folder: LoopFolder,
         revise: Revise | None,
@@ -137,13 +149,17 @@ class _Loop:
     ) -> None:
         self.target = target
         self.task = task
+        self.data_options = data_options
         self.options = options
         self.folder = folder
         # A function given by the caller replaces discovery.
         may_discover = options.follows_decisions and revise is None
         self.discovers = options.discovers if may_discover else "never"
         discovery = LoopDiscovery(
-            model, options.discovery, derived_seed(seed, "discovery in the loop")
+            model,
+            data_options,
+            options.discovery,
+            seed=derived_seed(seed, "discovery in the loop"),
         )
         self.model = LoopModel(model, target, discovery, revise)
         self.seed = seed
@@ -382,6 +398,7 @@ class _Loop:
         return infer_posterior(
             self.model.model,
             self.rollouts.joined(None if options.rollouts_used == "all" else options.rollouts),
+            self.data_options,
             options,
             self.backend,
             rounds=rounds + count_actions(decisions, Action.MORE_ROUNDS),

@@ -18,7 +18,7 @@ from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.parameter_units import parameter_units
 from npdr_ppl.posterior.posterior import Posterior
 from npdr_ppl.posterior.prepare import prepare
-from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.data_options import DataOptions, checked_options
 from npdr_ppl.preparation.evaluation import score
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
@@ -70,7 +70,7 @@ def fit(
             prepared = prepare(
                 model,
                 train,
-                options or DataOptions(),
+                checked_options(options),
                 seed=seed,
                 progress=report.stage("find the closest parameters"),
             )

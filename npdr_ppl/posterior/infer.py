@@ -26,6 +26,7 @@ from npdr_ppl.preparation.data_options import (
     MAX_READINGS_PER_CHUNK,
     PLAIN_FEATURES,
     DataOptions,
+    checked_options,
 )
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.randomness import seeded
@@ -105,7 +106,7 @@ def infer(
     method = backend_by_name(backend) if isinstance(backend, str) else backend
     if not method.uses_simulations:
         rounds = 1
-    options = options or DataOptions()
+    options = checked_options(options)
     if preparation is None and isinstance(data, Rollouts):
         if options.initial_state != "uncertain":
             options = replace(options, noise="model")

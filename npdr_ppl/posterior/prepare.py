@@ -237,8 +237,9 @@ def prepare(
     searcher = Searcher(
         model,
         rollouts,
-        DiscoveryOptions(precision=options.precision, seed=seed),
+        DiscoveryOptions(),
         binding=binding,
+        seed=seed,
     )
     simulator = searcher.base.simulator
     # Wrong units are reported here; the search would only find that nothing fits.

@@ -6,6 +6,7 @@ from typing import Literal
 import torch
 
 from npdr_ppl.embeddings import Embedding
+from npdr_ppl.errors import DataError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import InitialState
@@ -15,6 +16,7 @@ __all__ = [
     "PLAIN_FEATURES",
     "DataOptions",
     "SegmentLength",
+    "checked_options",
     "default_segment_length",
 ]
 
@@ -103,3 +105,20 @@ class DataOptions:
         if self.initial_state != "uncertain":
             return self
         return replace(self, initial_state="estimated")
+
+
+def checked_options(
+    options: DataOptions | None, default: DataOptions | None = None
+) -> DataOptions:
+    """Returns the options that a function was given, or its default ones.
+
+    Raises:
+        DataError: ``options`` is of another type.
+    """
+    if options is None:
+        return default or DataOptions()
+    if not isinstance(options, DataOptions):
+        raise DataError(
+            f"options takes a DataOptions, which says how rollouts are prepared; got {options!r}."
+        )
+    return options

@@ -20,6 +20,7 @@ from npdr_ppl.loop.real_rollouts import RealRollouts
 from npdr_ppl.models.furuta import Furuta, furuta
 from npdr_ppl.models.furuta_mujoco import FurutaRig
 from npdr_ppl.models.furuta_targets import FurutaTarget
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.run_files import read_json, write_json
@@ -56,7 +57,7 @@ DEMO_OPTIONS = LoopOptions(
     least_success=0.0,
     deploys="last",
     discovers="after diagnosis",
-    discovery=DiscoveryOptions(max_effects=2, precision="float32"),
+    discovery=DiscoveryOptions(max_effects=2),
 )
 """Settings for a short demo; a study needs more simulations, domains and iterations."""
 
@@ -82,7 +83,8 @@ def run_demo(
     out: Path,
     *,
     seed: int = 0,
-    options: LoopOptions | None = None,
+    options: DataOptions | None = None,
+    loop: LoopOptions | None = None,
     num_steps: int | None = None,
     progress: bool | Reporter | None = None,
 ) -> Demonstration:
@@ -91,7 +93,8 @@ def run_demo(
     Args:
         out: Folder for the run and ``demo.json``; an interrupted run in it continues.
         seed: Seed of everything random.
-        options: Options of the loop; ``DEMO_OPTIONS`` if ``None``.
+        options: How rollouts are prepared; ``LOOP_DATA`` if ``None``.
+        loop: Options of the loop; ``DEMO_OPTIONS`` if ``None``.
         num_steps: Steps of an episode; the task's if ``None``.
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.
     """
@@ -102,7 +105,14 @@ def run_demo(
         task = replace(task, num_steps=num_steps)
     with reporter(progress) as report:
         training = train(
-            furuta, target, task, options or DEMO_OPTIONS, out=out, seed=seed, progress=report
+            furuta,
+            target,
+            task,
+            options=options,
+            loop=loop or DEMO_OPTIONS,
+            out=out,
+            seed=seed,
+            progress=report,
         )
         step = report.stage("run the last policy on the rig")
         after = RealRollouts(target, task, Furuta(), out / "last_policy").collect(

@@ -16,6 +16,7 @@ from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.posterior import Posterior
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.evaluation import replay
+from npdr_ppl.progress import Reporter
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = [
@@ -65,14 +66,14 @@ class Budget:
         num_simulations: Simulations of each round; other methods get all in one round.
         seed: Seed of everything random.
         out: Folder for runs; an interrupted one continues from there.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
     """
 
     rounds: int
     num_simulations: int
     seed: int
     out: Path
-    progress: bool | None
+    progress: bool | Reporter | None
 
     def fit(
         self, model: Model, candidate: Candidate, rollouts: Rollouts, label: str, name: str

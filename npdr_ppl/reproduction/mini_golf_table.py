@@ -24,6 +24,7 @@ from npdr_ppl.models.mini_golf import MiniGolf, mini_golf, mini_golf_two_restitu
 from npdr_ppl.posterior.comparison.compared_backends import Candidate, requested
 from npdr_ppl.posterior.posterior import Posterior
 from npdr_ppl.preparation.evaluation import nominal_parameters
+from npdr_ppl.progress import Reporter
 from npdr_ppl.reproduction.mini_golf_clock import clocks_aligned
 from npdr_ppl.reproduction.mini_golf_fit import (
     BALL,
@@ -78,7 +79,7 @@ def reproduce_mini_golf(
     rounds: int | None = None,
     num_simulations: int | None = None,
     seed: int = 0,
-    progress: bool | None = None,
+    progress: bool | Reporter | None = None,
 ) -> tuple[dict[str, list[Posterior]], dict[str, Any]]:
     """Computes Table 1 and writes ``mini-golf.json``.
 
@@ -90,7 +91,7 @@ def reproduce_mini_golf(
         rounds: Rounds of inference; :data:`ROUNDS` if not given.
         num_simulations: Simulations per round; :data:`NUM_SIMULATIONS` if not given.
         seed: Seed of everything random.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Returns:
         The posteriors of the single strikes by method, and the content of ``mini-golf.json``.

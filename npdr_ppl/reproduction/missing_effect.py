@@ -21,11 +21,11 @@ from npdr_ppl import metrics
 from npdr_ppl.discovery import Discovery, DiscoveryOptions, Investigation
 from npdr_ppl.discovery.discovery_folder import DiscoveryFolder, findings_until
 from npdr_ppl.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
-from npdr_ppl.discovery.search_progress import sentences
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.furuta import Furuta, furuta
-from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.data_options import DataOptions, checked_options
 from npdr_ppl.preparation.evaluation import nominal_parameters, score
+from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.reproduction.table2 import PAPER, SEGMENT_LENGTH
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import InitialState
@@ -84,8 +84,10 @@ def reproduce_missing_effect(
     out: Path,
     *,
     holdout: tuple[int, ...] = (3, 4),
-    options: DiscoveryOptions | None = None,
-    progress: bool | None = None,
+    options: DataOptions | None = None,
+    search: DiscoveryOptions | None = None,
+    seed: int = 0,
+    progress: bool | Reporter | None = None,
 ) -> tuple[Story | None, dict[str, Any]]:
     """Finds the effects that the paper's equations lack; writes ``missing-effect.json``.
 
@@ -94,8 +96,10 @@ def reproduce_missing_effect(
         chirps: The same rig under another excitation, or ``None``.
         out: Folder for results; an interrupted search in it continues, a finished one is read.
         holdout: Swing-ups for the evaluation; the others are fitted.
-        options: Options of the search.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        options: How the recordings are prepared for discovery.
+        search: Settings of the search.
+        seed: Seed of everything random.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Returns:
         Discovery and models, ``None`` if results of a finished run were read, and the content of
@@ -108,15 +112,21 @@ def reproduce_missing_effect(
         raise DataError(f"rollout {max(holdout)} is to be held out; there are {len(swing_ups)}.")
     train = swing_ups[[i for i in range(len(swing_ups)) if i not in holdout]]
     test = swing_ups[list(holdout)]
-    options = options or DiscoveryOptions()
+    options, search = checked_options(options), search or DiscoveryOptions()
     folder, file = DiscoveryFolder(out), out / "missing-effect.json"
     with claimed(out):
-        folder.begin(furuta, train, test, options)
+        folder.begin(furuta, train, test, options, search, seed=seed)
         if file.exists():
             return None, read_json(file)
-        with sentences(options, progress) as report, folder.kept():
+        with reporter(progress) as report, folder.kept():
             investigation = Investigation(
-                furuta, train, holdout=test, options=options, report=report
+                furuta,
+                train,
+                holdout=test,
+                options=options,
+                search=search,
+                seed=seed,
+                progress=report,
             )
             found, discovery = findings_until(investigation, "prove")
         assert discovery is not None

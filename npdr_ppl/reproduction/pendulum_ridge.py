@@ -33,6 +33,7 @@ from npdr_ppl.posterior.comparison.compared_backends import Candidate, folder_na
 from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.posterior import Posterior
 from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.progress import Reporter
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import write_json
@@ -85,7 +86,7 @@ def reproduce_pendulum(
     *,
     backends: Sequence[str] | None = None,
     seed: int = 0,
-    progress: bool | None = None,
+    progress: bool | Reporter | None = None,
 ) -> tuple[dict[str, Ridge], dict[str, Any]]:
     """Infers mass and length from one second and from eight, and compares with NUTS.
 
@@ -94,7 +95,7 @@ def reproduce_pendulum(
         backends: Labels of :data:`METHODS`, or other backends; ``None`` for all methods with an
             available backend; the others are recorded as skipped.
         seed: Seed of everything random.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Returns:
         The posteriors by duration, and the content of ``pendulum.json``.
@@ -157,7 +158,7 @@ def infer_mass_and_length(
     candidate: Candidate,
     rollouts: Rollouts,
     seed: int,
-    progress: bool | None = None,
+    progress: bool | Reporter | None = None,
     *,
     checkpoint: Path | None = None,
 ) -> Posterior:
@@ -167,7 +168,7 @@ def infer_mass_and_length(
         candidate: The backend.
         rollouts: The recording.
         seed: Seed of everything random.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
         checkpoint: Folder for the rounds; existing rounds are not run again.
     """
     rounds = ROUNDS if candidate.is_sequential else 1

@@ -19,7 +19,7 @@ from npdr_ppl.errors import TooShortError
 from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.loop.control_task import ControlTask, control_task
 from npdr_ppl.loop.domains import Domains, domains_at, prior_of
-from npdr_ppl.loop.loop_options import LoopOptions
+from npdr_ppl.loop.loop_options import LOOP_DATA, LoopOptions
 from npdr_ppl.loop.npdr_loop import train
 from npdr_ppl.loop.policy_optimisation import optimise_policy, returns_of
 from npdr_ppl.loop.real_rollouts import RealRollouts
@@ -28,6 +28,7 @@ from npdr_ppl.models.furuta import Furuta, furuta
 from npdr_ppl.models.furuta_targets import furuta_target
 from npdr_ppl.policies.base import Policy
 from npdr_ppl.policies.search_registry import policy_search
+from npdr_ppl.preparation.data_options import DataOptions, checked_options
 from npdr_ppl.progress import Reporter
 from npdr_ppl.randomness import derived_seed, seeded
 from npdr_ppl.run_files import read_json, write_json
@@ -107,8 +108,9 @@ def run_method(
     method: RigMethod,
     target: TargetDomain,
     task: ControlTask,
-    options: LoopOptions,
+    loop: LoopOptions,
     *,
+    options: DataOptions | None = None,
     seed: int,
     num_episodes: int = 3,
     out: Path | None = None,
@@ -120,31 +122,41 @@ def run_method(
         method: The method.
         target: The rig.
         task: The task.
-        options: Options of the loop; those of the policy search apply to every method.
+        loop: Options of the loop; those of the policy search apply to every method.
+        options: How rollouts are prepared; ``LOOP_DATA`` if ``None``.
         seed: Seed of everything random.
         num_episodes: New episodes on the rig that evaluate the last policy.
         out: Folder for the loop's run.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
     """
     model = furuta_with_effects() if method.has_effects else furuta
     records: Sequence[Mapping[str, Any]] = ()
     domain: Mapping[str, float] = {name: float(v) for name, v in Furuta().nominal().items()}
     policy = task.policy
     if method.domains == "posterior":
-        binding = options.binding
+        options = checked_options(options, LOOP_DATA)
         if method.embedding is not None:
-            binding = replace(binding, embedding=method.embedding)
+            options = replace(options, embedding=method.embedding)
         discovers = "before inference" if method.discovers else "never"
-        chosen = replace(options, backend=method.backend, binding=binding, discovers=discovers)
+        chosen = replace(loop, backend=method.backend, discovers=discovers)
         try:
-            trained = train(model, target, task, chosen, out=out, seed=seed, progress=progress)
+            trained = train(
+                model,
+                target,
+                task,
+                options=options,
+                loop=chosen,
+                out=out,
+                seed=seed,
+                progress=progress,
+            )
             policy, domain, records = trained.policy, trained.domain, trained.iterations
         except TooShortError as error:
             # A rollout that ended early can be too short for a method; the prior's policy is used.
             _LOGGER.warning("%s", error)
-            policy = _trained_once(METHODS["prior"], model, target, task, options, seed)
+            policy = _trained_once(METHODS["prior"], model, target, task, loop, seed)
     elif method.domains != "none":
-        policy = _trained_once(method, model, target, task, options, seed)
+        policy = _trained_once(method, model, target, task, loop, seed)
     real = RealRollouts(target, task, Furuta())
     returns = []
     for episode in range(num_episodes):
@@ -153,7 +165,7 @@ def run_method(
         assert rollout.rewards is not None
         returns.append(float(rollout.rewards[0].sum()))
     generator = torch.Generator().manual_seed(derived_seed(seed, "nominal episodes"))
-    starts = task.initial_states(options.num_initial_states, generator)
+    starts = task.initial_states(loop.num_initial_states, generator)
     in_simulation = returns_of(task, _nominal(), policy.parameters[None], starts)
     return Outcome(tuple(returns), float(in_simulation.mean()), records)
 
@@ -162,9 +174,10 @@ def study(
     methods: Sequence[str],
     rigs: Sequence[str],
     seeds: Sequence[int],
-    options: LoopOptions,
+    loop: LoopOptions,
     out: Path,
     *,
+    options: DataOptions | None = None,
     progress: bool | Reporter | None = None,
     note: Callable[[str, str, int, Outcome], None] | None = None,
 ) -> dict[str, dict[str, list[Outcome]]]:
@@ -174,9 +187,10 @@ def study(
         methods: Labels of :data:`METHODS`.
         rigs: Names for :func:`~npdr_ppl.models.furuta_targets.furuta_target`.
         seeds: Seeds of the training.
-        options: Options of the loop.
+        loop: Options of the loop.
         out: Folder for all runs.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        options: How rollouts are prepared; ``LOOP_DATA`` if ``None``.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
         note: Called with method, rig, seed and outcome of every run.
 
     Returns:
@@ -199,7 +213,8 @@ def study(
                         METHODS[label],
                         furuta_target(rig),
                         task,
-                        options,
+                        loop,
+                        options=options,
                         seed=seed,
                         out=folder / "run",
                         progress=progress,
@@ -236,7 +251,7 @@ def _trained_once(
     model: Callable[..., Any],
     target: TargetDomain,
     task: ControlTask,
-    options: LoopOptions,
+    loop: LoopOptions,
     seed: int,
 ) -> Policy:
     """Trains a policy without the rig, with as many iterations as the loop's first policy."""
@@ -244,15 +259,15 @@ def _trained_once(
     if method.domains == "prior":
         prior = prior_of(model, target.sensors, target.actions, target.time_step)
         with seeded(seed, "prior domains"):
-            domains = domains_at(prior, prior.sample(options.num_domains))
-    search = options.search
+            domains = domains_at(prior, prior.sample(loop.num_domains))
+    search = loop.search
     return optimise_policy(
         task,
         domains,
         policy_search(search) if isinstance(search, str) else search,
         task.policy.parameters,
-        iterations=options.search_iterations,
-        num_initial_states=options.num_initial_states,
+        iterations=loop.search_iterations,
+        num_initial_states=loop.num_initial_states,
         seed=derived_seed(seed, "policy", 0),
     ).policy
 

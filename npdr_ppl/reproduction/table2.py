@@ -21,6 +21,7 @@ from npdr_ppl.posterior.comparison.compared_backends import requested
 from npdr_ppl.posterior.comparison.comparison_result import Comparison
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.evaluation import nominal_parameters, score
+from npdr_ppl.progress import Reporter
 from npdr_ppl.reproduction.rig_study import study, summarise
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import InitialState
@@ -98,7 +99,7 @@ def reproduce_table2(
     num_simulations: int | None = None,
     initial_state: InitialState = "recorded",
     seed: int = 0,
-    progress: bool | None = None,
+    progress: bool | Reporter | None = None,
 ) -> tuple[Comparison, dict[str, Any]]:
     """Computes the columns of Table 2 and writes ``table2.json``.
 
@@ -112,7 +113,7 @@ def reproduce_table2(
         num_simulations: Simulations per round; :data:`NUM_SIMULATIONS` if not given.
         initial_state: ``"recorded"``, as in the paper, or ``"estimated"``.
         seed: Seed of everything random.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Returns:
         The comparison and the content of ``table2.json``.
@@ -163,8 +164,9 @@ def add_returns(
     out: Path,
     *,
     num_seeds: int,
-    options: LoopOptions | None = None,
-    progress: bool | None = None,
+    options: DataOptions | None = None,
+    loop: LoopOptions | None = None,
+    progress: bool | Reporter | None = None,
 ) -> dict[str, Any]:
     """Trains policies by every method and adds their returns to the rows of ``table2.json``.
 
@@ -174,8 +176,9 @@ def add_returns(
         result: The content of ``table2.json``.
         out: Folder for results and runs; existing results are reused.
         num_seeds: Training runs of each method.
-        options: Options of the loop.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        options: How rollouts are prepared; the loop's default if ``None``.
+        loop: Options of the loop.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Returns:
         The changed content of ``table2.json``.
@@ -185,8 +188,9 @@ def add_returns(
         [RIG],
         range(num_seeds),
         # Checks are disabled, so that every method trains equally often.
-        options or LoopOptions(least_success=0.0),
+        loop or LoopOptions(least_success=0.0),
         out / "returns",
+        options=options,
         progress=progress,
     )
     success = control_task("furuta-swing-up").success

@@ -11,10 +11,11 @@ from sparse_regression import least_squares, select, sparse_choice
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.segment_options import segment_options
 
 
 def fitted(case):
-    return fit_hypothesis(case.model, case.fit, npdr.DiscoveryOptions().binding(case.fit))
+    return fit_hypothesis(case.model, case.fit, segment_options(case.fit))
 
 
 def hidden(place, strength):

@@ -50,7 +50,7 @@ def test_the_names_are_those_of_the_registries():
         (("fit", "furuta_"), ["furuta_paper"]),
         (("fit", "furuta", "--backend", "snpe"), ["snpe-a", "snpe-c"]),
         (("fit", "furuta", "--effect", "arm.cou"), ["arm.coulomb_friction"]),
-        (("discover", "furuta", "--effects", "arm.cogging,voltage.inp"),
+        (("discover", "furuta", "--candidates", "arm.cogging,voltage.inp"),
          ["arm.cogging,voltage.input_delay"]),
         (("compare", "furuta", "--backends", "abc,nr"), ["abc,nre"]),
         (("train", "furuta", "--target", "furuta-h"), ["furuta-hard"]),

@@ -11,9 +11,9 @@ import pytest
 from npdr_ppl.cli import main as cli
 from npdr_ppl.display.reports import read_run, write_report
 from npdr_ppl.reproduction import demo
-from tests.helpers.small_demo import FILTER, NUM_STEPS, OPTIONS
+from tests.helpers.small_demo import FILTER, LOOP, NUM_STEPS, OPTIONS
 
-SMALL = functools.partial(demo.run_demo, options=OPTIONS, num_steps=NUM_STEPS)
+SMALL = functools.partial(demo.run_demo, options=OPTIONS, loop=LOOP, num_steps=NUM_STEPS)
 
 
 def run(*words):

@@ -68,7 +68,7 @@ def model_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def words(recording, model_file, tmp_path_factory):
     return [
-        "discover", f"{model_file}:rod", "--data", recording, "--holdout", 3, "--effects",
+        "discover", f"{model_file}:rod", "--data", recording, "--holdout", 3, "--candidates",
         CANDIDATES, "--max-effects", 1, "--out", tmp_path_factory.mktemp("out") / "discovery",
     ]  # fmt: skip
 
@@ -198,14 +198,18 @@ def test_stages_stop_where_they_are_told_and_an_unfinished_run_goes_on(words, tm
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
-        (["--effects", "hinge.coulomb"], "did you mean 'coulomb_friction'"),
-        (["--effects", "knee.bias"], "knee"),
-        (["--effects", "hinge.input_delay"], "hinge"),
+        (["--candidates", "hinge.coulomb"], "did you mean 'coulomb_friction'"),
+        (["--candidates", "knee.bias"], "knee"),
+        (["--candidates", "hinge.input_delay"], "hinge"),
         (["--effect", "hinge.coulomb"], "did you mean 'coulomb_friction'"),
         (["--holdout", "9"], "has 4"),
         (["--holdout-data", "DATA"], "give one"),
         (["--false-alarm-rate", "2"], "between 0 and 1"),
         (["--segment-length", "400"], "too few"),
+        (["--segment-length", "0"], "got whole rollouts"),
+        (["--segment-length", "short"], "a number of steps, auto or 0"),
+        (["--initial-state", "recorded"], "initial_state must be 'uncertain'"),
+        (["--noise", "model"], "noise must be 'auto'"),
     ],
 )
 def test_bad_input_gets_one_sentence(words, recording, tmp_path, changed, sentence):
@@ -249,5 +253,5 @@ def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, t
 
 def test_the_command_has_the_defaults_of_the_options():
     declared = inspect.signature(discover.discover).parameters
-    for name in ("max_effects", "false_alarm_rate", "seed"):
+    for name in ("max_effects", "false_alarm_rate"):
         assert declared[name].default == getattr(DiscoveryOptions(), name)

@@ -5,6 +5,7 @@ from hidden_rigs import make_case
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.models.effects import QuadraticDrag
 
 
@@ -12,7 +13,7 @@ from npdr_ppl.models.effects import QuadraticDrag
 def quiet():
     """A pendulum without anything hidden, fitted."""
     case = make_case("pendulum", "null", (), seed=2001)
-    binding = npdr.DiscoveryOptions().binding(case.fit)
+    binding = segment_options(case.fit)
     return fit_hypothesis(case.model, case.fit, binding)
 
 
@@ -21,7 +22,7 @@ def dragged():
     """A pendulum in a hidden drag, fitted without it."""
     place = ("hinge", "quadratic_drag")
     case = make_case("pendulum", "one", (place,), strength=0.3, seed=2001)
-    binding = npdr.DiscoveryOptions().binding(case.fit)
+    binding = segment_options(case.fit)
     return case, fit_hypothesis(case.model, case.fit, binding)
 
 
@@ -31,5 +32,5 @@ def proven():
     place = ("hinge", "quadratic_drag")
     case = make_case("pendulum", "one", (place,), strength=1.0, seed=2001)
     options = npdr.DiscoveryOptions(effects=(QuadraticDrag("hinge"),), max_effects=1)
-    found = npdr.discover(case.model, case.fit, holdout=case.holdout, options=options)
+    found = npdr.discover(case.model, case.fit, holdout=case.holdout, search=options)
     return case, options, found

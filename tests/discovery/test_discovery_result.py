@@ -15,7 +15,7 @@ from npdr_ppl.models.effects import QuadraticDrag
 def test_saving_writes_json_with_the_documented_names(tmp_path):
     case = make_case("pendulum", "null", (), seed=2001)
     options = npdr.DiscoveryOptions(effects=(QuadraticDrag("hinge"),))
-    found = npdr.discover(case.model, case.fit, holdout=case.holdout, options=options)
+    found = npdr.discover(case.model, case.fit, holdout=case.holdout, search=options)
     found.save(tmp_path)
     written = json.loads((tmp_path / "discovery.json").read_text())
     assert written["verdict"] == "none"

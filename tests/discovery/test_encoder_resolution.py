@@ -60,4 +60,4 @@ def test_who_searches_for_counts_is_told():
     case = make_case("pendulum", "null", (), seed=2000)
     options = npdr.DiscoveryOptions(effects=(ViscousFriction("hinge"), Quantisation("angle")))
     with pytest.raises(ModelError, match="read from the recording"):
-        npdr.discover(case.model, case.fit, options=options)
+        npdr.discover(case.model, case.fit, search=options)

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.search.evidence import closest, evidence, weigh
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.models.effects import CoulombFriction, QuadraticDrag
 
 
@@ -16,7 +16,7 @@ from npdr_ppl.models.effects import CoulombFriction, QuadraticDrag
 def fitted(dragged):
     """The model without an effect, with the hidden one, and with another one."""
     case, without = dragged
-    binding = npdr.DiscoveryOptions().binding(case.fit)
+    binding = segment_options(case.fit)
     return without, *(
         fit_hypothesis(case.model, case.fit, binding, effects=(effect,))
         for effect in (QuadraticDrag("hinge"), CoulombFriction("hinge"))

@@ -44,12 +44,13 @@ def discover(
     effects=None,
     num_rollouts=None,
     num_steps=None,
-    segment_length=None,
+    segment_length="auto",
 ):
     case = make_case(rig, condition, places, strength=strength, seed=SEED)
-    options = npdr.DiscoveryOptions(segment_length, effects, max_effects)
+    options = npdr.DataOptions(segment_length=segment_length)
+    search = npdr.DiscoveryOptions(effects, max_effects)
     fit, holdout = (begun(part[:num_rollouts], num_steps) for part in (case.fit, case.holdout))
-    return case, npdr.discover(case.model, fit, holdout=holdout, options=options)
+    return case, npdr.discover(case.model, fit, holdout=holdout, options=options, search=search)
 
 
 def begun(rollouts, num_steps):
@@ -312,12 +313,12 @@ def _rollouts(readings, actions):
 def test_coarse_steps_are_no_discovery_and_hide_none():
     # One Euler step per sample is off by half a sample: a delay of 10 ms, if one believed it.
     few = (InputDelay("torque"), CoulombFriction("hinge"), ViscousFriction("hinge"))
-    options = npdr.DiscoveryOptions(effects=few)
-    still = npdr.discover(pendulum, swing(0.0, num_rollouts=3, seed=SEED), options=options)
+    search = npdr.DiscoveryOptions(effects=few)
+    still = npdr.discover(pendulum, swing(0.0, num_rollouts=3, seed=SEED), search=search)
     assert (still.verdict, still.effects) == ("none", []), still.reason
     assert "the revised model takes finer ones" in still.reason
     recording = swing(0.3, num_rollouts=4, seed=SEED)
-    found = npdr.discover(pendulum, recording[[0, 1, 2]], holdout=recording[[3]], options=options)
+    found = npdr.discover(pendulum, recording[[0, 1, 2]], holdout=recording[[3]], search=search)
     assert [f.effect.name for f in found.effects] == ["hinge.coulomb_friction"], found.reason
     assert found.verdict == "named"
     assert found.effects[0].parameters["magnitude"].mean == pytest.approx(0.3, rel=0.03)
@@ -340,7 +341,7 @@ def test_coarse_steps_of_an_engine_are_no_discovery():
 
     few = (InputDelay("torque"), CoulombFriction("hinge"))
     recording = swing(0.0, num_rollouts=2, seed=SEED)
-    found = npdr.discover(rod, recording, options=npdr.DiscoveryOptions(effects=few))
+    found = npdr.discover(rod, recording, search=npdr.DiscoveryOptions(effects=few))
     assert (found.verdict, found.effects) == ("none", []), found.reason
     assert "the revised model takes finer ones" in found.reason
 

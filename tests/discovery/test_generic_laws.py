@@ -11,6 +11,7 @@ from npdr_ppl.discovery.screening.generic_laws import reading_laws, ringing_laws
 from npdr_ppl.discovery.screening.permutation_tests import LargestStatistic
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.settings import ALARM
+from npdr_ppl.discovery.segment_options import segment_options
 
 
 def test_a_sensor_error_that_depends_on_the_measurement_is_detected(quiet):
@@ -31,7 +32,7 @@ def test_a_resonance_is_detected_at_its_frequency(quiet):
     hidden = make_case(
         "pendulum", "one", (("hinge", "joint_elasticity"),), strength=1.0, seed=2001
     )
-    binding = npdr.DiscoveryOptions().binding(hidden.fit)
+    binding = segment_options(hidden.fit)
     ringing = Projection(fit_hypothesis(hidden.model, hidden.fit, binding))
 
     def heard(projection):

@@ -28,7 +28,7 @@ def proofs(proven):
     case, options, found = proven
     assert case.holdout.channel_names == ("angle", "velocity")
     holdout = disturbed(case.holdout)
-    return found, npdr.discover(case.model, case.fit, holdout=holdout, options=options)
+    return found, npdr.discover(case.model, case.fit, holdout=holdout, search=options)
 
 
 def test_the_closed_share_is_that_of_the_gap_above_the_noise_floor():

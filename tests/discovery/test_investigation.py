@@ -16,7 +16,7 @@ def test_the_same_seed_gives_the_same_result():
     case = make_case("pendulum", "one", (place,), strength=0.3, seed=2001)
     effects = (QuadraticDrag("hinge"), CoulombFriction("hinge"))
     options = npdr.DiscoveryOptions(effects=effects, max_effects=1)
-    first, second = (npdr.discover(case.model, case.fit, options=options) for _ in range(2))
+    first, second = (npdr.discover(case.model, case.fit, search=options) for _ in range(2))
     assert first.effects[0].to_dict() == second.effects[0].to_dict()
     assert first.alarm == second.alarm
 
@@ -51,10 +51,26 @@ def test_numbers_in_place_of_held_out_rollouts_are_refused():
 def test_too_short_a_recording_is_refused():
     case = make_case("pendulum", "null", (), seed=2001)
     with pytest.raises(DataError, match="too few"):
-        npdr.discover(case.model, case.fit, options=npdr.DiscoveryOptions(segment_length=500))
+        npdr.discover(case.model, case.fit, options=npdr.DataOptions(segment_length=500))
 
 
-@pytest.mark.parametrize("wrong", [{"segment_length": 1}, {"false_alarm_rate": 0.0}])
-def test_options_out_of_range_are_refused(wrong):
-    with pytest.raises(DataError):
+@pytest.mark.parametrize("wrong", [{"max_effects": -1}, {"false_alarm_rate": 0.0}])
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(DataError, match=next(iter(wrong))):
         npdr.DiscoveryOptions(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (npdr.DataOptions(initial_state="recorded"), "initial_state must be 'uncertain'"),
+        (npdr.DataOptions(noise="model"), "noise must be 'auto'"),
+        (npdr.DataOptions(segment_length=None), "at least 2; got whole rollouts"),
+        (npdr.DataOptions(segment_length=1), "at least 2; got 1"),
+        (npdr.DiscoveryOptions(), "options takes a DataOptions"),
+    ],
+)
+def test_options_that_discovery_cannot_use_are_refused(options, sentence):
+    case = make_case("pendulum", "null", (), seed=2001)
+    with pytest.raises(DataError, match=sentence):
+        npdr.discover(case.model, case.fit, options=options)

@@ -13,6 +13,7 @@ from npdr_ppl.discovery.screening.latent_force import responses
 from npdr_ppl.discovery.screening.moments import forces_at_moments
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.settings import ALARM, MOMENT_TEST
+from npdr_ppl.discovery.segment_options import segment_options
 
 SEED = 2000
 """No seed of the benchmark's, neither of its tuning nor of its reporting."""
@@ -24,7 +25,7 @@ HEARD = ALARM.moment_share * npdr.DiscoveryOptions().false_alarm_rate
 def seen(condition, places=(), rig="pendulum"):
     """Returns a fitted rig, and what pulses of force would change."""
     case = make_case(rig, condition, places, strength=1.0, seed=SEED)
-    fitted = fit_hypothesis(case.model, case.fit, npdr.DiscoveryOptions().binding(case.fit))
+    fitted = fit_hypothesis(case.model, case.fit, segment_options(case.fit))
     return Projection(fitted), responses(fitted)
 
 

@@ -5,9 +5,9 @@ import torch
 from hidden_rigs import make_case
 from torch.distributions import MultivariateNormal
 
-import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.proof.parameter_intervals import Draws, estimates, posterior_draws
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.models.effects import Spring
 from npdr_ppl.preparation.ridges import RidgeCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
@@ -16,7 +16,7 @@ from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 def fitted(effects):
     """A pendulum that lacks nothing, fitted with effects that it does not have."""
     case = make_case("pendulum", "null", (), seed=2001)
-    binding = npdr.DiscoveryOptions().binding(case.fit)
+    binding = segment_options(case.fit)
     return fit_hypothesis(case.model, case.fit, binding, effects=effects)
 
 

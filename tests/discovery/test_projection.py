@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.projection import Projection, loss_without
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import QuadraticDrag
 
@@ -23,7 +23,7 @@ def test_parameters_explain_nothing_of_a_projected_column(quiet):
 def test_the_loss_without_an_effect_equals_that_of_a_fit_without_it(dragged):
     case, without = dragged
     drag = QuadraticDrag("hinge")
-    binding = npdr.DiscoveryOptions().binding(case.fit)
+    binding = segment_options(case.fit)
     fitted = fit_hypothesis(case.model, case.fit, binding, effects=(drag,))
     scale = fitted.fit.scale
     lost = fitted.share * float((without.losses(scale) - fitted.losses(scale)).sum())

@@ -8,6 +8,7 @@ from hidden_rigs import make_case
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.repetition import keeps_in_step, period_of
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.models.effects import PeriodicDisturbance
 
 TIME = 0.01 * np.arange(2000)
@@ -37,7 +38,7 @@ def test_other_motions_have_none(motion):
 def test_a_wave_is_in_step_where_it_repeats_with_the_motion(frequency, is_in_step):
     case = make_case("pendulum", "null", (), strength=1.0, seed=2000)
     effect = PeriodicDisturbance("hinge")
-    options = npdr.DiscoveryOptions().binding(case.fit)
+    options = segment_options(case.fit)
     start = {f"{effect.name}.frequency": torch.tensor(frequency)}
     fitted = fit_hypothesis(
         case.model, case.fit, options, effects=(effect,), start=start, max_steps=1, is_rough=True

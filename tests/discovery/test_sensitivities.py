@@ -5,10 +5,10 @@ from dataclasses import replace
 import torch
 from hidden_rigs import make_case
 
-import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.screening.settings import SENSITIVITY
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.models.effects import CoulombFriction, EncoderBias, QuadraticDrag, candidate_effects
 
 
@@ -27,7 +27,7 @@ def test_sensitivities_equal_finite_differences(quiet):
 
 def test_an_effect_that_changes_nothing_but_the_last_digits_is_no_candidate():
     case = make_case("emps", "null", seed=2001)
-    fitted = fit_hypothesis(case.model, case.fit, npdr.DiscoveryOptions().binding(case.fit))
+    fitted = fit_hypothesis(case.model, case.fit, segment_options(case.fit))
     # No force of this drive depends on where it is.
     assert not list(sensitivities(fitted, (EncoderBias("position"),)))
     assert list(sensitivities(fitted, (CoulombFriction("carriage"),)))

@@ -18,9 +18,9 @@ def test_two_processes_find_what_one_finds(dragged):
     case, _ = dragged
     effects = (QuadraticDrag("hinge"), CoulombFriction("hinge"))
     options = npdr.DiscoveryOptions(effects=effects, max_effects=1)
-    alone = npdr.discover(case.model, case.fit[[0]], options=options)
+    alone = npdr.discover(case.model, case.fit[[0]], search=options)
     with npdr.workers("loky", 2) as used:
-        together = npdr.discover(case.model, case.fit[[0]], options=options)
+        together = npdr.discover(case.model, case.fit[[0]], search=options)
     assert used.is_used
     kinds = [{k: v for k, v in d.to_dict().items() if k != "seconds"} for d in (alone, together)]
     assert kinds[0] == kinds[1]

@@ -14,7 +14,7 @@ from npdr_ppl.posterior.comparison.compare import compare
 from npdr_ppl.posterior.fit import fit
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
-from tests.helpers.small_loop import HandmadePendulum, small_options, small_task
+from tests.helpers.small_loop import SMALL_DATA, HandmadePendulum, small_options, small_task
 
 OPTIONS = DataOptions("all/10", 25, "recorded")
 PIXEL = bytes.fromhex(
@@ -67,7 +67,8 @@ def runs(tmp_path_factory, recording):
         pendulum,
         HandmadePendulum(),
         small_task(),
-        small_options(),
+        options=SMALL_DATA,
+        loop=small_options(),
         out=folder / "train",
         seed=0,
         progress=False,

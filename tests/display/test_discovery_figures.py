@@ -25,7 +25,7 @@ def found():
     effects = (CoulombFriction("hinge"), Bias("hinge"))
     return npdr.discover(
         pendulum, rollouts[[0, 1, 2]], holdout=rollouts[[3]],
-        options=npdr.DiscoveryOptions(effects=effects, max_effects=1),
+        search=npdr.DiscoveryOptions(effects=effects, max_effects=1),
     )  # fmt: skip
 
 
@@ -119,7 +119,7 @@ def test_a_discovery_that_adds_nothing_has_figures_too(tmp_path):
     rollouts = pendulum_recording(num_rollouts=2)
     options = npdr.DiscoveryOptions(effects=(Bias("hinge"),), max_effects=0)
     torch.manual_seed(0)
-    found = npdr.discover(pendulum, rollouts, options=options)
+    found = npdr.discover(pendulum, rollouts, search=options)
     paths = write_discovery_figures(found, tmp_path)
     assert {path.stem for path in paths} == {
         "residual_map", "latent_force", "ranking", "separation", "parameters"

@@ -26,6 +26,7 @@ import torch
 from npdr_ppl.loop.npdr_loop import train
 from npdr_ppl.models.pendulum import pendulum
 from tests.helpers.small_loop import (
+    SMALL_DATA,
     DryPendulum,
     HandmadePendulum,
     accurate_pendulum,
@@ -60,8 +61,8 @@ def fork(folder, seed, mode, modules=None):
             # No policy succeeds, so the loop does all that a check can ask for.
             task = replace(small_task(), success=1e9)
             options = small_options(iterations=1, extra_rollouts=1, least_success=0.5)
-        train(model, target(folder / "episodes.log"), task, options, out=folder / "run",
-              seed=seed, progress=False)  # fmt: skip
+        train(model, target(folder / "episodes.log"), task, options=SMALL_DATA, loop=options,
+              out=folder / "run", seed=seed, progress=False)  # fmt: skip
         if modules is not None:
             modules.write_text("\n".join(sys.modules))
         os._exit(0)

@@ -149,13 +149,16 @@ def swinging_task(gain=0.5):
     )
 
 
+SMALL_DATA = DataOptions("all/10", 20, "recorded", "float64")
+"""How the rollouts of a small loop are prepared."""
+
+
 def small_options(**changed):
     settings = {
         "iterations": 2,
         "rounds": 2,
         "num_simulations": 100,
         "backend": backend("snpe-c", transforms=1, hidden=(16,), epochs=5, members=2),
-        "binding": DataOptions("all/10", 20, "recorded", "float64"),
         "search": policy_search("power", population=8, memory=4),
         "search_iterations": 2,
         "search_restarts": 0,
@@ -169,8 +172,8 @@ def small_options(**changed):
 
 
 def discovering_options(when="before inference", **changed):
-    """Looks for one of two effects in segments of 0.2 s."""
+    """Looks for one of two effects."""
     few = (CoulombFriction("hinge"), InputDelay("torque"))
-    discovery = DiscoveryOptions(segment_length=10, effects=few, max_effects=1)
+    discovery = DiscoveryOptions(effects=few, max_effects=1)
     settings = {"iterations": 1, "discovers": when, "discovery": discovery}
     return small_options(**{**settings, **changed})

@@ -8,13 +8,16 @@ NUM_STEPS = 200
 """0.4 s of a swing-up, in which no policy gets the pole up."""
 
 
+TINY_DATA = DataOptions("all/50", 100, "recorded", "float32")
+"""How the rollouts of the study are prepared."""
+
+
 def tiny_options(**changed):
     settings = {
         "iterations": 1,
         "rounds": 1,
         "extra_rounds": 0,
         "num_simulations": 20,
-        "binding": DataOptions("all/50", 100, "recorded", "float32"),
         "start": "prior",
         "search": policy_search("power", population=4, memory=2),
         "search_iterations": 1,

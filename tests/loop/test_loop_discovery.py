@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from npdr_ppl.discovery import DiscoveryOptions
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect, num_finer_steps
 from npdr_ppl.loop import loop_discovery
@@ -21,13 +22,21 @@ from npdr_ppl.loop.npdr_loop import train
 from npdr_ppl.models.effects import CoulombFriction, InputDelay
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.policies.playback import Sinusoid
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
-from tests.helpers.small_loop import DryPendulum, discovering_options, swinging_task
+from tests.helpers.small_loop import SMALL_DATA, DryPendulum, discovering_options, swinging_task
 
 
 def run(folder, options, **kwargs):
     return train(
-        pendulum, DryPendulum(), swinging_task(), options, out=folder, progress=False, **kwargs
+        pendulum,
+        DryPendulum(),
+        swinging_task(),
+        options=SMALL_DATA,
+        loop=options,
+        out=folder,
+        progress=False,
+        **kwargs,
     )
 
 
@@ -104,7 +113,13 @@ def test_a_rollout_too_short_to_tell_anything_by_leaves_the_model(tmp_path):
     short = dataclasses.replace(swinging_task(), num_steps=30)
     target = DryPendulum()
     result = train(
-        pendulum, target, short, discovering_options(), out=tmp_path / "run", progress=False
+        pendulum,
+        target,
+        short,
+        options=SMALL_DATA,
+        loop=discovering_options(),
+        out=tmp_path / "run",
+        progress=False,
     )
     assert result.model is pendulum
     assert result.iterations[0]["effects"] == []
@@ -120,7 +135,7 @@ def test_a_rollout_that_ended_early_is_followed_by_an_excitation(tmp_path):
     task = dataclasses.replace(swinging_task(), excitation=sinusoid)
     options = discovering_options(extra_rollouts=1)
     settings = {"out": tmp_path / "run", "progress": False}
-    result = train(pendulum, Stops(), task, options, **settings)
+    result = train(pendulum, Stops(), task, options=SMALL_DATA, loop=options, **settings)
     decisions = result.iterations[0]["decisions"]
     assert decisions[0]["action"] == Action.ANOTHER_ROLLOUT
     assert "40 steps of 200" in decisions[0]["reason"]
@@ -130,7 +145,10 @@ def test_a_rollout_that_ended_early_is_followed_by_an_excitation(tmp_path):
     sine = 3 * np.sin(2 * math.pi * 0.7 * time)
     assert np.allclose(result.rollouts.actions[1][:, 0], sine, atol=1e-4)
     # Taken over from disk, it is the same run.
-    assert train(pendulum, Stops(), task, options, **settings).to_dict() == result.to_dict()
+    assert (
+        train(pendulum, Stops(), task, options=SMALL_DATA, loop=options, **settings).to_dict()
+        == result.to_dict()
+    )
 
 
 def test_segments_are_shorter_where_rollouts_ended_early():
@@ -139,15 +157,16 @@ def test_segments_are_shorter_where_rollouts_ended_early():
         channel_names=("angle", "velocity"), action_names=("torque",), time_step=0.002,
     )  # fmt: skip
     # Sixteen segments instead of five of 100 steps.
-    assert DiscoveryOptions().binding(rollouts).segment_length == 31
+    assert segment_options(rollouts).segment_length == 31
     with pytest.raises(DataError, match="500 steps are too few for 8 segments of 100 steps"):
-        DiscoveryOptions(segment_length=100).binding(rollouts)
+        segment_options(rollouts, DataOptions(segment_length=100))
 
 
 def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
     """An effect that was named too early is gone once more rollouts speak against it."""
     model = add_effect(pendulum, CoulombFriction("hinge"))
-    look = LoopDiscovery(model, DiscoveryOptions(effects=(InputDelay("torque"),)), seed=0)
+    search = DiscoveryOptions(effects=(InputDelay("torque"),))
+    look = LoopDiscovery(model, SMALL_DATA, search, seed=0)
     (tmp_path / "discovery.json").write_text(
         json.dumps(
             {

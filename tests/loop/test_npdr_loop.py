@@ -22,7 +22,7 @@ from npdr_ppl.posterior.diagnostics import Decision, Diagnosis
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import load_tensors
 from npdr_ppl.targets import RecordedTarget
-from tests.helpers.small_loop import HandmadePendulum, small_options, small_task
+from tests.helpers.small_loop import SMALL_DATA, HandmadePendulum, small_options, small_task
 
 
 def scripted(monkeypatch, *decisions):
@@ -41,14 +41,15 @@ def scripted(monkeypatch, *decisions):
     return asked
 
 
-def run(tmp_path, options=None, **kwargs):
+def run(tmp_path, loop=None, **kwargs):
     target = kwargs.pop("target", None) or HandmadePendulum()
     task = kwargs.pop("task", None) or small_task()
     return train(
         kwargs.pop("model", pendulum),
         target,
         task,
-        options or small_options(iterations=1),
+        options=kwargs.pop("options", SMALL_DATA),
+        loop=loop or small_options(iterations=1),
         out=tmp_path / "run",
         progress=False,
         **kwargs,
@@ -276,7 +277,8 @@ def test_recordings_serve_as_target_until_they_run_out(tmp_path):
         pendulum,
         RecordedTarget(bare),
         small_task(),
-        small_options(iterations=5),
+        options=SMALL_DATA,
+        loop=small_options(iterations=5),
         out=tmp_path / "again",
         progress=False,
     )
@@ -314,7 +316,14 @@ def test_the_best_measured_policy_is_deployed(tmp_path):
     assert run(tmp_path / "measured", small_options(iterations=3)).to_dict() == measured.to_dict()
     hopeless = dataclasses.replace(small_task(), success=1e9)
     target = HandmadePendulum()
-    found = train(pendulum, target, hopeless, small_options(iterations=1), progress=False)
+    found = train(
+        pendulum,
+        target,
+        hopeless,
+        options=SMALL_DATA,
+        loop=small_options(iterations=1),
+        progress=False,
+    )
     assert found.deployed is None
 
 
@@ -322,9 +331,9 @@ def test_the_best_measured_policy_is_deployed(tmp_path):
 def test_inference_may_start_from_the_last_posterior_or_the_closest_fit(tmp_path):
     options = small_options(iterations=2, num_simulations=200, start="prior")
     anew = run(tmp_path / "anew", options)
-    uncertain = dataclasses.replace(options.binding, initial_state="uncertain")
-    nearby = dataclasses.replace(options, start="closest fit", binding=uncertain)
-    run(tmp_path / "nearby", nearby)
+    uncertain = dataclasses.replace(SMALL_DATA, initial_state="uncertain")
+    nearby = dataclasses.replace(options, start="closest fit")
+    run(tmp_path / "nearby", nearby, options=uncertain)
     options = dataclasses.replace(options, start="posterior")
     onward = run(tmp_path / "onward", options)
     spreads = [

@@ -27,7 +27,7 @@ from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.policies.playback import Playback, Sinusoid
 from npdr_ppl.posterior.diagnostics import Decision, Diagnosis
 from npdr_ppl.run_files import load_tensors
-from tests.helpers.small_loop import HandmadePendulum, small_options, small_task
+from tests.helpers.small_loop import SMALL_DATA, HandmadePendulum, small_options, small_task
 
 SINUSOID = Sinusoid("torque", parameters=torch.tensor([3.0, 2.0, 0.0]))
 
@@ -67,7 +67,16 @@ def searches(monkeypatch):
 def run(folder, options, task=None, **kwargs):
     model = kwargs.pop("model", pendulum)
     task = task or small_task()
-    return train(model, HandmadePendulum(), task, options, out=folder, progress=False, **kwargs)
+    return train(
+        model,
+        HandmadePendulum(),
+        task,
+        options=SMALL_DATA,
+        loop=options,
+        out=folder,
+        progress=False,
+        **kwargs,
+    )
 
 
 def verdicts(result, iteration=0):

@@ -9,6 +9,7 @@ import torch
 from hidden_rigs import make_case
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.language.inputs import Inputs
@@ -66,7 +67,7 @@ def test_parameters_known_a_thousand_times_better_hold_up_no_other():
     place = ("arm", "stribeck_friction")
     case = make_case("furuta", "one", (place,), strength=1.0, seed=2001)
     model = add_effect(case.model, StribeckFriction("arm"))
-    segments = SegmentModel(model, case.fit, npdr.DiscoveryOptions().binding(case.fit))
+    segments = SegmentModel(model, case.fit, segment_options(case.fit))
     (hidden,) = case.truth
     typical = {
         f"{hidden.name}.{name}": torch.tensor(0.5 * value).double()

@@ -14,6 +14,7 @@ from npdr_ppl.display.plots.missing_effect_figures import write_missing_effect_f
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import CoulombFriction, InputDelay, SensorLowPass
 from npdr_ppl.models.furuta import furuta
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.reproduction.missing_effect import (
     CHIRP,
     SWING_UP,
@@ -27,10 +28,10 @@ pytestmark = pytest.mark.skipif(
 )
 
 FILTER = "arm_velocity,pole_velocity"
-OPTIONS = DiscoveryOptions(
+OPTIONS = DataOptions(precision="float32")
+SEARCH = DiscoveryOptions(
     effects=(SensorLowPass(FILTER), InputDelay("voltage"), CoulombFriction("arm")),
     max_effects=3,
-    precision="float32",
 )
 
 
@@ -46,7 +47,7 @@ def test_filter_delay_and_friction_are_found_and_help_on_another_excitation(
     swing_ups, chirps = recordings
     part = swing_ups[[0, 1, 3, 4]]  # One to fit leaves flat directions to chance.
     story, result = reproduce_missing_effect(
-        part, chirps[[0]], tmp_path, holdout=(2, 3), options=OPTIONS, progress=False
+        part, chirps[[0]], tmp_path, holdout=(2, 3), options=OPTIONS, search=SEARCH, progress=False
     )
     lag, delay, friction = result["effects"]
     assert (lag["port"], lag["effect"]) == (FILTER, "sensor_low_pass")
@@ -69,7 +70,7 @@ def test_filter_delay_and_friction_are_found_and_help_on_another_excitation(
     assert "sensor_low_pass" in text and "Another excitation" in text and "rmse, paper" in text
     # Finished, it is read, not searched again.
     again, read = reproduce_missing_effect(
-        part, chirps[[0]], tmp_path, holdout=(2, 3), options=OPTIONS, progress=False
+        part, chirps[[0]], tmp_path, holdout=(2, 3), options=OPTIONS, search=SEARCH, progress=False
     )
     assert again is None and read == json.loads((tmp_path / "missing-effect.json").read_text())
 
@@ -77,8 +78,8 @@ def test_filter_delay_and_friction_are_found_and_help_on_another_excitation(
 @pytest.mark.slow
 def test_filter_and_delay_are_found_among_the_whole_catalogue(recordings):
     swing_ups, _ = recordings
-    options = DiscoveryOptions(max_effects=2, precision="float32")
-    found = discover(furuta, swing_ups[[0, 1]], options=options)
+    search = DiscoveryOptions(max_effects=2)
+    found = discover(furuta, swing_ups[[0, 1]], options=OPTIONS, search=search)
     assert [f.effect.name for f in found.effects] == [
         f"{FILTER}.sensor_low_pass",
         "voltage.input_delay",

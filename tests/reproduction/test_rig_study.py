@@ -15,7 +15,7 @@ from npdr_ppl.reproduction import rig_study
 from npdr_ppl.reproduction.rig_study import METHODS, Outcome, run_method, study, summarise
 from npdr_ppl.run_files import read_json, write_json
 from npdr_ppl.targets.base import TargetDomain, end_episode
-from tests.helpers.small_rig_study import NUM_STEPS, tiny_options
+from tests.helpers.small_rig_study import NUM_STEPS, TINY_DATA, tiny_options
 
 
 @pytest.fixture
@@ -69,8 +69,9 @@ def test_policies_that_need_no_rig_meet_it_only_to_be_judged(task, method):
 @pytest.mark.slow
 def test_returns_of_the_loop_are_of_fresh_episodes_on_the_rig(task):
     rig = Upright(num_honest=1)
-    options = tiny_options()
-    found = run_method(METHODS["bayessim"], rig, task, options, seed=0, num_episodes=2)
+    found = run_method(
+        METHODS["bayessim"], rig, task, tiny_options(), options=TINY_DATA, seed=0, num_episodes=2
+    )
     # One episode to learn from, and two to be judged by.
     assert rig.num_episodes_run == 3
     (record,) = found.iterations
@@ -82,8 +83,8 @@ def test_returns_of_the_loop_are_of_fresh_episodes_on_the_rig(task):
 def test_too_short_a_rollout_leaves_the_policy_of_the_prior(task, caplog):
     rig = Upright(num_honest=1, num_steps=3)
     method = METHODS["bayesian-linear-regression"]
-    options = tiny_options(binding=DataOptions("all", 100, "recorded", "float32"))
-    found = run_method(method, rig, task, options, seed=0, num_episodes=1)
+    options = DataOptions("all", 100, "recorded", "float32")
+    found = run_method(method, rig, task, tiny_options(), options=options, seed=0, num_episodes=1)
     assert found.iterations == () and "got one of 4" in caplog.text
     trained = run_method(METHODS["prior"], Upright(), task, tiny_options(), seed=0, num_episodes=1)
     assert found.sim_return == trained.sim_return

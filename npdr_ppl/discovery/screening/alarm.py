@@ -6,7 +6,6 @@ from itertools import chain
 
 from torch import Tensor
 
-from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.screening.generic_laws import (
     GenericLaw,
     generic_laws,
@@ -52,7 +51,9 @@ def sound_alarm(
     variants: Iterable[Variant],
     found: Responses,
     sensors: Sequence[Channel],
-    options: DiscoveryOptions,
+    *,
+    false_alarm_rate: float,
+    seed: int,
     num_looks: int = 0,
 ) -> tuple[Alarm, list[Screened]]:
     """Tests a fitted hypothesis against every candidate and every generic law at once.
@@ -66,13 +67,14 @@ def sound_alarm(
         variants: All candidates, in all shapes and sizes.
         found: The responses to pulses of force.
         sensors: The simulator's sensors.
-        options: The false-alarm rate and the seed.
+        false_alarm_rate: Probability that an alarm fires although nothing is missing.
+        seed: Seed of the simulated noise.
         num_looks: How often the recording was tested before.
 
     Returns:
         The alarm, and the candidates that explain a part of the misfit, the best first.
     """
-    chance = LargestStatistic(projection, seed=options.seed)
+    chance = LargestStatistic(projection, seed=seed)
     generic = generic_laws(found, sensors) + reading_laws(projection)
     waves = wave_laws(found)
     listed = [wave for port in waves.values() for wave in port] + ripple_laws(found, sensors)
@@ -102,7 +104,7 @@ def sound_alarm(
     for moment in moments:
         values[moment.name] = min(1.0, len(moments) * moment.p_value / ALARM.moment_share)
     # Some segments stand out by chance: their gain is used only where that is unlikely.
-    unlikely = [moment for moment in moments if values[moment.name] <= options.false_alarm_rate]
+    unlikely = [moment for moment in moments if values[moment.name] <= false_alarm_rate]
     gains |= {moment.name: moment.gain for moment in unlikely}
     if not values:
         return Alarm(1.0, False, "", 0.0, {}), ranking
@@ -111,7 +113,7 @@ def sound_alarm(
     alarm = Alarm(
         p_value,
         # Every added effect means one more test of the same recording.
-        p_value <= options.false_alarm_rate / (1 + num_looks),
+        p_value <= false_alarm_rate / (1 + num_looks),
         min(strongest, key=lambda name: (-gains.get(name, 0.0), name)),
         max(gains.values(), default=0.0),
         values,

@@ -28,6 +28,7 @@ from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
 from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.memory import release_freed_memory
@@ -90,9 +91,10 @@ class Searcher:
     Args:
         model: The original model.
         rollouts: The recording.
-        options: Options of the search.
+        options: Settings of the search.
         report: Called with a sentence at each step.
-        binding: How the recording is cut into segments; as in the options by default.
+        binding: How the recording is cut into segments; into discovery's default ones if ``None``.
+        seed: Seed of all random numbers.
 
     Attributes:
         rollouts: The recording.
@@ -110,11 +112,13 @@ class Searcher:
         report: Callable[[str], None] = lambda _: None,
         *,
         binding: DataOptions | None = None,
+        seed: int = 0,
     ) -> None:
         self._model = model
         self.rollouts = rollouts
         self.options = options
-        self.binding: DataOptions = binding or options.binding(rollouts)
+        self.binding: DataOptions = binding or segment_options(rollouts)
+        self.seed = seed
         self.are_steps_coarse = False
         self.are_priors_widened = False
         self._last: Round | None = None
@@ -142,7 +146,7 @@ class Searcher:
     ) -> Hypothesis:
         """Fits the original model; see :func:`~npdr_ppl.discovery.search.base_fit.fit_base`."""
         self._report("fitting the original model")
-        return fit_base(self.base, near=near, seed=self.options.seed, progress=progress)
+        return fit_base(self.base, near=near, seed=self.seed, progress=progress)
 
     def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
         """Returns a hypothesis with finer steps if its own are too coarse; else unchanged.
@@ -232,7 +236,15 @@ class Searcher:
         variants = variants_of(candidates, projection, found, number=number)
         sensors = hypothesis.simulator.sensors
         looks = len(hypothesis.effects)
-        alarm, ranking = sound_alarm(projection, variants, found, sensors, self.options, looks)
+        alarm, ranking = sound_alarm(
+            projection,
+            variants,
+            found,
+            sensors,
+            false_alarm_rate=self.options.false_alarm_rate,
+            seed=self.seed,
+            num_looks=looks,
+        )
         separation = separation_matrix(projection, ranking[: SEARCH.num_leading])
         ranking = [candidate.without_change() for candidate in ranking]
         width = averaged.segments.steps_per_average

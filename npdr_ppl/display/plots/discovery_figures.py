@@ -46,7 +46,7 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
     if discovery.separation_names:
         matrix = discovery.separation.numpy()
         figures["separation"] = plot_separation(matrix, discovery.separation_names)
-    seed = discovery.options.seed
+    seed = discovery.seed
     units = {name: estimate.unit for name, estimate in discovery.parameters.items()}
     drawn = discovery.draws if after is None else posterior_draws(start, seed=seed)
     prior, draws = _draws(start, drawn, seed)

@@ -55,7 +55,7 @@ def calibrate(
     thin: int = 1,
     refit: bool = False,
     seed: int = 0,
-    progress: bool | None = None,
+    progress: bool | Reporter | None = None,
 ) -> Calibration:
     """Tests whether a posterior is calibrated, by simulated data sets with known parameters.
 
@@ -73,7 +73,7 @@ def calibrate(
         refit: Repeats the whole inference, all rounds, for every data set. Posteriors that hold
             for one observation only, sequential ones among them, need it.
         seed: Seed of everything random.
-        progress: Whether to show progress; ``None`` shows it on a terminal.
+        progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Returns:
         The ranks, with their tests and coverage.

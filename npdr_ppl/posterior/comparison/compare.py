@@ -28,7 +28,7 @@ from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.posterior import Posterior, PosteriorBase
 from npdr_ppl.posterior.prepare import held_out
 from npdr_ppl.preparation.binding import BoundModel, Data, bind
-from npdr_ppl.preparation.data_options import PLAIN_FEATURES, DataOptions
+from npdr_ppl.preparation.data_options import PLAIN_FEATURES, DataOptions, checked_options
 from npdr_ppl.preparation.evaluation import score
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
@@ -100,7 +100,7 @@ def compare(
         >>> comparison.ensemble.sample(10)["mean"].shape
         torch.Size([10])
     """
-    options = options or DataOptions()
+    options = checked_options(options)
     named = candidates(backends)
     judged_by = train if test is None else test
     settings = {
