@@ -229,6 +229,12 @@ def _details(row: dict[str, object]) -> str:
 def _wrapped(text: str) -> str:
     """Returns a text in lines that fit the terminal, indented below its name."""
     width = max(40, shutil.get_terminal_size().columns)
+    # Neither at hyphens nor within words, so that names can be typed as they are shown.
     return textwrap.fill(
-        text, width, initial_indent="    ", subsequent_indent="    ", break_long_words=False
+        text,
+        width,
+        initial_indent="    ",
+        subsequent_indent="    ",
+        break_long_words=False,
+        break_on_hyphens=False,
     )

@@ -201,18 +201,32 @@ def test_bad_input_gets_one_sentence(monkeypatch, capsys, tmp_path, recording, w
     assert len(err.strip().splitlines()) == 1
 
 
-@pytest.mark.parametrize("command", ["models", "backends", "effects"])
+@pytest.mark.parametrize(
+    "command", ["models", "backends", "effects", "targets", "tasks", "searches"]
+)
 def test_listings(monkeypatch, capsys, command):
     code, text, _ = run(monkeypatch, capsys, command, "--json")
     rows = json.loads(text)
     assert code == 0
     assert all(row["summary"] for row in rows)
-    monkeypatch.setenv("COLUMNS", "80")
-    code, text, _ = run(monkeypatch, capsys, command)
-    assert code == 0
-    # Each name stands on a line of its own, as it is to be typed.
-    assert {row["name"] for row in rows} <= set(text.splitlines())
-    assert max(map(len, text.splitlines())) <= 80
+    for columns in (60, 80):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        code, text, _ = run(monkeypatch, capsys, command)
+        assert code == 0
+        # Each name stands on a line of its own, as it is to be typed.
+        assert {row["name"] for row in rows} <= set(text.splitlines())
+        assert max(map(len, text.splitlines())) <= columns
+    # No name in the details is cut, however narrow the terminal is.
+    monkeypatch.setenv("COLUMNS", "40")
+    for row in rows:
+        code, text, _ = run(monkeypatch, capsys, command, row["name"])
+        words = [word for value in row.values() for word in _texts(value)]
+        assert code == 0 and set(words) <= set(text.split()) | {""}
+
+
+def _texts(value):
+    """Returns the words of a row's value, unbroken."""
+    return [w for v in (value if isinstance(value, list) else [value]) for w in str(v).split()]
 
 
 def test_a_listing_shows_the_details_of_one_name(monkeypatch, capsys):

@@ -207,12 +207,3 @@ def test_effects_are_split_at_the_commas_between_them():
         "arm_velocity,pole_velocity.sensor_low_pass",
         "pole.coulomb_friction",
     ]
-
-
-@pytest.mark.parametrize("command", ["targets", "tasks", "searches"])
-def test_listings(monkeypatch, capsys, command):
-    code, text, _ = run(monkeypatch, capsys, command, "--json")
-    rows = json.loads(text)
-    assert code == 0
-    assert all(row["summary"] for row in rows)
-    assert run(monkeypatch, capsys, command)[0] == 0
