@@ -1,5 +1,6 @@
 """`npdr reproduce`: repeats the paper's experiments."""
 
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -55,11 +56,19 @@ def reproduce(
 
     table2, mini-golf and missing-effect need the paper's recordings in --data; missing-effect also
     takes a folder with two recordings. All methods of the paper run unless --backends chooses
-    some, with recorded initial states as in the paper. Only mini-golf has --rounds and
-    --simulations. To continue an interrupted experiment, give the same command again.
+    some, with recorded initial states as in the paper. A flag that has no effect on an experiment
+    is refused. To continue an interrupted experiment, give the same command again.
 
     Example: npdr reproduce table2 --data swing_up_500hz_5s.csv --out table2
     """
+    given = {
+        "--backends": bool(backends),
+        "--initial-state": initial_state is not InitialState.RECORDED,
+        "--returns": bool(returns),
+        "--rounds": rounds is not None,
+        "--simulations": simulations is not None,
+    }
+    _check_flags(experiment, [flag for flag, is_given in given.items() if is_given])
     if experiment is Experiment.MISSING_EFFECT:
         _reproduce_missing_effect(data, out / experiment.value, seed, as_json, quiet)
         return
@@ -121,6 +130,22 @@ def reproduce(
         typer.echo((out / f"{experiment.value}.json").read_text(), nl=False)
     elif not quiet:
         show_rows(experiment.value, result)
+
+
+def _check_flags(experiment: Experiment, given: Sequence[str]) -> None:
+    """Raises an error for a flag that would have no effect."""
+    from npdr_ppl.errors import DataError
+
+    own = {
+        Experiment.TABLE2: ("--backends", "--initial-state", "--returns"),
+        Experiment.PENDULUM: ("--backends",),
+        Experiment.MINI_GOLF: ("--backends", "--rounds", "--simulations"),
+        Experiment.MISSING_EFFECT: (),
+    }
+    for flag in given:
+        if flag not in own[experiment]:
+            others = ", ".join(name for name, flags in own.items() if flag in flags)
+            raise DataError(f"{flag} has no effect on {experiment}; it belongs to {others}.")
 
 
 def _reproduce_missing_effect(

@@ -58,9 +58,7 @@ class Investigation:
         rollouts: The recording that is used to find and fit effects.
         holdout: Rollouts that measure the improvement, best with another excitation. They are
             never used to choose or fit anything.
-        options: How the recording is prepared. Discovery estimates initial states and noise, and
-            compares trajectories themselves: ``initial_state`` and ``noise`` must have their
-            defaults, ``segment_length`` must not be ``None``, and ``embedding`` has no effect.
+        options: How the recording is prepared; see :func:`discover`.
         search: Settings of the search.
         seed: Seed of everything random.
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.

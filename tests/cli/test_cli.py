@@ -190,6 +190,9 @@ def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path
         (["reproduce", "missing-effect"], "pass --data"),
         (["reproduce", "missing-effect", "--data", "OUT"], "does not exist"),
         (["reproduce", "pendulum", "--backends", "mcmc"], "mcmc"),
+        (["reproduce", "pendulum", "--rounds", "2"], "belongs to mini-golf"),
+        (["reproduce", "missing-effect", "--backends", "abc"],
+         "belongs to table2, pendulum, mini-golf"),
     ],
 )  # fmt: skip
 def test_bad_input_gets_one_sentence(monkeypatch, capsys, tmp_path, recording, words, sentence):
