@@ -1,34 +1,23 @@
 """`npdr demo`, small: what it prints and writes, and the report on it."""
 
-import contextlib
 import functools
-import io
 import json
-import sys
 
 import pytest
 
-from npdr_ppl.cli import main as cli
 from npdr_ppl.display.reports import read_run, write_report
 from npdr_ppl.reproduction import demo
+from tests.helpers.command_line import run_for_module
 from tests.helpers.small_demo import FILTER, LOOP, NUM_STEPS, OPTIONS
 
 SMALL = functools.partial(demo.run_demo, options=OPTIONS, loop=LOOP, num_steps=NUM_STEPS)
 
 
 def run(*words):
-    """Runs the command line in this process; returns exit code, output and error text."""
-    out, err = io.StringIO(), io.StringIO()
-    with (
-        pytest.MonkeyPatch.context() as context,
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-    ):
+    """Runs `npdr demo`, small; returns exit code, output and error text."""
+    with pytest.MonkeyPatch.context() as context:
         context.setattr(demo, "run_demo", SMALL)
-        context.setattr(sys, "argv", ["npdr", "demo", *map(str, words)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-    return stop.value.code or 0, out.getvalue(), err.getvalue()
+        return run_for_module("demo", *words)
 
 
 @pytest.fixture(scope="module")

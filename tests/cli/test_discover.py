@@ -13,10 +13,10 @@ import pytest
 from rich.console import Console
 
 from npdr_ppl.cli import discover, show
-from npdr_ppl.cli import main as cli
 from npdr_ppl.cli.resolve import resolve_holdout, resolve_model
 from npdr_ppl.discovery import DiscoveryOptions, Investigation, kept_fits
 from npdr_ppl.run_files import save_tensors
+from tests.helpers.command_line import run_for_module
 from tests.helpers.discovery_recording import CANDIDATES, FRICTION, MISSING, pendulum_recording
 
 NAMES = {
@@ -30,15 +30,7 @@ FIGURES = {
 
 
 def run(words):
-    """Runs the command line in this process; returns exit code, output and error text."""
-    with pytest.MonkeyPatch.context() as patch:
-        out, err = StringIO(), StringIO()
-        patch.setattr(sys, "argv", ["npdr", *map(str, words)])
-        patch.setattr(sys, "stdout", out)
-        patch.setattr(sys, "stderr", err)
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-    return stop.value.code or 0, out.getvalue(), err.getvalue()
+    return run_for_module(*words)
 
 
 @pytest.fixture(scope="module")

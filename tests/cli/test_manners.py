@@ -12,9 +12,10 @@ import pytest
 import typer
 
 from npdr_ppl import progress
-from npdr_ppl.cli.main import app, main
+from npdr_ppl.cli.main import app
 from npdr_ppl.cli.manners import INTERRUPTED, resumable
 from npdr_ppl.rollouts import Rollouts
+from tests.helpers.command_line import run
 
 NPDR = [sys.executable, "-m", "npdr_ppl.cli"]
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
@@ -28,15 +29,6 @@ def npdr(*words, **environment):
         text=True,
         env={**os.environ, **environment},
     )
-
-
-def inside(monkeypatch, capsys, *words):
-    """Runs the command line in this process; returns exit code, output and error text."""
-    monkeypatch.setattr(sys, "argv", ["npdr", *map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    out, err = capsys.readouterr()
-    return stop.value.code or 0, out, err
 
 
 @pytest.fixture
@@ -98,7 +90,7 @@ def test_commands_that_compute_can_be_silent_verbose_or_read_by_machines(name):
     ],
 )  # fmt: skip
 def test_a_word_almost_right_gets_a_suggestion(monkeypatch, capsys, words, hint):
-    code, _, err = inside(monkeypatch, capsys, *words)
+    code, _, err = run(monkeypatch, capsys, *words)
     assert code == 2
     assert hint in " ".join(err.replace("│", " ").split())
 
@@ -126,7 +118,7 @@ def test_json_quiet_and_verbose(monkeypatch, capsys, recording, tmp_path):
     assert json.loads(first.stdout) == json.loads((tmp_path / "fit" / "fit.json").read_text())
     assert "round 1/1: 20 simulations" in first.stderr
     # No bars either: there is no terminal.
-    assert inside(monkeypatch, capsys, *words, "--quiet") == (0, "", "")
+    assert run(monkeypatch, capsys, *words, "--quiet") == (0, "", "")
 
 
 def test_an_interruption_says_how_to_go_on(capsys):

@@ -142,8 +142,6 @@ def test_inference_survives_faults_and_reports_them(recording, tmp_path):
 
 
 MODEL_FILE = """
-import sys
-sys.path.insert(0, {here!r})
 import pyro, pyro.distributions as dist
 import npdr_ppl as npdr
 from tests.helpers.bullet_models import SENSORS, TORQUE
@@ -168,7 +166,8 @@ def test_the_command_line_chooses_workers(monkeypatch, capsys, recording, tmp_pa
     folder, _ = recording
     file = tmp_path / "own.py"
     urdf = str(folder / "pendulum.urdf")
-    file.write_text(MODEL_FILE.format(here=str(Path(__file__).parents[2]), urdf=urdf))
+    file.write_text(MODEL_FILE.format(urdf=urdf))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
 
     def fit(model, *words):
         out = tmp_path / f"fit-{len(list(tmp_path.iterdir()))}"

@@ -1,5 +1,7 @@
 """The command line, run inside a test's own process."""
 
+import contextlib
+import io
 import sys
 
 import pytest
@@ -14,3 +16,17 @@ def run(monkeypatch, capsys, *words):
         cli.main()
     out, err = capsys.readouterr()
     return stop.value.code or 0, out, err
+
+
+def run_for_module(*words):
+    """Does the same in a fixture of a module, which has neither ``monkeypatch`` nor ``capsys``."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        pytest.raises(SystemExit) as stop,
+    ):
+        patch.setattr(sys, "argv", ["npdr", *map(str, words)])
+        cli.main()
+    return stop.value.code or 0, out.getvalue(), err.getvalue()
