@@ -33,6 +33,9 @@ SEARCH = DiscoveryOptions(
     effects=(SensorLowPass(FILTER), InputDelay("voltage"), CoulombFriction("arm")),
     max_effects=3,
 )
+"""Few candidates, so that the steps after the search take seconds. That discovery needs no such
+list is tested below. Among more candidates a spring of the arm comes before its friction, and
+without friction the error on held-out swing-ups falls by a quarter only."""
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +44,7 @@ def recordings():
 
 
 @pytest.mark.slow
-def test_filter_delay_and_friction_are_found_and_help_on_another_excitation(
+def test_a_revised_model_with_filter_delay_and_friction_helps_on_another_excitation(
     recordings, tmp_path, capsys
 ):
     swing_ups, chirps = recordings
