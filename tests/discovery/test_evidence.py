@@ -74,6 +74,12 @@ class Losses:
         return self.values
 
 
+def test_correlated_measurements_count_by_their_effective_share():
+    correlated = Losses(torch.full((40,), 3.0).double(), complexity=2.0, share=0.25)
+    total = float(evidence([correlated], [1.0], correlated).sum())
+    assert total == pytest.approx(-0.25 * 40 * 3.0 + 1.0 - 2.0)
+
+
 def test_a_hypothesis_that_is_better_in_a_single_segment_is_not_certain():
     level = torch.full((40,), 1.0).double()
     everywhere, once = level.clone(), level.clone()
