@@ -5,7 +5,7 @@
 
 The model's simulator starts a program for every simulation; one in twenty hangs while two programs
 run, one of them in a session of its own. Prints a row for each stop. The exit code is 1 if a
-process is left ten seconds after the signal, or if SIGTERM does not end with its sentence.
+process is left ``--limit`` seconds after the signal, or if SIGTERM does not end with its sentence.
 """
 
 import argparse
@@ -17,7 +17,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 
-HEADER = "executor", "signal", "after, s", "running", "exit code", "gone after, s", "left"
+HEADER = (
+    "executor", "signal", "after, s", "running", "exit code", "workers gone, s", "all gone, s",
+    "left",
+)  # fmt: skip
 
 
 def main() -> int:
@@ -25,6 +28,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--stops", type=int, default=50, help="Number of stops in all.")
     parser.add_argument("--executors", default="serial,loky,dask,ray")
+    parser.add_argument("--limit", type=float, default=10.0, help="s until all must be gone.")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     executors = options.executors.split(",")
@@ -33,9 +37,9 @@ def main() -> int:
     print(f"| {' | '.join(HEADER)} |\n|{'---|' * len(HEADER)}", flush=True)
     is_wrong = False
     with tempfile.TemporaryDirectory() as folder:
-        words = [sys.executable, str(script), folder, options.executors, str(each)]
+        words = [script, folder, options.executors, each, options.seed, options.limit]
         with subprocess.Popen(
-            [*words, str(options.seed)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+            [sys.executable, *map(str, words)], cwd=ROOT, stdout=subprocess.PIPE, text=True
         ) as run:
             assert run.stdout is not None
             for line in run.stdout:
@@ -43,7 +47,8 @@ def main() -> int:
                 says = row["signal"] == "SIGKILL" or "npdr: interrupted" in row["errors"]
                 is_wrong |= bool(row["left"]) or not says
                 cells = [row["executor"], row["signal"], row["after"], row["running"]]
-                cells += [row["exit_code"], row["seconds"], len(row["left"])]
+                cells += [row["exit_code"], row["workers_seconds"], row["seconds"]]
+                cells.append(len(row["left"]))
                 print(f"| {' | '.join(map(str, cells))} |", *row["left"], flush=True)
     return int(is_wrong or run.returncode != 0)
 

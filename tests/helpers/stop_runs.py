@@ -109,6 +109,11 @@ def command_line(process):
     return ""
 
 
+def is_worker(run, process, words):
+    """Returns whether a process is neither the command nor a tracker that ends with it."""
+    return process != run.pid and "resource_tracker" not in words
+
+
 def stop(folder, executor, number, seconds, limit):
     """Ends a fit by a signal, so long after its first worker was started; returns a row."""
     run = start(folder, executor)
@@ -120,9 +125,16 @@ def stop(folder, executor, number, seconds, limit):
     was_alive = run.poll() is None
     run.send_signal(number)
     sent = time.monotonic()
+    workers_seconds = None
     while (left := descendants()) and time.monotonic() < sent + limit:
+        if workers_seconds is None and not any(
+            is_worker(run, *process) for process in left.items()
+        ):
+            workers_seconds = time.monotonic() - sent
         time.sleep(0.05)
     seconds_left = time.monotonic() - sent
+    if workers_seconds is None:
+        workers_seconds = seconds_left
     for process in left:
         os.kill(process, signal.SIGKILL)
     run.wait()
@@ -132,7 +144,8 @@ def stop(folder, executor, number, seconds, limit):
     return {
         "executor": executor, "signal": signal.Signals(number).name, "after": round(seconds, 2),
         "was_alive": was_alive, "running": running, "exit_code": run.returncode,
-        "seconds": round(seconds_left, 2), "left": sorted(left.values()),
+        "workers_seconds": round(workers_seconds, 2), "seconds": round(seconds_left, 2),
+        "left": sorted(left.values()),
         "errors": (folder / "errors").read_text()[-300:],
     }  # fmt: skip
 
