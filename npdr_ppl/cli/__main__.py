@@ -1,6 +1,6 @@
 """`python -m npdr_ppl.cli`, the same as `npdr`."""
 
-from npdr_ppl.cli.main import main
+from npdr_ppl.cli.main import run
 
 if __name__ == "__main__":
-    main()
+    run()

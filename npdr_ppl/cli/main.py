@@ -1,5 +1,6 @@
 """Entry point of `npdr`: registers the commands; bad input gives one sentence and exit code 2."""
 
+import logging
 import os
 import sys
 from typing import Any
@@ -7,10 +8,10 @@ from typing import Any
 import typer
 
 from npdr_ppl.cli import compare, demo, discover, fit, listings, report, reproduce, train
-from npdr_ppl.cli.manners import Stopped, stop_on_signals
+from npdr_ppl.cli.manners import INTERRUPTIONS, Stopped, stop_on_signals
 from npdr_ppl.errors import NpdrError
 
-__all__ = ["app", "main"]
+__all__ = ["app", "main", "run"]
 
 # Base class of the errors for wrong options, values and commands.
 _UsageError: Any = typer.BadParameter.__bases__[0]
@@ -57,6 +58,23 @@ def main() -> None:
         _refuse(str(error))
     except OSError as error:
         _refuse(f"{error.filename or 'A file'}: {error.strerror or error}.")
+
+
+def run() -> None:
+    """Runs the command line as a program, which ends at once after an interruption.
+
+    Python would take seconds to free its modules. Results are complete or not written at all, and
+    workers end with this process.
+    """
+    try:
+        main()
+    except SystemExit as stop:
+        if stop.code in INTERRUPTIONS:
+            logging.shutdown()
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(int(stop.code))
+        raise
 
 
 def _sentence(message: str) -> str:

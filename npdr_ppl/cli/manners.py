@@ -11,6 +11,7 @@ import typer
 
 __all__ = [
     "INTERRUPTED",
+    "INTERRUPTIONS",
     "AsJson",
     "Quiet",
     "Stopped",
@@ -22,6 +23,10 @@ __all__ = [
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, the same as in shells."""
+
+
+INTERRUPTIONS = (INTERRUPTED, 143, 129)
+"""Exit codes after Ctrl-C, SIGTERM and SIGHUP."""
 
 
 class Stopped(BaseException):

@@ -135,7 +135,7 @@ def test_a_killed_discovery_continues_to_the_same_result(finished, words, tmp_pa
     out = tmp_path / "killed"
     words = [*map(str, words[:-1]), str(out), "--quiet"]
     process = subprocess.Popen([sys.executable, "-m", "npdr_ppl.cli", *words])
-    deadline = time.monotonic() + 300
+    deadline = time.monotonic() + 600
     while len(list(out.glob("fits/*.safetensors"))) < 4:
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.01)

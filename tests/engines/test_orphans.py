@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from npdr_ppl.cli.main import main
+from npdr_ppl.cli.main import main, run
 from npdr_ppl.cli.manners import Stopped, resumable, stop_on_signals
 from npdr_ppl.engines.workers import Pool, WorkerOptions
 from tests.helpers.pool_tasks import StartsPrograms
@@ -118,3 +118,17 @@ def test_a_signal_where_nothing_was_begun_gets_a_sentence(capsys, monkeypatch):
         main()
     assert stop.value.code == 143
     assert capsys.readouterr().err == "npdr: interrupted.\n"
+
+
+def test_an_interrupted_program_ends_at_once(monkeypatch):
+    def interrupted():
+        sys.exit(143)
+
+    def leave(code):
+        raise TimeoutError(code)
+
+    monkeypatch.setattr("npdr_ppl.cli.main.main", interrupted)
+    monkeypatch.setattr("npdr_ppl.cli.main.os._exit", leave)
+    monkeypatch.setattr("npdr_ppl.cli.main.logging.shutdown", lambda: None)
+    with pytest.raises(TimeoutError, match="143"):
+        run()
