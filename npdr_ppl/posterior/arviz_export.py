@@ -136,18 +136,18 @@ def to_arviz(posterior: DensityMixture, num_samples: int = 1_000, *, seed: int =
 def _predicted(
     posterior: DensityMixture, z: Tensor, is_kept: Tensor, num_readings: int, *, seed: int
 ) -> tuple[dict[str, Tensor], dict[str, tuple[Tensor, str]]]:
-    """Simulates draws part by part, and keeps some of the trajectories.
+    """Simulates draws in parts, and keeps some of the trajectories.
 
     Args:
         posterior: The posterior.
         z: The draws, ``(n, d)``.
-        is_kept: Of which the trajectories are kept, a mask ``(n,)``.
-        num_readings: Readings of one simulation.
-        seed: Seed of what simulations draw.
+        is_kept: Mask of the draws whose trajectories are kept, ``(n,)``.
+        num_readings: Number of measurements in one simulation.
+        seed: Seed of the random numbers in simulations.
 
     Returns:
-        The trajectories kept, and the log likelihood ``(n, segments)`` of all draws with its error
-        model, by site.
+        Two dictionaries by site: the trajectories that are kept; and the log likelihood of all
+        draws, ``(n, segments)``, with the description of its error model.
     """
     sites = {name: _SegmentLikelihood(posterior, name) for name in posterior.bound.observations}
     kept: dict[str, list[Tensor]] = {name: [] for name in posterior.prior.black_boxes}

@@ -40,7 +40,7 @@ REFERENCE_SITE = "_reference"
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a posterior came about.
+    """Seed, budget, figures and duration of the run that learnt a posterior.
 
     Attributes:
         seed: Seed of the run.
@@ -123,18 +123,19 @@ class PosteriorBase(DensityMixture):
 
 
 class Posterior(PosteriorBase):
-    """What a backend has learnt: an equal mixture of independently trained ensemble members.
+    """A posterior learnt by a backend: an equal mixture of independently trained members.
 
     Attributes:
         bound: The model and its data.
         backend: The backend that learnt it.
-        problem: What the backend knew.
-        states: The backend's state after each round known, the last one being this posterior's.
-        densities: The members, in reference coordinates.
-        provenance: How they came about.
-        preparation: What was done with the recording first, where that is known.
-        estimator: How the learnt posterior compares with the simulator, where that was checked.
-        correction: What took its place; ``None`` if it is the learnt one.
+        problem: The problem that was given to the backend.
+        states: The backend's states after the rounds that were kept; the last one is the state of
+            this posterior.
+        densities: The members of the ensemble, in reference coordinates.
+        provenance: Seed, budget, figures and duration of the run that learnt it.
+        preparation: How the recording was prepared; ``None`` if that is not known.
+        estimator: Result of the estimator check; ``None`` if it was not made.
+        correction: The corrected posterior that replaces the learnt one; ``None`` if none does.
     """
 
     def __init__(

@@ -159,7 +159,7 @@ def sample_posterior(
 def smoothed_weights(log_weights: Tensor) -> tuple[Tensor, float]:
     """Returns Pareto-smoothed log weights, normalised, ``(n,)``, and the shape of their tail.
 
-    If too few draws have a weight, all weights are equal and the shape is infinite.
+    If too few draws have a positive weight, all weights are set equal and the shape is infinite.
     """
     from npdr_ppl.arviz_module import pareto_smoothed
 

@@ -53,9 +53,10 @@ class Linearisation:
 
     @property
     def is_finite(self) -> bool:
-        """Whether the simulation succeeded at the point and everywhere beside it.
+        """Whether residuals and derivatives are finite, and their squares, which are summed later.
 
-        Their squares, which are summed later, must be finite too.
+        They are not if the simulation fails at the point, or at one of the points next to it that
+        the finite differences need.
         """
         parts = self.residual, self.by_parameters, self.by_starts
         return all(bool(part.square().sum().isfinite()) for part in parts)
@@ -64,8 +65,8 @@ class Linearisation:
     def is_regular(self) -> bool:
         """Whether it is finite and the initial states of every segment can be integrated out.
 
-        They cannot where derivatives by the offsets are so large that 1 + Gᵀ G is singular to
-        working precision: there the simulation diverges beside the point.
+        They cannot if derivatives by the offsets are so large that 1 + Gᵀ G is singular to working
+        precision. The simulation then diverges at points next to this one.
         """
         return self.is_finite and bool(is_invertible(self._inner).all())
 

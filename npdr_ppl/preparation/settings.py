@@ -67,6 +67,9 @@ class LinearisationSettings:
 class SegmentFitSettings:
     """Damped Gauss-Newton steps, and restarts from other points.
 
+    A fit begins with rough steps, which use one-sided differences and estimate the scale of each
+    channel's residuals again after every step. Precise steps at that scale follow.
+
     Attributes:
         first_damping: Damping of the first step, relative to the curvature of each parameter and
             of each segment's initial state.
@@ -74,18 +77,18 @@ class SegmentFitSettings:
         near_factors: Multiples of the last successful damping that are tried first.
         far_factors: Multiples that are tried if the near ones gain too little; the steps end only
             after these.
-        rough_gain: Reduction of the objective, as a share of it, below which rough steps end.
-        settled_scale: Rough steps end only if each channel's scale is at least this share of its
-            value before the step.
+        rough_gain: Rough steps end when a step reduces the objective by less than this share.
+        settled_scale: Rough steps end only when the last step has kept each channel's scale at
+            this share of its previous value or more.
         longest_step: Greatest change of a parameter's reference coordinate in one step, in
             standard deviations of the prior. Initial states are not limited: on an unstable motion
             they can be wrong by many standard deviations, and each segment has its own damping.
         largest_coordinate: Greatest distance of a fit from the prior's centre, in standard
             deviations. A strength that is much smaller than its half-normal prior expects lies at
             −3 and beyond.
-        least_gain: Reduction of the objective, in variances of the measurement noise, below which
-            steps end. It is a quarter of a unit of log evidence, which is a tenth of what makes
-            one of two models ten times as likely.
+        least_gain: Steps end when a step reduces the objective, in variances of the measurement
+            noise, by less than this. The default is a quarter of a unit of log evidence. A model
+            that is ten times as likely as another has 2.3 units more.
         outlier_misfit: Multiple of the median segment's misfit above which other initial states
             are tried.
         initial_state_restarts: Distances of these initial states, in standard deviations of the

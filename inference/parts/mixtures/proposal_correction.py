@@ -40,9 +40,9 @@ PROPOSALS = ("gaussian", "mixture")
 def proposal_of(
     posteriors: Sequence[GaussianMixture], kind: Literal["gaussian", "mixture"]
 ) -> GaussianMixture:
-    """Returns the next round's proposal: the posterior, no wider than the prior.
+    """Returns the next round's proposal: the posterior, made no wider than the prior.
 
-    Eigenvalues of covariances above one, that of the prior, are set to one.
+    Eigenvalues of a covariance are limited to one, the variance of the prior.
 
     Args:
         posteriors: The posteriors of an ensemble's members.

@@ -41,7 +41,7 @@ class Signals:
         simulator: Declares actions, sensors and effects.
         domain: All parameters, each broadcasting to ``shape``.
         inputs: The segments, float64.
-        shape: The batch shape and the segments, of numel N.
+        shape: The batch shape, followed by the number of segments. N is the product of all.
 
     Attributes:
         start_times: Seconds from the start of the rollout to each segment's start, ``(N,)``.
