@@ -23,8 +23,9 @@ __all__ = ["to_arviz"]
 
 
 MAX_PREDICTIVE_DRAWS = 100
-"""Posterior predictive draws of each member. All of them have log likelihoods; trajectories are
-kept of as many as :data:`~npdr_ppl.preparation.settings.DRAW_BUDGET` allows."""
+"""Number of posterior predictive draws of each member. All of them have log likelihoods. The
+number of trajectories that are kept is limited by
+:data:`~npdr_ppl.preparation.settings.DRAW_BUDGET`."""
 
 MAX_PRIOR_PREDICTIVE_DRAWS = 50
 """Prior predictive draws, those of the first prior draws; enough to see what the prior allows."""
@@ -204,7 +205,7 @@ class _SegmentLikelihood:
             self._parts.append((square * self._mask).sum(2))
 
     def finish(self) -> tuple[Tensor, str]:
-        """Returns the log likelihood, ``(n, segments)``, and what error model it stands on."""
+        """Returns the log likelihood, ``(n, segments)``, and the name of its error model."""
         log_prob, error_model = torch.cat(self._parts), "declared noise"  # (n, G, C)
         if not self._has_density:
             variance = self._square / (self._num_draws * self._left[..., 0].numel())

@@ -42,11 +42,11 @@ class DensityMixture(ABC):
     @property
     @abstractmethod
     def backend_name(self) -> str:
-        """Which backend, or which mixture of backends, it comes from."""
+        """Name of the backend, or of the mixture of backends, that made it."""
 
     @abstractmethod
     def sample_reference(self, num_samples: int, *, seed: int = 0) -> Tensor:
-        """Draws ``(chains, num_samples, d)``: what ArviZ takes for chains."""
+        """Returns draws ``(chains, num_samples, d)``; ArviZ treats each member as a chain."""
 
     @property
     def prior(self) -> Prior:
@@ -54,7 +54,7 @@ class DensityMixture(ABC):
         return self.bound.prior
 
     def checks(self) -> dict[str, Any]:
-        """Returns what is known of estimator and model by other means; empty if nothing is."""
+        """Returns checks of estimator and model that do not use the draws; empty without any."""
         return {}
 
     def sample(self, num_samples: int, *, seed: int = 0) -> dict[str, Tensor]:

@@ -20,7 +20,8 @@ __all__ = [
 ]
 
 FEWEST_SEGMENTS = 8
-"""Least number of segments with which influential ones count. Each of fewer is influential."""
+"""Least number of segments for the share of influential ones. With fewer segments, each one is
+influential."""
 
 
 def conditional_contraction(groups: Mapping[str, "xr.Dataset"]) -> dict[str, float]:
@@ -108,10 +109,10 @@ def _counted(
 def _worst_segment_p_value(
     predictive: NDArray[np.float64], observed: NDArray[np.float64], counted: NDArray[np.bool_]
 ) -> float:
-    """Returns how often a draw's segment is as far from the mean as the worst recorded one.
+    """Returns the share of draws with a segment as far from the mean as the worst recorded one.
 
-    Discrepancy: the greatest over segments of the mean squared distance from the predictive
-    mean, in units of the predictive variance; with the draws themselves as replicates.
+    The distance is the mean squared difference from the predictive mean, in units of the
+    predictive variance.
     """
     mean = predictive.mean(0)
     scale = predictive.std(0)

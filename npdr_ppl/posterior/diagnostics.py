@@ -39,8 +39,8 @@ __all__ = ["Decision", "Diagnosis", "Thresholds", "diagnose"]
 
 
 CONDITIONAL_CONTRACTION = 0.5
-"""Least contraction of a parameter, given all others, with which the data determine it in
-combination with them. At 0.5 its conditional standard deviation is half that of its prior."""
+"""A parameter counts as determined in combination with others if its contraction, given all
+others, is at least this. At 0.5 its conditional standard deviation is half that of its prior."""
 
 
 class Decision(StrEnum):
@@ -62,17 +62,19 @@ class Thresholds:
     Attributes:
         r_hat: Chains agree below this (Vehtari et al. 2021 advise 1.01 for MCMC; networks trained
             on the same simulations differ by more).
-        ess: Least effective sample size: what five chains at the limit of r̂ have. Where there is
-            one chain, the ends of a 90 % interval are known to half a standard deviation.
-        coverage_shortfall: The recording leaves its 90 % band by this much more than it should.
-        segment_p_value: The worst segment is this unlikely under the posterior predictive.
-        noise_ratio: Residuals at the best parameters are this many times the declared noise: at
-            1.25 an interval of 90 % holds 81 %.
-        edge_mass: Share of a marginal in the outermost 2 % of the prior that makes it too narrow.
-        contraction: A parameter that learnt less than this is not determined by the data.
-        pareto_k: PSIS-LOO is unreliable for segments above it.
-        influential_share: Share of the segments above ``pareto_k`` from which the posterior is
-            said to hang on few of them.
+        ess: Least effective sample size. Five chains at the limit of r̂ have this one. For a
+            single chain, it determines the ends of a 90 % interval to half a standard deviation.
+        coverage_shortfall: Greatest difference between 0.9 and the share of the recording inside
+            the 90 % band.
+        segment_p_value: Least p-value of the worst segment.
+        noise_ratio: Greatest ratio of the residuals at the best parameters to the declared noise.
+            At 1.25 an interval of 90 % holds 81 %.
+        edge_mass: Greatest share of a marginal in the outermost 2 % of the prior; above it, the
+            prior is too narrow.
+        contraction: Least contraction of a parameter that the data determine.
+        pareto_k: Greatest Pareto k of a segment for which PSIS-LOO is reliable.
+        influential_share: Greatest share of the segments above ``pareto_k``; above it, the
+            posterior depends on few of the segments.
     """
 
     r_hat: float = 1.1
@@ -104,10 +106,10 @@ class Diagnosis:
         pareto_k: Greatest Pareto k of a segment.
         conditional_contraction: Contraction given all other parameters.
         influential_share: Share of the segments whose Pareto k is above the limit.
-        estimator_k: Pareto k of the posterior's draws weighted by what the simulator says of them;
-            NaN where that is not known.
-        model_p_value: Probability of as large a disagreement at the best parameters by chance, as
-            ``npdr discover`` computes it; NaN where that is not known.
+        estimator_k: Pareto k of the posterior's draws, weighted by the simulator's likelihood;
+            NaN if it was not computed.
+        model_p_value: Probability that the misfit at the best parameters is as large by chance, as
+            ``npdr discover`` computes it; NaN if it was not computed.
     """
 
     decision: Decision
@@ -195,7 +197,7 @@ class _Reading:
     rollouts_left: int
 
     def decide(self) -> tuple[Decision, str]:
-        """Returns the first decision that there is reason for."""
+        """Returns the first decision whose condition holds, and the reason for it."""
         found = (
             self._of_model()
             or self._of_priors()
@@ -218,12 +220,12 @@ class _Reading:
         if model is None:
             return f"The chains agree and the posterior explains the recording ({self._shown})."
         return (
-            "The posterior is what the simulator says, and nothing in the recording speaks "
-            f"against the model (p = {model['p_value']:.2g})."
+            "The posterior agrees with the simulator, and the recording shows no disagreement "
+            f"with the model (p = {model['p_value']:.2g})."
         )
 
     def _misfit(self) -> bool:
-        """Whether predictions miss the recording, where nothing better is known."""
+        """Whether predictions miss the recording; used only if there is no likelihood."""
         figures, limits = self.figures, self.limits
         return (
             0.9 - figures.coverage_90 > limits.coverage_shortfall
@@ -253,7 +255,7 @@ class _Reading:
         return None
 
     def _of_predictions(self) -> tuple[Decision, str] | None:
-        """Decides about the model by predictions alone, once the estimator can be believed."""
+        """Decides about the model by predictions alone, once the estimator has converged."""
         if not self._misfit():
             return None
         if self.figures.r_hat > self.limits.r_hat and self.rounds_left > 0:
@@ -297,7 +299,7 @@ class _Reading:
         return (
             Decision.MORE_ROUNDS,
             f"The estimator has not converged ({self._convergence()}): more rounds, more "
-            "simulations or other features are needed before the posterior can be believed.",
+            "simulations or other features are needed before the posterior is reliable.",
         )
 
     def _convergence(self) -> str:

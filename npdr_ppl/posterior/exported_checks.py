@@ -1,7 +1,7 @@
-"""What is known of an estimator and a model by other means than the posterior's own draws.
+"""Checks of an estimator and a model that do not use the posterior's own draws.
 
 The checks travel with the exported posterior, as JSON in the attribute ``checks``, so that
-:func:`npdr_ppl.diagnose` reads nothing but the export::
+:func:`npdr_ppl.diagnose` needs only the export::
 
     estimator   how the learnt posterior compares with the simulator, and whether it was corrected
     model       whether the recording shows anything that no parameters explain
@@ -24,10 +24,10 @@ ATTRIBUTE = "checks"
 def checks_of(
     preparation: "Preparation | None", estimator: "EstimatorCheck | None"
 ) -> dict[str, Any]:
-    """Returns the checks as JSON-serialisable values; empty where nothing is known.
+    """Returns the checks as JSON-serialisable values; empty if none were made.
 
     Args:
-        preparation: What was done with the recording first.
+        preparation: The preparation of the recording.
         estimator: How the learnt posterior compares with the simulator.
     """
     result: dict[str, Any] = {}

@@ -70,14 +70,14 @@ def infer(
         seed: Seed of everything random.
         options: How the data are prepared; defaults if left out.
         device: Where trajectories are simulated and the backend trains.
-        start: Posterior of the same model given other data, or another density over its
-            reference coordinates. A backend that can correct for it simulates the prior in that
-            region only; if the new posterior lies elsewhere it is not found.
+        start: Where the search begins: a posterior of the same model given other data, or another
+            density over its reference coordinates. Backends that can correct for it simulate only
+            in that region of the prior. If the new posterior lies elsewhere, it is not found.
         checkpoint: Folder to save every round in; an interrupted run continues from there.
-        preparation: What :func:`~npdr_ppl.posterior.prepare.prepare` made of the model and
-            the data, whose options then count instead of those given here.
-        corrects: Whether a learnt posterior that differs from what the simulator says is
-            corrected; see :mod:`npdr_ppl.posterior.estimator_check`.
+        preparation: Result of :func:`~npdr_ppl.posterior.prepare.prepare` for the model and the
+            data. Its options replace those given here.
+        corrects: Whether a learnt posterior that differs from the simulator is corrected; see
+            :mod:`npdr_ppl.posterior.estimator_check`.
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Returns:
@@ -182,7 +182,8 @@ def run_round(
     Args:
         bound: The model and its data.
         method: The backend.
-        problem: What it knows; its observation need not be that of ``bound``.
+        problem: The problem that the backend gets; its observation may differ from the one in
+            ``bound``.
         state: Its state before the round.
         index: Number of the round, from 0.
         num_simulations: Simulations of the round.
@@ -227,8 +228,8 @@ def simulate_features(
 ) -> Tensor:
     """Simulates the model at points and embeds the outputs, chunk by chunk.
 
-    Only features are kept, so memory does not grow with simulations × steps unless the embedding
-    wants raw trajectories.
+    Only features are kept. Memory therefore grows with simulations × steps only if the embedding
+    takes raw trajectories.
 
     Args:
         bound: The model and its data.

@@ -56,7 +56,7 @@ class Provenance:
 
     @property
     def faults(self) -> dict[str, int]:
-        """Counts of what went wrong at workers, by kind; empty where none were used."""
+        """Number of faults at workers, by kind; empty if no workers were used."""
         counts: Counter[str] = Counter()
         for info in self.rounds:
             counts.update(info.faults)
@@ -170,7 +170,7 @@ class Posterior(PosteriorBase):
         return self.backend.name
 
     def checks(self) -> dict[str, Any]:
-        """What is known of estimator and model, as :func:`exported_checks.checks_of` says."""
+        """Returns the checks of estimator and model; see :func:`exported_checks.checks_of`."""
         if self._checks is None:
             self._checks = checks_of(self.preparation, self.estimator)
         return self._checks
@@ -251,7 +251,7 @@ class Posterior(PosteriorBase):
         )
 
     def corrected(self, estimator: EstimatorCheck, correction: Correction | None) -> "Posterior":
-        """Returns the posterior as it is after the comparison with the simulator."""
+        """Returns the posterior with the results of its comparison with the simulator."""
         return Posterior(
             self.bound,
             self.backend,
@@ -271,7 +271,8 @@ class Posterior(PosteriorBase):
         """
         if not 0 <= index < len(self.states):
             raise BackendError(
-                f"Round {index} is not known; this posterior knows {len(self.states)}."
+                f"Round {index} does not exist; this posterior has the states of "
+                f"{len(self.states)} rounds, counted from 0."
             )
         provenance = replace(self.provenance, rounds=self.provenance.rounds[: index + 1])
         states = self.states[: index + 1]

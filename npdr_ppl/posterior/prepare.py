@@ -143,8 +143,8 @@ class Preparation:
     def neighbourhood(self) -> GaussianMixture | None:
         """Returns a normal density around the closest fit, wider than the posterior should be.
 
-        Its covariance is that of Laplace's approximation, plus that of ``MARGIN`` in every
-        direction, because the model is not linear and may lack effects.
+        Its covariance is the one of Laplace's approximation, plus a variance of ``MARGIN`` squared
+        in every direction, because the model is not linear and may lack effects.
         """
         if self.likelihood is None:
             return None
@@ -170,7 +170,7 @@ class Preparation:
         }
 
     def sentence(self) -> str:
-        """Returns what was done with the recording in one line."""
+        """Returns a line that says how the recording was prepared."""
         length = self.options.steps(self.rollouts)
         cut = (
             "whole rollouts"
@@ -279,7 +279,7 @@ def prepare(
 
 
 def held_out(prepared: Preparation, rollouts: Rollouts) -> SegmentLikelihood | None:
-    """Returns the likelihood of another recording, to judge a posterior by.
+    """Returns the likelihood of another recording, on which a posterior is evaluated.
 
     Scale and share of independent measurements are those of the recording that was fitted; initial
     states are estimated along the motion that was found there.
@@ -329,7 +329,7 @@ def _with_certain_starts(
     seed: int,
     progress: Step | None,
 ) -> Preparation:
-    """Prepares what has no closest fit with uncertain initial states."""
+    """Prepares a recording for which no fit with uncertain initial states is possible."""
     if options.embedding == "score":
         options = replace(options, embedding=PLAIN_FEATURES)
     if keeps_noise:
@@ -340,7 +340,7 @@ def _with_certain_starts(
 
 
 def _likelihood(base: BaseFit, is_declared: bool) -> SegmentLikelihood:
-    """Returns the recording's likelihood, at the noise that the model declares where it does."""
+    """Returns the recording's likelihood, with the model's declared noise if there is one."""
     found = base.hypothesis
     scale = _declared_scale(base) if is_declared else None
     if scale is None:

@@ -65,13 +65,13 @@ class SavedRound:
 
 @dataclasses.dataclass(frozen=True)
 class SavedPreparation:
-    """What was done with a recording before anything was inferred.
+    """The preparation of a recording before inference.
 
     Attributes:
         starts: The segments' estimated initial states.
-        score: The features, where they were made for the recording.
+        score: The score features, if they were made for the recording.
         noise: Estimated noise by sensor; ``None`` if the model kept its own.
-        num_finer_steps: How often the model's integration steps were refined.
+        num_finer_steps: Number of times that the model's integration steps were refined.
     """
 
     starts: InitialStates | None = None
@@ -80,7 +80,7 @@ class SavedPreparation:
     num_finer_steps: int = 0
 
     def apply(self, model: Any) -> Any:
-        """Returns a model with the same noise and steps as that which was inferred."""
+        """Returns a model with the noise and steps with which the posterior was inferred."""
         for _ in range(self.num_finer_steps):
             model = with_finer_steps(model)
         return model if self.noise is None else with_noise(model, self.noise)
@@ -135,7 +135,7 @@ class RunFolder:
         )
 
     def save_preparation(self, found: Preparation) -> None:
-        """Saves what was done with the recording before anything was inferred."""
+        """Saves the preparation of the recording before inference."""
         tensors = {}
         if found.starts is not None:
             for field in dataclasses.fields(found.starts):
@@ -153,7 +153,7 @@ class RunFolder:
         )
 
     def preparation(self) -> "SavedPreparation":
-        """Returns what :meth:`save_preparation` wrote, or that nothing was done."""
+        """Returns the saved preparation; an empty one if none was saved."""
         file = self.path / "preparation.json"
         if not file.exists():
             return SavedPreparation()
@@ -172,7 +172,7 @@ class RunFolder:
         )
 
     def save_correction(self, correction: Correction | None, checks: Mapping[str, Any]) -> None:
-        """Saves what took a learnt posterior's place, and what is known of it."""
+        """Saves the posterior that replaces the learnt one, if any, and the checks."""
         file = self.path / "correction.safetensors"
         if correction is not None:
             save_tensors(file, correction.tensors())

@@ -57,18 +57,17 @@ def compare(
     and the same seed; a backend that is not sequential spends its budget in one round. A backend
     that fails becomes a row that says why.
 
-    Every posterior is judged by held-out segments: log predictive density (elpd) under one error
-    model for all, see :mod:`npdr_ppl.posterior.comparison.error_model`; CRPS and coverage of its
-    predictive distribution; RMSE and DTW of its most likely draw. The ranking is by elpd, and
-    stacking weights maximise the elpd of the posteriors' mixture, so that the mixture's own
-    figures are those of the segments that chose its weights. Without held-out data the fitted
-    segments are judged by, with elpd by leaving out each (PSIS-LOO), which presumes exact
-    posteriors.
+    Every posterior is evaluated on held-out segments: log predictive density (elpd) under an error
+    model that is common to all, see :mod:`npdr_ppl.posterior.comparison.error_model`; CRPS and
+    coverage of its predictive distribution; RMSE and DTW of its most likely draw. The ranking is
+    by elpd. Stacking weights maximise the elpd of the posteriors' mixture on the same segments, so
+    the figures of the mixture are optimistic. Without held-out data the fitted segments are used,
+    with elpd by leave-one-out (PSIS-LOO), which presumes exact posteriors.
 
     Args:
         model: A Pyro model with black-box sites.
         train: Rollouts to fit, or other data that :func:`npdr_ppl.infer` takes.
-        test: Held-out data of the same kind; ``None`` judges by the fitted ones.
+        test: Held-out data of the same kind; ``None`` evaluates on the fitted data.
         backends: Backends by label, or in sequence by name or text; see
             :mod:`npdr_ppl.posterior.comparison.compared_backends`.
         rounds: Rounds of simulating and training.
@@ -174,7 +173,7 @@ def compare(
 
 @dataclasses.dataclass(frozen=True)
 class _Judge:
-    """Judges posteriors by a recording, in float64 whatever they were fitted in."""
+    """Evaluates posteriors on a recording, in float64, also those that were fitted in float32."""
 
     error_model: ErrorModel
     data: Data
@@ -261,7 +260,7 @@ class _Run:
         return peak
 
     def row(self, posterior: Posterior, peak: float | None, judge: _Judge) -> Row:
-        """Samples the posterior, has it judged, and saves it."""
+        """Draws from the posterior, evaluates it, and saves it."""
         step = self.report.stage("judge")
         started = time.perf_counter()
         most_likely = posterior.most_likely(seed=judge.seed)

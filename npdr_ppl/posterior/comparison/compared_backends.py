@@ -36,11 +36,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Candidate:
-    """A backend as it enters a comparison.
+    """A backend of a comparison, with its options and features.
 
     Attributes:
         backend: The backend with its options.
-        embedding: The features it conditions on; ``None`` for those of the comparison.
+        embedding: The features from which it infers; ``None`` for those of the comparison.
     """
 
     backend: Backend
@@ -53,7 +53,8 @@ class Candidate:
 
 
 Backends = Sequence[str | Backend | Candidate] | Mapping[str, str | Backend | Candidate]
-"""Backends to compare: in sequence, under their own names or texts, or by label."""
+"""Backends to compare: a sequence, in which names or texts are the labels; or a mapping by
+label."""
 
 
 def candidates(backends: Backends) -> dict[str, Candidate]:
@@ -109,13 +110,13 @@ def split_candidates(text: str) -> list[str]:
 
 
 def available(texts: Mapping[str, str]) -> tuple[dict[str, Candidate], dict[str, str]]:
-    """Returns those of a method's usual candidates whose backends there are.
+    """Returns the usual candidates whose backends are installed.
 
     Args:
         texts: Candidates' texts by label.
 
     Returns:
-        The candidates by label, and why the others are left out, a sentence by label.
+        The candidates by label, and for each other one a sentence that says why it is left out.
     """
     found: dict[str, Candidate] = {}
     skipped: dict[str, str] = {}
@@ -130,18 +131,18 @@ def available(texts: Mapping[str, str]) -> tuple[dict[str, Candidate], dict[str,
 def requested(
     texts: Sequence[str] | None, usual: Mapping[str, str]
 ) -> tuple[dict[str, Candidate], dict[str, str]]:
-    """Returns the candidates that were asked for, usual ones by their label alone.
+    """Returns the requested candidates; usual ones can be requested by their labels.
 
     Args:
-        texts: Labels of usual candidates, or candidates' texts; ``None`` for the usual ones whose
-            backends there are.
+        texts: Labels of usual candidates, or texts of candidates; ``None`` for all usual ones
+            whose backends are installed.
         usual: Texts of the usual candidates by label.
 
     Returns:
-        The candidates by label, and why usual ones are left out, a sentence by label.
+        The candidates by label, and for each usual one that is left out a sentence that says why.
 
     Raises:
-        BackendError: What was asked for is none, occurs twice or does not exist.
+        BackendError: No candidate was requested, or one twice, or one that does not exist.
     """
     if texts is None:
         return available(usual)

@@ -24,9 +24,10 @@ class Comparison:
         rows: A row for every backend by label, in the order given.
         posteriors: The posteriors by label, of the backends that did not fail.
         stacking: Stacking weights and differences; ``None`` where no backend has a finite elpd.
-        mixture: Figures of the mixture by these weights, on the segments that chose them.
-        error_model: The error model that all are judged by.
-        settings: What was asked for.
+        mixture: Scores of the mixture with these weights, on the segments to which the weights
+            were fitted.
+        error_model: The error model with which all backends are evaluated.
+        settings: The settings of the comparison.
     """
 
     rows: Mapping[str, Row]
@@ -40,7 +41,8 @@ class Comparison:
     def ranking(self) -> list[str]:
         """Labels from the best to the worst, by elpd, or CRPS where no elpd is finite.
 
-        Backends that failed are not ranked; equal ones keep the order they were given in.
+        Backends that failed are not ranked. Backends with equal scores keep the order in which
+        they were given.
         """
         ranked = [label for label, row in self.rows.items() if row.error is None]
         return sorted(ranked, key=lambda label: self.rows[label].score)

@@ -1,4 +1,4 @@
-"""What became of each backend that was compared."""
+"""Results of each backend that was compared."""
 
 import math
 from collections.abc import Mapping
@@ -15,18 +15,20 @@ __all__ = ["Figures", "Row"]
 
 @dataclass(frozen=True)
 class Figures:
-    """How a posterior does on the recording it is judged by.
+    """Scores of a posterior on the recording on which it is evaluated.
 
     Attributes:
         rmse: RMSE of the most likely draw per rollout, dimensionless; empty for observations that
             are not rollouts.
-        dtw: DTW of the most likely draw per rollout, likewise.
-        most_likely: That draw, by latent site.
-        elpd: Log predictive density of every segment, ``(segments,)``; ``None`` where there is
-            no likelihood.
-        elpd_draws: Effective number of draws that the least certain segment's density stands on.
-        crps: Mean CRPS of a reading in units of its channel's range.
-        coverage: Share of readings inside the central predictive interval, by its probability.
+        dtw: DTW of the most likely draw per rollout, dimensionless; empty for observations that
+            are not rollouts.
+        most_likely: The most likely draw, by latent site.
+        elpd: Log predictive density of every segment, ``(segments,)``; ``None`` if there is no
+            likelihood.
+        elpd_draws: Effective number of draws in a segment's density, for the segment where it is
+            smallest.
+        crps: Mean CRPS of a measurement in units of its channel's range.
+        coverage: Share of measurements inside the central predictive interval, by its probability.
         num_failed: Predictive draws that could not be simulated.
     """
 
@@ -60,19 +62,20 @@ class Figures:
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one backend.
+    """Results of one backend.
 
     Attributes:
         backend: Its name.
-        error: Why it failed, one sentence; ``None`` if it did not, and then the rest is there.
-        figures: How its posterior does on the recording it is judged by.
-        diagnosis: What ArviZ says of its posterior.
+        error: Why it failed, one sentence; ``None`` if it succeeded. The attributes below are set
+            only if it succeeded.
+        figures: Scores of its posterior on the recording on which it is evaluated.
+        diagnosis: Diagnosis of its posterior.
         parameters: Mean, standard deviation and 94 % interval of every parameter.
-        rounds: Rounds it took.
-        num_simulations: Simulations in all.
-        num_failed: Of these, how many failed.
-        faults: Counts of what went wrong at workers, by kind; empty where none were used.
-        seconds: To ``simulate``, ``train`` and ``sample`` (ten thousand draws with densities).
+        rounds: Number of rounds.
+        num_simulations: Number of simulations in all rounds.
+        num_failed: Number of these simulations that failed.
+        faults: Number of faults at workers, by kind; empty if no workers were used.
+        seconds: Time to ``simulate``, ``train`` and ``sample`` (10 000 draws with densities).
         peak_memory: Sampled increase of resident memory while it ran, MiB; ``None`` if unknown.
     """
 
@@ -90,7 +93,7 @@ class Row:
 
     @property
     def score(self) -> tuple[float, float]:
-        """What is ranked by, smaller is better: minus elpd, then CRPS, infinite if not finite."""
+        """Sort key of the ranking, smaller is better: −elpd, then CRPS; infinite if unknown."""
         if self.figures is None:
             return (math.inf, math.inf)
         elpd = -math.inf if self.figures.elpd is None else float(np.sum(self.figures.elpd))

@@ -29,17 +29,17 @@ __all__ = ["ErrorModel", "find_error_model", "segment_log_likelihood"]
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """What the backends' simulations and their comparison have in common.
+    """The measurement errors that all backends of a comparison assume.
 
     Attributes:
-        prepared: What was done with the recording first; ``None`` for observations of plain
-            functions and for several sites, which keep the model's own noise.
-        fitted: The model the backends get.
-        judged: The model with the error that likelihoods are computed under; another one only
-            where a model without noise is fitted as it is.
+        prepared: The preparation of the recording; ``None`` for observations of plain functions
+            and for several sites, which keep the model's own noise.
+        fitted: The model that the backends receive.
+        judged: The model whose noise is used for likelihoods. It differs from ``fitted`` only if
+            the backends fit a model without noise.
         noise: Estimated standard deviation by channel, in its unit; ``None`` if the model declares
             its own.
-        share: Share of independent measurements by channel; empty counts every one.
+        share: Share of independent measurements by channel; if empty, all count as independent.
     """
 
     prepared: Preparation | None
@@ -68,10 +68,11 @@ def find_error_model(
 
     Args:
         model: The Pyro model.
-        train: What is fitted; never the held-out recording. Observations of a plain function, and
-            those of several sites, keep the model's own noise, and all their readings count.
-        options: How the data are prepared. Where they keep a model without noise as it is, the
-            scale is estimated for the comparison alone.
+        train: The recording to be fitted, not the held-out one. For observations of a plain
+            function or of several sites, the model's own noise is used, and all measurements count
+            as independent.
+        options: How the data are prepared. If they keep a model without noise, the scale is
+            estimated only for the comparison.
         seed: Seed of the search.
         progress: Called with the fraction done and a short status.
 
@@ -92,7 +93,7 @@ def find_error_model(
 
 
 def prepare_as_it_is(found: Preparation, noise: Literal["auto", "model"]) -> Preparation:
-    """Returns a preparation whose model keeps its own noise, if that is what is wanted."""
+    """Returns a preparation whose model keeps its own noise if ``noise`` is ``"model"``."""
     if noise == "auto" or found.noise is None:
         return found
     return replace(found, model=found.plain_model, noise=None, noise_of_sensors=None)
@@ -101,7 +102,7 @@ def prepare_as_it_is(found: Preparation, noise: Literal["auto", "model"]) -> Pre
 def _share_of_residuals(
     model: Callable[..., Any], train: Rollouts, options: DataOptions, closest: ClosestFit
 ) -> dict[str, float]:
-    """Returns the share of independent measurements where initial states are taken as true."""
+    """Returns the share of independent measurements if initial states are taken as exact."""
     replayed = replay(model, train, closest.parameters, options)
     observed = train.observation(replayed.inputs, channels=replayed.channel_names)
     residual = (replayed.trajectory[0] - observed).double().cpu()
@@ -115,9 +116,9 @@ def segment_log_likelihood(bound: BoundModel, z: Tensor, share: Mapping[str, flo
     An observation of a plain function, which has no segments, counts as one.
 
     Args:
-        bound: The model with its error, and the recording to judge by.
+        bound: The model with its noise, and the recording on which it is evaluated.
         z: Draws in reference coordinates, ``(n, d)``.
-        share: Share of independent readings by channel; empty counts every reading.
+        share: Share of independent measurements by channel; if empty, all count as independent.
 
     Raises:
         IntractableError: The model declares no noise, so there is no density.

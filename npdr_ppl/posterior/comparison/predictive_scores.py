@@ -23,11 +23,11 @@ LEVELS = (0.5, 0.8, 0.95)
 """Nominal probabilities of the predictive intervals."""
 
 NUM_LIKELIHOOD_DRAWS = 1_000
-"""Posterior draws that a segment's predictive density is averaged over."""
+"""Number of posterior draws over which a segment's predictive density is averaged."""
 
 NUM_PREDICTIVE_DRAWS = 200
-"""Posterior predictive trajectories behind CRPS and coverage; fewer where they are too large to be
-held in memory, see :mod:`npdr_ppl.preparation.draw_budget`."""
+"""Number of posterior predictive trajectories from which CRPS and coverage are computed; fewer if
+they do not fit in memory, see :mod:`npdr_ppl.preparation.draw_budget`."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,13 @@ class PredictiveScores:
     """Scores of a posterior on a recording.
 
     Attributes:
-        elpd: Log predictive density of every segment, ``(segments,)``, by the common error model;
-            ``None`` where there is no likelihood.
-        elpd_draws: Effective number of the draws that the least certain segment's density stands
-            on; near 1 it is one draw's. NaN without elpd.
-        crps: Mean CRPS of a reading in units of its channel's range; NaN if no draw could be
+        elpd: Log predictive density of every segment, ``(segments,)``, with the common error
+            model; ``None`` if there is no likelihood.
+        elpd_draws: Effective number of draws in a segment's density, for the segment where it is
+            smallest. Near 1, a single draw determines that density. NaN without elpd.
+        crps: Mean CRPS of a measurement in units of its channel's range; NaN if no draw could be
             simulated.
-        coverage: Share of readings inside the central predictive interval, by its probability.
+        coverage: Share of measurements inside the central predictive interval, by its probability.
         num_failed: Predictive draws that could not be simulated, and were left out.
     """
 
@@ -64,8 +64,8 @@ def predictive_scores(
 
     Args:
         posterior: The posterior.
-        bound: The model with its error, and the recording to judge by.
-        share: Share of independent readings by channel; see
+        bound: The model with its noise, and the recording on which it is evaluated.
+        share: Share of independent measurements by channel; see
             :mod:`npdr_ppl.posterior.comparison.error_model`.
         is_held_out: Whether the posterior never saw the recording; if it did, elpd is that of
             leaving each segment out.
@@ -141,7 +141,7 @@ def _of_readings(
     """Returns mean scaled CRPS, coverage by level, and how many draws failed.
 
     Args:
-        bound: The model and what it is judged by.
+        bound: The model, and the recording on which it is evaluated.
         predictive: Simulations ``(n,) + plates + event`` by site, in parts.
     """
     valid = torch.stack(
@@ -173,10 +173,10 @@ def _of_readings(
 
 
 def _columns(observation: Observation) -> Iterator[tuple[int | None, Tensor, Tensor]]:
-    """Yields each measured channel's position, its readings, and which of them count.
+    """Yields each measured channel's position, its measurements, and a mask of those that count.
 
-    One by one, because scores of an ensemble make several copies of it. A plain function's output
-    is one channel.
+    Channels are processed one by one, because the scores of an ensemble copy it several times. A
+    plain function's output is one channel.
     """
     observed = observation.value.double().cpu()
     if observation.inputs is None or observation.channels is None:

@@ -89,11 +89,11 @@ class StackedPosterior(PosteriorBase):
 
 @dataclass(frozen=True)
 class Stacking:
-    """What :func:`stack` found.
+    """Weights of posteriors, and the differences of their elpd; see :func:`stack`.
 
     Attributes:
         weights: Weight by label; 0 for those without a finite density.
-        difference: How far each elpd is behind the best, by label, not negative.
+        difference: The best elpd minus each elpd, by label; not negative.
         standard_error: Standard error of that difference over segments, by label.
     """
 
@@ -107,7 +107,7 @@ def stack(pointwise: Mapping[str, NDArray[np.float64]]) -> Stacking:
 
     Args:
         pointwise: log p_k(y_i), ``(segments,)`` by label. A posterior with a value that is not
-            finite rules out what was recorded; it gets no weight and no difference.
+            finite excludes a recorded segment; it gets no weight and no difference.
 
     Raises:
         DataError: No posterior has finite densities.
@@ -142,12 +142,13 @@ def mixture_elpd(
 def _compared(pointwise: Mapping[str, NDArray[np.float64]]) -> "pd.DataFrame":
     """Returns ArviZ's comparison by given pointwise densities.
 
-    ArviZ compares by leaving out each observation of draws. A predictive density that does not
-    depend on draws is the same whatever is left out, so draws that all have it carry it through.
+    ArviZ computes a leave-one-out density from the densities of many draws. Here the predictive
+    densities are already known. Every draw that is passed to ArviZ therefore has the same density,
+    which leave-one-out returns unchanged.
 
-    ArviZ exponentiates the densities, which underflow where segments have many readings. Each
-    segment's greatest is therefore taken off first: a factor that all posteriors share changes
-    neither the weights nor a difference.
+    ArviZ exponentiates the log densities, which underflow if segments have many measurements. The
+    greatest value of each segment is therefore subtracted first. A common factor of all posteriors
+    changes neither the weights nor a difference.
     """
     from npdr_ppl.arviz_module import compare, from_dict
 
