@@ -153,7 +153,7 @@ def _case(task: Task) -> tuple[Case, float | tuple[float, ...], float]:
     if task.condition == "beyond":
         return _beyond(task, at)
     if task.condition == "two":
-        # Of the same multiple of their typical sizes one may be heard alone.
+        # At the same multiple of their typical sizes, perhaps only one of them is detectable.
         alone = replace(task, condition="one")
         each, found = zip(*(_strength(alone, (place,)) for place in chosen), strict=True)
         return at(each), each, min(found)

@@ -1,4 +1,4 @@
-"""Prints what the rows of the blind benchmark come to: the table, and what went wrong."""
+"""Prints the results of the blind benchmark: the table, and the cases that went wrong."""
 
 import json
 from collections import Counter

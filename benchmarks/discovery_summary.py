@@ -1,4 +1,4 @@
-"""What the rows of the blind benchmark come to, as the lines of one table.
+"""Summarises the rows of the blind benchmark as the lines of one table.
 
 A rate comes with its 95 % interval after Clopper and Pearson, a percentile with one by the
 bootstrap. "yes" and "no" say whether the figure itself meets its target; where the interval holds
@@ -218,7 +218,7 @@ def gap_closed(rows: Iterable[Row]) -> list[float]:
     """Returns the shares of the held-out gaps that were closed, of gaps that can be seen.
 
     A gap is what the given model's error is above that of the true model, with the true effects
-    and parameters: what is left of the latter is due to the readings and the initial states.
+    and parameters: the rest of the latter is due to the errors of measurements and initial states.
     """
     return [
         (row["gap"]["rmse"]["before"] - row["gap"]["rmse"]["after"])

@@ -49,7 +49,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Baselines:
-    """What others come to, in words: refitting alone, BIC forward selection, sparse regression."""
+    """Results of refitting alone, of BIC forward selection and of sparse regression, as text."""
 
     refit: str = "–"
     bic: str = "–"
@@ -68,7 +68,7 @@ class Line:
         lower: Least value that meets the target.
         upper: Greatest value that meets it.
         greatest_end: Greatest upper end of the interval that meets it.
-        baselines: What others come to.
+        baselines: Results of the baselines.
         unit: ``"%"`` where the figure is a share, else what stands behind it.
     """
 

@@ -200,7 +200,7 @@ def measure(keys: list[Key], data: Path, num_samples: int, results: Results) -> 
 
 
 def compare(rows: dict[Key, Row]) -> list[dict[str, float | int | str | bool | None]]:
-    """Sets every row of ours beside its peers': times faster, both scores, which is lower."""
+    """Compares each row of ours with its peers: speed-up, both scores, and which is lower."""
     lines = []
     for key, ours in rows.items():
         source, _, name = key.method.partition(":")

@@ -34,7 +34,7 @@ SHORT_TRAINING = [
 ]  # fmt: skip
 
 TABLE2 = ["--backends", "bayesian-linear-regression"]
-"""The quickest column; the nominal one stands beside it."""
+"""The quickest column; the nominal one is next to it."""
 
 IGNORED = {"seconds", "version", "versions", "path", "folder", "file", "command", "created"}
 IGNORED |= {"cpu_seconds", "peak_memory", "memory", "platform", "provenance", "out", "data"}

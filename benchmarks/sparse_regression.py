@@ -50,7 +50,7 @@ Laws = dict[tuple[str, str], Array]
 
 @dataclass(frozen=True)
 class SparseChoice:
-    """What sparse regression came to.
+    """Result of sparse regression.
 
     Attributes:
         first: Name of the effect whose term explains most, ``None`` if no term was kept. A term

@@ -1,4 +1,4 @@
-"""Checks that an HDF5 file contains all of its data itself, and what they take in memory.
+"""Checks that an HDF5 file refers to no other file, and how much memory its data need.
 
 HDF5 can take data from other files: by external and soft links, external storage, and virtual
 data sets. A recording could then show any file that the user may read, or wait for a pipe.

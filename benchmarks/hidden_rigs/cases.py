@@ -235,7 +235,7 @@ def _pair(rig: Rig, seed: int) -> tuple[Place, ...]:
 def _alternatives(
     rig: Rig, condition: Condition, hidden: Sequence[Place]
 ) -> tuple[tuple[str, ...], ...]:
-    """Returns what comes to the same as what is hidden."""
+    """Returns the effects that are equivalent to the hidden ones."""
     table = rig.inseparable if condition == "inseparable" else rig.same
     choices = [((place,), *table.get(place, ())) for place in hidden]
     found = [

@@ -1,4 +1,4 @@
-"""What a command goes through on its way to the drive, one substep at a time."""
+"""Laws that change a command before it reaches the drive, one substep at a time."""
 
 import math
 from collections.abc import Callable, Mapping

@@ -58,7 +58,7 @@ def _one_of(*members: Place) -> _Alternatives:
 
 
 def _asymmetric(*joints: str) -> _Alternatives:
-    """Returns asymmetric friction with what comes to the same: friction and a bias."""
+    """Returns asymmetric friction with its equivalent: friction and a bias."""
     return {
         (joint, "asymmetric_coulomb_friction"): (((joint, "coulomb_friction"), (joint, "bias")),)
         for joint in joints

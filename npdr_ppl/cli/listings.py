@@ -22,7 +22,7 @@ from npdr_ppl.registry import hint
 
 __all__ = ["backends", "effects", "models", "searches", "targets", "tasks"]
 
-DETAILS = "Show all that is known of this one."
+DETAILS = "Name of one entry, to show all its details."
 
 
 def models(
@@ -187,7 +187,7 @@ def _first_line(documented: object) -> str:
 def _show(
     command: str, rows: Sequence[dict[str, object]], name: str | None, as_json: bool
 ) -> None:
-    """Prints names with a line about each, or all that is known of one.
+    """Prints names with a line about each, or all details of one.
 
     Args:
         command: The command that lists them.
@@ -216,7 +216,7 @@ def _show(
 
 
 def _details(row: dict[str, object]) -> str:
-    """Returns all that is known of one, a heading for each kind of fact."""
+    """Returns the details of one entry, with a heading for each kind."""
     lines = [str(row["name"]), _wrapped(str(row["summary"]))]
     for key, value in row.items():
         if key in ("name", "summary"):

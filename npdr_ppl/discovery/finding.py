@@ -16,13 +16,13 @@ class Finding:
     Attributes:
         effect: The effect.
         probability: Probability that it is this effect, given all other effects found.
-        alternatives: Probabilities of the effects that could stand in its place, itself included,
-            by name.
-        equivalent_to: Ids of causes that the recording may not distinguish from it.
+        alternatives: Probabilities by name, of this effect and of those that could replace it.
+        equivalent_to: Ids of causes that the recording possibly cannot distinguish from it.
         share: Share of the misfit that it explains.
         parameters: Its parameters' estimates by short name.
-        at_edge: Names of shape parameters that have, or may as well have, an implausible value.
-            The law is then at a limit where it may be another law.
+        at_edge: Names of shape parameters with an implausible value, or with a value that the
+            recording cannot distinguish from an implausible one. The law may then equal another
+            law.
     """
 
     effect: Effect

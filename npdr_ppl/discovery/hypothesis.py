@@ -135,7 +135,7 @@ class Hypothesis:
     def at_edge(self, effect: Effect) -> tuple[str, ...]:
         """Returns the names of an effect's shape parameters with an implausible value.
 
-        There the law is at a limit where it may be another law: wind without a speed is drag.
+        With such a value the law may equal another law: wind with a speed of zero is drag.
         Strengths may have any size, and frequencies are searched everywhere.
         """
         shapes = {p.name for p in effect.parameters} - set(effect.strength) - {effect.wave}

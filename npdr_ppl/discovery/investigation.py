@@ -404,7 +404,7 @@ def _finding(
 
 
 def _unexplained(search: Search) -> float:
-    """Returns the share of the misfit that the final model leaves and one law could explain."""
+    """Returns the share of the misfit that a further law could explain in the final model."""
     done = explained(search.rounds[0].hypothesis, search.final)
     left = search.rounds[-1].alarm.gain
     return left / max(left + done, 1e-12)

@@ -44,7 +44,7 @@ def keep_fits(folder: Path | None) -> Iterator[None]:
 
 
 def keeping(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
-    """Returns a function that keeps its fits as this process does, in whichever it runs."""
+    """Returns a function that keeps its fits in this process's folder, in any process."""
     return partial(_kept, function, _FOLDER.get())
 
 
@@ -58,7 +58,7 @@ def made_or_read(
     segments: SegmentModel,
     *rest: Any,
 ) -> dict[str, Tensor]:
-    """Returns tensors that were kept, or makes them and keeps them.
+    """Returns tensors from disk, or computes them and writes them to disk.
 
     Args:
         make: Makes the tensors, by name.

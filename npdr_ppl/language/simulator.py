@@ -105,7 +105,7 @@ class Simulator(ABC):
         return 0.0
 
     def with_finer_steps(self) -> Self | None:
-        """Returns a copy with a smaller integration error; ``None`` if the engine has none."""
+        """Returns a copy with smaller integration errors; ``None`` if there is none."""
         return None
 
     @property

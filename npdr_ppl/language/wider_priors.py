@@ -1,4 +1,4 @@
-"""An effect handler that widens the priors of some sites, to test whether they are too narrow."""
+"""A handler that widens the priors of some sites, to test whether they were too narrow."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -18,8 +18,8 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["LOOP_DATA", "NEW_ATTEMPTS", "SPREAD_WIDER", "Action", "LoopOptions", "Model", "Revise"]
 
 LOOP_DATA = DataOptions("score", 50, "uncertain", "float32")
-"""How the loop prepares rollouts by default: in segments of 50 steps and in float32, with which it
-was validated on hidden rigs."""
+"""How the loop prepares rollouts by default: in segments of 50 steps and in float32. The loop was
+validated on hidden rigs with these values."""
 
 Model = Callable[..., Any]
 

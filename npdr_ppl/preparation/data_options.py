@@ -21,24 +21,24 @@ __all__ = [
 ]
 
 MAX_READINGS_PER_CHUNK = 2_000_000
-"""Measurements that one chunk of simulations may hold, 16 MiB in float64: larger arrays leave the
-cache and are mapped afresh by the allocator every time, smaller ones pay the overhead of many
-calls."""
+"""Greatest number of measurements in one chunk of simulations, 16 MiB in float64. Larger arrays do
+not fit in the cache, and the allocator maps their memory again every time. With smaller ones the
+overhead of the calls dominates."""
 
 SEGMENT_SECONDS = 0.2
-"""Default length of a segment: long compared with delays and lags, short compared with the time in
-which an unstable motion forgets its initial state."""
+"""Default length of a segment in s. It is long compared with delays and lags, and short compared
+with the time in which an unstable motion amplifies errors of the initial state."""
 
 FEWEST_STEPS, MOST_STEPS = 20, 200
-"""Bounds of a segment's default length in steps: shorter segments spend most of their measurements
-on their initial states, longer ones cost memory and say no more."""
+"""Bounds of a segment's default length in steps. Shorter segments need most of their measurements
+for their initial states. Longer ones need more memory and contain no more information."""
 
 FEWEST_SEGMENTS = 8
-"""Segments that a recording is cut into where it is long enough; with fewer there is nothing to
-tell an effect from chance by."""
+"""Least number of segments of a recording that is long enough. With fewer, a test cannot
+distinguish an effect from chance."""
 
 PLAIN_FEATURES = "bayessim"
-"""Features where there is no closest fit at which a score could be taken."""
+"""Features if there is no closest fit, at which the score features are computed."""
 
 SegmentLength = int | Literal["auto"] | None
 """Steps between re-synchronisations: a number, ``"auto"`` for :func:`default_segment_length`, or
@@ -48,9 +48,9 @@ SegmentLength = int | Literal["auto"] | None
 def default_segment_length(rollouts: Rollouts) -> int:
     """Returns the default length of a segment in steps.
 
-    ``SEGMENT_SECONDS`` within ``FEWEST_STEPS`` and ``MOST_STEPS``, and less where a recording is
-    so short that it would have fewer than ``FEWEST_SEGMENTS`` segments: it is then cut into
-    twice as many.
+    It is ``SEGMENT_SECONDS``, within ``FEWEST_STEPS`` and ``MOST_STEPS``. A recording that would
+    have fewer than ``FEWEST_SEGMENTS`` segments of this length is cut into twice
+    ``FEWEST_SEGMENTS``.
     """
     length = round(SEGMENT_SECONDS / rollouts.time_step)
     length, total = max(FEWEST_STEPS, min(MOST_STEPS, length)), sum(rollouts.lengths)
@@ -65,17 +65,17 @@ class DataOptions:
 
     Attributes:
         embedding: Maps trajectories to features: a name such as ``"bayessim"`` or ``"all/10"``,
-            an embedding of one's own, or ``"score"``, which
-            :func:`~npdr_ppl.posterior.prepare.prepare` makes for a recording. Plain functions
-            have none.
+            your own embedding, or ``"score"``, which
+            :func:`~npdr_ppl.posterior.prepare.prepare` computes for a recording. Not used for
+            plain functions.
         segment_length: Steps between re-synchronisations; see :data:`SegmentLength`.
         initial_state: How the state at a segment's start is found: ``"uncertain"`` estimates it
-            and takes the estimate's error into account; ``"estimated"`` takes the estimate for the
-            truth, and ``"recorded"`` the measurement, which gives posteriors that are too narrow
-            and biased unless measurements have no noise.
-        precision: ``"float64"`` or ``"float32"``, of the simulation.
-        noise: ``"auto"`` gives a model without noise that of its closest fit's residuals, where
-            initial states are uncertain; ``"model"`` takes the model as it is.
+            and takes the estimate's error into account; ``"estimated"`` takes the estimate as
+            exact, and ``"recorded"`` the measurement. If measurements have noise, the last two
+            give posteriors that are too narrow and biased.
+        precision: Floating-point type of the simulation, ``"float64"`` or ``"float32"``.
+        noise: ``"auto"`` estimates the noise of a model that declares none, from the residuals of
+            its closest fit, if initial states are uncertain; ``"model"`` keeps the model's noise.
     """
 
     embedding: str | Embedding | None = "score"

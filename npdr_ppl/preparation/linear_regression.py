@@ -220,9 +220,9 @@ def regression_of(
 ) -> LinearRegression:
     """Returns a model and a recording as a linear regression.
 
-    Whole rollouts are used, whatever the segments: nothing is simulated, so that nothing has to
-    be re-synchronised. The rows of each joint are divided by the standard deviation of what the
-    fit leaves of them, which makes newtons and newton metres one kind.
+    Whole rollouts are used, not segments: nothing is simulated, so no simulation has to be
+    re-synchronised. The rows of each joint are divided by the standard deviation of their
+    residuals, so that forces in N and torques in N m are comparable.
 
     Args:
         prior: The model's prior.

@@ -88,14 +88,14 @@ class Linearisation:
         return torch.where(is_solved[:, None, None], weights, 0.0)
 
     def taken_back(self) -> Tensor:
-        """Returns how much of each parameter's change the offsets take back, ``(S, m, d)``.
+        """Returns how the offsets compensate a change of each parameter, ``(S, m, d)``.
 
-        Zero in segments where that cannot be computed; see :attr:`is_regular`.
+        Zero in segments where this cannot be computed; see :attr:`is_regular`.
         """
         return self._solved()[0]
 
     def _solved(self) -> tuple[Tensor, Tensor]:
-        """Returns what the offsets take back, and in which segments it was found, ``(S,)``."""
+        """Returns the compensation, and a mask of segments where it was computed, ``(S,)``."""
         inner = self._inner
         taken_back, is_solved = solve_or_zero(inner, self.by_starts.mT @ self.by_parameters)
         is_solved &= is_invertible(inner)
@@ -311,7 +311,7 @@ class SegmentModel:
         return z[0].nan_to_num(0.0).clamp(-LINEARISATION.start_limit, LINEARISATION.start_limit)
 
     def black_box(self, z: Tensor) -> SimulatorBlackBox:
-        """Returns the black-box site as the model makes it at n points, ``(n, d)``."""
+        """Returns the black-box site of the model at n points, ``(n, d)``."""
         box = self.prior.black_boxes_at(z)[self._site]
         assert isinstance(box, SimulatorBlackBox)
         return box

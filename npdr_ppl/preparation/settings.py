@@ -84,8 +84,8 @@ class SegmentFitSettings:
             standard deviations of the prior. Initial states are not limited: on an unstable motion
             they can be wrong by many standard deviations, and each segment has its own damping.
         largest_coordinate: Greatest distance of a fit from the prior's centre, in standard
-            deviations. A strength that is much smaller than its half-normal prior expects lies at
-            −3 and beyond.
+            deviations. A strength that is much smaller than typical for its half-normal prior has
+            a coordinate of −3 or less.
         least_gain: Steps end when a step reduces the objective, in variances of the measurement
             noise, by less than this. The default is a quarter of a unit of log evidence. A model
             that is ten times as likely as another has 2.3 units more.

@@ -79,8 +79,8 @@ def check_channels(
         extra += [name for name in rollouts.channel_names if name not in expected]
     if extra:
         raise DataError(
-            f"the column {', '.join(extra)} is not expected; remove it, or rename it to what it "
-            f"is: the model knows {', '.join(c.name for c in (*channels, *actions))}."
+            f"the column {', '.join(extra)} is not expected; remove it, or give it the name of a "
+            f"channel of the model: {', '.join(c.name for c in (*channels, *actions))}."
         )
 
 

@@ -1,4 +1,4 @@
-"""Figures of a discovery: they show what they say, and draw whatever a discovery came to."""
+"""Figures of a discovery: their content is right, and they work for every result."""
 
 import matplotlib
 import numpy as np

@@ -2,7 +2,7 @@
 
     python kill_runs.py FOLDER NUM_KILLS SEED [discover | check]
 
-One process imports everything, also what a run imports on its way, and forks a child for every
+One process imports everything, also what a run imports later, and forks a child for every
 attempt, so that a hundred take minutes.
 It exits with an error if a resumed run differs from the undisturbed one, or if the target ran an
 episode again that had finished. The target writes an episode down after it has finished, so a kill

@@ -110,7 +110,7 @@ class Parent(Task):
 
 
 class StartsPrograms(Task):
-    """Starts a program in its own process group and one in another, and ends as it is told."""
+    """Starts a program in its own process group and one in another, and ends in a given way."""
 
     def __init__(self, folder):
         self.folder = folder

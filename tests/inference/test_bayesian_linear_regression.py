@@ -1,4 +1,4 @@
-"""Counting and leaving out what is implausible, and the density of what is left."""
+"""Counting and leaving out implausible draws, and the density of the others."""
 
 import logging
 import math

@@ -163,7 +163,7 @@ def test_segments_are_shorter_where_rollouts_ended_early():
 
 
 def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
-    """An effect that was named too early is gone once more rollouts speak against it."""
+    """An effect that was named too early is removed when more rollouts contradict it."""
     model = add_effect(pendulum, CoulombFriction("hinge"))
     search = DiscoveryOptions(effects=(InputDelay("torque"),))
     look = LoopDiscovery(model, SMALL_DATA, search, seed=0)

@@ -26,7 +26,7 @@ from tests.helpers.small_loop import SMALL_DATA, HandmadePendulum, small_options
 
 
 def scripted(monkeypatch, *decisions):
-    """Makes diagnoses come to these decisions, one after the other."""
+    """Makes diagnoses return these decisions, one after the other."""
     left = list(decisions)
     asked = []
 

@@ -45,7 +45,7 @@ class Gaussian(Density):
 
 @dataclass(frozen=True)
 class Fixed(Backend):
-    """Always answers N(mean, sd²), whatever it is told."""
+    """Always returns N(mean, sd²), for any simulations."""
 
     name: ClassVar[str] = "fixed"
     summary: ClassVar[str] = "a posterior known beforehand"

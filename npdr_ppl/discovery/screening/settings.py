@@ -69,7 +69,7 @@ class EncoderSettings:
 
 @dataclass(frozen=True)
 class GenericLawSettings:
-    """Laws that stand for effects that no catalogue has.
+    """Laws that represent effects outside the catalogue.
 
     Attributes:
         sign_width: Width over which a sign changes, as a fraction of the channel's spread.

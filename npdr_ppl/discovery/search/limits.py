@@ -24,7 +24,7 @@ DISTINCT = 5.0
 
 
 def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ...]:
-    """Returns the names of shape parameters that fit as well at one end of their priors.
+    """Returns the names of shape parameters that fit equally well at one end of their priors.
 
     All other parameters are refitted at each end (a profile likelihood).
 

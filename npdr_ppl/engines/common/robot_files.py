@@ -219,7 +219,7 @@ def references(tree: ElementTree.Element) -> Iterator[str]:
 
 
 def _check_mesh(path: Path) -> None:
-    """Checks a file that an engine reads as a whole; Bullet believes the size that STL states."""
+    """Checks a file that an engine reads as a whole; Bullet does not check the size in an STL."""
     try:
         if not path.is_file():
             return

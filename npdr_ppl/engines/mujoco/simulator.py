@@ -79,7 +79,7 @@ class MujocoSimulator(MujocoMechanism):
         return bound_inverse_dynamics(self)
 
     def with_finer_steps(self) -> Self | None:
-        """Returns a copy with twice the engine steps, of order four; ``None`` for such a copy."""
+        """Returns a copy with twice the steps, of order four; ``None`` if this is such a copy."""
         if self.refinement > 1:
             return None
         mujoco: Any = importlib.import_module("mujoco")

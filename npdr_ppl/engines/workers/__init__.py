@@ -1,4 +1,4 @@
-"""A pool for engines that run one simulation at a time; faults cost only the draws they hit.
+"""A pool for engines that run one simulation at a time. A fault loses only its own draw.
 
 May import: errors, randomness. Start reading at ``session.py`` (``npdr.workers``), then
 ``pool.py``.

@@ -1,4 +1,4 @@
-"""The supervisors of one process: reused for one chunk after another, stopped with it."""
+"""The supervisors of one process: reused for many chunks, and stopped with the process."""
 
 import atexit
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Ends worker processes with the process that started them, however that one ends.
+"""Ends worker processes when the process that started them ends, for any reason.
 
 A worker of loky waits for minutes for its next task. After SIGKILL, its parent cannot stop it.
 """

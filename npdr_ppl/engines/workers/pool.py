@@ -30,7 +30,7 @@ CHUNKS_PER_WORKER = 16
 to finish at about the same time."""
 
 MAX_CHUNK_SIZE = 32
-"""Greatest default number of draws in a chunk; so many are repeated if a worker machine fails."""
+"""Greatest default number of draws in a chunk. If a worker fails, its chunk is repeated."""
 
 WAVE = 32
 """Chunks per worker that may be running or waiting for the caller; this limits memory."""

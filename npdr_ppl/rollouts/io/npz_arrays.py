@@ -29,8 +29,8 @@ def read_arrays(
 
     Args:
         path: The file.
-        required: Number of dimensions by name of the arrays that must be there.
-        optional: Likewise, of those that may be missing.
+        required: Number of dimensions, by name, of the arrays that the file must contain.
+        optional: The same for arrays that may be missing.
 
     Raises:
         DataError: An array is missing, too large, or not of numbers or text.

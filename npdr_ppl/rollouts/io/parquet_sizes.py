@@ -1,8 +1,8 @@
-"""Checks what a Parquet file will take in memory, from its footer and the headers of its pages.
+"""Checks how much memory a Parquet file needs, from its footer and the headers of its pages.
 
-The footer states the number of rows and columns. A page states in its own header how many bytes it
-decompresses to, and the decompressor believes it, so these headers are read as well. They are
-Thrift structures in the compact protocol, of which only the first three numbers matter.
+The footer states the number of rows and columns. The header of a page states its size after
+decompression. The decompressor does not check this size, so these headers are read as well. They
+are Thrift structures in the compact protocol. Only their first three numbers are needed.
 
 References:
     Apache Parquet, parquet.thrift, ``PageHeader``; Apache Thrift, compact protocol specification.
