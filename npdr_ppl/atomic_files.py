@@ -8,21 +8,19 @@ from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 
-__all__ = ["remove_leftovers", "replacing"]
+__all__ = ["remove_unfinished", "replacing"]
 
-LEFTOVER = re.compile(r"\..+\.[a-z0-9_]{8}\.tmp")
-"""Names of the temporary files of :func:`replacing`."""
-
-DEEPEST = 3
-"""Number of folders below that of a run in which it writes files."""
+_UNFINISHED = re.compile(r"\..+\.[a-z0-9_]{8}\.tmp")
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Removes temporary files that a killed process has left in a folder that nobody else uses."""
-    for depth in range(DEEPEST + 1):
-        for file in folder.glob(f"{'*/' * depth}.*.tmp"):
-            if LEFTOVER.fullmatch(file.name):
-                file.unlink(missing_ok=True)
+def remove_unfinished(folder: Path) -> None:
+    """Removes the temporary files that a killed process left in a folder and below it.
+
+    No other process may write to the folder meanwhile.
+    """
+    for file in folder.rglob(".*.tmp"):
+        if _UNFINISHED.fullmatch(file.name) and file.is_file():
+            file.unlink(missing_ok=True)
 
 
 @contextmanager

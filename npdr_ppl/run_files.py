@@ -1,29 +1,35 @@
 """Files in a run's folder: JSON, tensors, and the description that identifies the run."""
 
 import functools
+import hashlib
 import inspect
 import json
 import math
 import os
 import platform
+import re
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import msgspec
+import torch
 from filelock import FileLock, Timeout
 from pyro.poutine.messenger import Messenger
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.torch import load, save
 from torch import Tensor
 
-from npdr_ppl.atomic_files import remove_leftovers, replacing
-from npdr_ppl.errors import DataError
+from npdr_ppl.atomic_files import remove_unfinished, replacing
+from npdr_ppl.errors import DataError, NpdrError
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors
+from npdr_ppl.reading_limits import LIMITS
 
 __all__ = [
     "claimed",
@@ -32,7 +38,10 @@ __all__ = [
     "load_tensors",
     "make_folder",
     "plain",
+    "read_bytes",
     "read_json",
+    "read_text",
+    "reading_back",
     "save_tensors",
     "source_text",
     "versions",
@@ -50,6 +59,16 @@ IN_WORDS = {
     "num_steps": "the number of steps",
 }
 """Plain words for the keys of a run's description, for messages to the user."""
+
+MAX_WHOLE_NUMBER = 2**63
+"""Largest absolute whole number in a file; seeds have at most 63 bits."""
+
+_CHECKSUM = "sha256"
+
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x1f\x7f-\x9f]")
+"""Characters that could change a terminal's state; source code has none of them."""
+
+T = TypeVar("T")
 
 _PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
 
@@ -93,7 +112,8 @@ def claimed(path: Path | None) -> Iterator[None]:
         ) from None
     try:
         (path / LOCK).write_text(str(os.getpid()))
-        remove_leftovers(path)
+        if lock.lock_counter == 1:
+            remove_unfinished(path)
         yield
     finally:
         lock.release()
@@ -152,19 +172,123 @@ def write_json(path: Path, value: Any) -> None:
         temporary.write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, kind: type[T] = dict[str, Any]) -> T:
     """Reads a JSON object.
 
+    Args:
+        path: The file.
+        kind: What it holds, such as a class of :mod:`npdr_ppl.run_records`; keys that the class
+            does not have are kept.
+
     Raises:
-        DataError: The file is not JSON.
+        DataError: The file is not JSON, or holds something else.
+    """
+    content = read_bytes(path)
+    try:
+        value: Any = msgspec.json.decode(content)
+        _check_plain(value)
+        msgspec.convert(value, kind)
+    except (msgspec.ValidationError, DataError) as error:
+        reason = str(error).replace("`", "").rstrip(".")
+        raise DataError(f"{path} is not what npdr writes: {shown_sentence(reason)}.") from None
+    except (ValueError, RecursionError) as error:
+        reason = "too deeply nested" if isinstance(error, RecursionError) else str(error)
+        raise DataError(f"{path} is not readable JSON: {shown_sentence(reason)}.") from None
+    return value
+
+
+def read_text(path: Path) -> str:
+    """Reads a text such as a model's source.
+
+    Raises:
+        DataError: The file is too large, or is not UTF-8.
     """
     try:
-        value = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} is not readable JSON: {error}.") from error
-    if not isinstance(value, dict):
-        raise DataError(f"{path} should hold a JSON object.")
-    return value
+        return read_bytes(path).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path} is not UTF-8 text (byte {error.start}).") from None
+
+
+def read_bytes(path: Path, limit: int = LIMITS.json_bytes) -> bytes:
+    """Reads a file of a run.
+
+    Args:
+        path: The file.
+        limit: Largest size in bytes.
+
+    Raises:
+        DataError: The file is larger, is not a regular file, or cannot be read.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise DataError(f"{path} is not a regular file.")
+        if status.st_size > limit:
+            raise DataError(f"{path} has {status.st_size} bytes, more than {limit}.")
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror}).") from error
+
+
+@contextmanager
+def reading_back(path: Path) -> Iterator[None]:
+    """Turns errors about the content of files that were read from a folder into one sentence.
+
+    The types of the content are checked when it is read; this is for values and shapes that do
+    not fit each other.
+
+    Args:
+        path: The file or folder, for the message.
+
+    Raises:
+        DataError: The block failed.
+    """
+    try:
+        yield
+    except NpdrError:
+        raise
+    except (
+        ArithmeticError,
+        AssertionError,
+        AttributeError,
+        LookupError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+    ) as error:
+        reason = shown_sentence(f"{type(error).__name__}: {error}")
+        raise DataError(f"{path} is not what npdr writes ({reason}).") from error
+
+
+def shown_sentence(text: str, limit: int = 200) -> str:
+    """Returns the beginning of a library's message as part of a sentence on one line."""
+    line = " ".join(text.split()).rstrip(".")
+    line = line if line.isprintable() else ascii(line)
+    return line if len(line) <= limit else f"{line[:limit]}…"
+
+
+def _check_plain(value: Any) -> None:
+    """Checks depth, numbers and texts of a JSON value.
+
+    Raises:
+        DataError: It is nested too deeply, or has a number or a text that npdr never writes.
+    """
+    layer = [value]
+    for _ in range(LIMITS.depth):
+        below: list[Any] = []
+        for item in layer:
+            if isinstance(item, dict):
+                below += [*item, *item.values()]
+            elif isinstance(item, list):
+                below += item
+            elif isinstance(item, str) and not item.isprintable() and _CONTROL.search(item):
+                raise DataError("a text has control characters")
+            elif isinstance(item, int) and abs(item) > MAX_WHOLE_NUMBER:
+                raise DataError("a whole number is too large")
+        if not below:
+            return
+        layer = below
+    raise DataError(f"it is nested more than {LIMITS.depth} deep")
 
 
 def versions() -> dict[str, str]:
@@ -222,19 +346,49 @@ def plain(value: Any) -> Any:
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Writes tensors atomically."""
-    content = save({k: v.detach().cpu().contiguous() for k, v in tensors.items()})
+    """Writes tensors atomically, with a checksum."""
+    kept = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+    content = save(kept, metadata={_CHECKSUM: _checksum(kept)})
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
-def load_tensors(path: Path) -> dict[str, Tensor]:
+def load_tensors(path: Path, *names: str) -> dict[str, Tensor]:
     """Reads tensors.
 
+    Args:
+        path: The file.
+        names: Tensors that must be there.
+
     Raises:
-        DataError: The file is not safetensors.
+        DataError: The file is not safetensors, lacks a tensor, or was changed.
     """
+    content = read_bytes(path, LIMITS.file_bytes)
     try:
-        return load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise DataError(f"{path} is not a readable safetensors file: {error}.") from error
+        tensors = load(content)
+        length = int.from_bytes(content[:8], "little")
+        header = msgspec.json.decode(content[8 : 8 + length], type=_TensorHeader)
+    except (SafetensorError, ValueError, LookupError, RecursionError, RuntimeError) as error:
+        reason = shown_sentence(str(error))
+        raise DataError(f"{path} is not a readable safetensors file: {reason}.") from error
+    if header.metadata.get(_CHECKSUM) != _checksum(tensors):
+        raise DataError(f"{path} was changed after npdr wrote it, or by another version.")
+    for name in names:
+        if name not in tensors:
+            raise DataError(f"{path} lacks {name}.")
+    return tensors
+
+
+class _TensorHeader(msgspec.Struct):
+    """The part of a safetensors header that is read here."""
+
+    metadata: dict[str, str] = msgspec.field(name="__metadata__", default_factory=dict)
+
+
+def _checksum(tensors: Mapping[str, Tensor]) -> str:
+    """Returns the SHA-256 of tensors with their names, types and shapes."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(repr((name, str(tensor.dtype), tuple(tensor.shape))).encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()

@@ -26,7 +26,11 @@ def cost():
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"},
+        env=os.environ
+        | {
+            "PYTHONPATH": os.pathsep.join((str(root), str(root / "benchmarks"))),
+            "OMP_NUM_THREADS": "1",
+        },
     ) as process:
 
         def ask(kind, path):

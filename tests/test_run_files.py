@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from npdr_ppl.arviz_module import from_dict, from_netcdf, to_netcdf
-from npdr_ppl.atomic_files import remove_leftovers, replacing
+from npdr_ppl.atomic_files import remove_unfinished, replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import claimed, load_tensors, read_json, save_tensors, write_json
@@ -77,7 +77,7 @@ def test_leftovers_are_those_of_our_own_temporary_files(tmp_path):
         name = temporary.name
         raise KeyboardInterrupt
     (tmp_path / name).touch()  # as if nobody had been there to remove it
-    remove_leftovers(tmp_path)
+    remove_unfinished(tmp_path)
     assert os.listdir(tmp_path) == []
 
 

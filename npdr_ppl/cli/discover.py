@@ -106,7 +106,7 @@ def discover(
         write_stage_figures,
     )
     from npdr_ppl.progress import reporter
-    from npdr_ppl.run_files import claimed
+    from npdr_ppl.run_files import claimed, reading_back
 
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_holdout(data, holdout, holdout_data)
@@ -145,4 +145,5 @@ def discover(
     if as_json:
         typer.echo((out / "discovery.json").read_text(), nl=False)
     elif not quiet:
-        show_discovery(found, out)
+        with reading_back(out / "discovery.json"):
+            show_discovery(found, out)

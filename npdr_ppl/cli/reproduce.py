@@ -156,7 +156,8 @@ def _reproduce_missing_effect(
     from npdr_ppl.engines.workers import workers
     from npdr_ppl.errors import DataError
     from npdr_ppl.reproduction.missing_effect import load_recordings, reproduce_missing_effect
-    from npdr_ppl.run_files import read_json
+    from npdr_ppl.run_files import read_json, reading_back
+    from npdr_ppl.run_records import DiscoveryRecord
 
     if data is None:
         raise DataError("missing-effect needs the paper's recordings: pass --data FOLDER.")
@@ -175,4 +176,6 @@ def _reproduce_missing_effect(
     if as_json:
         typer.echo((out / "missing-effect.json").read_text(), nl=False)
     elif not quiet:
-        show_missing_effect(read_json(out / "discovery.json"), result, out)
+        with reading_back(out):
+            found = read_json(out / "discovery.json", DiscoveryRecord)
+            show_missing_effect(found, result, out)

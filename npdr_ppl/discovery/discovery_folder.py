@@ -22,6 +22,7 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery, describe_candidate
 from npdr_ppl.discovery.investigation import Investigation
 from npdr_ppl.discovery.kept_fits import keep_fits
+from npdr_ppl.errors import DataError
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import (
@@ -33,6 +34,7 @@ from npdr_ppl.run_files import (
     versions,
     write_json,
 )
+from npdr_ppl.run_records import DiscoveryRecord
 
 __all__ = ["STAGES", "DiscoveryFolder", "Stage", "findings_until"]
 
@@ -103,8 +105,10 @@ class DiscoveryFolder:
         file = self.path / "discovery.json"
         if not file.exists():
             return None
-        found = read_json(file)
+        found = dict(read_json(file, DiscoveryRecord))
         reached = found.get("stage", STAGES[0])
+        if reached not in STAGES:
+            raise DataError(f"{file} has an unknown stage.")
         return found if STAGES.index(reached) >= STAGES.index(stage) else None
 
     def finish(self, found: dict[str, Any], source: str | None = None) -> None:

@@ -8,13 +8,27 @@ steps so far remain; if it is killed right after the episode, the whole episode 
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.run_files import read_bytes, reading_back
 from npdr_ppl.targets.base import Array, Controller, TargetDomain
 
 __all__ = ["Journal", "read_journal"]
+
+
+class _Line(msgspec.Struct):
+    """A step: measurements and commands, or the last measurements at the end."""
+
+    readings: list[float] = []
+    commands: list[float] = []
+    end: list[float] | None = None
+
+
+_DECODER = msgspec.json.Decoder(_Line)
 
 
 class Journal:
@@ -75,22 +89,23 @@ def read_journal(path: Path, target: TargetDomain) -> tuple[Rollouts | None, Arr
     readings: list[list[float]] = []
     commands: list[list[float]] = []
     is_complete = False
-    lines = path.read_text().splitlines()
+    lines = read_bytes(path, LIMITS.file_bytes).splitlines()
     for number, text in enumerate(lines):
         try:
-            line = json.loads(text)
-        except ValueError:
+            line = _DECODER.decode(text)
+        except (ValueError, RecursionError):
             if number == len(lines) - 1:  # the process was killed while writing it
                 break
-            raise DataError(f"{path}: line {number + 1} is not JSON.") from None
-        if "end" in line:
-            readings.append(line["end"])
+            raise DataError(f"{path}: line {number + 1} is not a step of an episode.") from None
+        if line.end is not None:
+            readings.append(line.end)
             is_complete = True
         else:
-            readings.append(line["readings"])
-            commands.append(line["commands"])
+            readings.append(line.readings)
+            commands.append(line.commands)
     commands = commands[: max(0, len(readings) - 1)]
-    raw = np.array(commands, dtype=np.float64).reshape(len(commands), len(target.actions))
-    if not commands:
-        return None, raw, is_complete
-    return target.rollout(readings, [target.limit(row) for row in raw]), raw, is_complete
+    with reading_back(path):
+        raw = np.array(commands, dtype=np.float64).reshape(len(commands), len(target.actions))
+        if not commands:
+            return None, raw, is_complete
+        return target.rollout(readings, [target.limit(row) for row in raw]), raw, is_complete

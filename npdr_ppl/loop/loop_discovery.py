@@ -19,10 +19,12 @@ from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect, with_finer_steps
 from npdr_ppl.loop.loop_options import Model
 from npdr_ppl.models.effects.registry import effect_class
+from npdr_ppl.posterior.run_folder import MAX_FINER_STEPS
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.progress import Reporter
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.run_files import read_json
+from npdr_ppl.run_files import read_json, reading_back
+from npdr_ppl.run_records import DiscoveryRecord
 
 __all__ = ["LoopDiscovery", "Revision", "effect_names"]
 
@@ -97,13 +99,14 @@ class LoopDiscovery:
                 _LOGGER.warning("Discovery: %s", error)
                 return Revision(None, str(error))
             found.save(folder)
-        return self._read(read_json(file))
+        with reading_back(file):
+            return self._read(read_json(file, DiscoveryRecord))
 
     def _read(self, result: Mapping[str, Any]) -> Revision:
         """Returns the revision that a saved discovery describes."""
         own = {effect.name: effect for effect in self.search.effects or ()}
         model = self.model
-        for _ in range(result.get("finer_steps", 0)):
+        for _ in range(min(result.get("finer_steps", 0), MAX_FINER_STEPS)):
             model = with_finer_steps(model)
         for row in result["effects"]:
             name = f"{row['port']}.{row['effect']}"

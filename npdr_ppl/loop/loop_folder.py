@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from npdr_ppl.errors import DataError
 from npdr_ppl.loop.control_task import ControlTask
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.run_files import (
@@ -36,6 +37,7 @@ from npdr_ppl.run_files import (
     versions,
     write_json,
 )
+from npdr_ppl.run_records import IterationRecord, PolicyRecord
 from npdr_ppl.targets.base import TargetDomain
 
 if TYPE_CHECKING:
@@ -126,7 +128,11 @@ class LoopFolder:
         file = self.path / f"policy_{_numbered(number, draft)}.json"
         if not file.exists():
             return None
-        return load_tensors(file.with_suffix(".safetensors"))["parameters"], read_json(file)
+        tensors = load_tensors(file.with_suffix(".safetensors"), "parameters")
+        figures = read_json(file, PolicyRecord)
+        if draft is not None and "check" not in figures:
+            raise DataError(f"{file} lacks the check of the policy.")
+        return tensors["parameters"], dict(figures)
 
     def save_iteration(self, index: int, record: Mapping[str, Any]) -> None:
         """Saves the record of a finished iteration."""
@@ -135,7 +141,12 @@ class LoopFolder:
     def iteration(self, index: int) -> dict[str, Any] | None:
         """Returns the record of an iteration, ``None`` if it is not finished."""
         file = self.path / f"iteration_{index}.json"
-        return read_json(file) if file.exists() else None
+        if not file.exists():
+            return None
+        record = read_json(file, IterationRecord)
+        if not record["decisions"] or not all("action" in d for d in record["decisions"]):
+            raise DataError(f"{file} lacks the actions after its decisions.")
+        return dict(record)
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Writes ``train.json``."""

@@ -421,6 +421,11 @@ class _Loop:
 
     def _use(self, parameters: Tensor) -> None:
         """Makes the policy with these parameters the current one."""
+        if parameters.shape != self.task.policy.parameters.shape:
+            raise DataError(
+                f"{self.folder.path} holds a policy with {parameters.numel()} parameters, but the "
+                f"task's has {self.task.policy.parameters.numel()}."
+            )
         self.policy = self.task.policy.with_parameters(parameters.to(self.task.policy.parameters))
 
     def _train(

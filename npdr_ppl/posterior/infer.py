@@ -31,7 +31,7 @@ from npdr_ppl.preparation.data_options import (
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.run_files import claimed
+from npdr_ppl.run_files import claimed, reading_back
 
 __all__ = ["infer", "run_round", "simulate_features"]
 
@@ -131,8 +131,10 @@ def infer(
                 store.save_preparation(prepared)
             for index in store.rounds()[:rounds]:
                 saved = store.load_round(index)
-                states.append(method.restore(problem, saved.tensors, saved.values))
-                infos, seconds = saved.infos, saved.seconds
+                with reading_back(store.path):
+                    states.append(method.restore(problem, saved.tensors, saved.values))
+                    seconds = {stage: saved.seconds[stage] for stage in seconds}
+                infos = saved.infos
         for index in range(len(infos), rounds):
             label = f"round {index + 1}/{rounds}"
             state, info, spent = run_round(

@@ -27,6 +27,7 @@ from npdr_ppl.posterior.run_folder import RunFolder
 from npdr_ppl.preparation.binding import BoundModel, bind, problem_of
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.randomness import seeded
+from npdr_ppl.run_files import reading_back
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -231,7 +232,9 @@ class Posterior(PosteriorBase):
         if not rounds:
             raise DataError(f"{path} holds a run without a complete round.")
         last = folder.load_round(rounds[-1])
-        options = DataOptions(**description["binding"])
+        with reading_back(folder.path / "run.json"):
+            options = DataOptions(**description["binding"])
+            method = backend_by_name(description["backend"], **description["options"])
         if embedding is not None:
             options = replace(options, embedding=embedding)
         kept = folder.preparation()
@@ -240,8 +243,8 @@ class Posterior(PosteriorBase):
         model = kept.apply(model)
         bound = bind(model, folder.data(), options, device, starts=kept.starts)
         problem = problem_of(bound, device)
-        method = backend_by_name(description["backend"], **description["options"])
-        state = method.restore(problem, last.tensors, last.values)
+        with reading_back(folder.path):
+            state = method.restore(problem, last.tensors, last.values)
         provenance = Provenance(
             description["seed"], description["num_simulations"], tuple(last.infos), last.seconds
         )

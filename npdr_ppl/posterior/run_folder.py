@@ -42,15 +42,20 @@ from npdr_ppl.run_files import (
     load_tensors,
     make_folder,
     read_json,
+    reading_back,
     save_tensors,
     source_text,
     versions,
     write_json,
 )
+from npdr_ppl.run_records import PreparationRecord, RoundRecord, RunDescription
 
 __all__ = ["RunFolder", "SavedPreparation", "SavedRound"]
 
 FORMAT = 1
+
+MAX_FINER_STEPS = 20
+"""Largest number of times that integration steps are halved; the search stops long before."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,19 +162,23 @@ class RunFolder:
         file = self.path / "preparation.json"
         if not file.exists():
             return SavedPreparation()
-        record, tensors = read_json(file), load_tensors(self.path / "preparation.safetensors")
+        record = read_json(file, PreparationRecord)
+        tensors = load_tensors(self.path / "preparation.safetensors")
+        if not 0 <= record["num_finer_steps"] <= MAX_FINER_STEPS:
+            raise DataError(f"{file} has an impossible number of finer steps.")
 
         def part(prefix: str) -> dict[str, Tensor]:
             chosen = {k: v for k, v in tensors.items() if k.startswith(prefix)}
             return {name.removeprefix(prefix): value for name, value in chosen.items()}
 
         starts, score = part("starts_"), part("score_")
-        return SavedPreparation(
-            InitialStates(**starts) if starts else None,
-            Score(**score) if score else None,
-            record["noise"],
-            int(record["num_finer_steps"]),
-        )
+        with reading_back(file):
+            return SavedPreparation(
+                InitialStates(**starts) if starts else None,
+                Score(**score) if score else None,
+                record["noise"],
+                record["num_finer_steps"],
+            )
 
     def save_correction(self, correction: Correction | None, checks: Mapping[str, Any]) -> None:
         """Saves the posterior that replaces the learnt one, if any, and the checks."""
@@ -189,17 +198,20 @@ class RunFolder:
         if not checks.pop("is_corrected", False):
             return None, checks
         tensors = load_tensors(self.path / "correction.safetensors")
-        return Correction.of_tensors(prior, tensors), checks
+        with reading_back(file):
+            return Correction.of_tensors(prior, tensors), checks
 
     def rounds(self) -> list[int]:
         """Returns the complete rounds, in order."""
-        return sorted(int(f.stem.removeprefix("round_")) for f in self.path.glob("round_*.json"))
+        names = (file.stem.removeprefix("round_") for file in self.path.glob("round_*.json"))
+        return sorted(int(name) for name in names if name.isdecimal() and len(name) < 10)
 
     def load_round(self, index: int) -> "SavedRound":
         """Returns what :meth:`save_round` wrote after a round."""
         stem = self.path / f"round_{index}"
-        record = read_json(stem.with_suffix(".json"))
-        infos = [RoundInfo(**info) for info in record["infos"]]
+        record = read_json(stem.with_suffix(".json"), RoundRecord)
+        with reading_back(stem.with_suffix(".json")):
+            infos = [RoundInfo(**info) for info in record["infos"]]
         tensors = load_tensors(stem.with_suffix(".safetensors"))
         return SavedRound(tensors, record["values"], infos, record["seconds"])
 
@@ -231,10 +243,10 @@ class RunFolder:
         file = self._simulations(index)
         if not file.exists():
             return None
-        saved = load_tensors(file)
+        saved = load_tensors(file, "z", "x")
         return saved["x"] if torch.equal(saved["z"], z.cpu()) else None
 
-    def description(self) -> dict[str, Any]:
+    def description(self) -> RunDescription:
         """Returns what :meth:`begin` wrote.
 
         Raises:
@@ -243,7 +255,7 @@ class RunFolder:
         file = self.path / "run.json"
         if not file.exists():
             raise DataError(f"{self.path} holds no inference run (run.json is missing).")
-        return read_json(file)
+        return read_json(file, RunDescription)
 
     def data(self) -> dict[str, Rollouts | Tensor]:
         """Returns the measured data by site."""
@@ -253,7 +265,7 @@ class RunFolder:
             if file.suffix == ".nc":
                 result[name] = Rollouts.from_netcdf(file)
             else:
-                result[name] = load_tensors(file)["value"]
+                result[name] = load_tensors(file, "value")["value"]
         return result
 
     def _simulations(self, index: int) -> Path:

@@ -24,6 +24,7 @@ from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.run_files import read_json, write_json
+from npdr_ppl.run_records import DiscoveryRecord
 
 __all__ = ["DEMO_OPTIONS", "RIG", "Demonstration", "run_demo"]
 
@@ -122,7 +123,7 @@ def run_demo(
     assert after.rewards is not None
     last = training.iterations[-1]
     revision = out / "revision_0" / "discovery.json"
-    found = read_json(revision) if revision.exists() else {}
+    found = read_json(revision, DiscoveryRecord) if revision.exists() else {}
     result = {
         "returns": {
             "policy from the prior": training.iterations[0]["real_return"],

@@ -30,6 +30,7 @@ from npdr_ppl.reproduction.table2 import PAPER, SEGMENT_LENGTH
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import InitialState
 from npdr_ppl.run_files import claimed, read_json, write_json
+from npdr_ppl.run_records import ReproductionRecord
 
 __all__ = ["Story", "load_recordings", "reproduce_missing_effect"]
 
@@ -117,7 +118,7 @@ def reproduce_missing_effect(
     with claimed(out):
         folder.begin(furuta, train, test, options, search, seed=seed)
         if file.exists():
-            return None, read_json(file)
+            return None, dict(read_json(file, ReproductionRecord))
         with reporter(progress) as report, folder.kept():
             investigation = Investigation(
                 furuta,

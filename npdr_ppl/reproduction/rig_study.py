@@ -32,6 +32,7 @@ from npdr_ppl.preparation.data_options import DataOptions, checked_options
 from npdr_ppl.progress import Reporter
 from npdr_ppl.randomness import derived_seed, seeded
 from npdr_ppl.run_files import read_json, write_json
+from npdr_ppl.run_records import OutcomeRecord
 from npdr_ppl.targets.base import TargetDomain
 
 __all__ = [
@@ -206,7 +207,9 @@ def study(
                 folder = out / f"{label.replace(' ', '_')}__{rig}__{seed}"
                 file = folder / "outcome.json"
                 if file.exists():
-                    outcome = Outcome(**read_json(file))
+                    saved = read_json(file, OutcomeRecord)
+                    records = saved.get("iterations", [])
+                    outcome = Outcome(tuple(saved["returns"]), saved["sim_return"], records)
                 else:
                     folder.mkdir(parents=True, exist_ok=True)
                     outcome = run_method(

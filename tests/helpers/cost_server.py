@@ -7,79 +7,17 @@ Each line of the input is a JSON list: the kind of file, and its path. The answe
 and ``megabytes`` above the start.
 """
 
-import contextlib
-import io
 import json
 import os
 import signal
 import sys
-import traceback
-import warnings
+from pathlib import Path
+
+from file_outcomes import outcome
 
 PAGE = os.sysconf("SC_PAGE_SIZE")
 TIME_LIMIT = 20
 """Processor time in seconds after which a child is ended."""
-
-
-def read(kind, path):
-    """Reads one file; errors are the caller's."""
-    from npdr_ppl.rollouts import Rollouts
-
-    if kind == "pickle":
-        Rollouts.from_simurlacra(path)
-    elif kind in ("csv", "parquet", "npz", "nc"):
-        Rollouts.load(path)
-    elif kind == "mjcf":
-        from npdr_ppl import MujocoSimulator
-
-        MujocoSimulator(path).recorded_settings()
-    elif kind == "urdf":
-        from npdr_ppl.engines.bullet import BulletSimulator, Sensor
-        from npdr_ppl.language.channels import Channel
-
-        sensors = (Sensor(Channel("x", "m"), "body robot x"),)
-        BulletSimulator(path, sensors=sensors).recorded_settings()
-    elif kind == "run":
-        report(path)
-    else:
-        raise AssertionError(kind)
-
-
-def report(path):
-    """Runs `npdr report` as a user would; anything but success or one sentence is an error."""
-    from npdr_ppl.cli import main
-    from npdr_ppl.errors import DataError
-
-    sys.argv = ["npdr", "report", path]
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            main.main()
-        except SystemExit as stop:
-            code = stop.code or 0
-    text = err.getvalue()
-    if code == 2 and text.startswith("npdr: "):
-        raise DataError(text.removeprefix("npdr: ").rstrip("\n"))
-    if code or text:
-        raise AssertionError(f"exit code {code}: {text}")
-
-
-def outcome(kind, path):
-    """Returns what happened, and the message."""
-    from npdr_ppl.errors import NpdrError
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            read(kind, path)
-        except NpdrError as error:
-            message = str(error)
-            is_sentence = message.isprintable() and message.endswith(".") and len(message) < 600
-            return ("refused" if is_sentence else "bad message"), message
-        # Whatever else comes out is what the tests look for.
-        except BaseException:
-            return "traceback", traceback.format_exc()
-    return "read", ""
 
 
 def measured(kind, path):
@@ -93,7 +31,7 @@ def measured(kind, path):
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         signal.alarm(6 * TIME_LIMIT)
         before = int(open("/proc/self/statm").read().split()[1]) * PAGE
-        found, message = outcome(kind, path)
+        found, message = outcome(kind, Path(path))
         os.write(writing, json.dumps([before, found, message[-3000:]]).encode())
         os._exit(0)
     os.close(writing)

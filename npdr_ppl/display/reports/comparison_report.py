@@ -19,6 +19,7 @@ from npdr_ppl.display.reports.content import (
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
 from npdr_ppl.posterior.comparison.compared_backends import folder_name
 from npdr_ppl.run_files import read_json
+from npdr_ppl.run_records import ComparisonRecord
 
 __all__ = ["comparison_report"]
 
@@ -32,7 +33,7 @@ def comparison_report(folder: Path) -> Report:
     Args:
         folder: Folder with ``comparison.json``.
     """
-    result = read_json(folder / "comparison.json")
+    result = read_json(folder / "comparison.json", ComparisonRecord)
     rows, ranking = result["backends"], result["ranking"]
     settings = result.get("settings") or {}
     # All backends ran on the same data and model, so the description of the best one is used.
@@ -97,7 +98,7 @@ def _key_figures(result: Mapping[str, Any], settings: Mapping[str, Any]) -> list
     ]
 
 
-def _ranking(ranked: Mapping[str, Any], weights: Mapping[str, float]) -> list[Part]:
+def _ranking(ranked: Mapping[str, Any], weights: Mapping[str, Any]) -> list[Part]:
     columns = ("backend", "elpd", "behind", "weight", "RMSE", "DTW", "CRPS", "r̂", "decision")
     rows = [
         [

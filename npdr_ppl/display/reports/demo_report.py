@@ -18,6 +18,7 @@ from npdr_ppl.display.reports.content import (
 from npdr_ppl.display.reports.discovery_report import discovery_report
 from npdr_ppl.display.reports.training_report import training_report
 from npdr_ppl.run_files import read_json
+from npdr_ppl.run_records import DemoRecord
 
 __all__ = ["demo_report"]
 
@@ -31,7 +32,7 @@ def demo_report(folder: Path) -> Report:
     Args:
         folder: Folder with ``demo.json`` and the run of the loop.
     """
-    result = read_json(folder / "demo.json")
+    result = read_json(folder / "demo.json", DemoRecord)
     returns = result["returns"]
     revision = folder / "revision_0"
     found: list[Section] = []

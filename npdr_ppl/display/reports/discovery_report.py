@@ -25,7 +25,8 @@ from npdr_ppl.display.reports.content import (
 )
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
 from npdr_ppl.drawing.theme import SERIES
-from npdr_ppl.run_files import read_json
+from npdr_ppl.run_files import read_bytes, read_json, read_text
+from npdr_ppl.run_records import DiscoveryRecord
 
 __all__ = ["discovery_report"]
 
@@ -40,9 +41,9 @@ def discovery_report(folder: Path) -> Report:
     Args:
         folder: Folder with ``discovery.json``, and possibly ``revised_model.py`` and figures.
     """
-    result = read_json(folder / "discovery.json")
+    result = read_json(folder / "discovery.json", DiscoveryRecord)
     description = run_description(folder) | {
-        name: result[name] for name in ("model", "seed", "versions") if name in result
+        name: result.get(name) for name in ("model", "seed", "versions") if name in result
     }
     effects = result.get("effects") or []
     sections = [
@@ -238,7 +239,7 @@ def _revision(folder: Path, description: Mapping[str, Any]) -> list[Section]:
     file = folder / "revised_model.py"
     if not file.exists():
         return []
-    revised = file.read_text(encoding="utf-8")
+    revised = read_text(file)
     model = description.get("model")
     before = model.get("source") if isinstance(model, Mapping) else model
     if not isinstance(before, str) or not before.strip():
@@ -254,10 +255,10 @@ def _pictures(folder: Path) -> list[Section]:
     parts: list[Part] = []
     left_out, size = [], 0
     for file in sorted(folder.glob("*.png")):
-        content = base64.b64encode(file.read_bytes()).decode("ascii")
-        if size + len(content) > MAX_PICTURE_BYTES:
+        if size + file.stat().st_size * 4 / 3 > MAX_PICTURE_BYTES:
             left_out.append(file.name)
             continue
+        content = base64.b64encode(read_bytes(file)).decode("ascii")
         size += len(content)
         caption = file.stem.replace("_", " ")
         parts.append(PicturePart(f"data:image/png;base64,{content}", caption))

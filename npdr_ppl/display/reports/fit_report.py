@@ -19,6 +19,7 @@ from npdr_ppl.display.reports.meanings import decision_verdict, findings
 from npdr_ppl.display.reports.posterior_parts import posterior_charts, predictive_charts
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
 from npdr_ppl.run_files import read_json
+from npdr_ppl.run_records import FitRecord
 
 __all__ = ["fit_report", "parameters_table"]
 
@@ -29,7 +30,7 @@ def fit_report(folder: Path) -> Report:
     Args:
         folder: Folder with ``fit.json`` and ``posterior.nc``.
     """
-    result = read_json(folder / "fit.json")
+    result = read_json(folder / "fit.json", FitRecord)
     description = run_description(folder)
     diagnosis = result.get("diagnosis") or {}
     return Report(

@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from npdr_ppl.display.reports.content import CodePart, Section, TablePart, TextPart
+from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.run_files import read_json
+from npdr_ppl.run_records import Description
 
 __all__ = ["checksum", "data_files", "provenance_section", "run_description", "source_section"]
 
@@ -15,7 +17,7 @@ def run_description(folder: Path) -> dict[str, Any]:
     """Returns the content of a run's ``run.json`` or ``loop.json``; empty if there is neither."""
     for file in (folder / "run.json", folder / "run" / "run.json", folder / "loop.json"):
         if file.exists():
-            return read_json(file)
+            return dict(read_json(file, Description))
     return {}
 
 
@@ -68,7 +70,9 @@ def provenance_section(description: Mapping[str, Any], folder: Path) -> Section:
 
 
 def checksum(path: Path) -> str:
-    """Returns a file's SHA-256 as hexadecimal digits."""
+    """Returns a file's SHA-256 as hexadecimal digits; a dash if it is no file of a run's size."""
+    if not path.is_file() or path.stat().st_size > LIMITS.file_bytes:
+        return "–"
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

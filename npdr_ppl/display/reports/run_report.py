@@ -15,6 +15,7 @@ from npdr_ppl.display.reports.discovery_report import discovery_report
 from npdr_ppl.display.reports.fit_report import fit_report
 from npdr_ppl.display.reports.training_report import training_report
 from npdr_ppl.errors import DataError
+from npdr_ppl.run_files import reading_back
 
 __all__ = ["MAX_BYTES", "read_run", "render", "write_report"]
 
@@ -45,12 +46,8 @@ def read_run(run: Path) -> Report:
         raise DataError(f"{run} is not a folder; give the one that was passed as --out.")
     for name, reader in _READERS.items():
         if (run / name).exists():
-            try:
+            with reading_back(run / name):
                 return reader(run)
-            except (KeyError, TypeError, AttributeError, IndexError) as error:
-                raise DataError(
-                    f"{run / name} is not what npdr writes: {type(error).__name__} {error}."
-                ) from error
     hint = " Its run is not finished: give the same command again." if _is_begun(run) else ""
     inside = sorted(f.parent for name in _READERS for f in run.glob(f"*/{name}"))
     if not hint and inside:

@@ -26,6 +26,7 @@ from npdr_ppl.display.reports.provenance import provenance_section, run_descript
 from npdr_ppl.loop.policy_check import NextStep
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import read_json
+from npdr_ppl.run_records import TrainingRecord
 
 __all__ = ["training_report"]
 
@@ -43,7 +44,7 @@ def training_report(folder: Path) -> Report:
     Args:
         folder: Folder with ``train.json``.
     """
-    result = read_json(folder / "train.json")
+    result = read_json(folder / "train.json", TrainingRecord)
     description = run_description(folder)
     records = result["iterations"]
     last = records[-1] if records else {}

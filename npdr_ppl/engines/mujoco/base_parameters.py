@@ -64,6 +64,10 @@ def load_mjcf(source: Any) -> Any:
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())[:MAX_REASON].rstrip(".")
         raise ModelError(f"{source} is not a readable MJCF file: {reason}.") from error
+    if not model.opt.timestep > 0:
+        raise ModelError(
+            f"{source} has a timestep of {model.opt.timestep:g} s; it must be positive."
+        )
     return model
 
 

@@ -33,6 +33,7 @@ from npdr_ppl.preparation.evaluation import score
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import claimed, holds_this_run, read_json, write_json
+from npdr_ppl.run_records import MemoryRecord
 
 __all__ = ["compare"]
 
@@ -255,7 +256,7 @@ class _Run:
             return peak
         file = self.folder / "memory.json"
         if file.exists():
-            peak = max(peak, float(read_json(file)["peak_memory_mib"]))
+            peak = max(peak, read_json(file, MemoryRecord)["peak_memory_mib"])
         write_json(file, {"peak_memory_mib": peak})
         return peak
 

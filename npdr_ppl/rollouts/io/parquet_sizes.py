@@ -29,8 +29,8 @@ def check_footer(file: IO[bytes]) -> None:
     """
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - 8))
-    length = int.from_bytes(file.read(4), "little")
-    if length > LIMITS.text_bytes:
+    length, mark = int.from_bytes(file.read(4), "little"), file.read(4)
+    if mark == b"PAR1" and length > LIMITS.text_bytes:
         raise DataError(f"its description takes {length} bytes, more than {LIMITS.text_bytes}.")
     file.seek(0)
 

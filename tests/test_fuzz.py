@@ -1,8 +1,7 @@
-"""A small edition of benchmarks/fuzz_csv.py, and a search by hypothesis."""
+"""A small edition of benchmarks/fuzz_files.py, and a search by hypothesis."""
 
-import importlib.util
-from pathlib import Path
-
+import file_outcomes
+import fuzz_files
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -10,32 +9,31 @@ from hypothesis import strategies as st
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
 
-BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "fuzz_csv.py"
+NUMBERS = {"csv": 1500, "parquet": 150, "npz": 150, "nc": 150, "pickle": 300, "mjcf": 150,
+           "urdf": 100, "run": 150, "resume": 150}  # fmt: skip
+"""Files by format."""
 
 
 @pytest.fixture(scope="module")
-def fuzz_csv():
-    specification = importlib.util.spec_from_file_location("fuzz_csv", BENCHMARK)
-    assert specification is not None and specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("fuzz")
 
 
 @pytest.mark.slow
-def test_malformed_files_are_read_or_refused_with_a_sentence(fuzz_csv):
-    outcomes, sentences, failures = fuzz_csv.fuzz(seed=1, first=0, last=2000)
+@pytest.mark.parametrize("kind", file_outcomes.FORMATS)
+def test_damaged_files_are_read_or_refused_with_a_sentence(kind, folder):
+    outcomes, sentences, failures = fuzz_files.fuzz(kind, 1, 0, NUMBERS[kind], folder)
     assert not failures
-    assert set(outcomes) == {"read", "refused"} and outcomes["read"] > 100
-    assert len(sentences) > 25
+    assert set(outcomes) == {"read", "refused"}
+    assert outcomes["refused"] > 0.2 * NUMBERS[kind] and len(sentences) > 2
 
 
-def test_a_failure_would_be_seen(fuzz_csv, tmp_path, monkeypatch):
-    def broken(path, actions=None):
+def test_a_failure_would_be_seen(tmp_path, monkeypatch):
+    def broken(path):
         raise KeyError(path)
 
-    monkeypatch.setattr(Rollouts, "from_csv", broken)
-    assert fuzz_csv.outcome(tmp_path / "fuzz.csv", None)[0] == "traceback"
+    monkeypatch.setattr(Rollouts, "load", broken)
+    assert file_outcomes.outcome("csv", tmp_path / "fuzz.csv")[0] == "traceback"
 
 
 cells = st.sampled_from(

@@ -1,33 +1,12 @@
-"""Reads a hundred thousand malformed CSV files: each is read or refused with one sentence.
+"""Damages CSV files in the ways that files get damaged, and any file byte by byte.
 
-Valid files are damaged in the ways that files get damaged - bytes, cells, rows, headers,
-delimiters, quoting, encodings, line ends, odd numbers - and handed to ``Rollouts.from_csv``.
-Anything but rollouts or a DataError of one sentence, warnings included, is a failure.
-
-    python benchmarks/fuzz_csv.py --files 100000 --seed 0
+Bytes, cells, rows, headers, delimiters, quoting, encodings, line ends and odd numbers are changed.
 """
 
-import argparse
 import csv
 import io
-import json
 import random
-import re
-import sys
-import tempfile
-import time
-import traceback
-import warnings
-from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
-
-from npdr_ppl.errors import DataError
-from npdr_ppl.rollouts import Rollouts
-
-MAX_SENTENCE = 500
-"""Characters of the longest message that a person would still read."""
 
 NUMBERS = (
     *("nan", "NaN", "inf", "-inf", "Infinity", "1e999", "-1e999", "1e308", "1e-400", "5e-324"),
@@ -268,100 +247,3 @@ def malformed(rng: Rng) -> bytes:
     for _ in range(rng.choice((0, 0, 1, 1, 2))):
         rng.choice(BYTE_EDITS)(rng, data)
     return bytes(data)
-
-
-def outcome(path: Path, actions: list[str] | None) -> tuple[str, str]:
-    """Reads one file; returns what happened and, unless it was read, the message."""
-    try:
-        Rollouts.from_csv(path, actions=actions)
-    except DataError as error:
-        message = str(error)
-        is_sentence = (
-            message.isprintable()
-            and message.startswith(f"{path.name}: ")
-            and message.endswith(".")
-            and len(message) <= MAX_SENTENCE
-            and not re.search(r"\. [A-Z]", kind_of(message))
-        )
-        return ("refused" if is_sentence else "bad message"), message.split(": ", 1)[-1]
-    # Whatever else comes out is exactly what this benchmark looks for.
-    except Exception:
-        return "traceback", traceback.format_exc()
-    return "read", ""
-
-
-def fuzz(seed: int, first: int, last: int) -> tuple[Counter[str], Counter[str], list[str]]:
-    """Reads files ``first`` to ``last − 1``, the same for the same seed.
-
-    Returns:
-        Numbers by outcome, numbers by kind of sentence, and descriptions of failures.
-    """
-    outcomes: Counter[str] = Counter()
-    sentences: Counter[str] = Counter()
-    failures: list[str] = []
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("error")
-        path = Path(folder) / "fuzz.csv"
-        for index in range(first, last):
-            rng = random.Random(f"{seed}/{index}")
-            data = malformed(rng)
-            path.write_bytes(data)
-            kind, message = outcome(path, rng.choice((None, None, None, ["u0"], ["x0"], [])))
-            outcomes[kind] += 1
-            if kind == "refused":
-                sentences[kind_of(message)] += 1
-            elif kind != "read" and len(failures) < 10:
-                failures.append(f"file {index}: {data[:300]!r}\n{message}")
-    return outcomes, sentences, failures
-
-
-def kind_of(message: str) -> str:
-    """Returns a message without what is particular to one file."""
-    message = re.sub(r"'[^']*'|\"[^\"]*\"", "'…'", message)
-    message = re.sub(
-        r"\b(x\d|u\d|θ|reward|rollout|time)\b(?= (is|was|reaches|goes))", "…", message
-    )
-    return re.sub(r"0x[0-9a-f]+|[-+]?\d[\d.e+-]*", "#", message)[:110]
-
-
-def main() -> int:
-    """Runs the benchmark and prints its figures; returns the exit status."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
-    parser.add_argument("--files", type=int, default=100_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--json", type=Path, help="where to write the figures")
-    options = parser.parse_args()
-    started = time.perf_counter()
-    bounds = [round(options.files * i / 50) for i in range(51)]
-    outcomes: Counter[str] = Counter()
-    sentences: Counter[str] = Counter()
-    failures: list[str] = []
-    with ProcessPoolExecutor(options.processes) as pool:
-        tasks = [
-            pool.submit(fuzz, options.seed, first, last)
-            for first, last in zip(bounds[:-1], bounds[1:], strict=True)
-        ]
-        for task in tasks:
-            counted, said, failed = task.result()
-            outcomes += counted
-            sentences += said
-            failures += failed
-    seconds = time.perf_counter() - started
-    print(f"{options.files} files in {seconds:.0f} s, seed {options.seed}")
-    for kind, count in outcomes.most_common():
-        print(f"{count:8d}  {kind}")
-    print(f"{len(sentences)} kinds of sentences, the most frequent:")
-    for sentence, count in sentences.most_common(25):
-        print(f"{count:8d}  {sentence}")
-    for failure in failures[:20]:
-        print(failure, file=sys.stderr)
-    if options.json is not None:
-        figures = {"files": options.files, "seed": options.seed, "seconds": seconds}
-        figures |= {"outcomes": dict(outcomes), "sentences": dict(sentences.most_common(100))}
-        options.json.write_text(json.dumps(figures, indent=2))
-    return int(bool(set(outcomes) - {"read", "refused"}))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
