@@ -61,8 +61,8 @@ def read_robot(path: str | PathLike[str]) -> RobotFiles:
         path: An MJCF or URDF file.
 
     Raises:
-        ModelError: A file is not XML, includes one outside of the first one's folder, or describes
-            far more than a robot has.
+        ModelError: A file is not XML in UTF-8, includes one outside of the first one's folder, or
+            describes far more than a robot has.
     """
     first = Path(path)
     files = RobotFiles(first.parent)
@@ -99,7 +99,10 @@ def _read(files: RobotFiles, name: str, includer: str) -> None:
         return  # the engine says so
     if path.stat().st_size + sum(map(len, files.texts.values())) > LIMITS.json_bytes:
         raise ModelError(f"{name} has more than {LIMITS.json_bytes} bytes of text.")
-    files.texts[name] = path.read_text(errors="replace")
+    try:
+        files.texts[name] = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ModelError(f"{name} is not UTF-8 text (byte {error.start}).") from None
     tree = files.trees[name] = _parsed(files.texts[name], name)
     _check(files, tree, name)
     for included in _included(tree):

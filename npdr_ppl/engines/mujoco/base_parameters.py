@@ -18,6 +18,7 @@ manipulator loads and links, 1986, Eqs. 2–10.
 """
 
 import importlib
+import math
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -42,6 +43,9 @@ JOINT = ("damping", "frictionloss", "armature")
 MAX_REASON = 300
 """Longest part of MuJoCo's own message that is shown, in characters."""
 
+MAX_FIELD = 1e6
+"""Bound of gravity in m/s² and of wind in m/s; on the surface of the sun gravity is 274 m/s²."""
+
 
 def load_mjcf(source: Any) -> Any:
     """Returns the ``mujoco.MjModel`` of an MJCF file, or the given one.
@@ -63,10 +67,13 @@ def load_mjcf(source: Any) -> Any:
         mujoco.mj_forward(model, mujoco.MjData(model))
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())[:MAX_REASON].rstrip(".")
+        reason = reason if reason.isprintable() else ascii(reason)
         raise ModelError(f"{source} is not a readable MJCF file: {reason}.") from error
-    if not model.opt.timestep > 0:
+    step, field = model.opt.timestep, np.concatenate((model.opt.gravity, model.opt.wind))
+    if not (0 < step < math.inf and np.all(np.abs(field) < MAX_FIELD)):
         raise ModelError(
-            f"{source} has a timestep of {model.opt.timestep:g} s; it must be positive."
+            f"{source} has a timestep of {step:g} s, gravity of {model.opt.gravity} m/s² and wind "
+            f"of {model.opt.wind} m/s, which no robot has."
         )
     return model
 
