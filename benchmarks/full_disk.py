@@ -55,15 +55,13 @@ class Disk:
             return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         state = os.statvfs(self.folder)
         ballast = state.f_bavail * state.f_frsize - num_bytes
-        os.posix_fallocate(self._ballast(), 0, max(1, ballast))
+        with (self.folder / "ballast").open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, max(1, ballast))
         return lambda: None
 
     def give_back(self) -> None:
         """Makes all bytes free again."""
         (self.folder / "ballast").unlink(missing_ok=True)
-
-    def _ballast(self) -> int:
-        return os.open(self.folder / "ballast", os.O_CREAT | os.O_WRONLY)
 
 
 def start(data: Path, out: Path, before: Callable[[], None] = lambda: None) -> int:

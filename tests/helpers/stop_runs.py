@@ -26,7 +26,7 @@ PR_SET_CHILD_SUBREAPER = 36
 LIMIT = 10.0
 """Default of the seconds after which nothing may be left."""
 
-LONGEST = {"serial": 10.0, "threads": 10.0, "loky": 15.0, "dask": 15.0, "ray": 20.0}
+LONGEST = {"serial": 15.0, "threads": 15.0, "loky": 20.0, "dask": 25.0, "ray": 30.0}
 """Longest time from the first worker to the signal, s: from starting to simulating, on a busy
 machine."""
 

@@ -2,6 +2,8 @@
 
 import logging
 import os
+import signal
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -9,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from npdr_ppl.engines.workers.crew import Crew, run_chunk
+from npdr_ppl.engines.workers.guard import guarded_cluster
 from npdr_ppl.engines.workers.lifetime import loky_settings
 from npdr_ppl.engines.workers.options import WorkerOptions
 from npdr_ppl.engines.workers.safe_path import safe_path
@@ -18,6 +21,8 @@ from npdr_ppl.errors import DependencyError, SimulationError
 __all__ = ["ChunkExecutor", "open_executor"]
 
 RAY_CLUSTERS = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+
+RAY_KILLS_CHILDREN = "RAY_kill_child_processes_on_worker_exit"
 
 
 class ChunkExecutor(ABC):
@@ -176,9 +181,14 @@ def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
         # processes read from the environment, makes it use the loopback interface only.
         stack.enter_context(_set_variable(RAY_CLUSTERS, "0"))
         stack.enter_context(_set_attribute(ray_constants, "ENABLE_RAY_CLUSTER", False))
+        # Ray would kill the supervised processes, but not what they have started. They end by
+        # themselves when Ray's worker has ended.
+        stack.enter_context(_set_variable(RAY_KILLS_CHILDREN, "0"))
+        stack.enter_context(guarded_cluster())
     # Ray would put the current folder on the module search path of its workers.
     empty = stack.enter_context(TemporaryDirectory(prefix="npdr-ray-"))
-    # Ray would replace the caller's handler of SIGTERM.
+    # Ray would replace the caller's handler of SIGTERM, in Python and once more in C++.
+    handler = signal.getsignal(signal.SIGTERM)
     stack.enter_context(_set_attribute(ray_utils, "set_sigterm_handler", lambda handler: None))
     try:
         ray.init(
@@ -191,6 +201,9 @@ def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
         )
     except (OSError, ValueError, RuntimeError) as error:
         raise _unreachable(options, error) from error
+    finally:
+        if handler is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, handler)
     stack.callback(ray.shutdown)
 
 
