@@ -43,7 +43,8 @@ class CMAESState(SearchState):
 class CMAES(GaussianSearch[CMAESState]):
     """CMA-ES with bounds; see the module's text. It deploys the mean of its distribution.
 
-    On the Furuta pendulum it is behind PoWER for about ten iterations and equal after forty.
+    On the Furuta pendulum its return is below that of PoWER for about ten iterations, and equal
+    after forty.
 
     Args:
         population: Number of candidates per iteration. With returns that have little noise, small

@@ -43,8 +43,8 @@ class SensorLowPass(SensorEffect):
         """Returns the weights in the next measurement, and the filter's output and past values.
 
         There are weights for the true value, for the previous one and for the output. A position
-        has two more for the curvature: that in the next measurement is zero, because the value
-        before is unknown; the other one holds from then on.
+        has two more for the curvature. The first of these applies to the next measurement only; it
+        is zero, because the value before is unknown. The second one applies to all later ones.
         """
         time_constant = start.parameters["time_constant"]
         decay = remaining(time_constant, start.time_step)

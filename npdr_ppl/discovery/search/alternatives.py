@@ -41,9 +41,9 @@ class Added:
         share: Share of the explained misfit that is lost without it.
         alternatives: Probability of each alternative, itself included, given all other effects,
             by name.
-        fitting: Names of the alternatives that fit as well. The simplest law is the likeliest.
-            But a law that contains it, as bristles contain dry friction, fits as well if its
-            further parameters have no visible influence.
+        fitting: Names of the alternatives that fit equally well. The simplest law is the
+            likeliest. But a law that contains it, as bristles contain dry friction, fits equally
+            well if its further parameters have no visible influence.
     """
 
     effect: Effect

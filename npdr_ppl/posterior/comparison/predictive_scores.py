@@ -67,8 +67,8 @@ def predictive_scores(
         bound: The model with its noise, and the recording on which it is evaluated.
         share: Share of independent measurements by channel; see
             :mod:`npdr_ppl.posterior.comparison.error_model`.
-        is_held_out: Whether the posterior never saw the recording; if it did, elpd is that of
-            leaving each segment out.
+        is_held_out: Whether the recording was not used for the posterior; if it was used, elpd is
+            computed by leave-one-out over segments.
         seed: Seed of the draws.
     """
     z = posterior.sample_mixture(NUM_LIKELIHOOD_DRAWS, seed=seed)

@@ -169,7 +169,7 @@ class _Machine:
         is_nested: Whether this pickle lies inside another one.
         stack: Operands.
         memo: Objects that later instructions refer to by number.
-        costs: What the whole pickle has cost so far.
+        costs: Work and memory of the whole pickle so far.
     """
 
     def __init__(
