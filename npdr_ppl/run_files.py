@@ -37,6 +37,7 @@ __all__ = [
     "holds_this_run",
     "load_tensors",
     "make_folder",
+    "model_name",
     "plain",
     "read_bytes",
     "read_json",
@@ -302,17 +303,21 @@ def versions() -> dict[str, str]:
     return found
 
 
+def model_name(model: Any) -> str:
+    """Returns the name of a model with what is attached to it; the same in every process."""
+    if _is_wrapped(model):
+        return model_name(model.args[-1])
+    if isinstance(model, ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors):
+        return repr(model)
+    return getattr(model, "__name__", type(model).__name__)
+
+
 def source_text(model: Any) -> str:
     """Returns the source of a model, and the names of what is attached to it."""
     if isinstance(model, ModelWithEffects):
         attached = "\n".join(f"# with {effect!r}" for effect, _ in model.effects)
         return f"{source_text(model.base)}\n{attached}"
-    if (
-        isinstance(model, functools.partial)
-        and model.args
-        and isinstance(model.args[0], Messenger)
-    ):
-        # Pyro wraps a model in a handler by a partial that has both as arguments.
+    if _is_wrapped(model):
         return f"{source_text(model.args[-1])}\n# under {type(model.args[0]).__name__}"
     if isinstance(model, ModelWithFinerSteps | ModelWithWiderPriors):
         return f"{source_text(model.base)}\n# {model!r}"
@@ -320,6 +325,15 @@ def source_text(model: Any) -> str:
         return inspect.getsource(model)
     except (OSError, TypeError):
         return repr(model)
+
+
+def _is_wrapped(model: Any) -> bool:
+    """Whether Pyro has wrapped a model in a handler: a partial that has both as arguments."""
+    return (
+        isinstance(model, functools.partial)
+        and bool(model.args)
+        and isinstance(model.args[0], Messenger)
+    )
 
 
 def engine_settings(prior: Prior) -> dict[str, Any]:

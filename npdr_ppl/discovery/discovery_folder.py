@@ -28,6 +28,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import (
     holds_this_run,
     make_folder,
+    model_name,
     plain,
     read_json,
     source_text,
@@ -87,7 +88,7 @@ class DiscoveryFolder:
             {
                 "command": "discover",
                 "model": {
-                    "name": getattr(model, "__name__", type(model).__name__),
+                    "name": model_name(model),
                     "source": source_text(model),
                 },
                 "options": settings,

@@ -41,6 +41,7 @@ from npdr_ppl.run_files import (
     holds_this_run,
     load_tensors,
     make_folder,
+    model_name,
     read_json,
     reading_back,
     save_tensors,
@@ -134,7 +135,7 @@ class RunFolder:
             | {
                 "rounds": rounds,
                 "versions": versions(),
-                "model": {"name": repr(bound.model), "source": source_text(bound.model)},
+                "model": {"name": model_name(bound.model), "source": source_text(bound.model)},
                 "engines": engine_settings(bound.prior),
             },
         )
