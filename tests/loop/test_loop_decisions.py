@@ -55,13 +55,14 @@ def loop(monkeypatch):
         options = {
             "iterations": 1, "rounds": 1, "extra_rounds": 0, "num_simulations": 100,
             "backend": backend("snpe-a", epochs=10, members=2, components=1),
-            "binding": DataOptions("score", 20, "uncertain"), "spread": SPREAD,
+            "spread": SPREAD,
             "domains": "most likely", "num_domains": 100, "search_iterations": 1,
             "num_initial_states": 1, "starts_from_prior": False,
         }  # fmt: skip
         result = npdr_loop.train(
             model, target or NoisyPendulum(), swinging_task(gain),
-            small_options(**{**options, **changed}), progress=False,
+            options=DataOptions("score", 20, "uncertain"),
+            loop=small_options(**{**options, **changed}), progress=False,
         )  # fmt: skip
         return result.iterations[0]["decisions"], domains[-1]
 
