@@ -28,7 +28,9 @@ class ReadingLimits:
             characters take a tenth of it.
         text_bytes: Longest text beside the data, such as attributes, names and footers, in bytes;
             ours have less than a tenth of it.
-        json_bytes: Largest JSON file of a run in bytes; policies with many parameters take 2 MB.
+        json_bytes: Largest JSON file or text of a run in bytes; policies with many parameters take
+            2 MB.
+        json_values: Largest count of keys and values of such a JSON file.
         parts: Largest count of parts of a file, such as data sets or chunks; posteriors
             have hundreds of data sets.
         robot_parts: Largest count of elements of a robot's description, with all repetitions;
@@ -45,7 +47,8 @@ class ReadingLimits:
     rollouts: int = 10_000
     line_length: int = 2**18
     text_bytes: int = 2**20
-    json_bytes: int = 2**24
+    json_bytes: int = 2**23
+    json_values: int = 1_000_000
     parts: int = 10_000
     robot_parts: int = 4_000
     depth: int = 200
@@ -53,7 +56,7 @@ class ReadingLimits:
 
     def __post_init__(self) -> None:
         check_range(self, 1, 2**40, "file_bytes", "free_bytes", "line_length", "text_bytes")
-        check_range(self, 1, 2**30, "json_bytes")
+        check_range(self, 1, 2**30, "json_bytes", "json_values")
         check_range(
             self,
             1,

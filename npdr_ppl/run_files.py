@@ -185,6 +185,9 @@ def read_json(path: Path, kind: type[T] = dict[str, Any]) -> T:
         DataError: The file is not JSON, or holds something else.
     """
     content = read_bytes(path)
+    # Texts may contain some of these characters, too.
+    if sum(map(content.count, (b",", b"[", b"{"))) > 4 * LIMITS.json_values:
+        raise DataError(f"{path} has more than {LIMITS.json_values} values.")
     try:
         value: Any = msgspec.json.decode(content)
         _check_plain(value)
@@ -269,13 +272,16 @@ def shown_sentence(text: str, limit: int = 200) -> str:
 
 
 def _check_plain(value: Any) -> None:
-    """Checks depth, numbers and texts of a JSON value.
+    """Checks size, depth, numbers and texts of a JSON value.
 
     Raises:
         DataError: It is nested too deeply, or has a number or a text that npdr never writes.
     """
-    layer = [value]
+    layer, count = [value], 0
     for _ in range(LIMITS.depth):
+        count += len(layer)
+        if count > LIMITS.json_values:
+            raise DataError(f"it has more than {LIMITS.json_values} values")
         below: list[Any] = []
         for item in layer:
             if isinstance(item, dict):

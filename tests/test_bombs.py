@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers import cost_server, robot_bombs, table_bombs, tree_bombs
+from tests.helpers import cost_server, robot_bombs, run_bombs, table_bombs, tree_bombs
 
-BOMBS = table_bombs.BOMBS | tree_bombs.BOMBS | robot_bombs.BOMBS
+BOMBS = table_bombs.BOMBS | tree_bombs.BOMBS | robot_bombs.BOMBS | run_bombs.BOMBS
 CASES = [(kind, name) for kind, bombs in BOMBS.items() for name in bombs]
 
 MAX_SECONDS = 2.0

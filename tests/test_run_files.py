@@ -8,6 +8,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 
 import npdr_ppl as npdr
@@ -25,6 +26,7 @@ from npdr_ppl.run_files import (
     save_tensors,
     write_json,
 )
+from npdr_ppl.run_records import FitRecord
 
 HOLD = """
 import sys
@@ -95,6 +97,51 @@ def test_an_error_names_the_file_that_was_to_be_written(tmp_path):
     with pytest.raises(FileNotFoundError) as caught:
         write_json(tmp_path / "deleted" / "fit.json", {})
     assert caught.value.filename == str(tmp_path / "deleted" / "fit.json")
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ('{"backend": 1, "parameters": {}}', "Expected str, got int"),
+        ('{"parameters": {}}', "missing required field backend"),
+        ('{"backend": "a", "parameters": {"m": {"mean": "x", "sd": 1, "hdi_94": []}}}', "got str"),
+        ('{"backend": "\\u001b[2J", "parameters": {}}', "control characters"),
+        ('{"backend": "a", "parameters": {}, "x": 9223372036854775809999}', "too large"),
+        ('{"x": ' + "[" * 300 + "]" * 300 + "}", "more than 200 deep"),
+        ('{"x": ' + "[" * 99_999 + "]" * 99_999 + "}", "too deeply nested"),
+        ("[]", "Expected object, got array"),
+        ('{"backend": "a"', "truncated"),
+        ("", "truncated"),
+    ],
+)
+def test_json_of_another_type_gets_one_sentence(text, sentence, tmp_path):
+    path = tmp_path / "fit.json"
+    path.write_text(text)
+    with pytest.raises(DataError, match=sentence) as caught:
+        read_json(path, FitRecord)
+    assert str(caught.value).isprintable() and str(caught.value).endswith(".")
+
+
+def test_keys_for_other_programs_are_kept(tmp_path):
+    content = {"backend": "a", "parameters": {}, "mine": [1]}
+    write_json(tmp_path / "fit.json", content)
+    assert read_json(tmp_path / "fit.json", FitRecord) == content
+
+
+def test_tensors_that_were_changed_are_refused(tmp_path):
+    path = tmp_path / "a.safetensors"
+    save_tensors(path, {"a": torch.arange(6.0), "b": torch.zeros(0), "c": torch.tensor(True)})
+    assert set(load_tensors(path, "a", "b")) == {"a", "b", "c"}
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-2] + b"\x01" + whole[-1:])
+    with pytest.raises(DataError, match="was changed"):
+        load_tensors(path)
+    path.write_bytes(whole)
+    with pytest.raises(DataError, match="lacks d"):
+        load_tensors(path, "d")
+    safetensors.torch.save_file({"a": torch.zeros(1)}, path)
+    with pytest.raises(DataError, match="was changed"):
+        load_tensors(path)
 
 
 def write_rollouts(path, size):

@@ -13,6 +13,9 @@ from npdr_ppl.errors import NpdrError
 
 __all__ = ["app", "main", "run"]
 
+COMPLETES = "_NPDR_COMPLETE"
+"""Environment variable by which a shell asks for completions."""
+
 # Base class of the errors for wrong options, values and commands.
 _UsageError: Any = typer.BadParameter.__bases__[0]
 
@@ -46,8 +49,7 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     try:
         with stop_on_signals():
-            # Without arguments, typer prints the help text itself.
-            sys.exit(app(standalone_mode=len(sys.argv) < 2) or 0)
+            sys.exit(_run() or 0)
     except Stopped as stop:
         typer.echo("npdr: interrupted.", err=True)
         sys.exit(stop.exit_code)
@@ -77,11 +79,26 @@ def run() -> None:
         raise
 
 
+def _run() -> Any:
+    """Runs the command; returns its exit code."""
+    is_completion = COMPLETES in os.environ or any("-completion" in word for word in sys.argv)
+    if len(sys.argv) < 2 or is_completion:
+        # Then typer itself prints and ends the program.
+        return app(standalone_mode=not is_completion)
+    try:
+        return app(standalone_mode=False)
+    except SystemExit as error:
+        _refuse(f"The model or its simulator ended the program by sys.exit({error.code!r}).")
+
+
 def _sentence(message: str) -> str:
     line = " ".join(message.split())
     return line if line.endswith((".", "?", "!")) else f"{line}."
 
 
 def _refuse(sentence: str) -> None:
+    # Messages of other libraries have several lines, and texts from files any characters.
+    sentence = " ".join(sentence.split())
+    sentence = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in sentence)
     typer.echo(f"npdr: {sentence}", err=True)
     sys.exit(2)

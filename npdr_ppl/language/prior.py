@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from pyro import poutine
 from torch import Tensor
+from torch.distributions import constraints
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.handlers import SkipSimulation
@@ -91,6 +92,7 @@ class Prior:
                     f"Site {name!r} is discrete ({type(fn).__name__}); latent sites must be "
                     "continuous: marginalise it inside the simulator, or relax it."
                 )
+            _check_parameters(name, fn)
             self.distributions[name] = fn
             to_value = reference_map(fn)
             self.is_standard_normal &= to_value.is_standard_normal
@@ -303,6 +305,23 @@ class Prior:
 
     def _without_padding(self, site: LatentSite, value: Tensor) -> Tensor:
         return value.reshape((value.shape[0], *site.shape))
+
+
+def _check_parameters(name: str, fn: Any) -> None:
+    """Checks what a site's distribution was made from; a program runs without validation."""
+    while hasattr(fn, "base_dist"):
+        fn = fn.base_dist
+    low, high = (getattr(fn.support, f"{end}_bound", None) for end in ("lower", "upper"))
+    is_valid = low is None or high is None or bool((torch.as_tensor(low) < high).all())
+    for word, constraint in fn.arg_constraints.items():
+        value = getattr(fn, word, None)
+        if isinstance(value, Tensor) and not constraints.is_dependent(constraint):
+            is_valid &= bool(constraint.check(value).all())
+    if not is_valid:
+        raise ModelError(
+            f"Site {name!r} has no valid {type(fn).__name__}: check its bounds and scales, which "
+            "must be finite, positive where they are scales, and in order."
+        )
 
 
 def _depth(trace: Any, name: str) -> int:

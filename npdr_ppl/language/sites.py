@@ -301,6 +301,8 @@ class SimulatorBlackBox(BlackBox):
             parameters = {name: value.expand(batch_shape) for name, value in parameters.items()}
         inputs = self.inputs.with_drawn_start(batch_shape)
         output = self.simulator.simulate(parameters, inputs)
+        if output.is_complex():
+            raise SimulationError(f"{self.simulator.name} returned complex numbers.")
         if output.shape[-3:] != self.event_shape:
             raise SimulationError(
                 f"{self.simulator.name} returned a trajectory of shape {tuple(output.shape)}; "
@@ -379,6 +381,10 @@ class FunctionBlackBox(BlackBox):
             raise SimulationError(
                 f"The function behind site {self.site!r} should return a tensor whose first "
                 f"dimension is the batch ({num_simulations}), got {came}."
+            )
+        if output.is_complex():
+            raise SimulationError(
+                f"The function behind site {self.site!r} returned complex numbers."
             )
         self._known_event_shape = output.shape[1:]
         return output.reshape(batch_shape + output.shape[1:])

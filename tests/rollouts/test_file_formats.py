@@ -180,6 +180,59 @@ def test_npz_pickles_and_bombs_are_refused(small, tmp_path):
         Rollouts.load(path)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("time_step", np.array("abc"), "time_step should hold numbers"),
+        ("lengths", np.array([7.0, 4.0, 5.0]), "lengths should hold integers"),
+        ("channel_names", np.array([1, 2]), "channel_names should hold text"),
+        ("channel_units", np.array(["rad", "\x1b[2J"]), "the unit of rate is"),
+        ("channel_names", np.array(["angle", "ra\x07te"]), r"is called 'ra\\x07te'"),
+        ("channel_units", np.array(["rad", "x" * 31]), "at most 30 printable"),
+        ("time_step", np.array(np.nan), "the time step is nan"),
+    ],
+)
+def test_wrong_npz_arrays_get_one_sentence(name, value, sentence, small, tmp_path):
+    path = tmp_path / "x.npz"
+    small.to_npz(path)
+    with np.load(path) as arrays:
+        content = dict(arrays)
+    np.savez(path, **(content | {name: value}))
+    with pytest.raises(DataError, match=sentence) as caught:
+        Rollouts.load(path)
+    assert str(caught.value).isprintable()
+
+
+def test_an_npz_with_a_code_point_that_does_not_exist(small, tmp_path):
+    path = tmp_path / "x.npz"
+    small.to_npz(path)
+    with np.load(path) as arrays:
+        content = dict(arrays)
+    content["channel_names"] = np.array([2**31, 5], dtype="<u4").view("<U1")
+    np.savez(path, **content)
+    with pytest.raises(DataError, match="not a readable NPZ file"):
+        Rollouts.load(path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("format_name", "steps", "channels"),
+    [("csv", 60_000, 7), ("parquet", 10**6, 3), ("npz", 10**6, 3), ("netcdf", 10**6, 3)],
+)
+def test_long_recordings_are_within_the_limits(format_name, steps, channels, tmp_path):
+    rng = np.random.default_rng(0)
+    recording = Rollouts.from_arrays(
+        [rng.normal(size=(steps + 1, channels))],
+        [rng.normal(size=(steps, 1))],
+        channel_names=[f"x{k}" for k in range(channels)],
+        action_names=("u",),
+        time_step=0.001,
+    )
+    path = tmp_path / FORMATS[format_name]
+    getattr(recording, f"to_{format_name}")(path)
+    assert Rollouts.load(path).lengths == (steps,)
+
+
 def test_parquet_of_text_is_refused(tmp_path):
     frame = pd.DataFrame({"rollout": [0, 0], "time": [0.0, 0.1], "x": ["a", "b"]})
     frame.to_parquet(tmp_path / "x.parquet")

@@ -50,6 +50,9 @@ def test_good_data_pass():
         (swing(1.0, 0.1 * DEGREES).select(["rate", "angle"]), None),
         (swing(channel_units=("deg", "rad/s")), "angle is in deg, but rad is expected"),
         (swing(1000.0), "check the unit"),
+        (swing(1e-6, 1e-6), "angle never exceeds .* far below its bound .* check the unit"),
+        (swing(0.0, 0.0), None),  # it never moved
+        (swing(0.01, 0.01), None),
     ],
 )
 def test_columns_and_units(rollouts, sentence):

@@ -35,6 +35,10 @@ MAX_PICTURE_BYTES = 700_000
 small; larger ones are only named."""
 
 
+MAX_COMPARED = 100_000
+"""Maximum number of characters of two models that are compared; this takes up to a second."""
+
+
 def discovery_report(folder: Path) -> Report:
     """Reads the results of ``npdr discover``.
 
@@ -242,7 +246,8 @@ def _revision(folder: Path, description: Mapping[str, Any]) -> list[Section]:
     revised = read_text(file)
     model = description.get("model")
     before = model.get("source") if isinstance(model, Mapping) else model
-    if not isinstance(before, str) or not before.strip():
+    is_long = len(revised) + len(str(before)) > MAX_COMPARED
+    if not isinstance(before, str) or not before.strip() or is_long:
         return [Section("Revised model", [CodePart(revised, "revised_model.py, for MODEL")])]
     lines = difflib.unified_diff(
         before.splitlines(), revised.splitlines(), "model", "revised_model.py", lineterm=""
