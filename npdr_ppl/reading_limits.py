@@ -48,7 +48,7 @@ class ReadingLimits:
     line_length: int = 2**18
     text_bytes: int = 2**20
     json_bytes: int = 2**23
-    json_values: int = 1_000_000
+    json_values: int = 200_000
     parts: int = 10_000
     robot_parts: int = 4_000
     depth: int = 200

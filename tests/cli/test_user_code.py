@@ -71,7 +71,7 @@ def test_a_wrong_model_gets_one_sentence(name, tmp_path, monkeypatch, capsys):
 
 def test_an_error_of_several_lines_in_a_model_file_is_one_sentence(tmp_path, monkeypatch, capsys):
     file = tmp_path / "models.py"
-    file.write_text("import torch\ntorch.distributions.Normal(0.0, -1.0)")
+    file.write_text("import torch\ntorch.distributions.Normal(0.0, -1.0, validate_args=True)")
     (tmp_path / "data.csv").write_text("rollout,time,angle\n0,0,1\n0,0.1,1\n")
     data, out = tmp_path / "data.csv", tmp_path / "out"
     code, _, err = run(monkeypatch, capsys, "fit", f"{file}:m", "--data", data, "--out", out)
