@@ -123,6 +123,10 @@ def parquet_of_many_row_groups(path):
     _parquet(path, {"x": np.zeros(6_000)}, row_group_size=1)
 
 
+def parquet_of_almost_too_many_row_groups(path):
+    _parquet(path, {"x": np.zeros(3_000)}, row_group_size=1)
+
+
 def parquet_of_nested_lists(path):
     kind = pa.float64()
     for _ in range(300):

@@ -6,11 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from npdr_ppl.display.reports.content import CodePart, Section, TablePart, TextPart
+from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import Description
 
 __all__ = ["checksum", "data_files", "provenance_section", "run_description", "source_section"]
+
+MAX_FILES = 2_000
+"""Maximum number of files with data of a run; each takes a row of the report."""
 
 
 def run_description(folder: Path) -> dict[str, Any]:
@@ -29,6 +33,8 @@ def data_files(folder: Path) -> list[Path]:
         *folder.glob("rollouts/*.nc"),
         *folder.glob("recording.*"),
     ]
+    if len(found) > MAX_FILES:
+        raise DataError(f"{folder} has more than {MAX_FILES} files with data.")
     return sorted(found)
 
 

@@ -126,7 +126,7 @@ def read_parquet(path: AnyPath, actions: Sequence[str] | None) -> Recording:
             with path.open("rb") as file:
                 check_footer(file)
                 parquet = pq.ParquetFile(file)
-                check_parquet(parquet, file)
+                check_parquet(parquet, path.stat().st_size)
                 # A thread for each column would decompress all of them at once.
                 table = parquet.read(use_threads=False)
             columns = {

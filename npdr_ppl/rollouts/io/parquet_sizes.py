@@ -1,11 +1,13 @@
 """Checks how much memory a Parquet file needs, from its footer and the headers of its pages.
 
 The footer states the number of rows and columns. The header of a page states its size after
-decompression. The decompressor does not check this size, so these headers are read as well. They
-are Thrift structures in the compact protocol. Only their first three numbers are needed.
+decompression. The decompressor does not check this size, so these headers are read as well. Both
+are Thrift structures in the compact protocol. They are read here because the library ends the
+whole process where a footer contradicts itself.
 
 References:
-    Apache Parquet, parquet.thrift, ``PageHeader``; Apache Thrift, compact protocol specification.
+    Apache Parquet, parquet.thrift, ``FileMetaData`` and ``PageHeader``; Apache Thrift, compact
+    protocol specification.
 """
 
 import os
@@ -17,30 +19,51 @@ from npdr_ppl.rollouts.rollout_checks import check_names, shown
 
 __all__ = ["check_footer", "check_parquet"]
 
+_MARK = b"PAR1"
+
+_GROUPS, _COLUMNS, _METADATA = 4, 1, 3
+"""Fields of the footer, of a row group and of a column."""
+
+_COMPRESSED, _DATA_OFFSET, _DICTIONARY_OFFSET = 7, 9, 11
+"""Fields of a column's metadata."""
+
+_PAGE_DECOMPRESSED, _PAGE_COMPRESSED = 2, 3
+"""Fields of a page's header."""
+
 HEADER_BYTES = 2**16
 """Longest page header that is read, in bytes; statistics of numbers take less than a hundred."""
 
 
 def check_footer(file: IO[bytes]) -> None:
-    """Checks the length of the footer, which is parsed as a whole when the file is opened.
+    """Checks the footer and the pages before the library opens the file.
 
     Raises:
-        DataError: It is longer than any footer of a recording.
+        DataError: The footer is longer than that of any recording, or the pages decompress to too
+            many bytes.
     """
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - 8))
     length, mark = int.from_bytes(file.read(4), "little"), file.read(4)
-    if mark == b"PAR1" and length > LIMITS.text_bytes:
+    if mark != _MARK or length + 8 > size:
+        raise DataError("it does not end as a Parquet file does.")
+    if length > LIMITS.text_bytes:
         raise DataError(f"its description takes {length} bytes, more than {LIMITS.text_bytes}.")
+    file.seek(size - 8 - length)
+    footer = _Compact(file.read(length)).structure()
+    total = 0.0
+    for group in footer[_GROUPS]:
+        for column in group[_COLUMNS]:
+            total += _page_bytes(file, column[_METADATA])
+            check_expansion(total, size)
     file.seek(0)
 
 
-def check_parquet(parquet: Any, file: IO[bytes]) -> None:
+def check_parquet(parquet: Any, size: int) -> None:
     """Checks that all columns are numbers, and how much memory they need.
 
     Args:
         parquet: The open ``pyarrow.parquet.ParquetFile``.
-        file: The same file.
+        size: Bytes of the file.
 
     Raises:
         DataError: A column does not hold numbers, or the table is too large.
@@ -56,28 +79,19 @@ def check_parquet(parquet: Any, file: IO[bytes]) -> None:
             raise DataError(
                 f"{field.name} is of type {shown(str(field.type))}, but numbers are needed."
             )
-    size = os.fstat(file.fileno()).st_size
     check_expansion(8.0 * metadata.num_rows * metadata.num_columns, size)
-    rows = pages = 0.0
-    for group in (metadata.row_group(index) for index in range(metadata.num_row_groups)):
-        rows += group.num_rows
-        for column in (group.column(index) for index in range(group.num_columns)):
-            pages += _page_bytes(file, column)
-            check_expansion(pages, size)
-    check_expansion(8.0 * rows * metadata.num_columns, size)
 
 
-def _page_bytes(file: IO[bytes], column: Any) -> float:
+def _page_bytes(file: IO[bytes], column: dict[int, Any]) -> float:
     """Returns the decompressed bytes of a column's pages, as their headers state them."""
-    position = column.dictionary_page_offset or column.data_page_offset
-    position = min(position, column.data_page_offset)
-    end = position + column.total_compressed_size
+    position = min(column[_DATA_OFFSET], column.get(_DICTIONARY_OFFSET) or column[_DATA_OFFSET])
+    end = position + column[_COMPRESSED]
     total = 0.0
     while position < end:
         file.seek(position)
         header = _Compact(file.read(HEADER_BYTES))
-        fields = header.leading_numbers()
-        decompressed, compressed = fields[2], fields[3]
+        fields = header.structure()
+        decompressed, compressed = fields[_PAGE_DECOMPRESSED], fields[_PAGE_COMPRESSED]
         if decompressed < 0 or compressed < 0:
             raise DataError("a page has a negative size.")
         total += decompressed
@@ -96,16 +110,15 @@ class _Compact:
         self.data = data
         self.position = 0
 
-    def leading_numbers(self) -> dict[int, int]:
-        """Reads a structure; returns its fields 1 to 3, which are numbers, and skips the rest."""
-        found: dict[int, int] = {}
+    def structure(self, depth: int = 0) -> dict[int, Any]:
+        """Reads a structure; returns its numbers, lists and structures by number of the field."""
+        if depth > LIMITS.depth:
+            raise ValueError("nested too deeply")
+        found: dict[int, Any] = {}
         identifier = 0
         while kind := self._byte():
             identifier = identifier + (kind >> 4) if kind >> 4 else self._number()
-            if identifier <= 3 and kind & 15 == 5:
-                found[identifier] = self._number()
-            else:
-                self._skip(kind & 15, 0)
+            found[identifier] = self._value(kind & 15, depth)
         return found
 
     def _byte(self) -> int:
@@ -123,27 +136,19 @@ class _Compact:
         value = self._length()
         return (value >> 1) ^ -(value & 1)
 
-    def _skip(self, kind: int, depth: int) -> None:
-        if depth > LIMITS.depth:
-            raise ValueError("nested too deeply")
+    def _value(self, kind: int, depth: int) -> Any:
         if kind in (4, 5, 6):
-            self._length()
-        elif kind == 3:
-            self._byte()
-        elif kind == 7:
-            self.position += 8
-        elif kind == 8:
-            length = self._length()
-            self.position += length
-        elif kind in (9, 10):
+            return self._number()
+        if kind in (9, 10):
             head = self._byte()
             length = head >> 4 if head >> 4 < 15 else self._length()
-            for _ in range(length):
-                self._skip(head & 15 if head & 15 > 2 else 3, depth + 1)
-        elif kind == 12:
-            while field := self._byte():
-                if not field >> 4:
-                    self._length()
-                self._skip(field & 15, depth + 1)
-        elif kind not in (1, 2):
-            raise ValueError("not a page header")
+            entry = head & 15 if head & 15 > 2 else 3  # in a list, a truth value takes a byte
+            return [self._value(entry, depth + 1) for _ in range(length)]
+        if kind == 12:
+            return self.structure(depth + 1)
+        if kind not in (1, 2, 3, 7, 8):
+            raise ValueError("not a structure of a Parquet file")
+        # Truth values, bytes, floating-point numbers and text are not needed.
+        length = self._length() if kind == 8 else {3: 1, 7: 8}.get(kind, 0)
+        self.position += length
+        return None
