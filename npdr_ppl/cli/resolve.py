@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import cloudpickle
 
 from npdr_ppl.errors import BackendError, DataError, ModelError, NpdrError
+from npdr_ppl.language.model import Model
 
 if TYPE_CHECKING:
     from npdr_ppl.embeddings import Embedding
@@ -101,7 +102,7 @@ def _load_function(path: Path, function: str) -> Callable[..., Any]:
     return model
 
 
-def resolve_effects(model: Callable[..., Any], words: Sequence[str]) -> Callable[..., Any]:
+def resolve_effects(model: Model, words: Sequence[str]) -> Callable[..., Any]:
     """Attaches effects given as ``port.effect``, e.g. ``pole.coulomb_friction``.
 
     A word may hold several effects, separated by commas.

@@ -12,7 +12,7 @@ reads its fits instead of repeating them. A complete one is not repeated.
 import dataclasses
 import hashlib
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -23,6 +23,7 @@ from npdr_ppl.discovery.discovery_result import Discovery, describe_candidate
 from npdr_ppl.discovery.investigation import Investigation
 from npdr_ppl.discovery.kept_fits import keep_fits
 from npdr_ppl.errors import DataError
+from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import (
@@ -66,7 +67,7 @@ class DiscoveryFolder:
 
     def begin(
         self,
-        model: Callable[..., Any],
+        model: Model,
         rollouts: Rollouts,
         holdout: Rollouts | None,
         options: DataOptions,

@@ -22,6 +22,7 @@ from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.search.effect_search import Search
 from npdr_ppl.discovery.search.prior_ends import PriorEnd
 from npdr_ppl.language.handlers import num_finer_steps
+from npdr_ppl.language.model import Model
 from npdr_ppl.run_files import write_json
 
 __all__ = ["Discovery", "Verdict", "describe_candidate"]
@@ -78,7 +79,7 @@ class Discovery:
     separation_names: tuple[str, ...]
     gap: dict[str, Gap]
     next_experiment: NextExperiment | None
-    model: Callable[..., Any]
+    model: Model
     revised: Callable[..., Any]
     parameters: dict[str, Estimate]
     draws: Draws

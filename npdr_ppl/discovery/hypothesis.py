@@ -1,10 +1,9 @@
 """A hypothesis: the model with some effects, fitted to the recording."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +13,7 @@ from npdr_ppl.discovery.settings import HYPOTHESIS
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import add_effect
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.effective_share import effective_share
@@ -24,9 +24,6 @@ from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Hypothesis", "extended", "fit_hypothesis", "fit_segment_model", "with_effects"]
-
-
-Model = Callable[..., Any]
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,10 @@
 """Discovery: finds which effect a model lacks, adds it and measures whether that helps."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 from torch.distributions import Distribution
 
@@ -34,6 +33,7 @@ from npdr_ppl.discovery.search_progress import SearchProgress
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.errors import DataError, ModelError
+from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.progress import Reporter, reporter
@@ -75,7 +75,7 @@ class Investigation:
 
     def __init__(
         self,
-        model: Callable[..., Any],
+        model: Model,
         rollouts: Rollouts,
         *,
         holdout: Rollouts | None = None,
@@ -292,7 +292,7 @@ class Investigation:
 
 
 def discover(
-    model: Callable[..., Any],
+    model: Model,
     rollouts: Rollouts,
     *,
     holdout: Rollouts | None = None,

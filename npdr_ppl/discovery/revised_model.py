@@ -12,6 +12,7 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps, num_finer_steps
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors
 
 __all__ = ["revised_source"]
@@ -19,9 +20,7 @@ __all__ = ["revised_source"]
 FUNCTION = "revised_model"
 
 
-def revised_source(
-    model: Callable[..., Any], effects: tuple[Effect, ...], fitted: Mapping[str, float]
-) -> str:
+def revised_source(model: Model, effects: tuple[Effect, ...], fitted: Mapping[str, float]) -> str:
     """Returns Python source that defines ``revised_model``.
 
     A model from an installed module is imported. A model from a file is copied, so that the result
@@ -92,7 +91,7 @@ def _distribution(prior: Distribution) -> str | None:
     return f"pyro.distributions.{name}({', '.join(given)})"
 
 
-def _base(model: Callable[..., Any]) -> tuple[str, str]:
+def _base(model: Model) -> tuple[str, str]:
     """Returns the source that defines a model, and the model's name."""
     module = inspect.getmodule(model)
     name = getattr(model, "__name__", type(model).__name__)

@@ -1,6 +1,5 @@
 """Effect handlers: change a model's black-box sites without changing the model's code."""
 
-from collections.abc import Callable
 from typing import Any
 
 import pyro
@@ -9,6 +8,7 @@ from pyro.poutine.messenger import Messenger
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.noise import Noise
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox, SiteLikelihood
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors
@@ -27,8 +27,6 @@ __all__ = [
     "with_finer_steps",
     "with_noise",
 ]
-
-Model = Callable[..., Any]
 
 
 class EffectMessenger(Messenger):

@@ -7,7 +7,7 @@ every point maps to a plausible parameter.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -25,6 +25,7 @@ from npdr_ppl.language.latent_sites import (
     WriteCoordinates,
     per_point,
 )
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.program_runs import (
     ALL_POINTS,
     BATCH_PLATE,
@@ -58,7 +59,7 @@ class Prior:
             the density of an observed ordinary site depends on latent sites.
     """
 
-    def __init__(self, model: Callable[..., Any], args: tuple[Any, ...] = ()) -> None:
+    def __init__(self, model: Model, args: tuple[Any, ...] = ()) -> None:
         self.model = model
         self.args = args
         with alone(), torch.random.fork_rng(devices=[]), SkipSimulation():

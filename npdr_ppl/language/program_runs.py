@@ -1,7 +1,7 @@
 """Runs of a program that are invisible to outer handlers."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -10,6 +10,7 @@ from pyro.poutine.util import site_is_subsample
 from torch.distributions import Distribution
 
 from npdr_ppl.errors import ModelError, NpdrError
+from npdr_ppl.language.model import Model
 
 __all__ = ["BATCH_PLATE", "alone", "sample_sites", "traced"]
 
@@ -40,7 +41,7 @@ def alone() -> Iterator[None]:
         Distribution.set_default_validate_args(is_validating)
 
 
-def traced(model: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+def traced(model: Model, args: tuple[Any, ...]) -> Any:
     """Traces a run of the program; our own errors are raised without Pyro's table of shapes.
 
     Raises:

@@ -1,6 +1,6 @@
 """A handler that widens the priors of some sites, to test whether they were too narrow."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import pyro.distributions as dist
@@ -9,9 +9,9 @@ from pyro.distributions.torch_distribution import ExpandedDistribution
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
-__all__ = ["ModelWithWiderPriors", "described_prior", "widened", "with_wider_priors"]
+from npdr_ppl.language.model import Model
 
-Model = Callable[..., Any]
+__all__ = ["ModelWithWiderPriors", "described_prior", "widened", "with_wider_priors"]
 
 TIMES = 3.0
 """Factor by which scales of distributions and widths of ranges are multiplied."""

@@ -1,8 +1,8 @@
 """Domains: the simulators for training a policy, drawn from a prior or a posterior."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 from npdr_ppl.engines.common.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.rollouts import Rollouts
@@ -60,7 +61,7 @@ class Domains:
 
 
 def prior_of(
-    model: Callable[..., Any],
+    model: Model,
     sensors: tuple[Channel, ...],
     actions: tuple[Channel, ...],
     time_step: float,

@@ -17,7 +17,7 @@ from torch import Tensor
 from npdr_ppl.discovery import DiscoveryOptions, discover
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect, with_finer_steps
-from npdr_ppl.loop.loop_options import Model
+from npdr_ppl.language.model import Model
 from npdr_ppl.models.effects.registry import effect_class
 from npdr_ppl.posterior.run_folder import MAX_FINER_STEPS
 from npdr_ppl.preparation.data_options import DataOptions

@@ -17,13 +17,14 @@ can continue from the folder.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.language.model import Model
 from npdr_ppl.loop.control_task import ControlTask
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.run_files import (
@@ -63,7 +64,7 @@ class LoopFolder:
 
     def begin(
         self,
-        model: Callable[..., Any],
+        model: Model,
         target: TargetDomain,
         task: ControlTask,
         options: DataOptions,

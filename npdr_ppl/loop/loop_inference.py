@@ -6,8 +6,9 @@ from pathlib import Path
 from torch import Tensor
 
 from npdr_ppl.inference.base import Backend
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
-from npdr_ppl.loop.loop_options import LoopOptions, Model
+from npdr_ppl.loop.loop_options import LoopOptions
 from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.posterior import Posterior
 from npdr_ppl.posterior.prepare import prepare

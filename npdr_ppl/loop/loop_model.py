@@ -5,9 +5,10 @@ from pathlib import Path
 
 from torch import Tensor
 
+from npdr_ppl.language.model import Model
 from npdr_ppl.loop.domains import prior_of
 from npdr_ppl.loop.loop_discovery import LoopDiscovery
-from npdr_ppl.loop.loop_options import Model, Revise
+from npdr_ppl.loop.loop_options import Revise
 from npdr_ppl.loop.next_excitation import proposed_excitation
 from npdr_ppl.policies.playback import Playback
 from npdr_ppl.progress import Reporter

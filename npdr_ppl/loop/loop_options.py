@@ -9,6 +9,7 @@ from typing import Any, Literal
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.errors import ModelError
 from npdr_ppl.inference.base import Backend
+from npdr_ppl.language.model import Model
 from npdr_ppl.loop.risk import MeanReturn, Risk, TailMean
 from npdr_ppl.policies.policy_search import PolicySearch
 from npdr_ppl.posterior.diagnostics import Thresholds
@@ -20,8 +21,6 @@ __all__ = ["LOOP_DATA", "NEW_ATTEMPTS", "SPREAD_WIDER", "Action", "LoopOptions",
 LOOP_DATA = DataOptions("score", 50, "uncertain", "float32")
 """How the loop prepares rollouts by default: in segments of 50 steps and in float32. The loop was
 validated on hidden rigs with these values."""
-
-Model = Callable[..., Any]
 
 Revise = Callable[[Model, Rollouts, Path | None], Model | None]
 """Searches for effects that a model lacks. It takes the model, all real rollouts and a folder of

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from npdr_ppl.loop.loop_options import Model
+from npdr_ppl.language.model import Model
 from npdr_ppl.policies.base import Policy
 from npdr_ppl.posterior.posterior import Posterior
 from npdr_ppl.rollouts import Rollouts

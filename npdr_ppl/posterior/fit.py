@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +13,7 @@ import numpy as np
 from npdr_ppl.engines.workers import collect_faults
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.inference.registry import backend as backend_by_name
+from npdr_ppl.language.model import Model
 from npdr_ppl.posterior.diagnostics import Decision, diagnose
 from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.parameter_units import parameter_units
@@ -31,7 +32,7 @@ __all__ = ["describe", "fit"]
 
 
 def fit(
-    model: Callable[..., Any],
+    model: Model,
     train: Rollouts,
     test: Rollouts | None = None,
     *,

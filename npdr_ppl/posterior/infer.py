@@ -2,11 +2,9 @@
 
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +14,7 @@ from npdr_ppl.errors import BackendError, NpdrError
 from npdr_ppl.inference.base import Backend, Density, Problem, RoundInfo, State
 from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 from npdr_ppl.inference.registry import backend as backend_by_name
+from npdr_ppl.language.model import Model
 from npdr_ppl.memory import release_freed_memory
 from npdr_ppl.posterior.estimator_check import check_estimator
 from npdr_ppl.posterior.posterior import Posterior, PosteriorBase, Provenance
@@ -42,7 +41,7 @@ CHUNKS_BETWEEN_RELEASES = 16
 
 
 def infer(
-    model: Callable[..., Any],
+    model: Model,
     data: Data,
     *,
     backend: str | Backend = "snpe-c",

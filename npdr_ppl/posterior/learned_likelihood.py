@@ -18,6 +18,7 @@ from npdr_ppl.errors import BackendError, ModelError, ShapeError
 from npdr_ppl.inference.parts.bases.likelihood_backend import LikelihoodBackend
 from npdr_ppl.language.handlers import LikelihoodMessenger
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox, SiteLikelihood
 from npdr_ppl.posterior.posterior import Posterior
 
@@ -136,7 +137,7 @@ class LearnedLikelihood:
 
 
 def with_likelihood(
-    model: Callable[..., Any],
+    model: Model,
     estimator: Posterior | SiteLikelihood,
     *,
     site: str | None = None,

@@ -19,6 +19,7 @@ from npdr_ppl.embeddings import Embedding
 from npdr_ppl.errors import BackendError, DataError
 from npdr_ppl.inference.base import Backend, Problem, RoundInfo, State
 from npdr_ppl.inference.registry import backend as backend_by_name
+from npdr_ppl.language.model import Model
 from npdr_ppl.posterior.density_mixture import DensityMixture
 from npdr_ppl.posterior.estimator_check import Correction, EstimatorCheck
 from npdr_ppl.posterior.exported_checks import checks_of
@@ -210,7 +211,7 @@ class Posterior(PosteriorBase):
     def load(
         cls,
         path: str | PathLike[str],
-        model: Callable[..., Any],
+        model: Model,
         *,
         embedding: Embedding | None = None,
         device: str | torch.device = "cpu",

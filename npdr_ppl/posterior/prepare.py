@@ -24,6 +24,7 @@ from npdr_ppl.embeddings import Embedding
 from npdr_ppl.embeddings.score import Score
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.language.handlers import with_noise
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.preparation.binding import BoundModel, bind
@@ -69,7 +70,7 @@ class Preparation:
         closest: The closest fit if initial states are taken as true.
     """
 
-    model: Callable[..., Any]
+    model: Model
     plain_model: Callable[..., Any]
     rollouts: Rollouts
     options: DataOptions
@@ -205,7 +206,7 @@ def has_closest_fit(prior: Prior) -> bool:
 
 
 def prepare(
-    model: Callable[..., Any],
+    model: Model,
     rollouts: Rollouts,
     options: DataOptions,
     *,
@@ -322,7 +323,7 @@ def score_embedding(likelihood: SegmentLikelihood) -> Score:
 
 
 def _with_certain_starts(
-    model: Callable[..., Any],
+    model: Model,
     rollouts: Rollouts,
     options: DataOptions,
     keeps_noise: bool,

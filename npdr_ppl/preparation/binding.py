@@ -13,6 +13,7 @@ from npdr_ppl.errors import DataError, ModelError, ShapeError
 from npdr_ppl.inference.base import Problem
 from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
 from npdr_ppl.preparation.data_options import PLAIN_FEATURES, DataOptions
@@ -79,7 +80,7 @@ class BoundModel:
             one deterministic simulator; ``None`` for all others.
     """
 
-    model: Callable[..., Any]
+    model: Model
     args: tuple[Any, ...]
     prior: Prior
     observations: Mapping[str, Observation]
@@ -122,7 +123,7 @@ class BoundModel:
 
 
 def bind(
-    model: Callable[..., Any],
+    model: Model,
     data: Data,
     options: DataOptions,
     device: str | torch.device = "cpu",

@@ -7,14 +7,13 @@ which trajectories are compressed into their score.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK, DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
@@ -41,7 +40,7 @@ class ClosestFit:
 
 
 def closest_fit(
-    model: Callable[..., Any],
+    model: Model,
     rollouts: Rollouts,
     options: DataOptions,
     *,

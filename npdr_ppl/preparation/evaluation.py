@@ -1,8 +1,7 @@
 """The distance of a model with given parameters from measured rollouts."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +10,7 @@ from npdr_ppl import metrics
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.preparation.data_options import DataOptions
@@ -46,7 +46,7 @@ class Replay:
 
 
 def replay(
-    model: Callable[..., Any],
+    model: Model,
     rollouts: Rollouts,
     parameters: Mapping[str, Tensor],
     options: DataOptions,
@@ -82,7 +82,7 @@ def replay(
 
 
 def score(
-    model: Callable[..., Any],
+    model: Model,
     rollouts: Rollouts,
     parameters: Mapping[str, Tensor],
     options: DataOptions,
@@ -105,7 +105,7 @@ def score(
     return {"rmse": metrics.rmse(simulated, measured), "dtw": metrics.dtw(simulated, measured)}
 
 
-def nominal_parameters(model: Callable[..., Any], inputs: Inputs) -> dict[str, Tensor]:
+def nominal_parameters(model: Model, inputs: Inputs) -> dict[str, Tensor]:
     """Returns the simulator's nominal value of every latent site that carries a parameter's name.
 
     Raises:

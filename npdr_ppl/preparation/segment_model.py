@@ -8,10 +8,9 @@ states. The simulator stays a black box.
 """
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +19,7 @@ from torch.nn.functional import pad
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
@@ -134,7 +134,7 @@ class SegmentModel:
 
     def __init__(
         self,
-        model: Callable[..., Any],
+        model: Model,
         rollouts: Rollouts,
         options: DataOptions,
         starts: InitialStates | None = None,
@@ -144,7 +144,7 @@ class SegmentModel:
         self._trace(model)
         self._start_from(starts)
 
-    def with_model(self, model: Callable[..., Any]) -> "SegmentModel":
+    def with_model(self, model: Model) -> "SegmentModel":
         """Returns another model along the same segments, with the same initial states.
 
         The recording is neither cut nor smoothed again, and both share its measurements.
@@ -221,7 +221,7 @@ class SegmentModel:
         part.steps_per_average = min(-(-readings // most), self.inputs.num_steps // fewest)
         return part if part.steps_per_average > 1 else self
 
-    def _trace(self, model: Callable[..., Any]) -> None:
+    def _trace(self, model: Model) -> None:
         """Runs the model once, to find its priors, its simulator and the measured channels."""
         self.model = model
         self.prior = Prior(with_noise(model, None), (self._cut,))

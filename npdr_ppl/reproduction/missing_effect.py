@@ -20,8 +20,9 @@ from typing import Any
 from npdr_ppl import metrics
 from npdr_ppl.discovery import Discovery, DiscoveryOptions, Investigation
 from npdr_ppl.discovery.discovery_folder import DiscoveryFolder, findings_until
-from npdr_ppl.discovery.hypothesis import Hypothesis, Model, fit_hypothesis
+from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis
 from npdr_ppl.errors import DataError
+from npdr_ppl.language.model import Model
 from npdr_ppl.models.furuta import Furuta, furuta
 from npdr_ppl.preparation.data_options import DataOptions, checked_options
 from npdr_ppl.preparation.evaluation import nominal_parameters, score

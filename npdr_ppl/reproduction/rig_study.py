@@ -17,6 +17,7 @@ import torch
 from npdr_ppl import metrics
 from npdr_ppl.errors import TooShortError
 from npdr_ppl.language.handlers import add_effect
+from npdr_ppl.language.model import Model
 from npdr_ppl.loop.control_task import ControlTask, control_task
 from npdr_ppl.loop.domains import Domains, domains_at, prior_of
 from npdr_ppl.loop.loop_options import LOOP_DATA, LoopOptions
@@ -251,7 +252,7 @@ def summarise(outcomes: Mapping[str, Sequence[Outcome]], success: float) -> dict
 
 def _trained_once(
     method: RigMethod,
-    model: Callable[..., Any],
+    model: Model,
     target: TargetDomain,
     task: ControlTask,
     loop: LoopOptions,

@@ -8,7 +8,7 @@ from functools import cached_property, partial
 from torch import Tensor
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
-from npdr_ppl.discovery.hypothesis import Hypothesis, Model
+from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.alarm import Alarm, sound_alarm
 from npdr_ppl.discovery.screening.candidate_effects import candidates_at, variants_of
 from npdr_ppl.discovery.screening.latent_force import Responses, responses
@@ -31,6 +31,7 @@ from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.model import Model
 from npdr_ppl.memory import release_freed_memory
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel

@@ -1,7 +1,6 @@
 """Predictive bands over the recording, as in Figure 5 of Muratore et al. (2021)."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 from npdr_ppl.display.plots.marginals import add_legend
 from npdr_ppl.drawing.theme import COLORS, theme
 from npdr_ppl.errors import DataError
+from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.evaluation import nominal_parameters, replay
 from npdr_ppl.rollouts import Rollouts
@@ -69,7 +69,7 @@ def plot_bands(
 
 
 def nominal_line(
-    model: Callable[..., Any], rollouts: Rollouts, options: DataOptions
+    model: Model, rollouts: Rollouts, options: DataOptions
 ) -> dict[str, NDArray[np.float64]]:
     """Returns the nominal simulation of the first rollout, for :func:`plot_bands`.
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from npdr_ppl.errors import BackendError, DataError, NpdrError
+from npdr_ppl.language.model import Model
 from npdr_ppl.memory import sampled_memory
 from npdr_ppl.posterior.comparison.compared_backends import (
     Backends,
@@ -39,7 +40,7 @@ __all__ = ["compare"]
 
 
 def compare(
-    model: Callable[..., Any],
+    model: Model,
     train: Data,
     test: Data | None = None,
     *,

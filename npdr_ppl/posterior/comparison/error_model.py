@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.posterior.prepare import Preparation, prepare
 from npdr_ppl.preparation.binding import BoundModel, Data
@@ -57,7 +58,7 @@ class ErrorModel:
 
 
 def find_error_model(
-    model: Callable[..., Any],
+    model: Model,
     train: Data,
     options: DataOptions,
     *,
@@ -100,7 +101,7 @@ def prepare_as_it_is(found: Preparation, noise: Literal["auto", "model"]) -> Pre
 
 
 def _share_of_residuals(
-    model: Callable[..., Any], train: Rollouts, options: DataOptions, closest: ClosestFit
+    model: Model, train: Rollouts, options: DataOptions, closest: ClosestFit
 ) -> dict[str, float]:
     """Returns the share of independent measurements if initial states are taken as exact."""
     replayed = replay(model, train, closest.parameters, options)
