@@ -19,7 +19,8 @@ class ReadingLimits:
     Attributes:
         file_bytes: Largest file in bytes; an hour at 1 kHz with ten channels takes less.
         numbers: Largest count of numbers in a file; as float64 they take 0.8 GB.
-        free_bytes: Bytes in memory that any file may describe; 10⁶ samples of eight columns.
+        free_bytes: Bytes in memory that any file may describe: 10⁶ samples of eight columns, or a
+            texture of 4096 × 4096 pixels.
         expansion: Bytes in memory per byte of the file that a larger recording may describe.
             Compression of measured data gains a factor of about two, that of a bomb a thousand.
         columns: Largest count of columns; robots have tens of channels.
@@ -41,7 +42,7 @@ class ReadingLimits:
 
     file_bytes: int = 2**30
     numbers: int = 10**8
-    free_bytes: int = 64 * 10**6
+    free_bytes: int = 2**26
     expansion: int = 20
     columns: int = 1_000
     rollouts: int = 10_000

@@ -34,6 +34,7 @@ from npdr_ppl.reading_limits import LIMITS
 __all__ = [
     "claimed",
     "engine_settings",
+    "file_text",
     "holds_this_run",
     "load_tensors",
     "make_folder",
@@ -187,7 +188,7 @@ def read_json(path: Path, kind: type[T] = dict[str, Any]) -> T:
     content = read_bytes(path)
     # Texts may contain some of these characters, too.
     if sum(map(content.count, (b",", b"[", b"{"))) > 4 * LIMITS.json_values:
-        raise DataError(f"{path} has more than {LIMITS.json_values} values.")
+        raise DataError(f"{path} has too many values or separators for a file of npdr.")
     try:
         value: Any = msgspec.json.decode(content)
         _check_plain(value)
@@ -331,6 +332,19 @@ def source_text(model: Any) -> str:
         return inspect.getsource(model)
     except (OSError, TypeError):
         return repr(model)
+
+
+def file_text(model: Any) -> str:
+    """Returns the file that defines a model; often its simulator is defined there, too.
+
+    Empty if there is no such file.
+    """
+    while _is_wrapped(model) or hasattr(model, "base"):
+        model = model.args[-1] if _is_wrapped(model) else model.base
+    try:
+        return Path(inspect.getsourcefile(model) or "").read_text(encoding="utf-8")
+    except (OSError, TypeError, UnicodeDecodeError):
+        return ""
 
 
 def _is_wrapped(model: Any) -> bool:

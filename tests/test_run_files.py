@@ -20,6 +20,7 @@ from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import (
     claimed,
+    file_text,
     load_tensors,
     model_name,
     read_json,
@@ -193,3 +194,9 @@ def test_a_model_has_the_same_name_in_every_process():
     noisy = npdr.with_noise(npdr.add_effect(pendulum, CoulombFriction("hinge")), 0.1)
     assert model_name(noisy) == "pendulum + hinge.coulomb_friction"
     assert model_name(pendulum) == "pendulum"
+
+
+def test_the_file_of_a_model_is_found_under_what_wraps_it():
+    noisy = npdr.with_noise(npdr.add_effect(pendulum, CoulombFriction("hinge")), 0.1)
+    assert "class Pendulum" in file_text(noisy)
+    assert file_text(len) == ""

@@ -84,8 +84,8 @@ def discover(
 ) -> None:
     """Find effects that a model lacks, add them, and test the revised model on held-out data.
 
-    Discovery estimates initial states and noise, and tests short segments: it accepts only the
-    defaults of --initial-state and --noise, and no whole rollouts. It uses no features.
+    Discovery always estimates initial states and noise, and always cuts the recording into short
+    segments. Other values of --initial-state and --noise, and --segment-length 0, are refused.
 
     Writes discovery.json, revised_model.py (a model for every other command) and figures. The
     same command continues an interrupted search, or shows the result of a finished one.

@@ -81,7 +81,9 @@ def run() -> None:
 
 def _run() -> Any:
     """Runs the command; returns its exit code."""
-    is_completion = COMPLETES in os.environ or any("-completion" in word for word in sys.argv)
+    is_completion = COMPLETES in os.environ or any(
+        word.split("=")[0] in ("--install-completion", "--show-completion") for word in sys.argv
+    )
     if len(sys.argv) < 2 or is_completion:
         # Then typer itself prints and ends the program.
         return app(standalone_mode=not is_completion)

@@ -2,7 +2,9 @@
 
 Fits take most of a search's time, and are deterministic. Inside a block of :func:`keep_fits`, each
 finished fit is written to a file whose name is a checksum of all that the fit depends on. The same
-search then reads it, takes the same decisions, and gives the same result.
+search then reads it, takes the same decisions, and gives the same result. A changed file of the
+model makes new fits. Changes in modules that this file imports are not noticed; delete the folder
+of fits after such a change.
 """
 
 import hashlib
@@ -19,7 +21,14 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.preparation.segment_model import SegmentModel
-from npdr_ppl.run_files import load_tensors, make_folder, save_tensors, source_text, versions
+from npdr_ppl.run_files import (
+    file_text,
+    load_tensors,
+    make_folder,
+    save_tensors,
+    source_text,
+    versions,
+)
 
 __all__ = ["keep_fits", "keeping", "made_or_read"]
 
@@ -89,6 +98,7 @@ def _checksum(segments: SegmentModel, *rest: Any) -> str:
     parts = [
         versions(),
         source_text(segments.model),
+        file_text(segments.model),
         segments.channel_names,
         type(simulator).__qualname__,
         simulator.recorded_settings(),

@@ -20,7 +20,7 @@ from npdr_ppl.language.handlers import ModelWithEffects, add_effect, with_finer_
 from npdr_ppl.language.model import Model
 from npdr_ppl.models.effects.registry import effect_class
 from npdr_ppl.posterior.run_folder import MAX_FINER_STEPS
-from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS, DataOptions
 from npdr_ppl.progress import Reporter
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import read_json, reading_back
@@ -54,8 +54,9 @@ class LoopDiscovery:
 
     Args:
         model: The loop's original model.
-        options: How the loop prepares rollouts. Discovery takes segment length and precision from
-            it; it estimates initial states and noise itself.
+        options: How the loop prepares rollouts. Discovery takes the precision from it, and the
+            segment length if the rollouts are long enough; it estimates initial states and noise
+            itself.
         search: Settings of the search.
         seed: Seed of all random numbers.
     """
@@ -64,12 +65,7 @@ class LoopDiscovery:
         self, model: Model, options: DataOptions, search: DiscoveryOptions, *, seed: int
     ) -> None:
         self.model = model
-        self.options = replace(
-            options,
-            segment_length=options.segment_length or "auto",
-            initial_state="uncertain",
-            noise="auto",
-        )
+        self.options = replace(options, initial_state="uncertain", noise="auto")
         self.search = search
         self.seed = seed
 
@@ -89,7 +85,7 @@ class LoopDiscovery:
                 found = discover(
                     self.model,
                     rollouts,
-                    options=self.options,
+                    options=self._options_for(rollouts),
                     search=self.search,
                     seed=self.seed,
                     progress=progress,
@@ -101,6 +97,13 @@ class LoopDiscovery:
             found.save(folder)
         with reading_back(file):
             return self._read(read_json(file, DiscoveryRecord))
+
+    def _options_for(self, rollouts: Rollouts) -> DataOptions:
+        """Returns the loop's options, with segments of a length that discovery can use."""
+        length = self.options.steps(rollouts)
+        if length is not None and 2 <= length <= sum(rollouts.lengths) // FEWEST_SEGMENTS:
+            return self.options
+        return replace(self.options, segment_length="auto")
 
     def _read(self, result: Mapping[str, Any]) -> Revision:
         """Returns the revision that a saved discovery describes."""

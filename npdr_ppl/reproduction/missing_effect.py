@@ -132,28 +132,28 @@ def reproduce_missing_effect(
             )
             found, discovery = findings_until(investigation, "prove")
         assert discovery is not None
+        nominal = nominal_parameters(furuta, train.inputs(SEGMENT_LENGTH))
+        story = Story(
+            discovery,
+            _refitted(furuta, investigation.given, train),
+            _refitted(discovery.model, discovery.search.final, train),
+        )
+        fits = {"refitted": story.refitted, "revised": story.revised}
+        result = {
+            "rows": {
+                "nominal": _row(furuta, nominal, test, chirps),
+                **{name: _row(h.model, h.parameters, test, chirps) for name, h in fits.items()},
+            },
+            "closest_fit": {name: h.parameters for name, h in fits.items()},
+            # The paper's fit of the same equations is its NPDR.
+            "paper": {"nominal": _published("nominal"), "refitted": _published("snpe-c")},
+            "skipped": {} if chirps is not None else {"chirp": f"There is no {CHIRP}."},
+            "verdict": discovery.verdict,
+            "effects": found["effects"],
+            "held_out": list(holdout),
+        }
         folder.finish(found, discovery.source())
-    nominal = nominal_parameters(furuta, train.inputs(SEGMENT_LENGTH))
-    story = Story(
-        discovery,
-        _refitted(furuta, investigation.given, train),
-        _refitted(discovery.model, discovery.search.final, train),
-    )
-    fits = {"refitted": story.refitted, "revised": story.revised}
-    result = {
-        "rows": {
-            "nominal": _row(furuta, nominal, test, chirps),
-            **{name: _row(h.model, h.parameters, test, chirps) for name, h in fits.items()},
-        },
-        "closest_fit": {name: h.parameters for name, h in fits.items()},
-        # The paper's fit of the same equations is its NPDR.
-        "paper": {"nominal": _published("nominal"), "refitted": _published("snpe-c")},
-        "skipped": {} if chirps is not None else {"chirp": f"There is no {CHIRP}."},
-        "verdict": discovery.verdict,
-        "effects": found["effects"],
-        "held_out": list(holdout),
-    }
-    write_json(file, result)
+        write_json(file, result)
     return story, result
 
 

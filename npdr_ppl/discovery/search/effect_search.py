@@ -99,8 +99,9 @@ class Searcher:
 
     Attributes:
         rollouts: The recording.
-        options: Options of the search.
+        options: Settings of the search.
         binding: How the recording is cut into segments.
+        seed: Seed of all random numbers.
         are_steps_coarse: Whether its own integration steps are too coarse.
         are_priors_widened: Whether some of its priors were too narrow and were widened.
     """
