@@ -37,7 +37,6 @@ def executor(name, package=None):
         executor("serial"),
         executor("loky"),
         executor("dask", "distributed"),
-        executor("ray", "ray"),
     ],
 )
 def test_a_stopped_fit_leaves_no_process(tmp_path, name):

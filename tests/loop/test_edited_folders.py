@@ -9,7 +9,7 @@ from fuzz_files import damage, edit_json
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.loop.npdr_loop import train
 from npdr_ppl.models.pendulum import pendulum
-from tests.helpers.small_loop import HandmadePendulum, small_options, small_task
+from tests.helpers.small_loop import SMALL_DATA, HandmadePendulum, small_options, small_task
 
 EDITS = 6
 """Edits of each file."""
@@ -20,7 +20,8 @@ def run(folder):
         pendulum,
         HandmadePendulum(),
         small_task(),
-        small_options(iterations=1),
+        options=SMALL_DATA,
+        loop=small_options(iterations=1),
         out=folder,
         progress=False,
     )
