@@ -120,7 +120,7 @@ class PolicySearch(ABC, Generic[S]):
 
     @abstractmethod
     def begin(self, space: SearchSpace, start: Tensor) -> dict[str, Tensor]:
-        """Returns the tensors that the search's own states add, before any return is told.
+        """Returns the tensors that the search adds to a state, before it has any returns.
 
         Args:
             space: Names and bounds of the parameters.
