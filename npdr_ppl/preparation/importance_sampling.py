@@ -73,6 +73,34 @@ class WeightedDraws:
         return mean, (self.weights[:, None] * away).mT @ away
 
 
+@dataclass(frozen=True)
+class _Proposal:
+    """One component of the mixture of all proposals.
+
+    Attributes:
+        density: The proposal.
+        num_draws: Number of draws it contributes.
+        space: Coordinates it is a density of; None for reference coordinates.
+    """
+
+    density: Density
+    num_draws: int
+    space: RidgeCoordinates | None = None
+
+    def log_prob(self, z: Tensor, w: Tensor) -> Tensor:
+        """Returns log(number of draws × density) over reference coordinates, ``(n,)``.
+
+        Args:
+            z: Reference coordinates of the points, ``(n, d)``.
+            w: The same points in coordinates in which ridges are straight, ``(n, d)``.
+        """
+        if self.space is None:
+            log_density = self.density.log_prob(z).double().cpu()
+        else:
+            log_density = self.density.log_prob(w).double() + self.space.log_jacobian(z)
+        return (log_density + math.log(self.num_draws)).nan_to_num(-math.inf)
+
+
 def heavy_tailed(mean: Tensor, covariance: Tensor) -> GaussianMixture:
     """Returns a density around a point with heavier tails than a normal density.
 
@@ -109,20 +137,17 @@ def sample_posterior(
         IMPORTANCE_SAMPLING.enough_effective
         + IMPORTANCE_SAMPLING.enough_per_weak_coordinate * space.num_weak
     )
-    own = [heavy_tailed(*space.moments())]
-    shares: list[int] = []
-    learnt = list(proposals)
-    z, w, target = (torch.empty(0) for _ in range(3))
+    settings = IMPORTANCE_SAMPLING
+    own = [_Proposal(heavy_tailed(*space.moments()), settings.draws_per_iteration, space)]
+    given = [_Proposal(density, settings.draws_of_given) for density in proposals]
+    z, w, target, log_mixture = (torch.empty(0, dtype=torch.float64) for _ in range(4))
     result: WeightedDraws | None = None
-    for iteration in range(IMPORTANCE_SAMPLING.most_iterations):
+    for iteration in range(settings.most_iterations):
         with seeded(seed, "importance", iteration):
-            new_w = own[-1].sample(IMPORTANCE_SAMPLING.draws_per_iteration).double()
+            new_w = own[-1].density.sample(settings.draws_per_iteration).double()
             new_z, inside = space.to_reference(new_w)
             if iteration == 0:
-                drawn = [
-                    density.sample(IMPORTANCE_SAMPLING.draws_of_given).double().cpu()
-                    for density in learnt
-                ]
+                drawn = [one.density.sample(one.num_draws).double().cpu() for one in given]
                 new_z = torch.cat((new_z, *drawn))
                 new_w = torch.cat((new_w, *(space.from_reference(part) for part in drawn)))
                 inside = torch.cat((inside, inside.new_ones(len(new_z) - len(inside))))
@@ -130,28 +155,20 @@ def sample_posterior(
         at = new_z[inside]
         if len(at):
             new[inside] = likelihood.log_prob(at) + prior.log_prob(at)
-        first = iteration == 0
-        z = new_z if first else torch.cat((z, new_z))
-        w = new_w if first else torch.cat((w, new_w))
-        target = new if first else torch.cat((target, new))
-        shares.append(IMPORTANCE_SAMPLING.draws_per_iteration)
-        jacobian = space.log_jacobian(z)
-        rows = [
-            density.log_prob(w).double() + jacobian + math.log(share)
-            for density, share in zip(own, shares, strict=True)
-        ]
-        rows += [
-            d.log_prob(z).double().cpu() + math.log(IMPORTANCE_SAMPLING.draws_of_given)
-            for d in learnt
-        ]
-        log_mixture = torch.stack(rows).nan_to_num(-math.inf).logsumexp(0)
+        if iteration > 0:  # earlier draws have met the earlier proposals already
+            log_mixture = torch.logaddexp(log_mixture, own[-1].log_prob(z, w))
+        new_mixture = torch.stack([one.log_prob(new_z, new_w) for one in own + given])
+        log_mixture = torch.cat((log_mixture, new_mixture.logsumexp(0)))
+        z, w = (new_z, new_w) if iteration == 0 else (torch.cat((z, new_z)), torch.cat((w, new_w)))
+        target = torch.cat((target, new))
         log_weights = (target - log_mixture).nan_to_num(-math.inf, -math.inf, -math.inf)
         smoothed, k_hat = smoothed_weights(log_weights)
         size = effective_size(smoothed)
         result = WeightedDraws(z, w, space, smoothed, k_hat, size, iteration + 1)
-        if result.k_hat <= IMPORTANCE_SAMPLING.reliable_k and result.effective >= enough:
+        if result.k_hat <= settings.reliable_k and result.effective >= enough:
             break
-        own.append(_adapted(w, log_weights, seed, iteration))
+        adapted = _adapted(w, log_weights, seed, iteration)
+        own.append(_Proposal(adapted, settings.draws_per_iteration, space))
     assert result is not None
     return result
 

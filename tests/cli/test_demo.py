@@ -39,6 +39,7 @@ def test_the_story_is_printed_and_written(told):
         assert (out / name).stat().st_size > 500
 
 
+@pytest.mark.slow
 def test_the_filter_of_the_rates_is_found_on_the_rig(told):
     out, _ = told
     result = json.loads((out / "demo.json").read_text())
@@ -65,6 +66,7 @@ def test_told_again_it_is_the_same_story(told):
     assert json.loads(json.dumps(again.training.to_dict())) == trained
 
 
+@pytest.mark.slow
 def test_the_report_tells_it(told):
     out, _ = told
     titles = [section.title for section in read_run(out).sections]

@@ -95,6 +95,7 @@ def test_it_names_what_is_missing(finished):
     assert max(map(len, text.splitlines())) <= 100
 
 
+@pytest.mark.slow
 def test_it_draws_its_figures(finished):
     folder, _ = finished
     assert {file.stem for file in folder.glob("*.png")} == FIGURES
@@ -117,6 +118,7 @@ def test_other_commands_accept_the_revised_model(finished, recording, tmp_path):
     assert set(fit["parameters"]) == {"mass", "length", f"{MISSING}.magnitude"}
 
 
+@pytest.mark.slow
 def test_a_finished_discovery_is_not_repeated(finished, words, monkeypatch):
     def never(*_):
         raise AssertionError("it was searched again")

@@ -52,6 +52,7 @@ def test_the_proof_is_of_the_held_out_rollouts(proofs):
     assert noisy["coverage"].after == pytest.approx(clean["coverage"].after / 2, abs=0.1)
 
 
+@pytest.mark.slow
 def test_held_out_rollouts_have_no_say_in_what_is_found(proofs):
     clean, noisy = proofs
     assert [f.to_dict() for f in clean.effects] == [f.to_dict() for f in noisy.effects]

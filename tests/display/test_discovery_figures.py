@@ -57,6 +57,7 @@ def test_the_latent_force_is_the_friction_and_is_gone_afterwards(found):
     figure.draw_without_rendering()
 
 
+@pytest.mark.slow
 def test_the_residual_map_frames_the_worst_windows(found):
     start, final = found.search.rounds[0].hypothesis, found.search.final
     figure = plot_residual_map(start, final, found.where)
@@ -87,6 +88,7 @@ def test_the_gap_has_its_noise_floor():
     figure.draw_without_rendering()
 
 
+@pytest.mark.slow
 def test_the_ranking_has_a_panel_for_every_effect(found):
     figure = plot_ranking(found.ranking, found)
     titles = [axis.get_title() for axis in figure.axes if axis.get_visible()]
@@ -94,6 +96,7 @@ def test_the_ranking_has_a_panel_for_every_effect(found):
     assert len(plot_ranking(found.ranking).axes) == 1
 
 
+@pytest.mark.slow
 def test_a_discovery_shows_itself_in_a_notebook(found):
     axes = found.plot()
     assert [axis.get_title().split(":")[0] for axis in axes] == [

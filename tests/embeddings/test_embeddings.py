@@ -183,6 +183,7 @@ def test_networks_tell_segments_apart(word):
     assert not torch.allclose(network(x), network(x[:, [1, 0, 2]]), atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("word", ["gru", "conv", "linear"])
 def test_networks_learn(word):
     """A frequency is read off noisy sines: far below the error of guessing the mean."""

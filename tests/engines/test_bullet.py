@@ -81,6 +81,7 @@ def test_a_urdf_pendulum_is_the_zoo_s_pendulum(urdf):
         torch.testing.assert_close(found, expected, rtol=0, atol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_the_integration_error_is_of_first_order(urdf):
     parameters = tensors(mass=1.2, damping=0.1)
     exact = Pendulum(integrator="rk4", substeps=20).simulate(parameters, inputs())

@@ -16,6 +16,7 @@ LENGTHS = torch.tensor([[0.11], [0.14], [0.16]], dtype=torch.float64)
 BELIEVED = {"pole_length": 0.125, "arm_mass": 0.1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "simulator",
     [Furuta(compile="never"), Furuta(compile="always"), furuta_in_mujoco(substeps=2)],

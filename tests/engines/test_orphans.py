@@ -64,6 +64,7 @@ def is_running(process):
         return False
 
 
+@pytest.mark.slow
 @on_linux
 @pytest.mark.parametrize("ending", ["hangs", "crashes", "raises", "returns"])
 def test_programs_that_a_simulation_started_end_with_it(tmp_path, ending):

@@ -130,6 +130,7 @@ def test_recovers_a_linear_gaussian_posterior_in_every_round(method):
         assert_exact_moments(draws(method, problem, state), **exactness)
 
 
+@pytest.mark.slow
 def test_density_is_normalised_and_fits_its_samples(method):
     problem = make_problem()
     state, _ = run_round(method, problem, method.init(problem), 0, n=500)
@@ -249,6 +250,7 @@ def test_has_no_posterior_before_the_first_round(method):
         method.densities(problem, method.init(problem))
 
 
+@pytest.mark.slow
 def test_stays_finite_far_from_the_simulations(brief):
     problem = make_problem(observation=torch.tensor([1e6, -1e9, 0.0]))
     state, _ = run_round(brief, problem, brief.init(problem), 0, n=200)

@@ -115,6 +115,7 @@ def test_learns_a_bimodal_posterior_in_rounds():
     assert ((z[:, 0].abs() - 1).abs() < 0.4).float().mean() > 0.8
 
 
+@pytest.mark.slow
 def test_embedding_network_is_trained_with_the_velocity():
     time = torch.linspace(0, 1, 20)[:, None]
     problem = make_problem(

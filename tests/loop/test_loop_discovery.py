@@ -63,6 +63,7 @@ def test_friction_that_the_model_lacks_is_found_before_anything_is_inferred(fini
     assert "hinge.coulomb_friction.magnitude" in record["parameters"]
 
 
+@pytest.mark.slow
 def test_what_was_found_is_in_the_run_as_a_model_and_as_json(finished):
     folder = finished[0]
     for index in range(2):
@@ -79,6 +80,7 @@ def test_what_was_found_is_in_the_run_as_a_model_and_as_json(finished):
         assert effect_names(names["revised_model"]) == ["hinge.coulomb_friction"]
 
 
+@pytest.mark.slow
 def test_a_resumed_run_reads_what_was_found(finished, monkeypatch):
     folder, options, result = finished
 
@@ -125,6 +127,7 @@ def test_a_rollout_too_short_to_tell_anything_by_leaves_the_model(tmp_path):
     assert result.iterations[0]["effects"] == []
 
 
+@pytest.mark.slow
 def test_a_rollout_that_ended_early_is_followed_by_an_excitation(tmp_path):
     class Stops(DryPendulum):
         def run(self, controller, num_steps, *, episode=0, seed):

@@ -54,6 +54,7 @@ def _number(counts, name):
     return sum(count for (called, _), count in counts.items() if called == name)
 
 
+@pytest.mark.slow
 def test_a_fit_runs_the_program_once_for_each_use_and_smooths_no_place_twice(case, calls):
     quick = backend("snpe-c", transforms=1, hidden=(8,), epochs=1, members=1)
     fit(pendulum, case.fit[:2], backend=quick, num_simulations=20, progress=False)
@@ -100,6 +101,7 @@ def test_a_fit_starts_no_processes_to_look_at_a_recording_once(case, monkeypatch
     assert alarm.fired
 
 
+@pytest.mark.slow
 def test_refits_of_a_model_do_not_run_the_program_again(case, calls):
     effects = QuadraticDrag("hinge"), CoulombFriction("hinge"), Bias("hinge")
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=effects))

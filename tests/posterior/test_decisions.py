@@ -139,6 +139,7 @@ def test_checks_travel_with_the_exported_posterior(found, tmp_path):
     assert again.to_dict() == npdr.diagnose(data).to_dict()
 
 
+@pytest.mark.slow
 def test_a_corrected_posterior_is_kept_on_disk(found, tmp_path):
     assert found.correction is not None
     found.save(tmp_path)

@@ -82,6 +82,7 @@ def test_held_out_rollouts_have_no_say_in_the_fit(recording, table, tmp_path):
     assert again.rows[METHOD].figures.rmse != comparison.rows[METHOD].figures.rmse
 
 
+@pytest.mark.slow
 def test_nominal_parameters_are_judged_on_every_rollout(recording, table):
     _, result, _ = table
     options = DataOptions("all/50", SEGMENT_LENGTH, "recorded", "float64")
@@ -93,6 +94,7 @@ def test_nominal_parameters_are_judged_on_every_rollout(recording, table):
         assert row["std"] == pytest.approx(float(every[metric].std(correction=0)))
 
 
+@pytest.mark.slow
 def test_what_is_written_is_what_is_returned(table):
     _, result, out = table
     written = json.loads((out / "table2.json").read_text())

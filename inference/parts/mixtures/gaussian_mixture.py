@@ -80,11 +80,13 @@ class GaussianMixture(Density):
 
     def log_prob(self, z: Tensor) -> Tensor:
         """Returns the log density at ``(n, d)``, shape ``(n,)``; differentiable in z."""
-        away = z.to(self.means)[:, None] - self.means
-        white = torch.einsum("kij,nkj->nki", self.precision_factors, away)
+        d = self.means.shape[1]
+        away = z.to(self.means) - self.means[:, None]
+        white = away @ self.precision_factors.mT
         log_det = self.precision_factors.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        log_normal = log_det - 0.5 * (white**2 + math.log(2 * math.pi)).sum(-1)
-        return (self.log_weights + log_normal).logsumexp(-1).to(z)
+        log_scale = self.log_weights + log_det - 0.5 * d * math.log(2 * math.pi)
+        log_normal = log_scale[:, None] - 0.5 * white.square().sum(-1)
+        return log_normal.logsumexp(0).to(z)
 
 
 def triangular_factors(roots: Tensor) -> Tensor:
