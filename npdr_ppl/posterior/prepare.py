@@ -159,8 +159,10 @@ class Preparation:
         """Returns JSON-serialisable values."""
         length = self.options.steps(self.rollouts)
         embedding = self.options.embedding
+        used, every = self.options.num_segments(self.rollouts)
         return {
             "segment_length": length,
+            "segments": {"used": used, "recorded": every},
             "segment_seconds": None if length is None else length * self.rollouts.time_step,
             "initial_states": self.options.initial_state,
             "embedding": embedding if isinstance(embedding, str) else repr(embedding),
@@ -178,6 +180,9 @@ class Preparation:
             if length is None
             else f"segments of {length} steps ({length * self.rollouts.time_step:.3g} s)"
         )
+        used, every = self.options.num_segments(self.rollouts)
+        if used < every:
+            cut = f"{used} of {every} {cut}, spread evenly over the recording"
         starts = {
             "uncertain": "estimated, uncertain initial states",
             "estimated": "estimated initial states taken as true",

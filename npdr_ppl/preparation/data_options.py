@@ -37,6 +37,11 @@ FEWEST_SEGMENTS = 8
 """Least number of segments of a recording that is long enough. With fewer, a test cannot
 distinguish an effect from chance."""
 
+MOST_READINGS = 300_000
+"""Greatest number of measurements in the segments of a fit, unless it has ``FEWEST_SEGMENTS``
+segments only: 43 s of 7 channels at 1 kHz. The derivatives of all measurements are in memory
+together; with so many, a fit of ``benchmarks/memory.py`` stays below 2 GB."""
+
 PLAIN_FEATURES = "bayessim"
 """Features if there is no closest fit, at which the score features are computed."""
 
@@ -90,9 +95,29 @@ class DataOptions:
         return {"float64": torch.float64, "float32": torch.float32}[self.precision]
 
     def inputs(self, rollouts: Rollouts) -> Inputs:
-        """Returns the inputs of rollouts, prepared like this."""
-        length = self.steps(rollouts)
-        return rollouts.inputs(length, self.initial_state, dtype=self.dtype)
+        """Returns the inputs of the segments that are used; see :meth:`num_segments`."""
+        inputs = self.every_segment(rollouts)
+        used, every = self.num_segments(rollouts)
+        if used == every:
+            return inputs
+        return inputs.segments(torch.linspace(0, every - 1, used).round().long())
+
+    def every_segment(self, rollouts: Rollouts) -> Inputs:
+        """Returns the inputs of all segments, of which a recording can be put together again."""
+        return rollouts.inputs(self.steps(rollouts), self.initial_state, dtype=self.dtype)
+
+    def num_segments(self, rollouts: Rollouts) -> tuple[int, int]:
+        """Returns how many segments of rollouts are used, and how many there are.
+
+        Of a very long recording, segments that are spread evenly over it are used, if initial
+        states are uncertain; see ``MOST_READINGS``. Otherwise all are used.
+        """
+        length = self.steps(rollouts) or max(rollouts.lengths)
+        every = sum(-(-steps // length) for steps in rollouts.lengths)
+        if self.initial_state != "uncertain":
+            return every, every
+        most = MOST_READINGS // (length * len(rollouts.channel_names))
+        return min(every, max(FEWEST_SEGMENTS, most)), every
 
     def steps(self, rollouts: Rollouts) -> int | None:
         """Returns the length of a segment of rollouts; ``None`` for whole rollouts."""

@@ -5,22 +5,26 @@ all proposals so far (deterministic mixture weights; Cornuet, Marin, Mira & Robe
 weights are too unequal, the next proposal is a kernel density estimate of the weighted draws,
 which follows curved ridges. The tail of the weights, fitted by Pareto smoothing, shows whether
 they are reliable (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
+
+Along ridges, an ensemble of the draws then moves by Markov chain Monte Carlo, because importance
+sampling gives too little weight to their ends.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
+from npdr_ppl.inference.parts.samplers.ensemble import ensemble_draws
 from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, systematic
 from npdr_ppl.preparation.ridges import RidgeCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING
-from npdr_ppl.randomness import seeded
+from npdr_ppl.randomness import derived_seed, seeded
 
 __all__ = [
     "WeightedDraws",
@@ -41,7 +45,7 @@ class WeightedDraws:
         space: These coordinates.
         log_weights: Logarithms of their weights, whose sum is one, ``(n,)``.
         k_hat: Shape of the tail of the weights; reliable up to ``IMPORTANCE_SAMPLING.reliable_k``.
-        effective: Effective sample size.
+        effective: Effective sample size of the importance sampling.
         iterations: Iterations that were needed.
     """
 
@@ -170,7 +174,38 @@ def sample_posterior(
         adapted = _adapted(w, log_weights, seed, iteration)
         own.append(_Proposal(adapted, settings.draws_per_iteration, space))
     assert result is not None
+    if space.num_weak and result.is_reliable:
+        return _moved(result, likelihood, seed)
     return result
+
+
+def _moved(draws: WeightedDraws, likelihood: SegmentLikelihood, seed: int) -> WeightedDraws:
+    """Returns draws of equal weight, after moves that lead them to the ends of a ridge.
+
+    Proposals reach these ends last, and the smoothed weights of the few draws there are too small.
+    """
+    settings, space, prior = IMPORTANCE_SAMPLING, draws.space, likelihood.segments.prior
+
+    def log_density(w: Tensor) -> Tensor:
+        z, inside = space.to_reference(w)
+        result = torch.full((len(w),), -torch.inf, dtype=torch.float64)
+        if bool(inside.any()):
+            at = z[inside]
+            result[inside] = likelihood.log_prob(at) + prior.log_prob(at) - space.log_jacobian(at)
+        return result.nan_to_num(-math.inf)
+
+    with seeded(seed, "walkers"):
+        first = draws.w[systematic(draws.log_weights, settings.num_walkers)]
+    generator = torch.Generator().manual_seed(derived_seed(seed, "ensemble"))
+    w = ensemble_draws(
+        log_density,
+        first,
+        sweeps=settings.sweeps,
+        interval=settings.sweeps_between_draws,
+        generator=generator,
+    )
+    log_weights = torch.full((len(w),), -math.log(len(w)), dtype=torch.float64)
+    return replace(draws, z=space.to_reference(w)[0], w=w, log_weights=log_weights)
 
 
 def smoothed_weights(log_weights: Tensor) -> tuple[Tensor, float]:

@@ -115,6 +115,8 @@ class SegmentModel:
         options: Segments, initial states and precision; where initial states are ``"uncertain"``
             they can be shifted, otherwise m is zero.
         starts: Initial states of the segments, if known better than by the smoother.
+        is_complete: Whether all segments are simulated, also those of a very long recording, to
+            compare the whole recording; see :meth:`DataOptions.num_segments`.
 
     Attributes:
         model: The model.
@@ -138,9 +140,11 @@ class SegmentModel:
         rollouts: Rollouts,
         options: DataOptions,
         starts: InitialStates | None = None,
+        *,
+        is_complete: bool = False,
     ) -> None:
         self.rollouts = rollouts
-        self._cut = options.inputs(rollouts)
+        self._cut = (options.every_segment if is_complete else options.inputs)(rollouts)
         self._trace(model)
         self._start_from(starts)
 

@@ -96,7 +96,7 @@ class _Scores:
     def of(
         cls, hypothesis: Hypothesis, drawn: Tensor, rollouts: Rollouts, options: DataOptions
     ) -> "_Scores":
-        segments = SegmentModel(hypothesis.model, rollouts, options)
+        segments = SegmentModel(hypothesis.model, rollouts, options, is_complete=True)
         z = hypothesis.fit.z[None]
         centre = segments.simulate(z, _no_offsets(segments, 1))[0].double()
         draws = _predictive(hypothesis, drawn, segments)
@@ -115,7 +115,7 @@ def _floor(
     Its initial states have errors as large as along the real recording, and its measurements have
     noise. It is compared with the prediction from the smoother's estimate.
     """
-    segments = SegmentModel(hypothesis.model, rollouts, options)
+    segments = SegmentModel(hypothesis.model, rollouts, options, is_complete=True)
     z, unmoved = hypothesis.fit.z[None], _no_offsets(segments, 1)
     centre = segments.simulate(z, unmoved)[0].double()
     offsets = torch.randn(unmoved.shape).double()
