@@ -10,6 +10,7 @@ process is left ``--limit`` seconds after the signal, or if SIGTERM does not end
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -39,7 +40,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         words = [script, folder, options.executors, each, options.seed, options.limit]
         with subprocess.Popen(
-            [sys.executable, *map(str, words)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+            [sys.executable, *map(str, words)],
+            cwd=ROOT,
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            text=True,
         ) as run:
             assert run.stdout is not None
             for line in run.stdout:
