@@ -55,6 +55,8 @@ def main() -> int:
                 cells += [row["exit_code"], row["workers_seconds"], row["seconds"]]
                 cells.append(len(row["left"]))
                 print(f"| {' | '.join(map(str, cells))} |", *row["left"], flush=True)
+                if not says:
+                    print(row["errors"], flush=True)
     return int(is_wrong or run.returncode != 0)
 
 
