@@ -1,7 +1,9 @@
 """Options that the commands share (--quiet, --json, --verbose); Ctrl-C and the like."""
 
 import logging
+import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,30 +31,55 @@ INTERRUPTIONS = (INTERRUPTED, 143, 129)
 """Exit codes after Ctrl-C, SIGTERM and SIGHUP."""
 
 
+AGAIN_SECONDS = 0.05
+"""Seconds until a dropped signal is sent again: a finaliser has ended by then."""
+
+
 class Stopped(BaseException):
     """SIGTERM, or SIGHUP from a closed terminal, came; it is handled like Ctrl-C.
 
     Attributes:
+        number: Number of the signal.
         exit_code: Exit code, the same as in shells: 128 plus the signal's number.
     """
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
+        self.number = number
         self.exit_code = 128 + number
 
 
 @contextmanager
 def stop_on_signals() -> Iterator[None]:
-    """Lets SIGTERM and SIGHUP raise :class:`Stopped` inside the block, unless they are ignored."""
+    """Lets SIGTERM and SIGHUP raise :class:`Stopped` inside the block, unless they are ignored.
+
+    Python drops exceptions in finalisers and around a fork. If it drops :class:`Stopped`, the
+    signal is sent once more, until it comes in a place where it stops the command.
+    """
     replaced = {}
+    before = sys.unraisablehook
+
+    def send_again(dropped: Any) -> None:
+        if isinstance(dropped.exc_value, Stopped):
+            number = dropped.exc_value.number
+            signal.signal(number, _stop)
+            # Later, because Python drops what is raised in here, too.
+            again = threading.Timer(AGAIN_SECONDS, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+        else:
+            before(dropped)
+
     if threading.current_thread() is threading.main_thread():  # others may not handle signals
         for name in ("SIGTERM", "SIGHUP"):
             number = getattr(signal, name, None)  # Windows has no SIGHUP
             if number is not None and signal.getsignal(number) is signal.SIG_DFL:
                 replaced[number] = signal.signal(number, _stop)
+    sys.unraisablehook = send_again
     try:
         yield
     finally:
+        sys.unraisablehook = before
         for number, handler in replaced.items():
             signal.signal(number, handler)
 

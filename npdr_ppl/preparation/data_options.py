@@ -97,14 +97,17 @@ class DataOptions:
     def inputs(self, rollouts: Rollouts) -> Inputs:
         """Returns the inputs of the segments that are used; see :meth:`num_segments`."""
         inputs = self.every_segment(rollouts)
-        used, every = self.num_segments(rollouts)
-        if used == every:
-            return inputs
-        return inputs.segments(torch.linspace(0, every - 1, used).round().long())
+        index = self.used_segments(rollouts)
+        return inputs if len(index) == inputs.num_segments else inputs.segments(index)
 
     def every_segment(self, rollouts: Rollouts) -> Inputs:
         """Returns the inputs of all segments, of which a recording can be put together again."""
         return rollouts.inputs(self.steps(rollouts), self.initial_state, dtype=self.dtype)
+
+    def used_segments(self, rollouts: Rollouts) -> torch.Tensor:
+        """Returns the indices of the segments that are used, among all of them."""
+        used, every = self.num_segments(rollouts)
+        return torch.linspace(0, every - 1, used, dtype=torch.float64).round().long()
 
     def num_segments(self, rollouts: Rollouts) -> tuple[int, int]:
         """Returns how many segments of rollouts are used, and how many there are.

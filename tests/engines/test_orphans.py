@@ -100,6 +100,26 @@ def test_a_signal_stops_a_command_like_ctrl_c(capsys, name, code):
     assert capsys.readouterr().err == "npdr: interrupted; do it again.\n"
 
 
+class StopsInFinaliser:
+    """Python drops what a finaliser raises."""
+
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)
+
+
+def test_a_signal_that_python_drops_comes_again(capsys):
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        with stop_on_signals(), pytest.raises(Stopped):
+            finalised = StopsInFinaliser()
+            del finalised
+            time.sleep(10.0)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err == ""
+
+
 def test_ignored_signals_stay_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:

@@ -99,11 +99,12 @@ class _Scores:
         segments = SegmentModel(hypothesis.model, rollouts, options, is_complete=True)
         z = hypothesis.fit.z[None]
         centre = segments.simulate(z, _no_offsets(segments, 1))[0].double()
-        draws = _predictive(hypothesis, drawn, segments)
+        part = segments.along(options.used_segments(rollouts))
+        draws = _predictive(hypothesis, drawn, part)
         return cls(
             *_distances(segments, centre, rollouts),
-            _crps(segments, draws, segments.observed.double()),
-            _coverage(segments, draws),
+            _crps(part, draws, part.observed.double()),
+            _coverage(part, draws),
         )
 
 
@@ -129,11 +130,13 @@ def _floor(
     channels = segments.channel_names
     predicted = stitch(centre, segments.inputs, channels)
     recorded = stitch(made, segments.inputs, channels)
-    draws = _predictive(hypothesis, drawn, segments)
+    used = options.used_segments(rollouts)
+    part = segments.along(used)
+    draws = _predictive(hypothesis, drawn, part)
     return {
         "rmse": float(metrics.rmse(predicted, recorded).mean()),
         "dtw": float(metrics.dtw(predicted, recorded).mean()),
-        "crps": _crps(segments, draws, made),
+        "crps": _crps(part, draws, made[used]),
     }
 
 
