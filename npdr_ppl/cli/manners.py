@@ -117,7 +117,22 @@ def resumable(how: str) -> Iterator[None]:
     """
     try:
         yield
-    except (KeyboardInterrupt, Stopped) as error:
+    except BaseException as error:
+        cause = _interruption(error)
+        if cause is None:
+            raise
         typer.echo(f"npdr: interrupted; {how}", err=True)
-        code = error.exit_code if isinstance(error, Stopped) else INTERRUPTED
+        code = cause.exit_code if isinstance(cause, Stopped) else INTERRUPTED
         raise typer.Exit(code) from None
+
+
+def _interruption(error: BaseException | None) -> KeyboardInterrupt | Stopped | None:
+    """Returns the interruption that an error is or was caused by; ``None`` if there is none.
+
+    Compiled code, such as Ray's, may turn an interruption into a ``SystemError``.
+    """
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt | Stopped):
+            return error
+        error = error.__cause__ or error.__context__
+    return None

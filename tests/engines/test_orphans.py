@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import typer
 
 from npdr_ppl.cli.main import main, run
 from npdr_ppl.cli.manners import Stopped, resumable, stop_on_signals
@@ -118,6 +119,18 @@ def test_a_signal_that_python_drops_comes_again(capsys):
     finally:
         signal.signal(signal.SIGTERM, before)
     assert capsys.readouterr().err == ""
+
+
+def test_an_interruption_that_compiled_code_disguised_is_one(capsys):
+    with pytest.raises(typer.Exit) as stop, resumable("do it again."):
+        try:
+            raise Stopped(signal.SIGTERM)
+        except Stopped as error:
+            raise SystemError("returned a result with an exception set") from error
+    assert stop.value.exit_code == 143
+    assert capsys.readouterr().err == "npdr: interrupted; do it again.\n"
+    with pytest.raises(SystemError, match="another"), resumable("do it again."):
+        raise SystemError("another")
 
 
 def test_ignored_signals_stay_ignored():
