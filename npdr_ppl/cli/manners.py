@@ -32,7 +32,7 @@ INTERRUPTIONS = (INTERRUPTED, 143, 129)
 
 
 AGAIN_SECONDS = 0.05
-"""Seconds until a dropped signal is sent again: a finaliser has ended by then."""
+"""Seconds until a dropped signal is sent again. The finaliser should have returned by then."""
 
 
 class Stopped(BaseException):
@@ -58,6 +58,7 @@ def stop_on_signals() -> Iterator[None]:
     """
     replaced = {}
     before = sys.unraisablehook
+    timers: list[threading.Timer] = []
 
     def send_again(dropped: Any) -> None:
         if isinstance(dropped.exc_value, Stopped):
@@ -67,6 +68,7 @@ def stop_on_signals() -> Iterator[None]:
             again = threading.Timer(AGAIN_SECONDS, os.kill, (os.getpid(), number))
             again.daemon = True
             again.start()
+            timers.append(again)
         else:
             before(dropped)
 
@@ -75,11 +77,13 @@ def stop_on_signals() -> Iterator[None]:
             number = getattr(signal, name, None)  # Windows has no SIGHUP
             if number is not None and signal.getsignal(number) is signal.SIG_DFL:
                 replaced[number] = signal.signal(number, _stop)
-    sys.unraisablehook = send_again
+        sys.unraisablehook = send_again
     try:
         yield
     finally:
         sys.unraisablehook = before
+        for timer in timers:
+            timer.cancel()
         for number, handler in replaced.items():
             signal.signal(number, handler)
 
@@ -127,12 +131,11 @@ def resumable(how: str) -> Iterator[None]:
 
 
 def _interruption(error: BaseException | None) -> KeyboardInterrupt | Stopped | None:
-    """Returns the interruption that an error is or was caused by; ``None`` if there is none.
+    """Returns the interruption that an error is, or that compiled code disguised; else ``None``.
 
-    Compiled code, such as Ray's, may turn an interruption into a ``SystemError``.
+    Compiled code, such as Ray's, may turn an interruption into a ``SystemError``. Other errors
+    that follow an interruption, such as a device that cannot be switched off, remain errors.
     """
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt | Stopped):
-            return error
-        error = error.__cause__ or error.__context__
-    return None
+    while isinstance(error, SystemError):
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    return error if isinstance(error, KeyboardInterrupt | Stopped) else None

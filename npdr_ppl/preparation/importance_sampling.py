@@ -192,7 +192,7 @@ def _moved(draws: WeightedDraws, likelihood: SegmentLikelihood, seed: int) -> We
         if bool(inside.any()):
             at = z[inside]
             result[inside] = likelihood.log_prob(at) + prior.log_prob(at) - space.log_jacobian(at)
-        return result.nan_to_num(-math.inf)
+        return result.nan_to_num(-math.inf, -math.inf, -math.inf)
 
     with seeded(seed, "walkers"):
         first = draws.w[systematic(draws.log_weights, settings.num_walkers)]

@@ -133,6 +133,14 @@ def test_an_interruption_that_compiled_code_disguised_is_one(capsys):
         raise SystemError("another")
 
 
+def test_an_error_that_follows_an_interruption_is_not_hidden_by_it():
+    with pytest.raises(OSError, match="cannot be switched off"), resumable("do it again."):
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise OSError("The device cannot be switched off.")
+
+
 def test_ignored_signals_stay_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:

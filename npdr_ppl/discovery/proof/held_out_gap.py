@@ -120,7 +120,9 @@ def _floor(
     z, unmoved = hypothesis.fit.z[None], _no_offsets(segments, 1)
     centre = segments.simulate(z, unmoved)[0].double()
     offsets = torch.randn(unmoved.shape).double()
-    now = segments.linearise(z[0], unmoved[0], hypothesis.fit.scale, is_rough=True)
+    used = options.used_segments(rollouts)
+    part = segments.along(used)
+    now = part.linearise(z[0], unmoved[0, used], hypothesis.fit.scale, is_rough=True)
     if now.is_finite:
         offsets = offsets * error_factors(now.residual, now.by_starts)
     made = segments.simulate(z, offsets)[0].double()
@@ -130,8 +132,6 @@ def _floor(
     channels = segments.channel_names
     predicted = stitch(centre, segments.inputs, channels)
     recorded = stitch(made, segments.inputs, channels)
-    used = options.used_segments(rollouts)
-    part = segments.along(used)
     draws = _predictive(hypothesis, drawn, part)
     return {
         "rmse": float(metrics.rmse(predicted, recorded).mean()),
