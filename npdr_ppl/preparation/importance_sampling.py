@@ -174,7 +174,7 @@ def sample_posterior(
         adapted = _adapted(w, log_weights, seed, iteration)
         own.append(_Proposal(adapted, settings.draws_per_iteration, space))
     assert result is not None
-    if space.num_weak and result.is_reliable:
+    if space.num_weak and result.is_reliable and result.iterations > settings.easy_iterations:
         return _moved(result, likelihood, seed)
     return result
 
@@ -200,7 +200,8 @@ def _moved(draws: WeightedDraws, likelihood: SegmentLikelihood, seed: int) -> We
     w = ensemble_draws(
         log_density,
         first,
-        sweeps=settings.sweeps,
+        # At most twice as many simulations as the draws have cost.
+        sweeps=min(settings.sweeps, 2 * len(draws.z) // settings.num_walkers),
         interval=settings.sweeps_between_draws,
         generator=generator,
     )

@@ -269,6 +269,8 @@ class ImportanceSamplingSettings:
             deviation.
         enough_per_weak_coordinate: Increase of this size for each weak coordinate of a ridge.
             Proposals reach the ends of a ridge only after some adaptation.
+        easy_iterations: Iterations after which draws need no moves: proposals that are this good
+            have reached the ends of a ridge.
         num_walkers: Number of draws that then move along a ridge as an ensemble.
         sweeps: Number of their moves. On tuning recordings of a Furuta pendulum, which has three
             weak coordinates, standard deviations from 500 effective draws were 4 to 9 % smaller
@@ -289,6 +291,7 @@ class ImportanceSamplingSettings:
     reliable_k: float = 0.7
     enough_effective: float = 200.0
     enough_per_weak_coordinate: float = 100.0
+    easy_iterations: int = 2
     num_walkers: int = 256
     sweeps: int = 30
     sweeps_between_draws: int = 5
@@ -302,6 +305,7 @@ class ImportanceSamplingSettings:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, math.inf, "draws_per_iteration", "most_iterations", "num_kernels")
         check_range(self, 1, math.inf, "num_walkers", "sweeps", "sweeps_between_draws")
+        check_range(self, 0, math.inf, "easy_iterations")
         check_range(self, 1, math.inf, "enough_effective", "least_effective", "draws_of_given")
         check_range(self, 0.0, math.inf, "enough_per_weak_coordinate")
         check_range(self, 0.0, 1.0, "reliable_k")
