@@ -54,7 +54,7 @@ def stop_on_signals() -> Iterator[None]:
     """Lets SIGTERM and SIGHUP raise :class:`Stopped` inside the block, unless they are ignored.
 
     Python drops exceptions in finalisers and around a fork. If it drops :class:`Stopped`, the
-    signal is sent once more, until it comes in a place where it stops the command.
+    signal is sent again, until the exception reaches the command.
     """
     replaced = {}
     before = sys.unraisablehook

@@ -38,9 +38,9 @@ FEWEST_SEGMENTS = 8
 distinguish an effect from chance."""
 
 MOST_READINGS = 300_000
-"""Greatest number of measurements in the segments of a fit, unless it has ``FEWEST_SEGMENTS``
-segments only: 43 s of 7 channels at 1 kHz. The derivatives of all measurements are in memory
-together; with so many, a fit of ``benchmarks/memory.py`` stays below 2 GB."""
+"""Greatest number of measurements that a fit uses, in at least ``FEWEST_SEGMENTS`` segments; 43 s
+of 7 channels at 1 kHz. The derivatives of all measurements are in memory together; with so
+many, a fit of ``benchmarks/memory.py`` stays below 2 GB."""
 
 PLAIN_FEATURES = "bayessim"
 """Features if there is no closest fit, at which the score features are computed."""
@@ -101,7 +101,7 @@ class DataOptions:
         return inputs if len(index) == inputs.num_segments else inputs.segments(index)
 
     def every_segment(self, rollouts: Rollouts) -> Inputs:
-        """Returns the inputs of all segments, of which a recording can be put together again."""
+        """Returns the inputs of all segments, from which whole rollouts can be stitched."""
         return rollouts.inputs(self.steps(rollouts), self.initial_state, dtype=self.dtype)
 
     def used_segments(self, rollouts: Rollouts) -> torch.Tensor:

@@ -84,7 +84,7 @@ class _Proposal:
     Attributes:
         density: The proposal.
         num_draws: Number of draws it contributes.
-        space: Coordinates it is a density of; None for reference coordinates.
+        space: Coordinates in which it is a density; None for reference coordinates.
     """
 
     density: Density
@@ -137,11 +137,8 @@ def sample_posterior(
     """
     prior = likelihood.segments.prior
     space = RidgeCoordinates.of(likelihood, seed=seed)
-    enough = (
-        IMPORTANCE_SAMPLING.enough_effective
-        + IMPORTANCE_SAMPLING.enough_per_weak_coordinate * space.num_weak
-    )
     settings = IMPORTANCE_SAMPLING
+    enough = settings.enough_effective + settings.enough_per_weak_coordinate * space.num_weak
     own = [_Proposal(heavy_tailed(*space.moments()), settings.draws_per_iteration, space)]
     given = [_Proposal(density, settings.draws_of_given) for density in proposals]
     z, w, target, log_mixture = (torch.empty(0, dtype=torch.float64) for _ in range(4))
@@ -159,7 +156,7 @@ def sample_posterior(
         at = new_z[inside]
         if len(at):
             new[inside] = likelihood.log_prob(at) + prior.log_prob(at)
-        if iteration > 0:  # earlier draws have met the earlier proposals already
+        if iteration > 0:  # the mixture at earlier draws lacks the newest proposal only
             log_mixture = torch.logaddexp(log_mixture, own[-1].log_prob(z, w))
         new_mixture = torch.stack([one.log_prob(new_z, new_w) for one in own + given])
         log_mixture = torch.cat((log_mixture, new_mixture.logsumexp(0)))
@@ -182,7 +179,7 @@ def sample_posterior(
 def _moved(draws: WeightedDraws, likelihood: SegmentLikelihood, seed: int) -> WeightedDraws:
     """Returns draws of equal weight, after moves that lead them to the ends of a ridge.
 
-    Proposals reach these ends last, and the smoothed weights of the few draws there are too small.
+    Importance sampling places few draws there, and Pareto smoothing makes their weights too small.
     """
     settings, space, prior = IMPORTANCE_SAMPLING, draws.space, likelihood.segments.prior
 

@@ -1,9 +1,10 @@
-"""Moves of an ensemble of walkers that keep a density: each walker moves relative to others.
+"""Markov chain Monte Carlo with an ensemble: steps of a walker are made from other walkers.
 
 One sweep moves each half of the walkers in turn, with the other half fixed (Foreman-Mackey et al.
-2013). The moves alternate between the stretch of Goodman & Weare (2010) and the differences of two
-walkers (differential evolution; ter Braak 2006). Both adapt to the scales and correlations of the
-density and have no step size to tune, and a whole half moves in one batch.
+2013). Three moves take turns: a small difference of two walkers, one of random length
+(differential evolution; ter Braak 2006), and the stretch of Goodman & Weare (2010). They adapt to
+the scales and correlations of the density and have no step size to tune. A whole half moves in one
+batch.
 """
 
 import math
@@ -22,7 +23,7 @@ DIFFERENCES = (0.2, 1.2)
 densities (ter Braak 2006). Smaller ones suit bent densities."""
 
 SMALL_DIFFERENCE = 0.3
-"""Factor of the third move, a small part of a difference."""
+"""Factor of the small difference."""
 
 
 def ensemble_draws(
@@ -38,7 +39,7 @@ def ensemble_draws(
     Args:
         log_density: Maps points ``(n, d)`` to log densities up to a constant, ``(n,)``; −∞ outside
             the support.
-        walkers: First positions, ``(W, d)`` in float64, about distributed like the density.
+        walkers: First positions, ``(W, d)`` in float64, distributed roughly like the density.
         sweeps: Number of sweeps; each costs W evaluations.
         interval: Sweeps between positions that are returned, counted back from the last one.
         generator: Source of all randomness.
