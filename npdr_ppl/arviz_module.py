@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike, fspath
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -29,7 +29,7 @@ __all__ = [
     "Loo",
     "compare",
     "ess",
-    "ess_of_array",
+    "ess_of_mean",
     "from_dict",
     "from_netcdf",
     "group",
@@ -148,9 +148,9 @@ def ess(data: Data) -> xr.Dataset:
     return az.ess(group(data, "posterior"), method="bulk")
 
 
-def ess_of_array(chains: NDArray[np.floating[Any]], *, method: Literal["bulk", "mean"]) -> float:
-    """Returns the effective sample size of one quantity, ``(chains, draws)``."""
-    return float(az.ess(chains, method=method))
+def ess_of_mean(chains: NDArray[np.floating[Any]]) -> float:
+    """Returns the effective sample size for the mean of one quantity, ``(chains, draws)``."""
+    return float(az.ess(chains, method="mean"))
 
 
 def loo(data: Data, *, var_name: str | None = None) -> Loo:

@@ -76,20 +76,17 @@ LIMITS = ReadingLimits()
 """The limits that all readers use."""
 
 
-def check_expansion(
-    described_bytes: float, file_bytes: int, limits: ReadingLimits = LIMITS
-) -> None:
+def check_expansion(described_bytes: float, file_bytes: int) -> None:
     """Checks the memory that a file's content needs, before it is read.
 
     Args:
         described_bytes: Bytes that the content takes in memory, as the file states it.
         file_bytes: Size of the file in bytes.
-        limits: The limits.
 
     Raises:
         DataError: The content is too large, or much larger than the file.
     """
-    allowed = min(8 * limits.numbers, max(limits.free_bytes, limits.expansion * file_bytes))
+    allowed = min(8 * LIMITS.numbers, max(LIMITS.free_bytes, LIMITS.expansion * file_bytes))
     if described_bytes > allowed:
         raise DataError(
             f"its content takes {described_bytes / 1e6:.4g} MB in memory, more than the "

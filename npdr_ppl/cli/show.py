@@ -1,6 +1,5 @@
 """Result tables on the terminal."""
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean, stdev
@@ -10,6 +9,8 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from npdr_ppl.drawing.numbers import number
 
 __all__ = [
     "show_comparison",
@@ -91,14 +92,14 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
         behind = row["elpd_difference"]
         table.add_row(
             escape(label),
-            _number(row["elpd"], ".1f"),
+            number(row["elpd"], ".1f"),
             "–" if not behind else f"{behind:.1f} ± {row['elpd_difference_se']:.1f}",
-            _number(row["weight"], ".2f"),
-            _number(row["rmse"], ".3f"),
-            _number(row["dtw"], ".0f"),
-            _number(row["crps"], ".4f"),
-            _number(row["r_hat"], ".2f"),
-            " ".join(_number(share, ".0%")[:-1] for share in row["coverage"].values()),
+            number(row["weight"], ".2f"),
+            number(row["rmse"], ".3f"),
+            number(row["dtw"], ".0f"),
+            number(row["crps"], ".4f"),
+            number(row["r_hat"], ".2f"),
+            " ".join(number(share, ".0%")[:-1] for share in row["coverage"].values()),
             f"{sum(row['seconds'].values()):.0f} s",
             row["decision"],
         )
@@ -154,8 +155,8 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         for column in ("before", "after", "noise floor", "closed"):
             table.add_column(column, justify="right", no_wrap=True)
         for metric, gap in found["gap"].items():
-            values = [_number(gap[k], ".4g") for k in ("before", "after", "noise_floor")]
-            table.add_row(metric, *values, _number(gap["closed"], ".0%"))
+            values = [number(gap[k], ".4g") for k in ("before", "after", "noise_floor")]
+            table.add_row(metric, *values, number(gap["closed"], ".0%"))
         console.print(table)
     _print_reason(console, found["verdict"], found["reason"])
     if found["remainder"]["fired"] and found["verdict"] != "unknown":
@@ -214,7 +215,7 @@ def _show_worst(console: Console, where: Sequence[Mapping[str, Any]]) -> None:
         table.add_row(
             str(row["rollout"]),
             f"{begin:.2f} … {end:.2f}",
-            _number(row["z"], ".1f"),
+            number(row["z"], ".1f"),
             escape(row["channel"]),
             escape(row["region"]),
         )
@@ -231,13 +232,13 @@ def show_training(result: Mapping[str, Any], out: Path) -> None:
     table.add_column("action", no_wrap=True)
     # Return of the policy that this iteration trained; the next iteration runs it.
     table.add_column("simulated return", justify="right", no_wrap=True)
-    for number, row in enumerate(result["iterations"], start=1):
+    for iteration, row in enumerate(result["iterations"], start=1):
         table.add_row(
-            str(number),
+            str(iteration),
             _spread(row["real_returns"]),
             "\n".join(decision["decision"] for decision in row["decisions"]),
             "\n".join(decision["action"] for decision in row["decisions"]),
-            _number(row.get("sim_return"), ".0f"),
+            number(row.get("sim_return"), ".0f"),
         )
     console.print(table)
     last = result["iterations"][-1]
@@ -321,10 +322,6 @@ def _console() -> Console:
 
 def _print_reason(console: Console, what: str, reason: str) -> None:
     console.print(f"[bold]{escape(what)}[/bold]: {escape(reason)}", highlight=False)
-
-
-def _number(value: float | None, format_spec: str) -> str:
-    return "–" if value is None or not math.isfinite(value) else format(value, format_spec)
 
 
 def _spread(values: Sequence[float]) -> str:

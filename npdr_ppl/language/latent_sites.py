@@ -31,7 +31,6 @@ class LatentSite:
         name: Name of the site.
         batch_shape: Shape of its plates.
         shape: Shape of one value, plates included.
-        coordinate_shape: Shape of its reference coordinates, plates included.
         coordinates: Its slice of the vector z.
         dtype: Floating-point type in which the program samples it.
         plates: Its plates as (name, size, dimension), outermost first.
@@ -40,7 +39,6 @@ class LatentSite:
     name: str
     batch_shape: torch.Size
     shape: torch.Size
-    coordinate_shape: torch.Size
     coordinates: slice
     dtype: torch.dtype
     plates: tuple[tuple[str, int, int], ...] = ()

@@ -104,7 +104,6 @@ class Prior:
                     name,
                     torch.Size(fn.batch_shape),
                     site["value"].shape,
-                    coordinate_shape,
                     slice(start, stop),
                     site["value"].dtype,
                     tuple(

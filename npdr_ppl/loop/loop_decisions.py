@@ -28,11 +28,10 @@ FROM_CHECK = "from_check"
 
 @dataclass(frozen=True)
 class Settled:
-    """A posterior, and the decisions and the action that followed from it."""
+    """A posterior, and the action that followed from it."""
 
     posterior: Posterior
     data: "Data"
-    decisions: list[dict[str, Any]]
     action: Action
 
 

@@ -140,8 +140,8 @@ class _Loop:
         model: Model,
         target: TargetDomain,
         task: ControlTask,
-        data_options: DataOptions,
-        options: LoopOptions,
+        options: DataOptions,
+        loop: LoopOptions,
         folder: LoopFolder,
         revise: Revise | None,
         seed: int,
@@ -149,30 +149,30 @@ class _Loop:
     ) -> None:
         self.target = target
         self.task = task
-        self.data_options = data_options
         self.options = options
+        self.loop = loop
         self.folder = folder
         # A function given by the caller replaces discovery.
-        may_discover = options.follows_decisions and revise is None
-        self.discovers = options.discovers if may_discover else "never"
+        may_discover = loop.follows_decisions and revise is None
+        self.discovers = loop.discovers if may_discover else "never"
         discovery = LoopDiscovery(
             model,
-            data_options,
-            options.discovery,
+            options,
+            loop.discovery,
             seed=derived_seed(seed, "discovery in the loop"),
         )
         self.model = LoopModel(model, target, discovery, revise)
         self.seed = seed
         self.report = report
-        search, backend = options.search, options.backend
+        search, backend = loop.search, loop.backend
         self.search = policy_search(search) if isinstance(search, str) else search
         self.backend = backend_by_name(backend) if isinstance(backend, str) else backend
         simulator = simulator_of(self.model.prior)
         self.domain = {name: float(value) for name, value in simulator.nominal().items()}
         real = RealRollouts(target, task, simulator, folder.rollouts)
-        self.rollouts = LoopRollouts(real, options, seed)
+        self.rollouts = LoopRollouts(real, loop, seed)
         self.training = LoopTraining(
-            task, options, folder, seed, from_prior=lambda number: self._prior_domains(number)
+            task, loop, folder, seed, from_prior=lambda number: self._prior_domains(number)
         )
         self.policy = task.policy
         self.posterior: Posterior | None = None
@@ -181,24 +181,24 @@ class _Loop:
 
     def run(self) -> Training:
         """Runs all iterations that are not finished yet."""
-        if not self.rollouts.can_collect(self.options.rollouts):
+        if not self.rollouts.can_collect(self.loop.rollouts):
             raise DataError(
                 f"{self.target.name} has {self.target.num_episodes} episodes; an iteration takes "
-                f"{self.options.rollouts}."
+                f"{self.loop.rollouts}."
             )
-        if self.options.starts_from_prior:
+        if self.loop.starts_from_prior:
             saved = self.folder.policy(0)
             if saved is None:
-                domains = self._prior_domains(self.options.num_domains)
-                saved = self._optimise(self.report, domains, self._start, self.options.risk, (0,))
+                domains = self._prior_domains(self.loop.num_domains)
+                saved = self._optimise(self.report, domains, self._start, self.loop.risk, (0,))
                 self.folder.save_policy(0, *saved)
             self._use(saved[0])
-        for index in range(self.options.iterations):
-            report = self.report.under(f"iteration {index + 1}/{self.options.iterations}")
-            if not self.rollouts.can_collect(self.options.rollouts):
+        for index in range(self.loop.iterations):
+            report = self.report.under(f"iteration {index + 1}/{self.loop.iterations}")
+            if not self.rollouts.can_collect(self.loop.rollouts):
                 _LOGGER.warning(
                     "All %d episodes of %s have been used, after %d of %d iterations.",
-                    self.target.num_episodes, self.target.name, index, self.options.iterations,
+                    self.target.num_episodes, self.target.name, index, self.loop.iterations,
                 )  # fmt: skip
                 break
             self.records.append(self._iterate(index, report))
@@ -208,7 +208,7 @@ class _Loop:
         return self._result()
 
     def _result(self) -> Training:
-        best = best_measured(self.tried, self.options.deploys, self.task.success)
+        best = best_measured(self.tried, self.loop.deploys, self.task.success)
         return Training(
             self.policy if best is None else self.tried[best].policy,
             self.domain if best is None else self.tried[best].domain,
@@ -244,10 +244,10 @@ class _Loop:
 
         While the mean return would end the loop by itself, extra rollouts confirm it.
         """
-        options = self.options
+        loop = self.loop
         returns: list[float] = []
-        while len(returns) < options.rollouts or (
-            len(returns) < options.rollouts + options.num_confirmations
+        while len(returns) < loop.rollouts or (
+            len(returns) < loop.rollouts + loop.num_confirmations
             and self._is_good_enough(sum(returns) / len(returns))
             and self.rollouts.extra_left(index)
         ):
@@ -257,9 +257,9 @@ class _Loop:
 
     def _is_good_enough(self, real_return: float) -> bool:
         """Returns whether the measured return is enough to end the loop."""
-        options = self.options
-        wanted = options.stop_return if options.stops == "measured return" else None
-        return options.follows_decisions and wanted is not None and real_return >= wanted
+        loop = self.loop
+        wanted = loop.stop_return if loop.stops == "measured return" else None
+        return loop.follows_decisions and wanted is not None and real_return >= wanted
 
     def _improved(self, index: int, real_return: float, report: Reporter) -> dict[str, Any]:
         """Infers the posterior, trains the next policy, and returns the iteration's record."""
@@ -269,7 +269,7 @@ class _Loop:
         while True:
             settled = self._infer_and_decide(index, real_return, decisions, report)
             is_last = is_final({"decisions": decisions})
-            if self.options.internal_model == "most likely" and not is_last:
+            if self.loop.internal_model == "most likely" and not is_last:
                 self.domain = most_likely_domain(settled.posterior, seed=self.seed)
             trained = None if is_last else self._train(index, settled, checks, report)
             if is_last or trained is not None:
@@ -324,21 +324,21 @@ class _Loop:
             decisions: The iteration's decisions so far; more are appended.
             report: Where to report progress.
         """
-        options = self.options
+        loop = self.loop
         self._discover_first(index, decisions, report)
         may_revise = self.model.revise is not None or self.discovers == "after diagnosis"
         while True:
             posterior = self._infer(index, decisions, report)
             data = posterior.to_arviz(PREDICTIVE_DRAWS, seed=self.seed)
-            extra_rounds = options.extra_rounds if self.backend.is_sequential else 0
+            extra_rounds = loop.extra_rounds if self.backend.is_sequential else 0
             diagnosis = diagnose(
                 data,
-                options.thresholds,
+                loop.thresholds,
                 rounds_left=extra_rounds - count_actions(decisions, Action.MORE_ROUNDS),
                 rollouts_left=self.rollouts.extra_left(index),
             )
             decision, reason = diagnosis.decision, diagnosis.reason
-            action = action_for(decision, options, may_revise=may_revise, real_return=real_return)
+            action = action_for(decision, loop, may_revise=may_revise, real_return=real_return)
             if action is Action.ANOTHER_ROLLOUT:
                 self._collect_excitation(posterior)
             elif action is Action.MORE_ROUNDS:
@@ -356,7 +356,7 @@ class _Loop:
                 reason = enough(real_return)
             decisions.append(decision_record(decision, reason, action, diagnosis.to_dict()))
             if action not in (Action.MORE_ROUNDS, *NEW_ATTEMPTS):
-                return Settled(posterior, data, decisions, action)
+                return Settled(posterior, data, action)
 
     def _discover_first(
         self, index: int, decisions: list[dict[str, Any]], report: Reporter
@@ -392,14 +392,14 @@ class _Loop:
         self, index: int, decisions: Sequence[Mapping[str, Any]], report: Reporter
     ) -> Posterior:
         """Infers the posterior after the decisions; saved rounds are not repeated."""
-        options = self.options
+        loop = self.loop
         attempt = count_actions(decisions, *NEW_ATTEMPTS)
-        rounds = options.rounds if self.backend.is_sequential else 1
+        rounds = loop.rounds if self.backend.is_sequential else 1
         return infer_posterior(
             self.model.model,
-            self.rollouts.joined(None if options.rollouts_used == "all" else options.rollouts),
-            self.data_options,
-            options,
+            self.rollouts.joined(None if loop.rollouts_used == "all" else loop.rollouts),
+            self.options,
+            loop,
             self.backend,
             rounds=rounds + count_actions(decisions, Action.MORE_ROUNDS),
             prior=self.model.prior,
@@ -417,7 +417,7 @@ class _Loop:
     @property
     def _start(self) -> Tensor:
         """Policy parameters from which a search begins."""
-        return (self.policy if self.options.is_warm_start else self.task.policy).parameters
+        return (self.policy if self.loop.is_warm_start else self.task.policy).parameters
 
     def _use(self, parameters: Tensor) -> None:
         """Makes the policy with these parameters the current one."""
@@ -455,17 +455,17 @@ class _Loop:
         number: tuple[int, ...],
     ) -> tuple[Tensor, dict[str, Any]]:
         """Searches for a policy and returns its parameters and figures of the search."""
-        options = self.options
+        loop = self.loop
         found = optimise_policy(
             self.task,
             domains,
             self.search,
             start,
-            iterations=options.search_iterations,
-            num_initial_states=options.num_initial_states,
+            iterations=loop.search_iterations,
+            num_initial_states=loop.num_initial_states,
             seed=derived_seed(self.seed, "policy", *number),
             risk=risk,
-            expected_calls=options.search_iterations * (options.iterations + 1),
+            expected_calls=loop.search_iterations * (loop.iterations + 1),
             progress=report.stage("train the policy"),
         )
         return found.parameters, found.figures()

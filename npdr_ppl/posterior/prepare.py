@@ -34,14 +34,12 @@ from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Preparation", "has_closest_fit", "held_out", "prepare", "score_embedding"]
-
-NEGLIGIBLE = 1e-9
-"""Standard deviation of a channel that was not measured; it is negligible in every unit."""
 
 MARGIN = 0.1
 """Least standard deviation of the neighbourhood of a fit, in standard deviations of the prior."""
@@ -265,7 +263,8 @@ def prepare(
         scale = likelihood.fit.scale * math.sqrt(likelihood.variance)
         segments = base.hypothesis.segments
         estimated = dict(zip(segments.channel_names, scale.tolist(), strict=True))
-        every = {name: estimated.get(name, NEGLIGIBLE) for name in segments.sensor_names}
+        absent = PRIOR_SEARCH.negligible_deviation
+        every = {name: estimated.get(name, absent) for name in segments.sensor_names}
     model = base.segments.model
     found = Preparation(
         model if every is None else with_noise(model, every),
@@ -306,8 +305,7 @@ def held_out(prepared: Preparation, rollouts: Rollouts) -> SegmentLikelihood | N
     starts = segments.estimated_starts(z, scale)
     if starts is not None:
         segments = segments.starting_from(starts)
-    shape = segments.inputs.num_segments, segments.num_offsets
-    fit = SegmentFit(z, torch.zeros(shape, dtype=torch.float64), scale * fitted.variance**0.5)
+    fit = SegmentFit(z, segments.no_offsets, scale * fitted.variance**0.5)
     now = segments.linearise(z, fit.offsets, fit.scale)
     # The scale is that of the noise, as if it had been declared.
     return SegmentLikelihood(segments, fit, now, fitted.share, is_noise_declared=True)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.model import Model
-from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK, DataOptions
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
@@ -66,8 +66,7 @@ def closest_fit(
     simulator = segments.simulator
     rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
     z = search_prior(segments, seed=seed, progress=progress)
-    unmoved = torch.zeros(segments.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
-    found = segments.scale_of(z, unmoved).tolist()
+    found = segments.scale_of(z, segments.no_offsets).tolist()
     scale = dict(zip(segments.channel_names, found, strict=True))
     noise = {
         name: scale.get(name, PRIOR_SEARCH.negligible_deviation) for name in segments.sensor_names
@@ -101,12 +100,10 @@ def search_prior(
     ranges = (every.observed * mask).abs().amax((0, 1)).double()
     ranges = ranges.clamp_min(torch.finfo(torch.float32).tiny)
     segments = _spread_out(every, seed)
-    starts = torch.zeros(segments.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
     num_parameters = segments.prior.num_parameters
     centre = torch.zeros(num_parameters, dtype=torch.float64)
     spread = torch.ones_like(centre)
     least, z, elite = math.inf, centre, centre[None]
-    together = max(1, MAX_READINGS_PER_CHUNK // max(1, segments.observed.numel()))
     for iteration in range(iterations):
         with seeded(seed, "residual noise", iteration):
             if iteration == 0:
@@ -115,7 +112,10 @@ def search_prior(
                 draws = torch.randn(PRIOR_SEARCH.population, num_parameters, dtype=torch.float64)
                 tried = centre + spread * draws
         error = torch.cat(
-            [_errors(segments, part, starts, ranges) for part in tried.split(together)]
+            [
+                _errors(segments, part, segments.no_offsets, ranges)
+                for part in tried.split(segments.draws_per_chunk)
+            ]
         )
         order = error.argsort()
         elite = tried[order[: PRIOR_SEARCH.population // 10]]
@@ -126,9 +126,8 @@ def search_prior(
             progress((iteration + 1) / iterations, f"error {least:.3g} of the range")
     if segments is not every:
         # Parameters that can be simulated along some segments may fail along others.
-        starts = torch.zeros(every.inputs.num_segments, every.num_offsets, dtype=torch.float64)
         for place in (z, *elite):
-            z, least = place, float(_errors(every, place[None], starts, ranges))
+            z, least = place, float(_errors(every, place[None], every.no_offsets, ranges))
             if math.isfinite(least):
                 break
     if not math.isfinite(least):

@@ -20,13 +20,13 @@ def effective_share(residual: Tensor, mask: Tensor) -> Tensor:
         residual: Residuals, ``(plates × segments, steps, channels)``.
         mask: Which steps exist, ``(segments, steps)``.
     """
-    from npdr_ppl.arviz_module import ess_of_array
+    from npdr_ppl.arviz_module import ess_of_mean
 
     whole = mask.all(-1).repeat(len(residual) // len(mask))
     chains = residual[whole] if bool(whole.any()) else residual
     total = chains.shape[0] * chains.shape[1]
     if chains.shape[1] < LEAST_STEPS:
         return torch.ones(residual.shape[-1], dtype=torch.float64)
-    sizes = [ess_of_array(values.numpy(), method="mean") for values in chains.unbind(-1)]
+    sizes = [ess_of_mean(values.numpy()) for values in chains.unbind(-1)]
     share = torch.tensor(sizes, dtype=torch.float64) / total
     return share.nan_to_num(1.0).clamp(1 / chains.shape[1], 1.0)

@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK
 from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
 from npdr_ppl.preparation.settings import SEGMENT_FIT
 from npdr_ppl.preparation.solving import solve_or_zero
@@ -76,8 +75,7 @@ def fit_segments(
     """
     z = z.double()
     if offsets is None:
-        shape = segments.inputs.num_segments, segments.num_offsets
-        offsets = torch.zeros(shape, dtype=torch.float64)
+        offsets = segments.no_offsets
     present = segments.scale_of(z, offsets)
     if not bool(present.isfinite().all()):
         raise DataError("The simulation fails at the parameters that the fit begins with.")
@@ -275,7 +273,7 @@ def _squares(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) 
         scale: Standard deviation of each channel's residuals, ``(C,)``.
     """
     a, b = offsets.shape[:2]
-    together = max(1, MAX_READINGS_PER_CHUNK // max(1, segments.observed.numel()))
+    together = segments.draws_per_chunk
     points = z.repeat_interleave(b, 0).split(together)
     squares = [
         segments.residuals(point, starts, scale).square().unflatten(-1, (-1, len(scale))).sum(-2)

@@ -114,10 +114,9 @@ class SegmentLikelihood:
 
     def _residuals(self, z: Tensor) -> Iterator[Tensor]:
         """Yields whitened residuals ``(n, S, N)`` at zero offsets, in chunks."""
-        together = max(1, MAX_READINGS_PER_CHUNK // max(1, self.segments.observed.numel()))
         offsets = self.fit.offsets[None]
         moved = (self.linearisation.by_starts @ self.fit.offsets[..., None])[..., 0]
-        for points in z.double().split(together):
+        for points in z.double().split(self.segments.draws_per_chunk):
             starts = offsets.expand(len(points), -1, -1)
             yield self.segments.residuals(points, starts, self.fit.scale) + moved
 

@@ -189,8 +189,7 @@ class SegmentModel:
         if starts is None:
             return None
         segments = self.starting_from(starts)
-        unmoved = torch.zeros(self.inputs.num_segments, segments.num_offsets, dtype=torch.float64)
-        now = segments.linearise(z, unmoved, scale, is_rough=True)
+        now = segments.linearise(z, segments.no_offsets, scale, is_rough=True)
         if not now.is_finite:
             return None
         return starts.scaled(segments.inputs, error_factors(now.residual, now.by_starts))
@@ -268,6 +267,17 @@ class SegmentModel:
         """Number m of components of an initial state that are uncertain."""
         return len(self._offsets)
 
+    @property
+    def no_offsets(self) -> Tensor:
+        """Offsets that leave every initial state at its estimate, ``(S, m)``."""
+        shape = self.inputs.num_segments, self.num_offsets
+        return torch.zeros(shape, dtype=torch.float64)
+
+    @property
+    def draws_per_chunk(self) -> int:
+        """Number of simulations of the whole recording that are made at once, to bound memory."""
+        return max(1, MAX_READINGS_PER_CHUNK // max(1, self.observed.numel()))
+
     def simulate(self, z: Tensor, offsets: Tensor) -> Tensor:
         """Returns readings after each step, ``(n, S, K, C)``.
 
@@ -344,8 +354,7 @@ class SegmentModel:
             offsets: Offsets of the initial states, ``(n, S, m)``.
             scale: Standard deviation of each channel's residuals, ``(C,)``.
         """
-        num, readings = max(len(z), len(offsets)), max(1, self.observed.numel())
-        together = max(1, MAX_READINGS_PER_CHUNK // readings)
+        num, together = max(len(z), len(offsets)), self.draws_per_chunk
         z, offsets = (part.expand(num, *part.shape[1:]) for part in (z, offsets))
         if num <= together:
             return self.whitened(self.observed - self.simulate(z, offsets), scale)

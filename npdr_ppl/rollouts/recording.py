@@ -147,7 +147,7 @@ class Recording:
 def _check_columns(recording: "Recording") -> None:
     """Raises a DataError if names, units or the time step are wrong."""
     names = (*recording.channel_names, *recording.action_names)
-    rollout_checks.check_names(names, "column")
+    rollout_checks.check_names(names)
     taken = set(rollout_checks.RESERVED_NAMES) & set(names)
     if taken:
         raise DataError(f"{min(taken)} is a reserved name, not a channel's or an action's.")

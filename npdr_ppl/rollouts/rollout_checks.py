@@ -115,12 +115,11 @@ def _neighbour(path: Path) -> str:
     return f" Did you mean {path.with_name(close[0])}?" if close else ""
 
 
-def check_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
+def check_names(names: Sequence[str]) -> tuple[str, ...]:
     """Returns column names as a tuple after checking that every format can store them.
 
     Args:
         names: Names of columns.
-        kind: Their kind, for the message: ``"channel"``, ``"action"`` or ``"column"``.
 
     Raises:
         DataError: A name is empty, repeated, or has characters that a format cannot store.
@@ -128,7 +127,7 @@ def check_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
     seen: set[str] = set()
     for position, name in enumerate(names, start=1):
         if not isinstance(name, str) or not name.strip():
-            raise DataError(f"{kind} {position} has no name.")
+            raise DataError(f"column {position} has no name.")
         is_plain = name.isprintable() and name.strip() == name
         if (
             not (name[0].isalpha() or name[0] == "_")
@@ -137,11 +136,11 @@ def check_names(names: Sequence[str], kind: str) -> tuple[str, ...]:
             or len(name) > _MAX_NAME_LENGTH
         ):
             raise DataError(
-                f"{kind} {position} is called {shown(name)}, but names begin with a letter, have "
+                f"column {position} is called {shown(name)}, but names begin with a letter, have "
                 f"at most {_MAX_NAME_LENGTH} characters and no comma, semicolon, quote or slash."
             )
         if name in seen:
-            raise DataError(f"the {kind} {shown(name)} appears twice.")
+            raise DataError(f"the column {shown(name)} appears twice.")
         seen.add(name)
     return tuple(names)
 

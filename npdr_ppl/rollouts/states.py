@@ -5,9 +5,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-__all__ = ["StateEstimate", "estimate_departures", "estimate_states", "rate_changes"]
+__all__ = [
+    "StateEstimate",
+    "estimate_departures",
+    "estimate_states",
+    "measurement_noise",
+    "rate_changes",
+]
 
 Array = NDArray[np.float64]
 
@@ -30,6 +38,11 @@ CONFIDENCE = 2.0
 NEGLIGIBLE = 1e-12
 """Differences between measurements below this fraction of the largest difference are not used to
 find the encoder resolution."""
+
+NOISE_PER_THIRD_DIFFERENCE = 1.0 / 0.6745 / 20.0**0.5
+"""Standard deviation of independent normal errors, per median absolute third difference. Errors of
+variance s² have third differences of variance 20 s², and the median absolute value of normal
+errors is 0.6745 standard deviations."""
 
 ERROR_RATIOS = 3.0, 4.0
 """Root-mean-square errors of values and rates, in standard errors. The window grows until bias
@@ -205,6 +218,23 @@ def _fit(
     return fit, error
 
 
+def measurement_noise(series: Sequence[Tensor]) -> Tensor:
+    """Returns the standard deviation of each channel's measurement noise, ``(C,)`` float64.
+
+    It is computed from third differences, in which any smooth motion is negligible.
+
+    Args:
+        series: Measurements of each rollout or segment, ``(T, C)``; those of less than four steps
+            are left out.
+    """
+    parts = []
+    for values in series:
+        third = values.double().diff(n=3, dim=0).abs()
+        if len(third):
+            parts.append(third.median(0).values * NOISE_PER_THIRD_DIFFERENCE)
+    return torch.stack(parts).median(0).values
+
+
 # One-sided windows near a recording's ends have different extents, about 1700 in total.
 @functools.lru_cache(maxsize=4096)
 def _weights(before: int, after: int) -> Array:
@@ -235,9 +265,7 @@ def _noise(readings: Array) -> float:
     third = np.diff(differences, n=2)
     third = third[differences[1:-1] != 0]
     if third.size:
-        # Independent errors of variance s² have third differences of variance 20 s². The median
-        # absolute value of normal errors is 0.6745 standard deviations.
-        noise = float(np.median(np.abs(third))) / 0.6745 / np.sqrt(20)
+        noise = float(np.median(np.abs(third))) * NOISE_PER_THIRD_DIFFERENCE
     count = float(size.min())
     remainder = np.abs(size / count - np.round(size / count))
     if np.mean(remainder < 0.05) > 0.95:

@@ -12,7 +12,7 @@ import npdr_ppl as npdr
 from npdr_ppl.arviz_module import (
     compare,
     ess,
-    ess_of_array,
+    ess_of_mean,
     from_dict,
     from_netcdf,
     group,
@@ -97,7 +97,7 @@ def test_convergence_figures():
     for t in range(1, correlated.shape[1]):
         correlated[:, t] = 0.8 * correlated[:, t - 1] + noise[:, t]
     expected = correlated.size * 0.2 / 1.8
-    assert abs(ess_of_array(correlated, method="mean") / expected - 1) < 0.2
+    assert abs(ess_of_mean(correlated) / expected - 1) < 0.2
 
 
 def test_equal_weights_have_no_tail_and_one_large_weight_has_a_heavy_one():

@@ -14,6 +14,7 @@ from npdr_ppl.preparation.initial_states import error_factors
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts, stitch
+from npdr_ppl.rollouts.states import measurement_noise
 
 __all__ = ["Gap", "prove"]
 
@@ -74,13 +75,13 @@ def prove(
     """
     with seeded(seed, "discovery", "proof"):
         drawn = draws_after.resampled(GAP.num_draws)
-        old = _Scores.of(before, draws_before.resampled(GAP.num_draws), rollouts, options)
-        new = _Scores.of(after, drawn, rollouts, options)
-        floor = _floor(after, drawn, rollouts, options)
+        old = _Simulated(before, draws_before.resampled(GAP.num_draws), rollouts, options).scores()
+        revised = _Simulated(after, drawn, rollouts, options)
+        new, floor = revised.scores(), revised.floor()
     return {
-        "rmse": Gap(old.rmse, new.rmse, floor["rmse"]),
-        "dtw": Gap(old.dtw, new.dtw, floor["dtw"]),
-        "crps": Gap(old.crps, new.crps, floor["crps"]),
+        "rmse": Gap(old.rmse, new.rmse, floor.rmse),
+        "dtw": Gap(old.dtw, new.dtw, floor.dtw),
+        "crps": Gap(old.crps, new.crps, floor.crps),
         "coverage": Gap(old.coverage, new.coverage, None),
     }
 
@@ -92,95 +93,68 @@ class _Scores:
     crps: float
     coverage: float
 
-    @classmethod
-    def of(
-        cls, hypothesis: Hypothesis, drawn: Tensor, rollouts: Rollouts, options: DataOptions
-    ) -> "_Scores":
+
+class _Simulated:
+    """A fitted model along held-out rollouts.
+
+    Args:
+        hypothesis: The model.
+        drawn: Draws of its posterior, ``(n, d)``.
+        rollouts: The recording.
+        options: How it is cut into segments.
+    """
+
+    def __init__(
+        self, hypothesis: Hypothesis, drawn: Tensor, rollouts: Rollouts, options: DataOptions
+    ) -> None:
         segments = SegmentModel(hypothesis.model, rollouts, options, is_complete=True)
-        z = hypothesis.fit.z[None]
-        centre = segments.simulate(z, _no_offsets(segments, 1))[0].double()
-        part = segments.along(options.used_segments(rollouts))
-        draws = _predictive(hypothesis, drawn, part)
-        return cls(
-            *_distances(segments, centre, rollouts),
-            _crps(part, draws, part.observed.double()),
-            _coverage(part, draws),
+        self.fit, self.drawn, self.segments = hypothesis.fit, drawn, segments
+        self.recorded = rollouts.series(segments.channel_names)
+        self.centre = segments.simulate(self.fit.z[None], segments.no_offsets[None])[0].double()
+        self.used = options.used_segments(rollouts)
+        # Draws are compared along these segments only, to bound memory.
+        self.part = segments.along(self.used)
+
+    def scores(self) -> _Scores:
+        """Returns the metrics of the recording."""
+        return self._scores(self.recorded, self.part.observed.double())
+
+    def floor(self) -> _Scores:
+        """Returns the metrics of a recording that is simulated with the model itself.
+
+        Its initial states have errors as large as along the real recording, and its measurements
+        have noise. It is compared with the prediction from the smoother's estimate.
+        """
+        segments, fit, unmoved = self.segments, self.fit, self.part.no_offsets
+        offsets = torch.randn(segments.no_offsets.shape).double()
+        now = self.part.linearise(fit.z, unmoved, fit.scale, is_rough=True)
+        if now.is_finite:
+            offsets = offsets * error_factors(now.residual, now.by_starts)
+        made = segments.simulate(fit.z[None], offsets[None])[0].double()
+        made = made + measurement_noise(self.recorded) * torch.randn(made.shape).double()
+        recorded = stitch(made, segments.inputs, segments.channel_names)
+        return self._scores(recorded, made[self.used])
+
+    def _scores(self, recorded: list[Tensor], observed: Tensor) -> _Scores:
+        """Returns the metrics of rollouts, and of their segments that draws are made along."""
+        predicted = stitch(self.centre, self.segments.inputs, self.segments.channel_names)
+        draws, mask = self._predictive(), self.part.inputs.mask
+        return _Scores(
+            float(metrics.rmse(predicted, recorded).mean()),
+            float(metrics.dtw(predicted, recorded).mean()),
+            _crps(draws, observed, mask),
+            float(metrics.coverage(metrics.pit(draws, observed), [GAP.level], mask)[0]),
         )
 
-
-def _floor(
-    hypothesis: Hypothesis, drawn: Tensor, rollouts: Rollouts, options: DataOptions
-) -> dict[str, float]:
-    """Returns the metrics of a recording that is simulated with the model itself.
-
-    Its initial states have errors as large as along the real recording, and its measurements have
-    noise. It is compared with the prediction from the smoother's estimate.
-    """
-    segments = SegmentModel(hypothesis.model, rollouts, options, is_complete=True)
-    z, unmoved = hypothesis.fit.z[None], _no_offsets(segments, 1)
-    centre = segments.simulate(z, unmoved)[0].double()
-    offsets = torch.randn(unmoved.shape).double()
-    used = options.used_segments(rollouts)
-    part = segments.along(used)
-    now = part.linearise(z[0], unmoved[0, used], hypothesis.fit.scale, is_rough=True)
-    if now.is_finite:
-        offsets = offsets * error_factors(now.residual, now.by_starts)
-    made = segments.simulate(z, offsets)[0].double()
-    made = (
-        made + reading_noise(rollouts, segments.channel_names) * torch.randn(made.shape).double()
-    )
-    channels = segments.channel_names
-    predicted = stitch(centre, segments.inputs, channels)
-    recorded = stitch(made, segments.inputs, channels)
-    draws = _predictive(hypothesis, drawn, part)
-    return {
-        "rmse": float(metrics.rmse(predicted, recorded).mean()),
-        "dtw": float(metrics.dtw(predicted, recorded).mean()),
-        "crps": _crps(part, draws, made[used]),
-    }
+    def _predictive(self) -> Tensor:
+        """Returns posterior predictive trajectories, measurement noise included."""
+        shape = len(self.drawn), *self.part.no_offsets.shape
+        offsets = torch.randn(shape, dtype=torch.float64)
+        draws = self.part.simulate(self.drawn, offsets).double()
+        return draws + self.fit.scale * torch.randn(draws.shape, dtype=torch.float64)
 
 
-def reading_noise(rollouts: Rollouts, channels: tuple[str, ...]) -> Tensor:
-    """Returns the standard deviation of the measurements' noise, ``(C,)``.
-
-    It is computed from third differences, in which any smooth motion is negligible.
-    """
-    columns = [rollouts.channel_names.index(name) for name in channels]
-    parts = []
-    for readings in rollouts.readings:
-        third = torch.as_tensor(readings[:, columns]).diff(n=3, dim=0).double()
-        parts.append(third.abs().median(0).values / 0.6745 / 20**0.5)
-    return torch.stack(parts).median(0).values
-
-
-def _no_offsets(segments: SegmentModel, num: int) -> Tensor:
-    shape = num, segments.inputs.num_segments, segments.num_offsets
-    return torch.zeros(shape, dtype=torch.float64)
-
-
-def _predictive(hypothesis: Hypothesis, drawn: Tensor, segments: SegmentModel) -> Tensor:
-    """Returns posterior predictive trajectories, measurement noise included."""
-    offsets = torch.randn(_no_offsets(segments, len(drawn)).shape, dtype=torch.float64)
-    trajectory = segments.simulate(drawn, offsets).double()
-    return trajectory + hypothesis.fit.scale * torch.randn(trajectory.shape, dtype=torch.float64)
-
-
-def _distances(segments: SegmentModel, centre: Tensor, rollouts: Rollouts) -> tuple[float, float]:
-    channels = segments.channel_names
-    simulated = stitch(centre, segments.inputs, channels)
-    measured = rollouts.series(channels)
-    return (
-        float(metrics.rmse(simulated, measured).mean()),
-        float(metrics.dtw(simulated, measured).mean()),
-    )
-
-
-def _crps(segments: SegmentModel, draws: Tensor, observed: Tensor) -> float:
-    ranges = (observed * segments.inputs.mask[..., None]).abs().amax((0, 1)).clamp_min(1e-12)
-    by_step = metrics.crps_by_step(draws, observed, segments.inputs.mask, is_fair=True)
-    return float((by_step / ranges).mean())
-
-
-def _coverage(segments: SegmentModel, draws: Tensor) -> float:
-    values = metrics.pit(draws, segments.observed.double())
-    return float(metrics.coverage(values, [GAP.level], segments.inputs.mask)[0])
+def _crps(draws: Tensor, observed: Tensor, mask: Tensor) -> float:
+    """Returns the mean continuous ranked probability score, relative to each channel's range."""
+    ranges = (observed * mask[..., None]).abs().amax((0, 1)).clamp_min(1e-12)
+    return float((metrics.crps_by_step(draws, observed, mask, is_fair=True) / ranges).mean())

@@ -174,10 +174,7 @@ def _separations(
     The distance is NaN if the other hypothesis cannot be simulated there.
     """
     segments = SegmentModel(refitted.model, recorded, options)
-    offsets: Tensor = torch.zeros(
-        segments.inputs.num_segments, segments.num_offsets, dtype=torch.float64
-    )
-    fit = SegmentFit(refitted.fit.z, offsets, made.fit.scale)
+    fit = SegmentFit(refitted.fit.z, segments.no_offsets, made.fit.scale)
     num = len(recorded.readings)
     try:
         projection = Projection(Hypothesis(refitted.model, refitted.effects, segments, fit))

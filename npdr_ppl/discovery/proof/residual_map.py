@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.proof.held_out_gap import reading_noise
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.states import measurement_noise
 
 __all__ = ["Spot", "standardised", "worst_windows"]
 
@@ -54,7 +54,7 @@ def standardised(hypothesis: Hypothesis, rollouts: Rollouts) -> Tensor:
         rollouts: The recording it was fitted to.
     """
     segments, fit = hypothesis.segments, hypothesis.fit
-    noise = reading_noise(rollouts, segments.channel_names).clamp_min(1e-9)
+    noise = measurement_noise(rollouts.series(segments.channel_names)).clamp_min(1e-9)
     flat = segments.residuals(fit.z[None], fit.offsets[None], noise)[0]
     return flat.unflatten(-1, (-1, len(noise)))
 

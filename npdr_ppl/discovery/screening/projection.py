@@ -25,7 +25,6 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.language.effects import Effect
-from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK
 
 __all__ = ["Projection", "Scores", "loss_without"]
 
@@ -124,27 +123,6 @@ class Projection:
     def parameter_information_by_segment(self) -> Tensor:
         """Information of the parameters in each segment, ``(S, d, d)``."""
         return self._by_z.mT @ self._weights
-
-    @property
-    def parameter_information(self) -> Tensor:
-        """Information of the parameters with their prior, ``(d, d)``."""
-        return self._information
-
-    def misfit_at(self, z: Tensor) -> Tensor:
-        """Returns rᵀ C⁻¹ r at other parameters, ``(n,)``, with the derivatives G of this fit.
-
-        Args:
-            z: Parameters, ``(n, d)``.
-        """
-        segments, fit = self.hypothesis.segments, self.hypothesis.fit
-        offsets = fit.offsets[None]
-        together = max(1, MAX_READINGS_PER_CHUNK // max(1, segments.observed.numel()))
-        result = []
-        for points in z.split(together):
-            left = segments.residuals(points, offsets.expand(len(points), -1, -1), fit.scale)
-            columns = left.permute(1, 2, 0) + self._starts @ fit.offsets[..., None]
-            result.append((columns * self.solve(columns)).sum((0, 1)))
-        return torch.cat(result)
 
     def solve(self, columns: Tensor) -> Tensor:
         """Returns C⁻¹ x, ``(S, N, P)``."""

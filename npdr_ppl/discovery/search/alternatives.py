@@ -147,7 +147,7 @@ def weigh_alternatives(
         log_prior(trial) - strain
         for trial, strain in zip(trials.values(), _strains(trials, without), strict=True)
     ]
-    weights = weigh(list(trials.values()), prior, seed=0)
+    weights = weigh(list(trials.values()), prior)
     probabilities = dict(zip(trials, weights, strict=True))
     best = max(probabilities, key=lambda name: probabilities[name])
     swapped = trials[best]

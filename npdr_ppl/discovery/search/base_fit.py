@@ -146,10 +146,7 @@ def in_finer_steps(
             finer = trials.refitted_along(segments, current, current.effects)
             if finer is not None:
                 finer = off_the_ends(finer)
-        if (
-            finer is None
-            or weigh([current, finer], [0.0, 0.0], seed=0)[0] > BASE_FIT.coarse_probability
-        ):
+        if finer is None or weigh([current, finer], [0.0, 0.0])[0] > BASE_FIT.coarse_probability:
             break
         report("the model's integration steps are too coarse for this recording; refining them")
         is_coarse, base = True, finer_base

@@ -74,7 +74,6 @@ class Search:
         rounds: The results before each addition, and at the end.
         final: The final model.
         added: Its effects.
-        removed: Names of effects that were added and removed again.
         trials: The final model with each alternative in an effect's place, by the names of the
             effect and of the alternative.
     """
@@ -82,7 +81,6 @@ class Search:
     rounds: list[Round]
     final: Hypothesis
     added: list[Added]
-    removed: list[str]
     trials: dict[tuple[str, str], Hypothesis]
 
 
@@ -192,7 +190,6 @@ class Searcher:
         """
         current, now = first.hypothesis, first
         rounds = [first]
-        removed: list[str] = []
         while (
             now.alarm.fired
             and len(current.effects) < max_effects
@@ -202,14 +199,12 @@ class Searcher:
             rounds[-1] = replace(now, weights=weights, trials=tried)
             if best is None or _is_negligible(first.hypothesis, current, tried[best]):
                 break
-            current, needless = self._pruned(tried[best])
-            current = self.trials.with_own_starts(current)
-            removed += needless
+            current = self.trials.with_own_starts(self._pruned(tried[best]))
             if not self.are_steps_coarse and self.with_finer_steps(current) is not current:
                 # The missing effect had hidden that the steps are too coarse: restart the search.
                 current = self.fit_base()
                 first = now = self.look(current)
-                rounds, removed = [first], []
+                rounds = [first]
                 continue
             if any(set(current.names) == set(r.hypothesis.names) for r in rounds):
                 break
@@ -218,7 +213,7 @@ class Searcher:
         current, added, trials = self.with_rivals(current, rounds)
         if set(current.names) != set(rounds[-1].hypothesis.names):
             rounds.append(self.look(current))  # an effect was replaced, so residuals differ
-        return Search(rounds, current, added, removed, trials)
+        return Search(rounds, current, added, trials)
 
     def look(self, hypothesis: Hypothesis, *, number: int | None = None) -> Round:
         """Screens all candidates at a fitted hypothesis; the last result is cached.
@@ -282,7 +277,7 @@ class Searcher:
             math.log(1 - SEARCH.prior_of_any),
             *(each + log_prior(t) for t in trials.values()),
         ]
-        weights = dict(zip(("", *trials), weigh(hypotheses, prior, seed=0), strict=True))
+        weights = dict(zip(("", *trials), weigh(hypotheses, prior), strict=True))
         best = max(trials, key=lambda name: weights[name])
         trials = self.trials.apart_from_waves_in_step(trials)
         if best not in trials:
@@ -298,9 +293,8 @@ class Searcher:
         self._report(f"adding {best}")
         return best, weights, trials
 
-    def _pruned(self, current: Hypothesis) -> tuple[Hypothesis, list[str]]:
+    def _pruned(self, current: Hypothesis) -> Hypothesis:
         """Removes effects that are no longer needed after the last addition."""
-        removed: list[str] = []
         for effect in current.effects[:-1]:
             if loss_without(current, effect) > TRIALS.certain_evidence:
                 continue
@@ -309,8 +303,8 @@ class Searcher:
                 continue
             if _speaks_for(without, current) > self.options.confidence:
                 self._report(f"removing {effect.name}")
-                current, removed = without, [*removed, effect.name]
-        return current, removed
+                current = without
+        return current
 
     def with_rivals(
         self, current: Hypothesis, rounds: list[Round]
@@ -366,7 +360,7 @@ class Searcher:
 
 def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:
     """Returns the probability of the first of two hypotheses."""
-    return weigh([one, other], [0.0, 0.0], seed=0)[0]
+    return weigh([one, other], [0.0, 0.0])[0]
 
 
 def _is_negligible(first: Hypothesis, current: Hypothesis, extended: Hypothesis) -> bool:

@@ -46,18 +46,15 @@ def evidence(
     return torch.stack(rows)
 
 
-def weigh(
-    hypotheses: Sequence[Hypothesis], log_prior: Sequence[float], *, seed: int
-) -> list[float]:
+def weigh(hypotheses: Sequence[Hypothesis], log_prior: Sequence[float]) -> list[float]:
     """Returns the probability of each hypothesis, assuming that one of them is true.
 
     Args:
         hypotheses: H fitted hypotheses.
         log_prior: Log of each one's prior probability, up to a constant.
-        seed: Seed of the bootstrap.
     """
     rows = evidence(hypotheses, log_prior, closest(hypotheses))
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     draws = torch.rand(
         EVIDENCE.num_resamplings, rows.shape[1], generator=generator, dtype=torch.float64
     )

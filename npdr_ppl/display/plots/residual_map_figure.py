@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.proof.residual_map import Spot
 from npdr_ppl.drawing.theme import COLORS, theme
+from npdr_ppl.rollouts.states import measurement_noise
 
 __all__ = ["plot_residual_map"]
 
@@ -102,12 +103,10 @@ def _shown(hypothesis: Hypothesis, where: Sequence[Spot]) -> list[int]:
 
 
 def _noise(hypothesis: Hypothesis) -> torch.Tensor:
-    """Returns the measurement noise, ``(C,)``, from third differences inside the segments."""
-    observed = hypothesis.segments.observed.double()
-    mask = hypothesis.segments.inputs.mask
-    third = observed.diff(n=3, dim=1).abs()[mask[:, 3:]]
-    # A third difference of white noise has 20 times its variance.
-    return (third.median(0).values / 0.6745 / 20**0.5).clamp_min(1e-9)
+    """Returns the standard deviation of the measurement noise, ``(C,)``."""
+    segments = hypothesis.segments
+    series = [o[m] for o, m in zip(segments.observed, segments.inputs.mask, strict=True)]
+    return measurement_noise(series).clamp_min(1e-9)
 
 
 def _by_rollout(hypothesis: Hypothesis, noise: torch.Tensor) -> dict[int, Array]:

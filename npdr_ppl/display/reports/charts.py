@@ -17,6 +17,7 @@ from npdr_ppl.drawing.theme import COLORS, SERIES
 __all__ = [
     "bands_chart",
     "bars_chart",
+    "drawn_points",
     "intervals_chart",
     "layout_of",
     "lines_chart",
@@ -138,6 +139,11 @@ def bars_chart(
     return ChartPart(name, caption, data, layout, 140 + 28 * count)
 
 
+def drawn_points(num: int) -> slice:
+    """Returns the points of a line that are drawn, evenly spread and ``MAX_POINTS`` at most."""
+    return slice(None, None, max(1, -(-num // MAX_POINTS)))
+
+
 def lines_chart(
     name: str,
     lines: Mapping[str, tuple[Sequence[float], Sequence[float | None]]],
@@ -171,8 +177,7 @@ def bands_chart(
         predictive: Draws, ``(n, T)``.
         titles: Of the axes.
     """
-    stride = max(1, -(-len(time) // MAX_POINTS))
-    kept = slice(None, None, stride)
+    kept = drawn_points(len(time))
     data: list[dict[str, Any]] = []
     for low, high, color in _BANDS:
         bounds = np.quantile(predictive[:, kept], [low, high], axis=0)

@@ -14,9 +14,9 @@ from npdr_ppl.display.reports.content import (
     Section,
     TablePart,
     Verdict,
-    number,
 )
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
+from npdr_ppl.drawing.numbers import number
 from npdr_ppl.posterior.comparison.compared_backends import folder_name
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import ComparisonRecord

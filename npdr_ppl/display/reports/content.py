@@ -1,6 +1,5 @@
 """Content of a report, independent of its layout; each kind of run fills it in."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -20,7 +19,6 @@ __all__ = [
     "TextPart",
     "Tone",
     "Verdict",
-    "number",
 ]
 
 Tone = Literal["good", "warn", "bad", "plain"]
@@ -177,10 +175,3 @@ class Report:
     verdict: Verdict
     figures: Sequence[KeyFigure]
     sections: Sequence[Section]
-
-
-def number(value: Any, format_spec: str = ".3g") -> str:
-    """Returns a number as text, or a dash if it is not known."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        return "–"
-    return format(value, format_spec)

@@ -13,10 +13,10 @@ from npdr_ppl.display.reports.content import (
     TablePart,
     TextPart,
     Verdict,
-    number,
 )
 from npdr_ppl.display.reports.discovery_report import discovery_report
 from npdr_ppl.display.reports.training_report import training_report
+from npdr_ppl.drawing.numbers import number
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import DemoRecord
 

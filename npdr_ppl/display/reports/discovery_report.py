@@ -21,9 +21,9 @@ from npdr_ppl.display.reports.content import (
     TablePart,
     TextPart,
     Verdict,
-    number,
 )
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
+from npdr_ppl.drawing.numbers import number
 from npdr_ppl.drawing.theme import SERIES
 from npdr_ppl.run_files import read_bytes, read_json, read_text
 from npdr_ppl.run_records import DiscoveryRecord

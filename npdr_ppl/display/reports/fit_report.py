@@ -13,11 +13,11 @@ from npdr_ppl.display.reports.content import (
     Section,
     TablePart,
     TextPart,
-    number,
 )
 from npdr_ppl.display.reports.meanings import decision_verdict, findings
 from npdr_ppl.display.reports.posterior_parts import posterior_charts, predictive_charts
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
+from npdr_ppl.drawing.numbers import number
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import FitRecord
 

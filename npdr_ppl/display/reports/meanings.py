@@ -4,7 +4,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from npdr_ppl.display.reports.content import Finding, Tone, Verdict, number
+from npdr_ppl.display.reports.content import Finding, Tone, Verdict
+from npdr_ppl.drawing.numbers import number
 from npdr_ppl.posterior.diagnostics import Decision, Thresholds
 
 __all__ = ["decision_verdict", "findings"]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from npdr_ppl.display.reports.charts import ChartPart, lines_chart
+from npdr_ppl.display.reports.charts import ChartPart, drawn_points, lines_chart
 from npdr_ppl.display.reports.content import (
     Finding,
     FindingsPart,
@@ -18,11 +18,11 @@ from npdr_ppl.display.reports.content import (
     TextPart,
     Tone,
     Verdict,
-    number,
 )
 from npdr_ppl.display.reports.fit_report import parameters_table
 from npdr_ppl.display.reports.meanings import findings
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
+from npdr_ppl.drawing.numbers import number
 from npdr_ppl.loop.policy_check import NextStep
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import read_json
@@ -34,8 +34,6 @@ Records = Sequence[Mapping[str, Any]]
 
 MAX_POLICY_PARAMETERS = 50
 """Maximum number of policy parameters that are listed; those of a network are not."""
-
-MAX_POINTS = 400
 
 
 def training_report(folder: Path) -> Report:
@@ -175,11 +173,11 @@ def _rollout(folder: Path) -> list[Section]:
     rollouts = Rollouts.from_netcdf(files[-1])
     readings = np.asarray(rollouts.series()[0], dtype=float)
     time = np.asarray(rollouts.time[0], dtype=float)[: len(readings)]
-    stride = max(1, -(-len(time) // MAX_POINTS))
+    kept = drawn_points(len(time))
     charts: list[ChartPart] = [
         lines_chart(
             f"rollout-{index}",
-            {name: (time[::stride].tolist(), readings[::stride, index].tolist())},
+            {name: (time[kept].tolist(), readings[kept, index].tolist())},
             titles=("time [s]", f"{name} [{unit}]" if unit else name),
             caption=f"{name} in the last real rollout.",
         )

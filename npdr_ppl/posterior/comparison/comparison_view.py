@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.drawing.html import facts, table
+from npdr_ppl.drawing.numbers import number
 from npdr_ppl.drawing.panels import panels
 from npdr_ppl.drawing.theme import COLORS, SERIES
 from npdr_ppl.posterior.comparison.comparison_rows import Row
@@ -36,11 +37,11 @@ def comparison_html(
         shown_rows.append(
             [
                 label,
-                _number(elpd, ".1f"),
-                _number(weights.get(label, math.nan), ".2f"),
-                _number(float(np.mean(figures.rmse)) if figures.rmse else math.nan, ".3g"),
-                _number(figures.crps, ".3g"),
-                _number(diagnosis.r_hat, ".2f"),
+                number(elpd, ".1f"),
+                number(weights.get(label, math.nan), ".2f"),
+                number(float(np.mean(figures.rmse)) if figures.rmse else math.nan, ".3g"),
+                number(figures.crps, ".3g"),
+                number(diagnosis.r_hat, ".2f"),
                 f"{sum(row.seconds.values()):.0f}",
                 diagnosis.decision.value,
             ]
@@ -91,7 +92,3 @@ def plot_comparison(
     if ranked:
         coverage.legend()
     return drawn
-
-
-def _number(value: float, format_spec: str) -> str:
-    return format(value, format_spec) if math.isfinite(value) else "–"

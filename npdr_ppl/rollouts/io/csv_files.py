@@ -170,7 +170,7 @@ def _checked_header(row: list[str]) -> list[str]:
         raise DataError("the first line holds numbers, but it should name the columns.")
     if len(header) > LIMITS.columns:
         raise DataError(f"it has {len(header)} columns, more than {LIMITS.columns}.")
-    rollout_checks.check_names(header, "column")
+    rollout_checks.check_names(header)
     for required in ("rollout", "time"):
         if required not in header:
             told = [n for n in header if _UNIT_IN_NAME.sub("", n) == required]

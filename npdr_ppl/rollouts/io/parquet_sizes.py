@@ -73,7 +73,7 @@ def check_parquet(parquet: Any, size: int) -> None:
     schema, metadata = parquet.schema_arrow, parquet.metadata
     if len(schema) > LIMITS.columns or metadata.num_columns > LIMITS.columns:
         raise DataError(f"it has {len(schema)} columns, more than {LIMITS.columns}.")
-    check_names(schema.names, "column")
+    check_names(schema.names)
     for field in schema:
         if not (pa.types.is_floating(field.type) or pa.types.is_integer(field.type)):
             raise DataError(

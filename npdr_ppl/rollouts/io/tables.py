@@ -34,7 +34,7 @@ def from_table(
     Raises:
         DataError: The table does not have this layout.
     """
-    names = rollout_checks.check_names(list(columns), "column")
+    names = rollout_checks.check_names(list(columns))
     for required in ("rollout", "time"):
         if required not in columns:
             raise DataError(
