@@ -131,9 +131,9 @@ def open_executor(options: WorkerOptions) -> ChunkExecutor:
             client = _dask_client(options, stack)
             executor = _Joblib(number, {"backend": "dask", "client": client}, stack)
         elif options.executor == "ray":
-            _connect_to_ray(options, stack)
+            backend = _connect_to_ray(options, stack)
             # Ray's pool cannot stream, so results arrive wave by wave.
-            executor = _Joblib(number, {"backend": "ray"}, stack, is_streaming=False)
+            executor = _Joblib(number, {"backend": backend}, stack, is_streaming=False)
         else:
             settings = {**loky_settings(), "inner_max_num_threads": 1}
             executor = _Joblib(number, settings, stack)
@@ -163,19 +163,26 @@ def _dask_client(options: WorkerOptions, stack: ExitStack) -> Any:
         raise _unreachable(options, error) from error
 
 
-def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
-    """Connects this process to a Ray cluster, or starts one on this machine."""
+def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> Any:
+    """Connects this process to a Ray cluster, or starts one; returns joblib's backend for it."""
     is_local = options.address is None
     try:
         import ray
         from ray._private import ray_constants
         from ray._private import utils as ray_utils
-        from ray.util.joblib import register_ray
+        from ray.util.joblib.ray_backend import RayBackend
     except ImportError as error:
         raise _missing("ray") from error
-    register_ray()
+
+    class Backend(RayBackend):
+        """Starts no new workers after an interruption; after errors the pool opens a new one."""
+
+        def abort_everything(self, ensure_ready: bool = True) -> None:
+            super().abort_everything(ensure_ready=False)
+
+    backend = Backend()
     if ray.is_initialized():  # the caller's own connection
-        return
+        return backend
     if is_local:
         # On Linux, Ray listens on all interfaces. Its switch for other systems, which its own
         # processes read from the environment, makes it use the loopback interface only.
@@ -205,6 +212,7 @@ def _connect_to_ray(options: WorkerOptions, stack: ExitStack) -> None:
         if handler is not None and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, handler)
     stack.callback(ray.shutdown)
+    return backend
 
 
 @contextmanager
