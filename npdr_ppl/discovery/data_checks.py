@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis
 from npdr_ppl.discovery.settings import DATA_CHECKS
@@ -151,12 +152,13 @@ def _lost_samples(rollouts: Rollouts, channels: Sequence[str]) -> list[str]:
         if moves.sum() < DATA_CHECKS.least_steps:
             continue
         # Only moving channels can jump; a step of the encoder resolution is no jump.
-        steady = np.median(first[moves], axis=0)
-        spread = np.maximum(np.median(second[moves], axis=0) / 0.6745, 0.1 * steady)
-        moving = steady > 0
+        moving = np.median(first[moves], axis=0) > 0
         if moving.sum() < 2:
             continue
-        jumps = second[:, moving] > DATA_CHECKS.jump_size * spread[moving]
+        usual = _usual_change(first[moves], second[moves])
+        # A swing-up beside seconds of balancing is no jump either, so compare with the steps near.
+        near = _usual_change(first, second, size=2 * DATA_CHECKS.least_steps + 1)
+        jumps = (second > DATA_CHECKS.jump_size * np.maximum(usual, near))[:, moving]
         together = jumps.mean(1) > 0.5
         count = int((np.diff(together.astype(int), prepend=0) == 1).sum())
         if 0 < count and together.mean() < DATA_CHECKS.most_lost:
@@ -166,3 +168,21 @@ def _lost_samples(rollouts: Rollouts, channels: Sequence[str]) -> list[str]:
                 f"at {begin:.3g} s)."
             )
     return problems
+
+
+def _usual_change(first: Array, second: Array, *, size: int | None = None) -> Array:
+    """Returns the standard deviation of second differences in steady motion, by channel.
+
+    Args:
+        first: Absolute first differences, ``(T, C)``.
+        second: Absolute second differences, ``(T, C)``.
+        size: Number of steps around each step that count, for a result ``(T, C)``; ``None`` for
+            all steps, ``(C,)``.
+    """
+
+    def median(values: Array) -> Array:
+        if size is None:
+            return np.median(values, axis=0)
+        return ndimage.median_filter(values, size=(size, 1), mode="nearest")
+
+    return np.maximum(median(second) / 0.6745, 0.1 * median(first))

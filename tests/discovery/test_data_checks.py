@@ -40,3 +40,11 @@ def test_a_device_that_rests_most_of_the_time_has_lost_nothing():
         np.concatenate((angle, angle[-1] + creep)), np.concatenate((velocity, 1e2 * creep))
     )
     assert not recording_problems(Pendulum().sensors, resting)
+
+
+def test_fast_motion_before_slow_motion_is_no_gap():
+    """The swing-up before seconds of slow motion, which determine the median change."""
+    time = STEP * np.arange(3000)
+    angle = 0.03 * time + np.exp(-np.square(time / 0.2)) * np.sin(20.0 * time)
+    velocity = np.gradient(angle, STEP) + 1e-3 * np.sin(50.0 * time)
+    assert not recording_problems(Pendulum().sensors, recording(angle, velocity))
