@@ -33,8 +33,8 @@ from npdr_ppl.discovery.data_checks import recording_problems
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis
 from npdr_ppl.discovery.proof.held_out_gap import prove
 from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
-from npdr_ppl.discovery.screening.candidate_effects import candidates_at
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.errors import DataError

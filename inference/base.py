@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from npdr_ppl.errors import BackendError, ShapeError
-from npdr_ppl.inference.linear_problem import LinearRegression
+from npdr_ppl.language.linear_regression_problem import LinearRegression
 from npdr_ppl.rollouts.differentiation import Smoothing
 
 __all__ = ["Backend", "Density", "Problem", "Progress", "RoundInfo", "State"]

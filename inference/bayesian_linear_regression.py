@@ -26,8 +26,8 @@ from torch import Tensor
 
 from npdr_ppl.errors import BackendError
 from npdr_ppl.inference.base import Backend, Density, Problem, Progress, State
-from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.inference.parts.samplers.conjugate import StudentT, linear_posterior
+from npdr_ppl.language.linear_regression_problem import LinearRegression
 from npdr_ppl.rollouts.differentiation import Smoothing
 
 __all__ = ["BayesianLinearRegression", "LinearRegressionState", "RegressionDensity"]

@@ -1,52 +1,38 @@
-"""Files in a run's folder: JSON, tensors, and the description that identifies the run."""
+"""Files in a run's folder: JSON, tensors, and the check that a folder holds this run."""
 
-import functools
 import hashlib
-import inspect
 import json
 import math
 import os
-import platform
 import re
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 import torch
 from filelock import FileLock, Timeout
-from pyro.poutine.messenger import Messenger
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
 from npdr_ppl.atomic_files import remove_unfinished, replacing
 from npdr_ppl.errors import DataError, NpdrError
-from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps
-from npdr_ppl.language.prior import Prior
-from npdr_ppl.language.sites import SimulatorBlackBox
-from npdr_ppl.language.wider_priors import ModelWithWiderPriors
 from npdr_ppl.reading_limits import LIMITS
 
 __all__ = [
     "claimed",
-    "engine_settings",
-    "file_text",
     "holds_this_run",
     "load_tensors",
     "make_folder",
-    "model_name",
     "plain",
     "read_bytes",
     "read_json",
     "read_text",
     "reading_back",
     "save_tensors",
-    "source_text",
-    "versions",
     "write_json",
 ]
 
@@ -71,8 +57,6 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x1f\x7f-\x9f]")
 """Characters that could change a terminal's state; source code has none of them."""
 
 T = TypeVar("T")
-
-_PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
 
 
 def make_folder(path: Path) -> None:
@@ -297,73 +281,6 @@ def _check_plain(value: Any) -> None:
             return
         layer = below
     raise DataError(f"it is nested more than {LIMITS.depth} deep")
-
-
-def versions() -> dict[str, str]:
-    """Returns the versions that a result depends on."""
-    found = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
-
-
-def model_name(model: Any) -> str:
-    """Returns the name of a model with what is attached to it; the same in every process."""
-    if _is_wrapped(model):
-        return model_name(model.args[-1])
-    if isinstance(model, ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors):
-        return repr(model)
-    return getattr(model, "__name__", type(model).__name__)
-
-
-def source_text(model: Any) -> str:
-    """Returns the source of a model, and the names of what is attached to it."""
-    if isinstance(model, ModelWithEffects):
-        attached = "\n".join(f"# with {effect!r}" for effect, _ in model.effects)
-        return f"{source_text(model.base)}\n{attached}"
-    if _is_wrapped(model):
-        return f"{source_text(model.args[-1])}\n# under {type(model.args[0]).__name__}"
-    if isinstance(model, ModelWithFinerSteps | ModelWithWiderPriors):
-        return f"{source_text(model.base)}\n# {model!r}"
-    try:
-        return inspect.getsource(model)
-    except (OSError, TypeError):
-        return repr(model)
-
-
-def file_text(model: Any) -> str:
-    """Returns the file that defines a model; often its simulator is defined there, too.
-
-    Empty if there is no such file.
-    """
-    while _is_wrapped(model) or hasattr(model, "base"):
-        model = model.args[-1] if _is_wrapped(model) else model.base
-    try:
-        return Path(inspect.getsourcefile(model) or "").read_text(encoding="utf-8")
-    except (OSError, TypeError, UnicodeDecodeError):
-        return ""
-
-
-def _is_wrapped(model: Any) -> bool:
-    """Whether Pyro has wrapped a model in a handler: a partial that has both as arguments."""
-    return (
-        isinstance(model, functools.partial)
-        and bool(model.args)
-        and isinstance(model.args[0], Messenger)
-    )
-
-
-def engine_settings(prior: Prior) -> dict[str, Any]:
-    """Returns the settings of the simulators' engines by site, without empty ones."""
-    settings = {
-        name: box.simulator.recorded_settings()
-        for name, box in prior.black_boxes.items()
-        if isinstance(box, SimulatorBlackBox)
-    }
-    return {name: values for name, values in settings.items() if values}
 
 
 def plain(value: Any) -> Any:

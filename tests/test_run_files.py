@@ -11,22 +11,11 @@ import pytest
 import safetensors.torch
 import torch
 
-import npdr_ppl as npdr
 from npdr_ppl.arviz_module import from_dict, from_netcdf, to_netcdf
 from npdr_ppl.atomic_files import remove_unfinished, replacing
 from npdr_ppl.errors import DataError
-from npdr_ppl.models.effects import CoulombFriction
-from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.run_files import (
-    claimed,
-    file_text,
-    load_tensors,
-    model_name,
-    read_json,
-    save_tensors,
-    write_json,
-)
+from npdr_ppl.run_files import claimed, load_tensors, read_json, save_tensors, write_json
 from npdr_ppl.run_records import FitRecord
 
 HOLD = """
@@ -187,16 +176,3 @@ def test_a_full_disk_leaves_the_old_file_and_says_which_it_is(tmp_path, name):
         assert path.read_bytes() == before
         assert os.listdir(tmp_path) == [name]
     read(path)
-
-
-def test_a_model_has_the_same_name_in_every_process():
-    # A handler of Pyro's is printed with its address in memory.
-    noisy = npdr.with_noise(npdr.add_effect(pendulum, CoulombFriction("hinge")), 0.1)
-    assert model_name(noisy) == "pendulum + hinge.coulomb_friction"
-    assert model_name(pendulum) == "pendulum"
-
-
-def test_the_file_of_a_model_is_found_under_what_wraps_it():
-    noisy = npdr.with_noise(npdr.add_effect(pendulum, CoulombFriction("hinge")), 0.1)
-    assert "class Pendulum" in file_text(noisy)
-    assert file_text(len) == ""

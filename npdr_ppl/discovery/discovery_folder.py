@@ -24,18 +24,10 @@ from npdr_ppl.discovery.investigation import Investigation
 from npdr_ppl.discovery.kept_fits import keep_fits
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.model import Model
+from npdr_ppl.model_identity import model_name, source_text, versions
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.run_files import (
-    holds_this_run,
-    make_folder,
-    model_name,
-    plain,
-    read_json,
-    source_text,
-    versions,
-    write_json,
-)
+from npdr_ppl.run_files import holds_this_run, make_folder, plain, read_json, write_json
 from npdr_ppl.run_records import DiscoveryRecord
 
 __all__ = ["STAGES", "DiscoveryFolder", "Stage", "findings_until"]

@@ -97,9 +97,14 @@ class Investigation:
         self.seed = seed
         self.seconds: dict[str, float] = {}
         self.progress = SearchProgress(self.settings, progress)
-        self._binding = segment_options(rollouts, options)
+        self._data_options = segment_options(rollouts, options)
         self._searcher = Searcher(
-            model, rollouts, self.settings, self.progress.say, binding=self._binding, seed=seed
+            model,
+            rollouts,
+            self.settings,
+            self.progress.say,
+            data_options=self._data_options,
+            seed=seed,
         )
         self._drawn: list[tuple[Hypothesis, Draws]] = []
 
@@ -118,7 +123,7 @@ class Investigation:
             try:
                 fitted = self._searcher.fit_base()
             except DataError as error:
-                measured = SegmentModel(self.model, self.rollouts, self._binding).measured
+                measured = SegmentModel(self.model, self.rollouts, self._data_options).measured
                 problems = recording_problems(measured, self.rollouts)
                 if not problems:
                     raise
@@ -160,7 +165,7 @@ class Investigation:
         """Problems of the recording itself."""
         start = self.start
         with self._stage("check data"):
-            return tuple(data_problems(start, self.rollouts, self._binding))
+            return tuple(data_problems(start, self.rollouts, self._data_options))
 
     @cached_property
     def where(self) -> list[Spot]:
@@ -215,12 +220,12 @@ class Investigation:
         given, final = self.given, self.search.final
         draws_before, draws_after = self._draws(given), self._draws(final)
         with self._stage("prove"):
-            binding = _like(self._binding, self.rollouts, self.holdout)
+            data_options = _like(self._data_options, self.rollouts, self.holdout)
             return prove(
                 given,
                 final,
                 self.holdout,
-                binding,
+                data_options,
                 draws_before=draws_before,
                 draws_after=draws_after,
                 seed=self.seed,
@@ -241,7 +246,7 @@ class Investigation:
             return None
         ids = {name.rsplit(".", 1)[1] for name in names}
         classes = [g for g in added.effect.equivalence if len(ids & set(g.members)) > 1]
-        return next_experiment(alternatives, self.rollouts, self._binding, classes)
+        return next_experiment(alternatives, self.rollouts, self._data_options, classes)
 
     def conclude(self) -> Discovery:
         """Runs all stages and returns the result."""
@@ -427,9 +432,9 @@ def _most_doubtful(effects: list[Finding], options: DiscoveryOptions) -> Finding
     )
 
 
-def _like(binding: DataOptions, rollouts: Rollouts, holdout: Rollouts) -> DataOptions:
+def _like(data_options: DataOptions, rollouts: Rollouts, holdout: Rollouts) -> DataOptions:
     """Returns options for segments of the same duration at the held-out sampling rate."""
-    length = binding.steps(rollouts)
+    length = data_options.steps(rollouts)
     assert length is not None
     steps = round(length * rollouts.time_step / holdout.time_step)
-    return replace(binding, segment_length=max(2, steps))
+    return replace(data_options, segment_length=max(2, steps))

@@ -20,15 +20,9 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.model_identity import file_text, source_text, versions
 from npdr_ppl.preparation.segment_model import SegmentModel
-from npdr_ppl.run_files import (
-    file_text,
-    load_tensors,
-    make_folder,
-    save_tensors,
-    source_text,
-    versions,
-)
+from npdr_ppl.run_files import load_tensors, make_folder, save_tensors
 
 __all__ = ["keep_fits", "keeping", "made_or_read"]
 

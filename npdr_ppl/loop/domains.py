@@ -1,4 +1,7 @@
-"""Domains: the simulators for training a policy, drawn from a prior or a posterior."""
+"""Domains: a simulator with many parameter sets, drawn from a prior or a posterior.
+
+``training_domains.py`` calls this module to make those in which a policy is trained.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

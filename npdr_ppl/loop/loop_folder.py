@@ -26,6 +26,7 @@ from torch import Tensor
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.model import Model
 from npdr_ppl.loop.control_task import ControlTask
+from npdr_ppl.model_identity import source_text, versions
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.run_files import (
     holds_this_run,
@@ -34,8 +35,6 @@ from npdr_ppl.run_files import (
     plain,
     read_json,
     save_tensors,
-    source_text,
-    versions,
     write_json,
 )
 from npdr_ppl.run_records import IterationRecord, PolicyRecord

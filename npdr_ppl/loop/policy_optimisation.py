@@ -1,4 +1,7 @@
-"""POLOPT of Algorithm 1: a policy search that evaluates policies in many domains at once."""
+"""POLOPT of Algorithm 1: a policy search that evaluates policies in many domains at once.
+
+``policy_training.py`` calls it and decides what follows.
+"""
 
 import math
 from collections.abc import Callable, Mapping

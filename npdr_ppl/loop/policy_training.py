@@ -1,4 +1,7 @@
-"""POLOPT of Algorithm 1, as the loop calls it: train a policy, check it, train it for the tail."""
+"""The training of the loop's policies: run POLOPT, check the policy, train it for the tail.
+
+POLOPT is the search in ``policy_optimisation.py``, which ``npdr_loop.py`` passes as ``optimise``.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass

@@ -1,4 +1,7 @@
-"""The domains in which the loop trains a policy after an iteration."""
+"""The choice of the domains in which the loop trains a policy after an iteration.
+
+They are made by ``domains.py``; this module chooses their parameters, with the options' spread.
+"""
 
 from collections.abc import Callable
 

@@ -1,5 +1,5 @@
 """From a bound model to a posterior: prepare, infer, check, export, diagnose.
 
 ``comparison`` sets backends side by side; ``calibration`` tests coverage. May import: discovery
-(its alarm), preparation, inference. Start reading at ``infer.py``.
+(its first fit and its alarm), preparation, inference. Start reading at ``infer.py``.
 """

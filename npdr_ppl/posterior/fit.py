@@ -14,6 +14,7 @@ from npdr_ppl.engines.workers import collect_faults
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.language.model import Model
+from npdr_ppl.model_identity import engine_settings
 from npdr_ppl.posterior.diagnostics import Decision, diagnose
 from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.parameter_units import parameter_units
@@ -23,7 +24,7 @@ from npdr_ppl.preparation.data_options import DataOptions, checked_options
 from npdr_ppl.preparation.evaluation import score
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.run_files import claimed, engine_settings, write_json
+from npdr_ppl.run_files import claimed, write_json
 
 if TYPE_CHECKING:
     from npdr_ppl.arviz_module import Data

@@ -1,9 +1,8 @@
-"""The preparation of a recording, with which every command begins.
+"""The preparation of a recording, with which ``fit``, ``compare`` and ``train`` begin.
 
 It estimates the initial states and their errors, finds the model's closest fit, refines
 integration steps that are too coarse, estimates noise that the model does not declare, and chooses
-features.
-``fit``, ``compare``, ``train`` and ``discover`` share it.
+features. ``discover`` shares its first part, the fit in ``discovery/search/base_fit.py``.
 """
 
 import math
@@ -237,12 +236,12 @@ def prepare(
             model, rollouts, options, is_declared or options.noise == "model", seed, progress
         )
     length = options.steps(rollouts) or max(rollouts.lengths)
-    binding = replace(options, embedding=None, segment_length=length)
+    data_options = replace(options, embedding=None, segment_length=length)
     searcher = Searcher(
         model,
         rollouts,
         DiscoveryOptions(),
-        binding=binding,
+        data_options=data_options,
         seed=seed,
     )
     simulator = searcher.base.simulator
@@ -300,8 +299,8 @@ def held_out(prepared: Preparation, rollouts: Rollouts) -> SegmentLikelihood | N
     if fitted is None:
         return None
     z, scale = fitted.fit.z, fitted.fit.scale
-    binding = replace(prepared.options, embedding=None, precision="float64")
-    segments = SegmentModel(prepared.plain_model, rollouts, binding)
+    data_options = replace(prepared.options, embedding=None, precision="float64")
+    segments = SegmentModel(prepared.plain_model, rollouts, data_options)
     starts = segments.estimated_starts(z, scale)
     if starts is not None:
         segments = segments.starting_from(starts)

@@ -31,22 +31,19 @@ from npdr_ppl.language.handlers import (
     with_noise,
 )
 from npdr_ppl.language.prior import Prior
+from npdr_ppl.model_identity import engine_settings, model_name, source_text, versions
 from npdr_ppl.posterior.estimator_check import Correction
 from npdr_ppl.posterior.prepare import Preparation
 from npdr_ppl.preparation.binding import BoundModel
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.run_files import (
-    engine_settings,
     holds_this_run,
     load_tensors,
     make_folder,
-    model_name,
     read_json,
     reading_back,
     save_tensors,
-    source_text,
-    versions,
     write_json,
 )
 from npdr_ppl.run_records import PreparationRecord, RoundRecord, RunDescription

@@ -11,8 +11,8 @@ from torch import Tensor
 from npdr_ppl.embeddings import Embedding, embedding_by_name
 from npdr_ppl.errors import DataError, ModelError, ShapeError
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.linear_regression_problem import LinearRegression
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox

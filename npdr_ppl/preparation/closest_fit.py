@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.model import Model
-from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.data_options import DataOptions, one_of_each_part
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
@@ -140,14 +140,8 @@ def search_prior(
 
 def _spread_out(segments: SegmentModel, seed: int) -> SegmentModel:
     """Returns the model along a segment of each of equal parts of the recording."""
-    num = segments.inputs.num_segments
-    if num <= PRIOR_SEARCH.most_segments:
-        return segments
-    generator = torch.Generator().manual_seed(seed)
-    places = torch.arange(PRIOR_SEARCH.most_segments) + torch.rand(
-        PRIOR_SEARCH.most_segments, generator=generator
-    )
-    return segments.along((places * (num / PRIOR_SEARCH.most_segments)).long())
+    num, used = segments.inputs.num_segments, PRIOR_SEARCH.most_segments
+    return segments if num <= used else segments.along(one_of_each_part(used, num, seed=seed))
 
 
 def _errors(segments: SegmentModel, z: Tensor, starts: Tensor, ranges: Tensor) -> Tensor:

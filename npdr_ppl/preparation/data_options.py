@@ -18,6 +18,7 @@ __all__ = [
     "SegmentLength",
     "checked_options",
     "default_segment_length",
+    "one_of_each_part",
 ]
 
 MAX_READINGS_PER_CHUNK = 2_000_000
@@ -106,14 +107,13 @@ class DataOptions:
 
     def used_segments(self, rollouts: Rollouts) -> torch.Tensor:
         """Returns the indices of the segments that are used, among all of them."""
-        used, every = self.num_segments(rollouts)
-        return torch.linspace(0, every - 1, used, dtype=torch.float64).round().long()
+        return one_of_each_part(*self.num_segments(rollouts), seed=0)
 
     def num_segments(self, rollouts: Rollouts) -> tuple[int, int]:
         """Returns how many segments of rollouts are used, and how many there are.
 
-        Of a very long recording, segments that are spread evenly over it are used, if initial
-        states are uncertain; see ``MOST_READINGS``. Otherwise all are used.
+        Of a very long recording, one segment of each of equal parts is used, if initial states
+        are uncertain; see ``MOST_READINGS``. Otherwise all are used.
         """
         length = self.steps(rollouts) or max(rollouts.lengths)
         every = sum(-(-steps // length) for steps in rollouts.lengths)
@@ -133,6 +133,22 @@ class DataOptions:
         if self.initial_state != "uncertain":
             return self
         return replace(self, initial_state="estimated")
+
+
+def one_of_each_part(num_parts: int, num: int, *, seed: int) -> torch.Tensor:
+    """Returns a random index of each of equal parts of a range, ``(num_parts,)``, in order.
+
+    Indices at equal distances could always meet the same phase of a periodic excitation.
+
+    Args:
+        num_parts: Number of parts, at most ``num``.
+        num: Length of the range.
+        seed: Seed of the choice.
+    """
+    ends = torch.arange(num_parts + 1) * num // num_parts
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand(num_parts, generator=generator, dtype=torch.float64)
+    return ends[:-1] + (share * ends.diff()).long()
 
 
 def checked_options(

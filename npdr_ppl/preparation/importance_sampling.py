@@ -19,8 +19,8 @@ from torch import Tensor
 
 from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
-from npdr_ppl.inference.parts.samplers.ensemble import ensemble_draws
 from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, systematic
+from npdr_ppl.inference.parts.samplers.walkers import ensemble_draws
 from npdr_ppl.preparation.ridges import RidgeCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING

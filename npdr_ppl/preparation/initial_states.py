@@ -25,7 +25,13 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.segments import cut
 from npdr_ppl.rollouts.states import estimate_departures
 
-__all__ = ["InitialStates", "error_factors", "estimate_starts", "uncertain_components"]
+__all__ = [
+    "InitialStates",
+    "error_draws",
+    "error_factors",
+    "estimate_starts",
+    "uncertain_components",
+]
 
 
 @dataclass(frozen=True)
@@ -244,8 +250,7 @@ def error_factors(residual: Tensor, by_starts: Tensor) -> Tensor:
         residual: Whitened residuals with all offsets at zero, ``(S, N)``.
         by_starts: Their derivatives by the offsets, ``(S, N, m)``.
     """
-    information = by_starts.mT @ by_starts
-    score = (by_starts.mT @ residual[..., None])[..., 0]
+    information, score = _normal_equations(residual, by_starts)
     eye = torch.eye(by_starts.shape[-1], dtype=torch.float64)
     factors = torch.ones(by_starts.shape[-1], dtype=torch.float64)
     # Checked at the largest factors, at which the matrix is closest to singular.
@@ -254,8 +259,42 @@ def error_factors(residual: Tensor, by_starts: Tensor) -> Tensor:
         return factors
     information, score = information[is_known], score[is_known]
     for _ in range(INITIAL_STATES.iterations):
-        covariance = torch.linalg.inv(eye + factors[:, None] * information * factors)
-        mean = (covariance @ (factors * score)[..., None])[..., 0]
+        mean, covariance = _posterior(information, score, factors)
         square = (mean.square() + covariance.diagonal(dim1=-2, dim2=-1)).mean(0)
         factors = (factors * square.sqrt()).clamp(*INITIAL_STATES.factor_limits)
     return factors
+
+
+def error_draws(residual: Tensor, by_starts: Tensor, factors: Tensor) -> Tensor:
+    """Returns a draw of the offsets that lead from the estimates to the true initial states.
+
+    It is a draw of their posterior, ``(S, m)``, from torch's global stream. In segments in which
+    the simulation diverges, it is one of their prior.
+
+    Args:
+        residual: Whitened residuals with all offsets at zero, ``(S, N)``.
+        by_starts: Their derivatives by the offsets, ``(S, N, m)``.
+        factors: Standard deviations of the offsets, see :func:`error_factors`, ``(m,)``.
+    """
+    is_finite = residual.isfinite().all(-1) & by_starts.isfinite().all(-1).all(-1)
+    information, score = _normal_equations(residual[is_finite], by_starts[is_finite])
+    eye = torch.eye(len(factors), dtype=torch.float64)
+    is_known = is_invertible(eye / factors.square() + information)
+    index = is_finite.nonzero()[is_known, 0]
+    mean, covariance = _posterior(information[is_known], score[is_known], factors)
+    drawn = torch.randn(len(residual), len(factors), dtype=torch.float64)
+    root = torch.linalg.cholesky(covariance)
+    drawn[index] = mean + (root @ drawn[index][..., None])[..., 0]
+    return factors * drawn
+
+
+def _normal_equations(residual: Tensor, by_starts: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns information ``(S, m, m)`` and score ``(S, m)`` of the offsets."""
+    return by_starts.mT @ by_starts, -(by_starts.mT @ residual[..., None])[..., 0]
+
+
+def _posterior(information: Tensor, score: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns mean ``(S, m)`` and covariance ``(S, m, m)`` of the offsets over their factors."""
+    eye = torch.eye(len(factors), dtype=torch.float64)
+    covariance = torch.linalg.inv(eye + factors[:, None] * information * factors)
+    return (covariance @ (factors * score)[..., None])[..., 0], covariance

@@ -9,10 +9,10 @@ from scipy import linalg
 from torch import Tensor
 
 from npdr_ppl.errors import BackendError, DataError, ModelError, TooShortError
-from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.inference.parts.samplers.conjugate import row_noise
 from npdr_ppl.language.effects import LinearForceEffect
 from npdr_ppl.language.linear_dynamics import InverseDynamics, Motion
+from npdr_ppl.language.linear_regression_problem import LinearRegression
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox

@@ -163,7 +163,7 @@ def _check_columns(recording: "Recording") -> None:
     ):
         if len(units) not in (0, len(columns)):
             raise DataError(f"{field} has {len(units)} entries for {len(columns)} columns.")
-        rollout_checks.check_units(units, columns)
+        rollout_checks.check_unit_texts(units, columns)
 
 
 def _check_arrays(recording: "Recording") -> None:

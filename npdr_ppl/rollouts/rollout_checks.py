@@ -21,7 +21,7 @@ __all__ = [
     "check_finite",
     "check_names",
     "check_time",
-    "check_units",
+    "check_unit_texts",
     "named",
     "shown",
 ]
@@ -145,7 +145,7 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def check_units(units: Sequence[str], names: Sequence[str]) -> None:
+def check_unit_texts(units: Sequence[str], names: Sequence[str]) -> None:
     """Checks that units are short, printable text; there is one for each name, or none at all.
 
     Raises:

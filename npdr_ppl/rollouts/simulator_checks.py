@@ -20,14 +20,14 @@ SMALLEST_SHARE = 1e-5
 and sensors of robots do not resolve so little."""
 
 
-def check_duplicates(rollouts: Recording) -> None:
+def check_duplicates(recording: Recording) -> None:
     """Raises a DataError if two rollouts are identical to the last bit.
 
     Two recordings of a device never are, so the same file was probably added twice.
     """
     seen: dict[bytes, int] = {}
     for index, (readings, actions) in enumerate(
-        zip(rollouts.readings, rollouts.actions, strict=True)
+        zip(recording.readings, recording.actions, strict=True)
     ):
         key = readings.tobytes() + actions.tobytes()
         if key in seen:
@@ -38,7 +38,7 @@ def check_duplicates(rollouts: Recording) -> None:
 
 
 def check_channels(
-    rollouts: Recording,
+    recording: Recording,
     channels: Sequence[Channel],
     actions: Sequence[Channel],
     *,
@@ -50,7 +50,7 @@ def check_channels(
     from the position.
 
     Args:
-        rollouts: The data.
+        recording: The data.
         channels: Expected state or sensor channels.
         actions: Expected actions.
         allow_extra: Accept channels that are not expected. Extra actions are never accepted.
@@ -58,25 +58,25 @@ def check_channels(
     Raises:
         DataError: A column is missing or extra, or an action was read as a channel.
     """
-    recorded = set(rollouts.channel_names)
+    recorded = set(recording.channel_names)
     for action in actions:
-        if action.name in recorded and action.name not in rollouts.action_names:
+        if action.name in recorded and action.name not in recording.action_names:
             raise DataError(
                 f"{action.name} is an action, but its cells in the last row of each rollout are "
                 "not empty; empty them if that row is the one measured after the last step, "
                 "otherwise append such a row (or, in Python, read with "
                 f"actions=[{action.name!r}])."
             )
-    missing = [a.name for a in actions if a.name not in rollouts.action_names]
+    missing = [a.name for a in actions if a.name not in recording.action_names]
     missing += [c.name for c in channels if c.name not in recorded and c.rate_of not in recorded]
-    found = ", ".join((*rollouts.channel_names, *rollouts.action_names))
+    found = ", ".join((*recording.channel_names, *recording.action_names))
     if missing:
         raise DataError(f"the column {', '.join(missing)} is missing; the data have {found}.")
     expected_actions = {action.name for action in actions}
-    extra = [name for name in rollouts.action_names if name not in expected_actions]
+    extra = [name for name in recording.action_names if name not in expected_actions]
     if not allow_extra:
         expected = {channel.name for channel in channels}
-        extra += [name for name in rollouts.channel_names if name not in expected]
+        extra += [name for name in recording.channel_names if name not in expected]
     if extra:
         raise DataError(
             f"the column {', '.join(extra)} is not expected; remove it, or give it the name of a "
@@ -84,7 +84,7 @@ def check_channels(
         )
 
 
-def check_units(rollouts: Recording, channels: Sequence[Channel]) -> None:
+def check_units(recording: Recording, channels: Sequence[Channel]) -> None:
     """Checks the units and signs of columns, e.g. finds degrees or millimetres instead of SI.
 
     Three symptoms show another unit. A range exceeds the declared bounds by the factor between the
@@ -92,37 +92,37 @@ def check_units(rollouts: Recording, channels: Sequence[Channel]) -> None:
     this factor. If the data have units, these are compared with the declared ones.
 
     Args:
-        rollouts: The data.
+        recording: The data.
         channels: State, sensor or action channels with units, bounds and ``rate_of``.
 
     Raises:
         DataError: A column is probably in another unit.
     """
-    units = dict(zip(rollouts.channel_names, rollouts.channel_units, strict=True))
-    units |= dict(zip(rollouts.action_names, rollouts.action_units, strict=True))
+    units = dict(zip(recording.channel_names, recording.channel_units, strict=True))
+    units |= dict(zip(recording.action_names, recording.action_units, strict=True))
     for channel in channels:
         own = units.get(channel.name, "")
         if own and channel.unit and own != channel.unit:
             raise DataError(f"{channel.name} is in {own}, but {channel.unit} is expected.")
     for channel in channels:
         if channel.name in units:
-            _check_range(rollouts, channel)
+            _check_range(recording, channel)
     for channel in channels:
-        if channel.name in rollouts.channel_names and channel.rate_of in rollouts.channel_names:
+        if channel.name in recording.channel_names and channel.rate_of in recording.channel_names:
             unit = channel.unit.removesuffix("/s")
-            _check_rate(rollouts, channel.name, channel.rate_of, unit)
+            _check_rate(recording, channel.name, channel.rate_of, unit)
 
 
-def _column(rollouts: Recording, name: str) -> list[NDArray[np.float64]]:
-    if name in rollouts.channel_names:
-        index = rollouts.channel_names.index(name)
-        return [readings[:, index] for readings in rollouts.readings]
-    index = rollouts.action_names.index(name)
-    return [actions[:, index] for actions in rollouts.actions]
+def _column(recording: Recording, name: str) -> list[NDArray[np.float64]]:
+    if name in recording.channel_names:
+        index = recording.channel_names.index(name)
+        return [readings[:, index] for readings in recording.readings]
+    index = recording.action_names.index(name)
+    return [actions[:, index] for actions in recording.actions]
 
 
-def _check_range(rollouts: Recording, channel: Channel) -> None:
-    largest = max(float(np.max(np.abs(values))) for values in _column(rollouts, channel.name))
+def _check_range(recording: Recording, channel: Channel) -> None:
+    largest = max(float(np.max(np.abs(values))) for values in _column(recording, channel.name))
     bound = max(abs(channel.lower), abs(channel.upper))
     # Sensors may exceed a bound by a few per cent, but not by several times the bound.
     if math.isfinite(bound) and largest > 3 * bound:
@@ -140,20 +140,21 @@ def _check_range(rollouts: Recording, channel: Channel) -> None:
         )
 
 
-def _check_rate(rollouts: Recording, rate: str, position: str, unit: str) -> None:
+def _check_rate(recording: Recording, rate: str, position: str, unit: str) -> None:
     """Compares the displacement of a position with the integral of its rate.
 
     Net displacements over a window of 0.1 s are insensitive to quantisation and to the low-pass
     filter of a driver. Both would disturb a comparison of derivatives at each sample.
     """
-    window = max(1, round(0.1 / rollouts.time_step))
+    window = max(1, round(0.1 / recording.time_step))
     moved: list[NDArray[np.float64]] = []
     integrated: list[NDArray[np.float64]] = []
-    for positions, rates in zip(_column(rollouts, position), _column(rollouts, rate), strict=True):
+    columns = _column(recording, position), _column(recording, rate)
+    for positions, rates in zip(*columns, strict=True):
         stride = min(window, len(positions) - 1)
         area = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2)])
         moved.append(positions[stride::stride] - positions[:-stride:stride])
-        integrated.append((area[stride::stride] - area[:-stride:stride]) * rollouts.time_step)
+        integrated.append((area[stride::stride] - area[:-stride:stride]) * recording.time_step)
     x, y = np.concatenate(integrated), np.concatenate(moved)
     size = float(np.linalg.norm(x)) * float(np.linalg.norm(y))
     # If the two curves differ in shape, their ratio says nothing about units.

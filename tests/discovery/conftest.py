@@ -13,8 +13,8 @@ from npdr_ppl.models.effects import QuadraticDrag
 def quiet():
     """A pendulum without anything hidden, fitted."""
     case = make_case("pendulum", "null", (), seed=2001)
-    binding = segment_options(case.fit)
-    return fit_hypothesis(case.model, case.fit, binding)
+    data_options = segment_options(case.fit)
+    return fit_hypothesis(case.model, case.fit, data_options)
 
 
 @pytest.fixture(scope="session")
@@ -22,8 +22,8 @@ def dragged():
     """A pendulum in a hidden drag, fitted without it."""
     place = ("hinge", "quadratic_drag")
     case = make_case("pendulum", "one", (place,), strength=0.3, seed=2001)
-    binding = segment_options(case.fit)
-    return case, fit_hypothesis(case.model, case.fit, binding)
+    data_options = segment_options(case.fit)
+    return case, fit_hypothesis(case.model, case.fit, data_options)
 
 
 @pytest.fixture(scope="session")

@@ -45,7 +45,7 @@ def test_every_effect_gets_its_own_alternatives(dragged):
     options = npdr.DiscoveryOptions(effects=(*three, Cogging("hinge")))
     searcher = Searcher(case.model, case.fit, options)
     two, all_three, ripple = (
-        fit_hypothesis(case.model, case.fit, searcher.binding, effects=effects)
+        fit_hypothesis(case.model, case.fit, searcher.data_options, effects=effects)
         for effects in (three[:2], three, (*three[:2], Cogging("hinge")))
     )
     # The last one's were tried when it was added.

@@ -7,8 +7,8 @@ import pytest
 from hidden_rigs import RIGS, make_case
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.screening.candidate_effects import candidates_at
 from npdr_ppl.discovery.screening.encoder_resolution import count_of, counts
+from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.errors import ModelError
 from npdr_ppl.models.effects import Quantisation, ViscousFriction

@@ -16,9 +16,9 @@ from npdr_ppl.models.effects import CoulombFriction, QuadraticDrag
 def fitted(dragged):
     """The model without an effect, with the hidden one, and with another one."""
     case, without = dragged
-    binding = segment_options(case.fit)
+    data_options = segment_options(case.fit)
     return without, *(
-        fit_hypothesis(case.model, case.fit, binding, effects=(effect,))
+        fit_hypothesis(case.model, case.fit, data_options, effects=(effect,))
         for effect in (QuadraticDrag("hinge"), CoulombFriction("hinge"))
     )
 

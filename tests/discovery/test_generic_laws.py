@@ -32,8 +32,8 @@ def test_a_resonance_is_detected_at_its_frequency(quiet):
     hidden = make_case(
         "pendulum", "one", (("hinge", "joint_elasticity"),), strength=1.0, seed=2001
     )
-    binding = segment_options(hidden.fit)
-    ringing = Projection(fit_hypothesis(hidden.model, hidden.fit, binding))
+    data_options = segment_options(hidden.fit)
+    ringing = Projection(fit_hypothesis(hidden.model, hidden.fit, data_options))
 
     def heard(projection):
         laws = ringing_laws(projection)

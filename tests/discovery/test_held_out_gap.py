@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.proof.held_out_gap import Gap
+from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.proof.held_out_gap import Gap, prove
+from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
+from npdr_ppl.language.handlers import with_finer_steps
+from npdr_ppl.models.pendulum import pendulum
+from npdr_ppl.preparation import data_options
+from npdr_ppl.preparation.data_options import DataOptions
+from tests.helpers.pendulum_recordings import swinging
 
 DISTURBANCE = 0.5
 """Standard deviation of what is added to held-out velocities, rad/s: fifty times their noise."""
@@ -58,3 +65,45 @@ def test_held_out_rollouts_have_no_say_in_what_is_found(proofs):
     assert [f.to_dict() for f in clean.effects] == [f.to_dict() for f in noisy.effects]
     assert (clean.verdict, clean.reason) == (noisy.verdict, noisy.reason)
     assert clean.parameters == noisy.parameters
+
+
+LENGTHS = 10, 20, 50
+"""Steps of a segment; the shorter, the larger the part of the initial states' errors."""
+
+
+@pytest.fixture
+def proved():
+    """Returns a proof of the true model on rollouts that it was not fitted to."""
+    model = with_finer_steps(with_finer_steps(pendulum))
+
+    def prove_at(length, seed=0):
+        rollouts, held_out = (swinging(rollouts=2, steps=400, seed=k) for k in (seed, seed + 10))
+        options = DataOptions(segment_length=length, initial_state="uncertain")
+        hypothesis = fit_hypothesis(model, rollouts, options)
+        draws = posterior_draws(hypothesis, seed=0)
+        return prove(
+            hypothesis, hypothesis, held_out, options,
+            draws_before=draws, draws_after=draws, seed=0,
+        )  # fmt: skip
+
+    return prove_at
+
+
+@pytest.mark.parametrize("length", LENGTHS)
+def test_the_true_model_reaches_the_noise_floor(proved, length):
+    found = proved(length)
+    for metric in ("rmse", "dtw", "crps"):
+        # A standard deviation over draws of the initial states is some 4 %.
+        assert found[metric].after == pytest.approx(found[metric].noise_floor, rel=0.12), metric
+    assert 0.85 < found["coverage"].after < 1.0
+
+
+def test_a_long_recording_is_proved_on_all_of_it_with_draws_along_a_part(proved, monkeypatch):
+    whole = proved(20)
+    monkeypatch.setattr(data_options, "MOST_READINGS", 20 * 20 * 2)
+    part = proved(20)
+    for metric in ("rmse", "dtw"):
+        # The fit used half the segments, and the proof simulates all of them.
+        assert part[metric].after == pytest.approx(whole[metric].after, rel=0.05)
+        assert part[metric].after == pytest.approx(part[metric].noise_floor, rel=0.12)
+    assert part["crps"].after == pytest.approx(whole["crps"].after, rel=0.5)

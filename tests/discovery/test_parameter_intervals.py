@@ -16,8 +16,8 @@ from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 def fitted(effects):
     """A pendulum that lacks nothing, fitted with effects that it does not have."""
     case = make_case("pendulum", "null", (), seed=2001)
-    binding = segment_options(case.fit)
-    return fit_hypothesis(case.model, case.fit, binding, effects=effects)
+    data_options = segment_options(case.fit)
+    return fit_hypothesis(case.model, case.fit, data_options, effects=effects)
 
 
 def test_where_the_model_is_linear_they_are_those_of_laplaces_approximation():

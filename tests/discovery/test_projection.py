@@ -23,8 +23,8 @@ def test_parameters_explain_nothing_of_a_projected_column(quiet):
 def test_the_loss_without_an_effect_equals_that_of_a_fit_without_it(dragged):
     case, without = dragged
     drag = QuadraticDrag("hinge")
-    binding = segment_options(case.fit)
-    fitted = fit_hypothesis(case.model, case.fit, binding, effects=(drag,))
+    data_options = segment_options(case.fit)
+    fitted = fit_hypothesis(case.model, case.fit, data_options, effects=(drag,))
     scale = fitted.fit.scale
     lost = fitted.share * float((without.losses(scale) - fitted.losses(scale)).sum())
     assert loss_without(fitted, drag) == pytest.approx(lost, rel=0.1)

@@ -10,9 +10,9 @@ import torch
 
 from npdr_ppl.errors import BackendError, ShapeError
 from npdr_ppl.inference.base import Problem
-from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 from npdr_ppl.inference.registry import backend, backend_class, backends
+from npdr_ppl.language.linear_regression_problem import LinearRegression
 from npdr_ppl.randomness import seeded
 
 GAIN = torch.tensor([[1.0, 0.5], [0.0, 1.0], [0.3, -0.6]])

@@ -11,9 +11,9 @@ from scipy import integrate, stats
 from npdr_ppl.errors import BackendError, DataError
 from npdr_ppl.inference.base import Problem
 from npdr_ppl.inference.bayesian_linear_regression import NUM_DRAWS
-from npdr_ppl.inference.linear_problem import LinearRegression
 from npdr_ppl.inference.parts.samplers.conjugate import linear_posterior
 from npdr_ppl.inference.registry import backend
+from npdr_ppl.language.linear_regression_problem import LinearRegression
 from npdr_ppl.randomness import seeded
 
 NAME = "bayesian-linear-regression"

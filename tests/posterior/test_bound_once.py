@@ -96,7 +96,7 @@ def test_a_fit_starts_no_processes_to_look_at_a_recording_once(case, monkeypatch
         raise AssertionError("A process was started.")
 
     with npdr.workers("loky", 2):
-        monkeypatch.setattr("npdr_ppl.discovery.screening.candidate_effects.side_by_side", refuse)
+        monkeypatch.setattr("npdr_ppl.discovery.screening.variants.side_by_side", refuse)
         alarm = prepared.alarm
     assert alarm.fired
 

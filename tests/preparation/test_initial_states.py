@@ -7,7 +7,8 @@ from hidden_rigs import RIGS
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.preparation.initial_states import error_factors
+from npdr_ppl.preparation.initial_states import error_draws, error_factors
+from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts.states import ERROR_RATIOS, estimate_departures
 from tests.helpers.rig_recordings import recording_of
 
@@ -92,3 +93,27 @@ def test_starts_along_a_fit_are_as_far_off_as_they_say_and_command_changes_do_no
         return float((error @ change).square() / (error @ error) / (change @ change))
 
     assert bias(inputs) < 0.05
+
+
+def test_draws_of_the_errors_have_the_moments_of_their_posterior():
+    generator = torch.Generator().manual_seed(0)
+    by_starts = torch.randn(1, 6, 2, generator=generator).double().expand(4000, 6, 2)
+    truth, factors = torch.tensor([1.5, -0.5]).double(), torch.tensor([2.0, 0.5]).double()
+    noise = torch.randn(6, generator=generator).double()
+    residual = (noise - by_starts[0] @ truth).expand(4000, 6)
+    inverse = torch.linalg.inv(by_starts[0].T @ by_starts[0] + (1.0 / factors.square()).diag())
+    expected = -inverse @ by_starts[0].T @ residual[0]
+    with seeded(0, "draws"):
+        drawn = error_draws(residual, by_starts, factors)
+    # Five standard errors of 4000 draws.
+    assert torch.allclose(drawn.mean(0), expected, atol=5.0 * float(inverse.max() / 4000) ** 0.5)
+    assert torch.allclose(drawn.T.cov(), inverse, atol=0.1 * float(inverse.max()))
+
+
+def test_draws_of_the_errors_where_a_simulation_diverges_are_of_the_prior():
+    residual, by_starts = torch.zeros(4000, 3).double(), torch.ones(4000, 3, 1).double()
+    residual[::2] = torch.inf
+    with seeded(0, "draws"):
+        drawn = error_draws(residual, by_starts, torch.tensor([2.0]).double())
+    assert float(drawn[::2].std()) == pytest.approx(2.0, rel=0.1)
+    assert float(drawn[1::2].std()) == pytest.approx((1.0 / (3.0 + 1.0 / 4.0)) ** 0.5, rel=0.1)

@@ -171,7 +171,8 @@ def _separations(
 ) -> NDArray[np.float64]:
     """Returns the distance of each rollout of one hypothesis from the other, refitted to it.
 
-    The distance is NaN if the other hypothesis cannot be simulated there.
+    The distance is NaN if the other hypothesis cannot be simulated there, and for rollouts of
+    which no segment is used.
     """
     segments = SegmentModel(refitted.model, recorded, options)
     fit = SegmentFit(refitted.fit.z, segments.no_offsets, made.fit.scale)
@@ -190,4 +191,6 @@ def _separations(
     information = by_rollout(projection.parameter_information_by_segment) + prior
     explained = (score * torch.linalg.solve(information, score)).sum(-1)
     left = by_rollout(projection.misfit_by_segment) - explained
-    return left.clamp_min(0.0).sqrt().numpy()
+    is_used = torch.zeros(num, dtype=torch.bool)
+    is_used[segments.inputs.rollout] = True
+    return torch.where(is_used, left.clamp_min(0.0).sqrt(), math.nan).numpy()

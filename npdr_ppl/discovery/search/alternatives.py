@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.screening.candidate_effects import candidates_at, variants_of
 from npdr_ppl.discovery.screening.latent_force import responses
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.screening import screen
 from npdr_ppl.discovery.screening.settings import GENERIC_LAWS
+from npdr_ppl.discovery.screening.variants import candidates_at, variants_of
 from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.settings import EVIDENCE
 from npdr_ppl.discovery.search.trials import Trials

@@ -10,11 +10,11 @@ from torch import Tensor
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.alarm import Alarm, sound_alarm
-from npdr_ppl.discovery.screening.candidate_effects import candidates_at, variants_of
 from npdr_ppl.discovery.screening.latent_force import Responses, responses
 from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.screening.separation import separation_matrix
+from npdr_ppl.discovery.screening.variants import candidates_at, variants_of
 from npdr_ppl.discovery.search.alternatives import (
     Added,
     Alternatives,
@@ -92,16 +92,16 @@ class Searcher:
         rollouts: The recording.
         options: Settings of the search.
         report: Called with a sentence at each step.
-        binding: How the recording is cut into segments; into discovery's default ones if ``None``.
+        data_options: How the recording is cut into segments; discovery's defaults if ``None``.
         seed: Seed of all random numbers.
 
     Attributes:
         rollouts: The recording.
         options: Settings of the search.
-        binding: How the recording is cut into segments.
+        data_options: How the recording is cut into segments.
         seed: Seed of all random numbers.
-        are_steps_coarse: Whether its own integration steps are too coarse.
-        are_priors_widened: Whether some of its priors were too narrow and were widened.
+        are_steps_coarse: Whether the model's own integration steps are too coarse.
+        are_priors_widened: Whether some of the model's priors were too narrow and were widened.
     """
 
     def __init__(
@@ -111,13 +111,13 @@ class Searcher:
         options: DiscoveryOptions,
         report: Callable[[str], None] = lambda _: None,
         *,
-        binding: DataOptions | None = None,
+        data_options: DataOptions | None = None,
         seed: int = 0,
     ) -> None:
         self._model = model
         self.rollouts = rollouts
         self.options = options
-        self.binding: DataOptions = binding or segment_options(rollouts)
+        self.data_options: DataOptions = data_options or segment_options(rollouts)
         self.seed = seed
         self.are_steps_coarse = False
         self.are_priors_widened = False
@@ -134,7 +134,7 @@ class Searcher:
         Raises:
             DataError: The recording does not fit the model.
         """
-        return SegmentModel(self._model, self.rollouts, self.binding)
+        return SegmentModel(self._model, self.rollouts, self.data_options)
 
     @property
     def trials(self) -> Trials:

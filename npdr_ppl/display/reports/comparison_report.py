@@ -6,14 +6,14 @@ from typing import Any
 
 from npdr_ppl.display.reports.charts import bars_chart, intervals_chart, lines_chart
 from npdr_ppl.display.reports.content import (
-    Finding,
+    Explained,
     FindingsPart,
+    Headline,
     KeyFigure,
     Part,
     Report,
     Section,
     TablePart,
-    Verdict,
 )
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
 from npdr_ppl.drawing.numbers import number
@@ -57,19 +57,19 @@ def comparison_report(folder: Path) -> Report:
     )
 
 
-def _verdict(ranked: Mapping[str, Any]) -> Verdict:
+def _verdict(ranked: Mapping[str, Any]) -> Headline:
     if not ranked:
-        return Verdict("nothing to rank", "Every backend failed.", "bad")
+        return Headline("nothing to rank", "Every backend failed.", "bad")
     best, *others = ranked
     if not others:
-        return Verdict(best, "It was the only one that finished.", "plain")
+        return Headline(best, "It was the only one that finished.", "plain")
     second = ranked[others[0]]
     behind, error = second.get("elpd_difference"), second.get("elpd_difference_se")
     if behind is None:
-        return Verdict(best, f"Best by CRPS; {others[0]} is second. No elpd was finite.", "plain")
+        return Headline(best, f"Best by CRPS; {others[0]} is second. No elpd was finite.", "plain")
     shown = f"{others[0]} has {number(abs(behind), '.1f')} ± {number(error, '.1f')} less elpd"
     if error is None:
-        return Verdict(
+        return Headline(
             best, f"{others[0]} has an elpd difference of {behind:.1f} on one segment.", "warn"
         )
     if abs(behind) > 2 * error:
@@ -77,8 +77,8 @@ def _verdict(ranked: Mapping[str, Any]) -> Verdict:
         sentence = f"It predicts best; {shown}."
         if word != "accept":
             sentence, tone = f"{sentence} Its own diagnosis says: {word}.", "warn"
-        return Verdict(best, sentence, tone)
-    return Verdict(
+        return Headline(best, sentence, tone)
+    return Headline(
         f"{best}, by a small margin", f"{shown}, which may be chance: use the cheaper one.", "warn"
     )
 
@@ -181,14 +181,14 @@ def _seconds_chart(ranked: Mapping[str, Any]) -> Part:
     return bars_chart("seconds", bars, title="seconds", caption="Computing time by stage.")
 
 
-def _diagnoses(rows: Mapping[str, Any]) -> list[Finding]:
+def _diagnoses(rows: Mapping[str, Any]) -> list[Explained]:
     result = []
     for label, row in rows.items():
         if row.get("error") is not None:
-            result.append(Finding(label, "failed", "bad", str(row["error"])))
+            result.append(Explained(label, "failed", "bad", str(row["error"])))
             continue
         diagnosis = row.get("diagnosis") or {}
         word = str(row.get("decision", "–"))
         tone = "good" if word == "accept" else "warn"
-        result.append(Finding(label, word, tone, str(diagnosis.get("reason", ""))))
+        result.append(Explained(label, word, tone, str(diagnosis.get("reason", ""))))
     return result

@@ -8,8 +8,9 @@ __all__ = [
     "ChartPart",
     "CodePart",
     "DiffPart",
-    "Finding",
+    "Explained",
     "FindingsPart",
+    "Headline",
     "KeyFigure",
     "Part",
     "PicturePart",
@@ -18,7 +19,6 @@ __all__ = [
     "TablePart",
     "TextPart",
     "Tone",
-    "Verdict",
 ]
 
 Tone = Literal["good", "warn", "bad", "plain"]
@@ -26,11 +26,11 @@ Tone = Literal["good", "warn", "bad", "plain"]
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """The main result.
+class Headline:
+    """The main result, at the top of the page.
 
     Attributes:
-        word: Verdict in a few words, such as ``"accept"``.
+        word: The result in a few words, such as ``"accept"``.
         sentence: Reason.
         tone: Rating.
     """
@@ -123,7 +123,7 @@ class PicturePart:
 
 
 @dataclass(frozen=True)
-class Finding:
+class Explained:
     """A diagnostic with its meaning in plain language.
 
     Attributes:
@@ -143,7 +143,7 @@ class Finding:
 class FindingsPart:
     """Several diagnostics."""
 
-    findings: Sequence[Finding]
+    findings: Sequence[Explained]
     kind: str = field(default="findings", init=False)
 
 
@@ -172,6 +172,6 @@ class Report:
 
     kind: str
     title: str
-    verdict: Verdict
+    verdict: Headline
     figures: Sequence[KeyFigure]
     sections: Sequence[Section]

@@ -6,13 +6,13 @@ from typing import Any
 
 from npdr_ppl.display.reports.charts import bars_chart
 from npdr_ppl.display.reports.content import (
+    Headline,
     KeyFigure,
     Part,
     Report,
     Section,
     TablePart,
     TextPart,
-    Verdict,
 )
 from npdr_ppl.display.reports.discovery_report import discovery_report
 from npdr_ppl.display.reports.training_report import training_report
@@ -51,16 +51,16 @@ def demo_report(folder: Path) -> Report:
     return Report("demo", "The story of a rig", _verdict(result), figures, sections)
 
 
-def _verdict(result: Mapping[str, Any]) -> Verdict:
+def _verdict(result: Mapping[str, Any]) -> Headline:
     before, after = result["returns"].values()
     gain = f"The return on the rig changed from {before:.0f} to {after:.0f}."
     names = ", ".join(f"{row['effect']} at {row['port']}" for row in result["effects"])
     if not names:
-        return Verdict("nothing was found", f"Discovery named no missing effect. {gain}", "warn")
+        return Headline("nothing was found", f"Discovery named no missing effect. {gain}", "warn")
     succeeds = after >= result["success"]
     meaning = f"Added: {names}. {gain} Above {result['success']:.0f} the pole balances upright."
     word = "the revised model's policy works" if succeeds else "the policy still fails"
-    return Verdict(word, meaning, "good" if succeeds else "warn")
+    return Headline(word, meaning, "good" if succeeds else "warn")
 
 
 def _returns(returns: Mapping[str, float]) -> list[Part]:

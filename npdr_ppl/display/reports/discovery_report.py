@@ -13,6 +13,7 @@ from npdr_ppl.display.reports.charts import ChartPart, bars_chart, layout_of, ro
 from npdr_ppl.display.reports.content import (
     CodePart,
     DiffPart,
+    Headline,
     KeyFigure,
     Part,
     PicturePart,
@@ -20,7 +21,6 @@ from npdr_ppl.display.reports.content import (
     Section,
     TablePart,
     TextPart,
-    Verdict,
 )
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
 from npdr_ppl.drawing.numbers import number
@@ -69,31 +69,31 @@ def discovery_report(folder: Path) -> Report:
     )
 
 
-def _verdict(result: Mapping[str, Any], effects: list[Any]) -> Verdict:
+def _verdict(result: Mapping[str, Any], effects: list[Any]) -> Headline:
     word = str(result["verdict"])
     best = _named(effects[0]) if effects else "an effect"
     others = ", ".join(_named(effect) for effect in effects[1:])
     p_value = number((result.get("alarm") or {}).get("p_value"))
     gained = _gained(result.get("gap") or {})
     verdicts = {
-        "none": Verdict(
+        "none": Headline(
             "no effect is missing",
             f"The present model explains the recording (alarm: p = {p_value}).",
             "good",
         ),
-        "named": Verdict(f"missing: {best}", gained, "good"),
-        "ambiguous": Verdict(
+        "named": Headline(f"missing: {best}", gained, "good"),
+        "ambiguous": Headline(
             f"missing: {best}, or another",
             f"These data do not distinguish it from {others or 'its equivalents'}. {gained}",
             "warn",
         ),
-        "unknown": Verdict(
+        "unknown": Headline(
             "something unknown is missing",
             "The model does not fit the recording, and no effect of the catalogue explains it.",
             "bad",
         ),
     }
-    return verdicts.get(word, Verdict(word, str(result.get("reason", ""))))
+    return verdicts.get(word, Headline(word, str(result.get("reason", ""))))
 
 
 def _gained(gap: Mapping[str, Any]) -> str:

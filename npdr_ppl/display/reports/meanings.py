@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from npdr_ppl.display.reports.content import Finding, Tone, Verdict
+from npdr_ppl.display.reports.content import Explained, Headline, Tone
 from npdr_ppl.drawing.numbers import number
 from npdr_ppl.posterior.diagnostics import Decision, Thresholds
 
@@ -27,13 +27,13 @@ _TONES: Mapping[str, Tone] = {
 }
 
 
-def decision_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
+def decision_verdict(diagnosis: Mapping[str, Any]) -> Headline:
     """Returns the verdict of a diagnosis, in the format of ``fit.json``."""
     word = str(diagnosis.get("decision", "no decision"))
-    return Verdict(word, str(diagnosis.get("reason", "")), _TONES.get(word, "plain"))
+    return Headline(word, str(diagnosis.get("reason", "")), _TONES.get(word, "plain"))
 
 
-def findings(diagnosis: Mapping[str, Any]) -> list[Finding]:
+def findings(diagnosis: Mapping[str, Any]) -> list[Explained]:
     """Returns the numbers of a diagnosis with their meaning."""
     limits = Thresholds()
     return [
@@ -45,14 +45,14 @@ def findings(diagnosis: Mapping[str, Any]) -> list[Finding]:
     ]
 
 
-def _against_simulator(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+def _against_simulator(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Explained]:
     """Returns the checks of model and estimator by the simulator, if they were made."""
     result = []
     p_value, k = _value(diagnosis, "model_p_value"), _value(diagnosis, "estimator_k")
     if not math.isnan(p_value):
         is_missing = diagnosis.get("decision") == Decision.REVISE_MODEL
         result.append(
-            Finding(
+            Explained(
                 "what no parameters explain",
                 f"p = {p_value:.2g}",
                 "bad" if is_missing else "good",
@@ -64,7 +64,7 @@ def _against_simulator(diagnosis: Mapping[str, Any], limits: Thresholds) -> list
     if not math.isnan(k):
         is_right = k <= limits.pareto_k
         result.append(
-            Finding(
+            Explained(
                 "posterior against the simulator, Pareto k",
                 number(k, ".2f"),
                 "good" if is_right else "warn",
@@ -77,31 +77,31 @@ def _against_simulator(diagnosis: Mapping[str, Any], limits: Thresholds) -> list
     return result
 
 
-def _convergence(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+def _convergence(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Explained]:
     r_hat, ess = _value(diagnosis, "r_hat"), _value(diagnosis, "ess")
     if math.isnan(r_hat):
-        agreement = Finding(
+        agreement = Explained(
             "r̂ across members",
             "–",
             "plain",
             "Only one estimator was trained, so its agreement with another one is not known.",
         )
     elif r_hat <= limits.r_hat:
-        agreement = Finding(
+        agreement = Explained(
             "r̂ across members",
             number(r_hat, ".2f"),
             "good",
             f"Independently trained estimators give the same posterior (limit {limits.r_hat}).",
         )
     else:
-        agreement = Finding(
+        agreement = Explained(
             "r̂ across members",
             number(r_hat, ".2f"),
             "warn",
             f"Independently trained estimators disagree (limit {limits.r_hat}): the result "
             "depends on the estimator, not only on the data. More simulations or rounds help.",
         )
-    draws = Finding(
+    draws = Explained(
         "Effective sample size",
         number(ess, ".0f"),
         "good" if ess >= MIN_ESS else "warn",
@@ -111,7 +111,7 @@ def _convergence(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Findi
     return [agreement, draws]
 
 
-def _prediction(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+def _prediction(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Explained]:
     coverage = _value(diagnosis, "coverage_90")
     p_value = _value(diagnosis, "segment_p_value")
     pit = _value(diagnosis, "pit_deviation")
@@ -119,7 +119,7 @@ def _prediction(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Findin
     unlikely = p_value < limits.segment_p_value
     wide = coverage > 0.98
     return [
-        Finding(
+        Explained(
             "Coverage of the 90 % band",
             number(coverage, ".0%"),
             "bad" if lost else "good",
@@ -132,7 +132,7 @@ def _prediction(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Findin
                 else "As expected."
             ),
         ),
-        Finding(
+        Explained(
             "Worst segment, p-value",
             number(p_value, ".3f"),
             "bad" if unlikely else "good",
@@ -144,7 +144,7 @@ def _prediction(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Findin
                 else "Large enough: no segment is suspicious."
             ),
         ),
-        Finding(
+        Explained(
             "Deviation of the PIT",
             number(pit, ".2f"),
             "good" if pit <= SMALL_PIT_DEVIATION else "warn",
@@ -160,7 +160,7 @@ def _prediction(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Findin
     ]
 
 
-def _against_prior(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+def _against_prior(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Explained]:
     contraction = _numbers(diagnosis, "contraction")
     edges = _numbers(diagnosis, "edge_mass")
     result = []
@@ -169,7 +169,7 @@ def _against_prior(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Fin
         nothing = len(unlearnt) == len(contraction)
         tone: Tone = "bad" if nothing else "warn" if unlearnt else "good"
         result.append(
-            Finding(
+            Explained(
                 "Contraction",
                 f"{min(contraction.values()):.0%} … {max(contraction.values()):.0%}",
                 tone,
@@ -186,7 +186,7 @@ def _against_prior(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Fin
     if edges:
         pressed = [name for name, mass in edges.items() if mass > limits.edge_mass]
         result.append(
-            Finding(
+            Explained(
                 "Mass at the prior's edge",
                 f"{max(edges.values()):.0%}",
                 "warn" if pressed else "good",
@@ -202,7 +202,7 @@ def _against_prior(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Fin
     return result
 
 
-def _leaving_out(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Finding]:
+def _leaving_out(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Explained]:
     elpd = diagnosis.get("elpd_loo") or [None, None]
     k = _value(diagnosis, "pareto_k")
     if elpd[0] is None:
@@ -217,7 +217,7 @@ def _leaving_out(diagnosis: Mapping[str, Any], limits: Thresholds) -> list[Findi
             "the estimate cannot be trusted; use held-out rollouts instead."
         )
     return [
-        Finding(
+        Explained(
             "elpd by PSIS-LOO",
             f"{number(elpd[0], '.1f')} ± {number(elpd[1], '.1f')}",
             "plain" if k <= limits.pareto_k else "warn",

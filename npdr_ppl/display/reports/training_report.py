@@ -8,8 +8,9 @@ import numpy as np
 
 from npdr_ppl.display.reports.charts import ChartPart, drawn_points, lines_chart
 from npdr_ppl.display.reports.content import (
-    Finding,
+    Explained,
     FindingsPart,
+    Headline,
     KeyFigure,
     Part,
     Report,
@@ -17,7 +18,6 @@ from npdr_ppl.display.reports.content import (
     TablePart,
     TextPart,
     Tone,
-    Verdict,
 )
 from npdr_ppl.display.reports.fit_report import parameters_table
 from npdr_ppl.display.reports.meanings import findings
@@ -62,9 +62,9 @@ def training_report(folder: Path) -> Report:
     return Report("train", title, _verdict(result, records), _key_figures(records), sections)
 
 
-def _verdict(result: Mapping[str, Any], records: Records) -> Verdict:
+def _verdict(result: Mapping[str, Any], records: Records) -> Headline:
     if not records:
-        return Verdict("nothing yet", "No iteration is finished.", "warn")
+        return Headline("nothing yet", "No iteration is finished.", "warn")
     deployed = result.get("deployed")
     first, best = records[0].get("real_return"), max(_real(records), default=float("nan"))
     gain = (
@@ -74,10 +74,10 @@ def _verdict(result: Mapping[str, Any], records: Records) -> Verdict:
     if deployed is None:
         word = "last policy"
         sentence = f"{gain} The result is the last policy, which has not run on the target."
-        return Verdict(word, sentence, "warn")
+        return Headline(word, sentence, "warn")
     measured = records[deployed].get("real_return") if deployed < len(records) else None
     word = f"policy of iteration {deployed + 1}"
-    return Verdict(
+    return Headline(
         word, f"{gain} The resulting policy was measured: {number(measured, '.4g')}.", "good"
     )
 
@@ -120,7 +120,7 @@ def _returns(records: Records) -> list[Part]:
     return [lines_chart("returns", lines, titles=("iteration", "return"), caption=caption)]
 
 
-def _decisions(records: Records) -> list[Finding]:
+def _decisions(records: Records) -> list[Explained]:
     result = []
     for index, record in enumerate(records, start=1):
         for decision in record.get("decisions") or [record]:
@@ -132,12 +132,12 @@ def _decisions(records: Records) -> list[Finding]:
                 if did
                 else str(decision.get("reason", ""))
             )
-            result.append(Finding(f"Iteration {index}", word, tone, meaning))
+            result.append(Explained(f"Iteration {index}", word, tone, meaning))
         for check in record.get("checks") or []:
             word = str(check["decision"])
             passed: Tone = "good" if word == NextStep.DEPLOY else "warn"
             name = f"Iteration {index}, the new policy"
-            result.append(Finding(name, word, passed, str(check["reason"])))
+            result.append(Explained(name, word, passed, str(check["reason"])))
     return result
 
 

@@ -1,4 +1,4 @@
-"""The candidates for a hypothesis: which effects may be added, and what each would change."""
+"""Effects that may be added to a hypothesis, in all their shapes, and what each would change."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

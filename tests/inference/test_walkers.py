@@ -2,7 +2,7 @@
 
 import torch
 
-from npdr_ppl.inference.parts.samplers.ensemble import ensemble_draws
+from npdr_ppl.inference.parts.samplers.walkers import ensemble_draws
 
 
 def drawn(log_density, walkers, seed=0, sweeps=60):

@@ -1,0 +1,86 @@
+"""What a result depends on besides the data: a model's name, source and engine, and versions."""
+
+import functools
+import inspect
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from pyro.poutine.messenger import Messenger
+
+from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.language.wider_priors import ModelWithWiderPriors
+
+__all__ = ["engine_settings", "file_text", "model_name", "source_text", "versions"]
+
+_PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions that a result depends on."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def model_name(model: Any) -> str:
+    """Returns the name of a model with what is attached to it; the same in every process."""
+    if _is_wrapped(model):
+        return model_name(model.args[-1])
+    if isinstance(model, ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors):
+        return repr(model)
+    return getattr(model, "__name__", type(model).__name__)
+
+
+def source_text(model: Any) -> str:
+    """Returns the source of a model, and the names of what is attached to it."""
+    if isinstance(model, ModelWithEffects):
+        attached = "\n".join(f"# with {effect!r}" for effect, _ in model.effects)
+        return f"{source_text(model.base)}\n{attached}"
+    if _is_wrapped(model):
+        return f"{source_text(model.args[-1])}\n# under {type(model.args[0]).__name__}"
+    if isinstance(model, ModelWithFinerSteps | ModelWithWiderPriors):
+        return f"{source_text(model.base)}\n# {model!r}"
+    try:
+        return inspect.getsource(model)
+    except (OSError, TypeError):
+        return repr(model)
+
+
+def file_text(model: Any) -> str:
+    """Returns the file that defines a model; often its simulator is defined there, too.
+
+    Empty if there is no such file.
+    """
+    while _is_wrapped(model) or hasattr(model, "base"):
+        model = model.args[-1] if _is_wrapped(model) else model.base
+    try:
+        return Path(inspect.getsourcefile(model) or "").read_text(encoding="utf-8")
+    except (OSError, TypeError, UnicodeDecodeError):
+        return ""
+
+
+def _is_wrapped(model: Any) -> bool:
+    """Whether Pyro has wrapped a model in a handler: a partial that has both as arguments."""
+    return (
+        isinstance(model, functools.partial)
+        and bool(model.args)
+        and isinstance(model.args[0], Messenger)
+    )
+
+
+def engine_settings(prior: Prior) -> dict[str, Any]:
+    """Returns the settings of the simulators' engines by site, without empty ones."""
+    settings = {
+        name: box.simulator.recorded_settings()
+        for name, box in prior.black_boxes.items()
+        if isinstance(box, SimulatorBlackBox)
+    }
+    return {name: values for name, values in settings.items() if values}

@@ -1,0 +1,19 @@
+"""A model's name and file, under what is attached to it and what wraps it."""
+
+import npdr_ppl as npdr
+from npdr_ppl.model_identity import file_text, model_name
+from npdr_ppl.models.effects import CoulombFriction
+from npdr_ppl.models.pendulum import pendulum
+
+
+def test_a_model_has_the_same_name_in_every_process():
+    # A handler of Pyro's is printed with its address in memory.
+    noisy = npdr.with_noise(npdr.add_effect(pendulum, CoulombFriction("hinge")), 0.1)
+    assert model_name(noisy) == "pendulum + hinge.coulomb_friction"
+    assert model_name(pendulum) == "pendulum"
+
+
+def test_the_file_of_a_model_is_found_under_what_wraps_it():
+    noisy = npdr.with_noise(npdr.add_effect(pendulum, CoulombFriction("hinge")), 0.1)
+    assert "class Pendulum" in file_text(noisy)
+    assert file_text(len) == ""
