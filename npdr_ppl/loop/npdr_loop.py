@@ -465,6 +465,8 @@ class _Loop:
             num_initial_states=loop.num_initial_states,
             seed=derived_seed(self.seed, "policy", *number),
             risk=risk,
+            # Policies are searched with the internal model they will be deployed with.
+            internal_model=self.domain,
             expected_calls=loop.search_iterations * (loop.iterations + 1),
             progress=report.stage("train the policy"),
         )

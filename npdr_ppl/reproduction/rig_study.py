@@ -133,7 +133,7 @@ def run_method(
     """
     model = furuta_with_effects() if method.has_effects else furuta
     records: Sequence[Mapping[str, Any]] = ()
-    domain: Mapping[str, float] = {name: float(v) for name, v in Furuta().nominal().items()}
+    domain: Mapping[str, float] = _nominal_values()
     policy = task.policy
     if method.domains == "posterior":
         options = checked_options(options, LOOP_DATA)
@@ -273,7 +273,13 @@ def _trained_once(
         iterations=loop.search_iterations,
         num_initial_states=loop.num_initial_states,
         seed=derived_seed(seed, "policy", 0),
+        internal_model=_nominal_values(),  # as on the rig
     ).policy
+
+
+def _nominal_values() -> dict[str, float]:
+    """Returns the nominal parameters of the simulator."""
+    return {name: float(value) for name, value in Furuta().nominal().items()}
 
 
 def _nominal() -> Domains:

@@ -130,6 +130,28 @@ def test_another_rollout_excites_the_device_and_joins_the_data(tmp_path, monkeyp
     assert np.allclose(result.rollouts.actions[1][:, 0], 3 * np.sin(4 * math.pi * time), atol=1e-5)
 
 
+def test_policies_are_searched_with_the_internal_model_that_they_are_deployed_with(
+    tmp_path, monkeypatch
+):
+    searched, deployed = [], []
+    optimise, collect = npdr_loop.optimise_policy, npdr_loop.RealRollouts.collect
+
+    def noted(*args, internal_model, **kwargs):
+        searched.append(internal_model)
+        return optimise(*args, internal_model=internal_model, **kwargs)
+
+    def noted_collect(self, index, policy, domain, **kwargs):
+        deployed.append(dict(domain))
+        return collect(self, index, policy, domain, **kwargs)
+
+    monkeypatch.setattr(npdr_loop, "optimise_policy", noted)
+    monkeypatch.setattr(npdr_loop.RealRollouts, "collect", noted_collect)
+    run(tmp_path, small_options(iterations=2))
+    assert deployed == searched[:2]
+    assert searched[0] == {name: float(v) for name, v in Pendulum().nominal().items()}
+    assert searched[1] != searched[0], "the second policy assumes the most likely sample"
+
+
 def test_a_widened_posterior_is_mixed_with_the_prior(tmp_path, monkeypatch):
     drawn, trained_in = [], []
     prior_domains, optimise = npdr_loop._Loop._prior_domains, npdr_loop.optimise_policy
