@@ -29,7 +29,6 @@ from hidden_rigs import RIGS, Case, Place, make_case, places
 from sparse_regression import sparse_choice
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.data_checks import recording_problems
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis
 from npdr_ppl.discovery.proof.held_out_gap import prove
 from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
@@ -39,7 +38,6 @@ from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
-from npdr_ppl.preparation.segment_model import SegmentModel
 
 SEEDS = {"tune": range(100), "test": range(1000, 1100)}
 """Seeds of both parts."""
@@ -129,14 +127,7 @@ def judge(task: Task) -> dict[str, Any]:
             "seconds": found.seconds,
         }
     except Exception as error:  # a failure is a row with its message
-        if task.condition == "bad_data" and isinstance(error, DataError):
-            # Reported is what the refusal names, not that there is one.
-            segments = SegmentModel(case.model, case.fit, segment_options(case.fit))
-            problems = recording_problems(segments.measured, case.fit)
-            told = [problem for problem in problems if problem in str(error)]
-            row |= {"verdict": "refused", "problems": told, "effects": [], "seconds": {}}
-        else:
-            row["error"] = f"{type(error).__name__}: {error}"[:300]
+        row["error"] = f"{type(error).__name__}: {error}"[:300]
     return row | {"cpu": time.process_time() - start}
 
 

@@ -22,6 +22,7 @@ from npdr_ppl.cli.options import (
     SeedOption,
     SegmentLengthOption,
     SimulationsOption,
+    StrictOption,
     data_options,
 )
 from npdr_ppl.cli.worker_options import (
@@ -50,6 +51,7 @@ def compare(
     initial_state: InitialStateOption = InitialState.UNCERTAIN,
     precision: PrecisionOption = Precision.FLOAT64,
     noise: NoiseOption = Noise.AUTO,
+    strict: StrictOption = False,
     device: DeviceOption = "cpu",
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
@@ -82,7 +84,7 @@ def compare(
     device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
     named = candidates(split_candidates(backends))
-    options = data_options(embedding, segment_length, initial_state, precision, noise)
+    options = data_options(embedding, segment_length, initial_state, precision, noise, strict)
     train, test = resolve_rollouts(data, holdout)
     with (
         resumable(f"the same command again continues the comparison in {out}."),

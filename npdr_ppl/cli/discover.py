@@ -22,6 +22,7 @@ from npdr_ppl.cli.options import (
     PrecisionOption,
     SeedOption,
     SegmentLengthOption,
+    StrictOption,
     data_options,
 )
 from npdr_ppl.cli.worker_options import (
@@ -66,6 +67,7 @@ def discover(
     initial_state: InitialStateOption = InitialState.UNCERTAIN,
     precision: PrecisionOption = Precision.FLOAT64,
     noise: NoiseOption = Noise.AUTO,
+    strict: StrictOption = False,
     max_effects: Annotated[int, typer.Option(min=0, help="Maximum number of effects to add.")] = 5,
     false_alarm_rate: Annotated[
         float, typer.Option(help="Probability of an alarm if nothing is missing.")
@@ -110,7 +112,7 @@ def discover(
 
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_holdout(data, holdout, holdout_data)
-    options = data_options(None, segment_length, initial_state, precision, noise)
+    options = data_options(None, segment_length, initial_state, precision, noise, strict)
     search = DiscoveryOptions(
         effects=tuple(named_effects([candidates])) if candidates else None,
         max_effects=max_effects,

@@ -24,6 +24,7 @@ from npdr_ppl.cli.options import (
     SeedOption,
     SegmentLengthOption,
     SimulationsOption,
+    StrictOption,
     data_options,
 )
 from npdr_ppl.cli.worker_options import (
@@ -55,6 +56,7 @@ def fit(
     initial_state: InitialStateOption = InitialState.UNCERTAIN,
     precision: PrecisionOption = Precision.FLOAT64,
     noise: NoiseOption = Noise.AUTO,
+    strict: StrictOption = False,
     device: DeviceOption = "cpu",
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
@@ -85,7 +87,7 @@ def fit(
     device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
     method, features = resolve_backend(backend, embedding)
-    options = data_options(features, segment_length, initial_state, precision, noise)
+    options = data_options(features, segment_length, initial_state, precision, noise, strict)
     train, test = resolve_rollouts(data, holdout)
     with (
         resumable(f"the same command again continues the run in {out}."),

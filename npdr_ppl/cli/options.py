@@ -47,6 +47,7 @@ __all__ = [
     "SeedOption",
     "SegmentLengthOption",
     "SimulationsOption",
+    "StrictOption",
     "data_options",
     "resolve_segment_length",
 ]
@@ -135,6 +136,9 @@ PrecisionOption = Annotated[Precision, typer.Option(help="Floating-point type of
 NoiseOption = Annotated[
     Noise, typer.Option(help="Measurement noise: auto estimates it, model keeps the model's.")
 ]
+StrictOption = Annotated[
+    bool, typer.Option("--strict", help="Refuse a recording with faults instead of repairing it.")
+]
 DeviceOption = Annotated[str, typer.Option(help="Where to train: cpu or cuda.")]
 
 
@@ -144,6 +148,7 @@ def data_options(
     initial_state: InitialState,
     precision: Precision,
     noise: Noise,
+    strict: bool = False,
 ) -> "DataOptions":
     """Returns how a command prepares rollouts.
 
@@ -158,6 +163,7 @@ def data_options(
         initial_state.value,
         precision.value,
         noise.value,
+        strict,
     )
 
 

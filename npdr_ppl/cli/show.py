@@ -114,7 +114,7 @@ def show_discovery(found: Mapping[str, Any], out: Path) -> None:
     """Prints the content of ``discovery.json``, up to the last finished stage."""
     console = _console()
     for problem in found["data_problems"]:
-        _print_reason(console, "data problem", problem)
+        _print_reason(console, "recording", problem)
     if "verdict" in found:
         _show_findings(console, found)
     elif "alarm" in found:

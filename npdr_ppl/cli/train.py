@@ -23,6 +23,7 @@ from npdr_ppl.cli.options import (
     SeedOption,
     SegmentLengthOption,
     SimulationsOption,
+    StrictOption,
     data_options,
 )
 from npdr_ppl.cli.worker_options import (
@@ -81,6 +82,7 @@ def train(
     initial_state: InitialStateOption = InitialState.UNCERTAIN,
     precision: PrecisionOption = Precision.FLOAT32,
     noise: NoiseOption = Noise.AUTO,
+    strict: StrictOption = False,
     search_iterations: Annotated[
         int, typer.Option(min=1, help="Iterations of each policy search.")
     ] = 20,
@@ -174,7 +176,7 @@ def train(
         )
     if animate:
         check_animated([sensor.name for sensor in device.sensors])
-    options = data_options(features, segment_length, initial_state, precision, noise)
+    options = data_options(features, segment_length, initial_state, precision, noise, strict)
     loop = LoopOptions(
         iterations=iterations,
         rollouts=rollouts,

@@ -155,4 +155,8 @@ def _checksum(rollouts: Rollouts) -> str:
     for readings, actions in zip(rollouts.readings, rollouts.actions, strict=True):
         digest.update(readings.tobytes())
         digest.update(actions.tobytes())
+    digest.update(repr(rollouts.spans).encode())
+    for sampling in rollouts.samplings:
+        for part in (sampling.values, sampling.lateness, sampling.is_read):
+            digest.update(part.tobytes())
     return digest.hexdigest()

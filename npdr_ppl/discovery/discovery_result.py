@@ -39,7 +39,7 @@ class Discovery:
     Attributes:
         verdict: One word; see :data:`Verdict`.
         reason: The reason for the verdict, in a sentence.
-        problems: Problems of the recording itself; if there are any, no effect is named.
+        problems: What was changed in the recording, or left out of it, a sentence each.
         narrow_priors: Priors that do not contain the revised model's parameters; the search used
             wider ones.
         alarm: Whether the original model and the recording disagree.

@@ -104,10 +104,8 @@ class Hypothesis:
         """Effective number of independent measurements, as a share of all measurements."""
         assert self.segments.steps_per_average == 1
         residual = self.segments.whitened(self.difference, self.fit.scale)
-        mask = self.segments.inputs.mask
-        return float(
-            effective_share(residual.unflatten(-1, (-1, len(self.fit.scale))), mask).mean()
-        )
+        residual = residual.unflatten(-1, (-1, len(self.fit.scale)))
+        return float(effective_share(residual, self.segments.is_measured).mean())
 
     @cached_property
     def likelihood(self) -> SegmentLikelihood:

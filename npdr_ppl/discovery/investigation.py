@@ -8,7 +8,6 @@ from functools import cached_property
 
 from torch.distributions import Distribution
 
-from npdr_ppl.discovery.data_checks import data_problems, recording_problems
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery, Verdict
 from npdr_ppl.discovery.finding import Finding
@@ -22,6 +21,7 @@ from npdr_ppl.discovery.proof.parameter_intervals import (
     posterior_draws,
 )
 from npdr_ppl.discovery.proof.residual_map import Spot, worst_windows
+from npdr_ppl.discovery.recording_repair import Repair, repair
 from npdr_ppl.discovery.screening.encoder_resolution import counts
 from npdr_ppl.discovery.screening.equivalents import equivalents
 from npdr_ppl.discovery.search.alternatives import Added
@@ -35,7 +35,6 @@ from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
-from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
 
@@ -64,6 +63,7 @@ class Investigation:
         progress: Whether to show progress, or where; ``None`` shows it on a terminal.
 
     Attributes:
+        recorded: The recording as it was given.
         settings: The settings of the search.
         seconds: Time spent, by stage.
         progress: The progress bar.
@@ -91,21 +91,13 @@ class Investigation:
         if holdout is not None and holdout.channel_names != rollouts.channel_names:
             raise DataError("The held-out rollouts have other channels than those to fit.")
         self.model = model
-        self.rollouts = rollouts
-        self.holdout = holdout
+        self.recorded = rollouts
+        self._recorded_holdout = holdout
         self.settings = search or DiscoveryOptions()
         self.seed = seed
         self.seconds: dict[str, float] = {}
         self.progress = SearchProgress(self.settings, progress)
         self._data_options = segment_options(rollouts, options)
-        self._searcher = Searcher(
-            model,
-            rollouts,
-            self.settings,
-            self.progress.say,
-            data_options=self._data_options,
-            seed=seed,
-        )
         self._drawn: list[tuple[Hypothesis, Draws]] = []
 
     @contextmanager
@@ -117,17 +109,43 @@ class Investigation:
         self.seconds[name] = time.monotonic() - begin
 
     @cached_property
+    def _repair(self) -> Repair:
+        with self._stage("check data"):
+            return repair(self.model, self.recorded, self._data_options)
+
+    @property
+    def rollouts(self) -> Rollouts:
+        """The recording that is searched, repaired where it has faults."""
+        return self._repair.rollouts
+
+    @cached_property
+    def holdout(self) -> Rollouts | None:
+        """The held-out recording, repaired like the other one."""
+        recorded = self._recorded_holdout
+        return None if recorded is None else self._repair.applied_to(recorded)
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What was changed in the recording, or left out of it, a sentence each."""
+        return self.rollouts.notes
+
+    @cached_property
+    def _searcher(self) -> Searcher:
+        return Searcher(
+            self.model,
+            self.rollouts,
+            self.settings,
+            self.progress.say,
+            data_options=self._data_options,
+            seed=self.seed,
+        )
+
+    @cached_property
     def given(self) -> Hypothesis:
         """The original model, fitted to the recording."""
+        searcher = self._searcher
         with self._stage("fit"):
-            try:
-                fitted = self._searcher.fit_base()
-            except DataError as error:
-                measured = SegmentModel(self.model, self.rollouts, self._data_options).measured
-                problems = recording_problems(measured, self.rollouts)
-                if not problems:
-                    raise
-                raise DataError(f"{error} {problems[0]}") from error
+            fitted = searcher.fit_base()
         for effect in self.settings.effects or ():
             # Screening skips effects that the simulator cannot have; requested ones raise errors.
             fitted.simulator.with_effects(effect)
@@ -161,13 +179,6 @@ class Investigation:
         return beyond(self._start[1], final)
 
     @cached_property
-    def problems(self) -> tuple[str, ...]:
-        """Problems of the recording itself."""
-        start = self.start
-        with self._stage("check data"):
-            return tuple(data_problems(start, self.rollouts, self._data_options))
-
-    @cached_property
     def where(self) -> list[Spot]:
         """The windows in which the original model fits worst, the worst first."""
         return worst_windows(self.start, self.rollouts)
@@ -181,12 +192,10 @@ class Investigation:
 
     @cached_property
     def search(self) -> Search:
-        """The missing effects. A recording with problems is not searched."""
-        problems, first = self.problems, self.first
+        """The missing effects."""
+        first = self.first
         with self._stage("search"):
-            return self._searcher.run(
-                first, max_effects=0 if problems else self.settings.max_effects
-            )
+            return self._searcher.run(first, max_effects=self.settings.max_effects)
 
     @cached_property
     def _at_edge(self) -> list[tuple[str, ...]]:
@@ -258,8 +267,8 @@ class Investigation:
             _finding(added, search, every, at_edge)
             for added, at_edge in zip(search.added, self._at_edge, strict=True)
         ]
-        verdict, reason = _judge(search, effects, self.problems, unexplained, self.settings)
-        if self.narrow_priors and not self.problems:
+        verdict, reason = _judge(search, effects, unexplained, self.settings)
+        if self.narrow_priors:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"
@@ -340,13 +349,10 @@ def discover(
 def _judge(
     search: Search,
     effects: list[Finding],
-    problems: tuple[str, ...],
     unexplained: float,
     options: DiscoveryOptions,
 ) -> tuple[Verdict, str]:
     """Returns the verdict and the reason for it."""
-    if problems:
-        return "unknown", f"The recording has a problem: {problems[0]}"
     if not effects:
         if not search.rounds[-1].alarm.fired:
             return "none", "This recording shows no missing effect."

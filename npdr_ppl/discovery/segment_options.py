@@ -44,9 +44,9 @@ def segment_options(rollouts: Rollouts, options: DataOptions | None = None) -> D
             f"{'whole rollouts' if length is None else options.segment_length}."
         )
     fewest = FEWEST_STEPS if options.segment_length == "auto" else length
-    if sum(rollouts.lengths) < FEWEST_SEGMENTS * fewest:
+    if rollouts.num_usable < FEWEST_SEGMENTS * fewest:
         raise DataError(
-            f"{sum(rollouts.lengths)} steps are too few for {FEWEST_SEGMENTS} segments of "
+            f"{rollouts.num_usable} steps are too few for {FEWEST_SEGMENTS} segments of "
             f"{fewest} steps; record more, or choose a shorter segment_length."
         )
     return replace(options, embedding=None, segment_length=length)

@@ -6,58 +6,43 @@ from dataclasses import dataclass
 from npdr_ppl.settings import check_range
 
 __all__ = [
-    "DATA_CHECKS",
+    "REPAIR",
     "HYPOTHESIS",
     "VERDICT",
-    "DataCheckSettings",
+    "RepairSettings",
     "HypothesisSettings",
     "VerdictSettings",
 ]
 
 
 @dataclass(frozen=True)
-class DataCheckSettings:
-    """Checks of a recording for wrong units, signs, time stamps and lost samples.
+class RepairSettings:
+    """Remedies for a recording with wrong units, signs or time stamps.
 
     Attributes:
         large_residual: Residual, relative to the change of a window's measurements, above which
             remedies are tried.
-        remedy_factor: A problem is reported if its remedy reduces the residual to less than this
-            fraction.
+        remedy_factor: A remedy is applied if it reduces the residual to less than this fraction.
+        most_remedies: Greatest number of remedies of one recording.
         shifts: Shifts of the commands' time stamps that are tried, in steps.
+        column_shifts: Shifts of one channel that are tried, in steps.
         longest_delay: Longest time in seconds that a device takes to answer a command. Early time
             stamps of commands look the same, so only larger shifts are tried for them.
-        jump_size: Jump that indicates lost samples, in standard deviations of a channel's second
-            differences.
-        rest_change: A channel rests in a step if it changes by less than this fraction of its
-            root-mean-square change.
-        least_steps: Least number of steps of a rollout that is checked.
-        most_lost: If more than this share of the steps are jumps, they are taken for the device's
-            motion.
+        fewest_clipped: Fewest repeated measurements at the end of a range that can be a limit.
     """
 
     large_residual: float = 0.1
     remedy_factor: float = 0.5
+    most_remedies: int = 3
     shifts: tuple[int, ...] = (1, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20)
+    column_shifts: tuple[int, ...] = (1, 2, 4, 8, 16)
     longest_delay: float = 0.04
-    jump_size: float = 12.0
-    rest_change: float = 0.01
-    least_steps: int = 20
-    most_lost: float = 0.02
+    fewest_clipped: int = 10
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
-        check_range(
-            self,
-            0.0,
-            1.0,
-            "large_residual",
-            "remedy_factor",
-            "rest_change",
-            "most_lost",
-            "longest_delay",
-        )
-        check_range(self, 1, 1000, "shifts", "jump_size", "least_steps")
+        check_range(self, 0.0, 1.0, "large_residual", "remedy_factor", "longest_delay")
+        check_range(self, 1, 1000, "most_remedies", "shifts", "column_shifts", "fewest_clipped")
 
 
 @dataclass(frozen=True)
@@ -114,6 +99,6 @@ class VerdictSettings:
         check_range(self, 2, 100, "most_separated")
 
 
-DATA_CHECKS = DataCheckSettings()
+REPAIR = RepairSettings()
 HYPOTHESIS = HypothesisSettings()
 VERDICT = VerdictSettings()

@@ -62,6 +62,8 @@ class Strided(_Wrapper):
             actions=inputs.actions[..., ::k, :][..., :num_steps, :],
             mask=mask,
             time_step=inputs.time_step * k,
+            is_read=None,
+            lateness=None,
         )
         return self.inner.features(trajectory[:, :, k - 1 :: k], thinned)
 
@@ -96,6 +98,8 @@ class Averaged(_Wrapper):
             actions=self._means(inputs.actions, inputs.mask),
             mask=self._blocks(inputs.mask[..., None])[..., 0].any(-1),
             time_step=inputs.time_step * self.block,
+            is_read=None,
+            lateness=None,
         )
         return self.inner.features(self._means(trajectory, mask), averaged)
 

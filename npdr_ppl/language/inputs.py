@@ -47,6 +47,9 @@ class Inputs:
             ``None`` if the values are assumed to be exact. With errors, every simulation starts
             from a different draw.
         initial_rate_errors: Standard deviations of the initial rates' errors.
+        is_read: Whether each channel was measured after each step, ``(S, K, C)``; ``None`` if all
+            were, at the end of the step.
+        lateness: Time from the end of the step to the measurement, in steps, ``(S, K, C)``.
     """
 
     actions: Tensor
@@ -62,6 +65,8 @@ class Inputs:
     initial_rates: Tensor | None = None
     initial_value_errors: Tensor | None = None
     initial_rate_errors: Tensor | None = None
+    is_read: Tensor | None = None
+    lateness: Tensor | None = None
 
     def __post_init__(self) -> None:
         """Checks that the shapes match."""
@@ -188,6 +193,7 @@ class Inputs:
             **self._starts(lambda value: value[..., index, :]),
             actions=self.actions[..., index, :, :],
             past_actions=self.past_actions[..., index, :, :],
+            **self._sampling(lambda value: value[index]),
             mask=self.mask[index],
             rollout=self.rollout[index],
             start=self.start[index],
@@ -197,7 +203,10 @@ class Inputs:
         """Returns the inputs with only these channels, in this order."""
         columns = [self.channel_names.index(name) for name in names]
         return replace(
-            self, **self._starts(lambda value: value[..., columns]), channel_names=tuple(names)
+            self,
+            **self._starts(lambda value: value[..., columns]),
+            **self._sampling(lambda value: value[..., columns]),
+            channel_names=tuple(names),
         )
 
     def element(self, index: int) -> "Inputs":
@@ -216,6 +225,55 @@ class Inputs:
             actions=chosen(self.actions),
             past_actions=chosen(self.past_actions),
         )
+
+    def measured(self, names: Sequence[str]) -> Tensor:
+        """Returns whether there is a measurement, ``(S, K, len(names))``, or ``(S, K, 1)``.
+
+        Args:
+            names: Names of channels; those that were not recorded count as measured.
+        """
+        if self.is_read is None:
+            return self.mask[..., None]
+        ones = torch.ones_like(self.mask)
+        known = dict(zip(self.channel_names, self.is_read.unbind(-1), strict=True))
+        return torch.stack([self.mask & known.get(name, ones) for name in names], dim=-1)
+
+    def at_measured_times(self, trajectory: Tensor, names: Sequence[str]) -> Tensor:
+        """Returns a simulated trajectory at the times of the measurements.
+
+        Each value is that of a parabola through three neighbouring steps. Values of the first and
+        the last step of a segment use the three steps at its end. Segments of fewer steps stay as
+        they are.
+
+        Args:
+            trajectory: Values at the end of each step, ``(..., S, K, len(names))``.
+            names: Names of its channels.
+        """
+        if self.lateness is None or self.num_steps < 3:
+            return trajectory
+        zeros = torch.zeros_like(self.lateness[..., 0])
+        known = dict(zip(self.channel_names, self.lateness.unbind(-1), strict=True))
+        late = torch.stack([known.get(name, zeros) for name in names], dim=-1).to(trajectory)
+        step = torch.arange(self.num_steps, device=late.device)
+        # Shorter segments are padded with zeros, which no parabola may include.
+        last = (self.mask.sum(-1, keepdim=True) - 2).clamp_min(1)
+        middle = torch.minimum(step.clamp_min(1), last.to(step)).clamp_max(self.num_steps - 2)
+        late = torch.where((self.mask.sum(-1) < 3)[:, None, None], 0.0, late)
+        x = late + (step - middle)[..., None]
+        weights = (0.5 * x * (x - 1.0), 1.0 - x * x, 0.5 * x * (x + 1.0))
+        shape = trajectory.shape
+        index = middle[..., None].expand(*shape[-3:])
+        moved = torch.zeros_like(trajectory)
+        for shift, weight in zip((-1, 0, 1), weights, strict=True):
+            around = trajectory.gather(-2, (index + shift).expand(shape))
+            moved = moved + weight * around
+        return torch.where(late == 0.0, trajectory, moved)
+
+    def _sampling(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
+        """Applies a function to ``is_read`` and ``lateness``, unless they are ``None``."""
+        if self.is_read is None or self.lateness is None:
+            return {}
+        return {"is_read": change(self.is_read), "lateness": change(self.lateness)}
 
     def _starts(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         """Applies a function to the fields of initial states that are not ``None``."""

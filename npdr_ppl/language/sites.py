@@ -272,8 +272,8 @@ class SimulatorBlackBox(BlackBox):
         return tuple(sensor.name for sensor in self.simulator.sensors)
 
     def _mask(self) -> Tensor | None:
-        mask = self.inputs.mask.to(self.inputs.actions.device)
-        return None if bool(mask.all()) else mask[..., None]
+        mask = self.inputs.measured(self._channel_names).to(self.inputs.actions.device)
+        return None if bool(mask.all()) else mask
 
     def with_effects(self, *effects: Any, parameters: Mapping[str, Tensor]) -> "SimulatorBlackBox":
         """Returns the site with effects attached and their parameters added."""
@@ -308,6 +308,7 @@ class SimulatorBlackBox(BlackBox):
                 f"{self.simulator.name} returned a trajectory of shape {tuple(output.shape)}; "
                 f"expected (..., {', '.join(map(str, self.event_shape))})."
             )
+        output = inputs.at_measured_times(output, self._channel_names)
         return output.expand(batch_shape + self.event_shape)
 
 

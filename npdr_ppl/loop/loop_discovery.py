@@ -107,9 +107,6 @@ class LoopDiscovery:
 
     def _read(self, result: Mapping[str, Any]) -> Revision:
         """Returns the revision that a saved discovery describes."""
-        if result.get("data_problems"):
-            # The search found no effect, which says nothing about those of earlier searches.
-            return Revision(None, _sentence(result))
         own = {effect.name: effect for effect in self.search.effects or ()}
         model = self.model
         for _ in range(min(result.get("finer_steps", 0), MAX_FINER_STEPS)):

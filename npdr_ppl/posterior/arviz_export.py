@@ -181,10 +181,11 @@ class _SegmentLikelihood:
         self._has_density = posterior.prior.black_boxes[name].has_density
         observed = self._segments(self._observation.value[None])[0]  # (G, K, C)
         inputs = self._observation.inputs
-        steps = torch.ones(observed.shape[:2], dtype=torch.bool)
+        self._mask = torch.ones(observed.shape, dtype=torch.bool)
         if inputs is not None:
-            steps = inputs.mask.cpu().repeat(len(observed) // inputs.num_segments, 1)
-        self._mask = steps[..., None]
+            measured = inputs.measured(inputs.channel_names).cpu()
+            repeats = len(observed) // inputs.num_segments
+            self._mask = measured.repeat(repeats, 1, 1).expand(observed.shape)
         self._parts: list[Tensor] = []
         self._left = torch.zeros(observed.shape, dtype=torch.float64)
         self._square = torch.zeros(observed.shape[-1], dtype=torch.float64)
@@ -194,7 +195,7 @@ class _SegmentLikelihood:
         """Takes simulations ``(n,) + plates + event`` at draws ``(n, d)`` into account."""
         residual = self._segments((predictive - self._observation.value).double().cpu())
         self._left += residual.sum(0)
-        square = residual.square_()
+        square = residual.square_() * self._mask
         self._square += square.sum((0, 1, 2))
         self._num_draws += len(z)
         if self._has_density:
@@ -202,13 +203,14 @@ class _SegmentLikelihood:
             density = self._prior.pointwise_log_prob(self._name, value, z).double().cpu()
             self._parts.append((self._segments(density) * self._mask).sum(2))
         else:
-            self._parts.append((square * self._mask).sum(2))
+            self._parts.append(square.sum(2))
 
     def finish(self) -> tuple[Tensor, str]:
         """Returns the log likelihood, ``(n, segments)``, and the name of its error model."""
         log_prob, error_model = torch.cat(self._parts), "declared noise"  # (n, G, C)
         if not self._has_density:
-            variance = self._square / (self._num_draws * self._left[..., 0].numel())
+            count = self._mask.sum((0, 1)).clamp_min(1)
+            variance = self._square / (self._num_draws * count)
             variance = variance.clamp_min(torch.finfo(torch.float64).tiny)
             constant = self._mask.sum(1) * torch.log(2 * torch.pi * variance)
             log_prob = -0.5 * (log_prob / variance + constant)
@@ -217,7 +219,7 @@ class _SegmentLikelihood:
         if inputs is None or self._observation.channels is None:
             return log_prob.sum((1, 2))[:, None], error_model
         # What the mean prediction leaves over tells how far readings of a segment are independent.
-        share = effective_share(self._left / self._num_draws, inputs.mask.cpu())
+        share = effective_share(self._left / self._num_draws, self._mask)
         shown = ", ".join(f"{value:.2g}" for value in share)
         return (log_prob * share).sum(-1), f"{error_model}, independent readings {shown}"
 

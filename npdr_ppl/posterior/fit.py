@@ -89,7 +89,7 @@ def fit(
             while True:
                 posterior = infer(
                     prepared.model,
-                    train,
+                    prepared.rollouts,
                     backend=method,
                     rounds=rounds,
                     num_simulations=num_simulations,
@@ -111,7 +111,9 @@ def fit(
             spent = sum(posterior.provenance.seconds.values())
             sampled = time.perf_counter() - started - spent
             step(0.8, "scores")
-            evaluated = train if test is None else test
+            evaluated = prepared.rollouts
+            if test is not None:
+                evaluated = prepared.repair.applied_to(test)
             metrics = score(prepared.model, evaluated, most_likely, options)
             step(1.0, "")
     # A resumed run knows the faults of its finished rounds from disk.

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.recording_repair import Repair, repair
 from npdr_ppl.discovery.screening.alarm import Alarm
 from npdr_ppl.discovery.search.base_fit import BaseFit
 from npdr_ppl.discovery.search.effect_search import Searcher
@@ -25,20 +26,19 @@ from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
-from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.preparation.binding import BoundModel, bind
 from npdr_ppl.preparation.closest_fit import ClosestFit, closest_fit
 from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS, PLAIN_FEATURES, DataOptions
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
-from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.preparation.segment_model import SegmentModel, has_closest_fit
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["Preparation", "has_closest_fit", "held_out", "prepare", "score_embedding"]
+__all__ = ["Preparation", "held_out", "prepare", "score_embedding"]
 
 MARGIN = 0.1
 """Least standard deviation of the neighbourhood of a fit, in standard deviations of the prior."""
@@ -51,7 +51,7 @@ class Preparation:
     Attributes:
         model: The model with noise, and with finer steps if its own are too coarse.
         plain_model: The same model without estimated noise.
-        rollouts: The recording.
+        repair: What was changed in the recording before.
         options: The options, with features that can be applied.
         noise: Estimated standard deviation by channel, in its unit; ``None`` if the model keeps
             its own.
@@ -69,7 +69,7 @@ class Preparation:
 
     model: Model
     plain_model: Callable[..., Any]
-    rollouts: Rollouts
+    repair: Repair
     options: DataOptions
     noise: dict[str, float] | None
     noise_of_sensors: dict[str, float] | None = None
@@ -83,6 +83,11 @@ class Preparation:
     _bound: dict[str, BoundModel] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
+
+    @property
+    def rollouts(self) -> Rollouts:
+        """The recording that is fitted."""
+        return self.repair.rollouts
 
     def bound(self, device: str | torch.device = "cpu") -> BoundModel:
         """Returns the model bound to the recording, the input of every backend.
@@ -158,6 +163,7 @@ class Preparation:
         embedding = self.options.embedding
         used, every = self.options.num_segments(self.rollouts)
         return {
+            "recording": list(self.rollouts.notes),
             "segment_length": length,
             "segments": {"used": used, "recorded": every},
             "segment_seconds": None if length is None else length * self.rollouts.time_step,
@@ -190,23 +196,6 @@ class Preparation:
         return f"Prepared: {cut}, {starts}, {noise}{steps}."
 
 
-def has_closest_fit(prior: Prior) -> bool:
-    """Returns whether a model has a closest fit: it has one deterministic simulator.
-
-    A simulator inside plates has several sets of parameters along the same recording.
-
-    Args:
-        prior: The model's prior along the recording.
-    """
-    boxes = [*prior.black_boxes.values()]
-    return (
-        len(boxes) == 1
-        and isinstance(boxes[0], SimulatorBlackBox)
-        and boxes[0].simulator.is_deterministic
-        and boxes[0].batch_shape == torch.Size()
-    )
-
-
 def prepare(
     model: Model,
     rollouts: Rollouts,
@@ -229,11 +218,13 @@ def prepare(
     Raises:
         DataError: No parameters can be simulated along the recording, or the data do not fit.
     """
+    repaired = repair(model, rollouts, options)
+    rollouts = repaired.rollouts
     prior = Prior(model, (options.with_certain_start().inputs(rollouts),))
     is_declared = any(box.noise is not None for box in prior.black_boxes.values())
     if options.initial_state != "uncertain" or not has_closest_fit(prior):
         return _with_certain_starts(
-            model, rollouts, options, is_declared or options.noise == "model", seed, progress
+            model, repaired, options, is_declared or options.noise == "model", seed, progress
         )
     length = options.steps(rollouts) or max(rollouts.lengths)
     data_options = replace(options, embedding=None, segment_length=length)
@@ -244,9 +235,6 @@ def prepare(
         data_options=data_options,
         seed=seed,
     )
-    simulator = searcher.base.simulator
-    # Wrong units are reported here; the search would only find that nothing fits.
-    rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
     with seeded(0, "try out"):
         # Run as inference will run it, so that the model's own mistakes are reported first.
         prior.execute(prior.sample(2))
@@ -268,7 +256,7 @@ def prepare(
     found = Preparation(
         model if every is None else with_noise(model, every),
         model,
-        rollouts,
+        repaired,
         replace(options, segment_length=length),
         estimated,
         every,
@@ -290,7 +278,7 @@ def held_out(prepared: Preparation, rollouts: Rollouts) -> SegmentLikelihood | N
 
     Args:
         prepared: The recording that was fitted.
-        rollouts: The other recording.
+        rollouts: The other recording, repaired.
 
     Returns:
         ``None`` where the recording that was fitted has no likelihood either.
@@ -326,7 +314,7 @@ def score_embedding(likelihood: SegmentLikelihood) -> Score:
 
 def _with_certain_starts(
     model: Model,
-    rollouts: Rollouts,
+    repaired: Repair,
     options: DataOptions,
     keeps_noise: bool,
     seed: int,
@@ -336,10 +324,10 @@ def _with_certain_starts(
     if options.embedding == "score":
         options = replace(options, embedding=PLAIN_FEATURES)
     if keeps_noise:
-        return Preparation(model, model, rollouts, options, None)
-    found = closest_fit(model, rollouts, options, seed=seed, progress=progress)
+        return Preparation(model, model, repaired, options, None)
+    found = closest_fit(model, repaired.rollouts, options, seed=seed, progress=progress)
     noisy = with_noise(model, found.noise)
-    return Preparation(noisy, model, rollouts, options, found.scale, found.noise, closest=found)
+    return Preparation(noisy, model, repaired, options, found.scale, found.noise, closest=found)
 
 
 def _likelihood(base: BaseFit, is_declared: bool) -> SegmentLikelihood:

@@ -275,7 +275,7 @@ def _observe(
     if not isinstance(data, Rollouts) or inputs is None:
         raise DataError(f"Site {name!r} simulates trajectories; give rollouts, not a tensor.")
     simulator = box.simulator
-    data.check(simulator.sensors, simulator.actions, allow_extra=True)
+    data.check(simulator.sensors, simulator.actions, allow_extra=True, strict=False)
     names = [sensor.name for sensor in simulator.sensors]
     measured = [channel for channel in names if channel in data.channel_names]
     if not measured:

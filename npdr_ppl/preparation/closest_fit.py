@@ -62,9 +62,6 @@ def closest_fit(
         DataError: No parameters could be simulated along the recording.
     """
     segments = SegmentModel(model, rollouts, options)
-    # Check units first, because the search itself would only find that nothing fits.
-    simulator = segments.simulator
-    rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
     z = search_prior(segments, seed=seed, progress=progress)
     found = segments.scale_of(z, segments.no_offsets).tolist()
     scale = dict(zip(segments.channel_names, found, strict=True))
@@ -96,8 +93,7 @@ def search_prior(
         DataError: No parameters could be simulated along the recording.
     """
     every = segments
-    mask = every.inputs.mask[..., None]
-    ranges = (every.observed * mask).abs().amax((0, 1)).double()
+    ranges = (every.observed * every.is_measured).abs().amax((0, 1)).double()
     ranges = ranges.clamp_min(torch.finfo(torch.float32).tiny)
     segments = _spread_out(every, seed)
     num_parameters = segments.prior.num_parameters
@@ -151,4 +147,5 @@ def _errors(segments: SegmentModel, z: Tensor, starts: Tensor, ranges: Tensor) -
     """
     residual = segments.residuals(z, starts.expand(len(z), -1, -1), ranges)
     square = residual.square().unflatten(-1, (-1, len(ranges))).sum((1, 2))
-    return (square / segments.inputs.mask.sum()).sqrt().mean(-1).nan_to_num(math.inf)
+    count = segments.num_measured.sum(0).clamp_min(1)
+    return (square / count).sqrt().mean(-1).nan_to_num(math.inf)

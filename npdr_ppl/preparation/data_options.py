@@ -9,7 +9,7 @@ from npdr_ppl.embeddings import Embedding
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.segments import InitialState
+from npdr_ppl.rollouts.segments import InitialState, layout_of
 
 __all__ = [
     "MAX_READINGS_PER_CHUNK",
@@ -59,7 +59,7 @@ def default_segment_length(rollouts: Rollouts) -> int:
     ``FEWEST_SEGMENTS``.
     """
     length = round(SEGMENT_SECONDS / rollouts.time_step)
-    length, total = max(FEWEST_STEPS, min(MOST_STEPS, length)), sum(rollouts.lengths)
+    length, total = max(FEWEST_STEPS, min(MOST_STEPS, length)), rollouts.num_usable
     if total >= FEWEST_SEGMENTS * length:
         return length
     return max(2, min(length, total // (2 * FEWEST_SEGMENTS)))
@@ -82,6 +82,7 @@ class DataOptions:
         precision: Floating-point type of the simulation, ``"float64"`` or ``"float32"``.
         noise: ``"auto"`` estimates the noise of a model that declares none, from the residuals of
             its closest fit, if initial states are uncertain; ``"model"`` keeps the model's noise.
+        strict: Whether a recording with faults is refused instead of repaired.
     """
 
     embedding: str | Embedding | None = "score"
@@ -89,6 +90,7 @@ class DataOptions:
     initial_state: InitialState = "uncertain"
     precision: Literal["float64", "float32"] = "float64"
     noise: Literal["auto", "model"] = "auto"
+    strict: bool = False
 
     @property
     def dtype(self) -> torch.dtype:
@@ -116,7 +118,7 @@ class DataOptions:
         are uncertain; see ``MOST_READINGS``. Otherwise all are used.
         """
         length = self.steps(rollouts) or max(rollouts.lengths)
-        every = sum(-(-steps // length) for steps in rollouts.lengths)
+        every = len(layout_of(rollouts, self.steps(rollouts)))
         if self.initial_state != "uncertain":
             return every, every
         most = MOST_READINGS // (length * len(rollouts.channel_names))

@@ -126,8 +126,8 @@ def estimate_starts(
 ) -> InitialStates | None:
     """Estimates initial states from the difference between measurements and a model.
 
-    The first state of a rollout is kept, because no measurement precedes it, and so are states at
-    which the model cannot be simulated.
+    The first state of a usable stretch is kept, because no measurement precedes it, and so are
+    states at which the model cannot be simulated.
 
     Args:
         box: The simulator and its parameters, those of a fit.
@@ -143,8 +143,8 @@ def estimate_starts(
     length = inputs.num_steps
     wanted = list(zip(inputs.rollout.tolist(), inputs.start.tolist(), strict=True))
     layout = [
-        (rollout, max(0, start - length), start + 1)  # one more step, for the rates
-        for rollout, start in wanted
+        (rollout, max(_first_usable(rollouts, rollout, start), start - length), start + 1)
+        for rollout, start in wanted  # one more step, for the rates
     ]
     around = cut(
         rollouts,
@@ -168,6 +168,7 @@ def estimate_starts(
             around.start[own].numpy(),
             inputs.start[own].numpy(),
             rollouts.time_step,
+            rollouts.samplings[index].is_read if rollouts.samplings else None,
         )
         shift, rate, error, rate_error = (
             torch.from_numpy(part).to(values)
@@ -182,6 +183,11 @@ def estimate_starts(
         is_better = is_reported & (new.values + new.rates).isfinite()
         found = found.replaced(own, new, is_better)
     return found
+
+
+def _first_usable(rollouts: Rollouts, rollout: int, step: int) -> int:
+    """Returns the first step of the usable stretch of a rollout that contains a step."""
+    return next(first for first, end in rollouts.spans[rollout] if first <= step < end)
 
 
 def _predicted(simulator: Simulator, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:

@@ -19,6 +19,7 @@ from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.preparation.settings import LINEAR_REGRESSION
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.collection import pieces
 from npdr_ppl.rollouts.differentiation import (
     Smoothing,
     cutoffs,
@@ -255,7 +256,7 @@ def _recorded_rows(
     form: LinearForm, rollouts: Rollouts, smoothing: Smoothing
 ) -> tuple[Tensor, Tensor]:
     """Returns filtered rows of all rollouts, ``(N, joints, r)`` and ``(N, joints)``."""
-    simulator = form.simulator
+    simulator, rollouts = form.simulator, pieces(rollouts)
     joints = [state.name for state in simulator.states if state.rate_of is None]
     missing = [name for name in joints if name not in rollouts.channel_names]
     if missing:

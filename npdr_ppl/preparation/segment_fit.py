@@ -249,7 +249,8 @@ def _steps(
             dampings = (dampings * torch.tensor(factors).double()[place]).clamp(
                 *SEGMENT_FIT.damping_limits
             )
-            left = squares[best][place, every].sum(0) / segments.inputs.mask.sum()
+            count = segments.num_measured.sum(0).clamp_min(1)
+            left = squares[best][place, every].sum(0) / count
             present_scale = (scale * left.sqrt()).maximum(segments.least_scale)
             if is_rough:
                 before, scale = scale, present_scale

@@ -53,7 +53,7 @@ class SegmentLikelihood:
     @cached_property
     def num_measurements(self) -> Tensor:
         """Number of measurements of each segment, ``(S,)``."""
-        return self.segments.inputs.mask.sum(-1).double() * len(self.segments.channel_names)
+        return self.segments.num_measured.sum(-1).double()
 
     @cached_property
     def _inner(self) -> Tensor:
@@ -85,7 +85,7 @@ class SegmentLikelihood:
     def by_segment(self, z: Tensor) -> Tensor:
         """Returns log p(segment | z), ``(n, S)`` float64, at points ``(n, d)``."""
         squares = torch.cat([self._squares(residual) for residual in self._residuals(z)])
-        log_scale = self.segments.inputs.mask.sum(-1) * self.fit.scale.log().sum()
+        log_scale = self.segments.num_measured.double() @ self.fit.scale.log()
         constant = (
             torch.linalg.slogdet(self._inner).logabsdet
             + self.num_measurements * math.log(2.0 * math.pi * self.variance)

@@ -34,7 +34,7 @@ from npdr_ppl.preparation.settings import LINEARISATION
 from npdr_ppl.preparation.solving import is_invertible, solve_or_zero
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["Linearisation", "SegmentModel"]
+__all__ = ["Linearisation", "SegmentModel", "has_closest_fit"]
 
 
 @dataclass(frozen=True)
@@ -202,6 +202,7 @@ class SegmentModel:
         """
         part = copy.copy(self)
         part.__dict__.pop("least_scale", None)
+        part.__dict__.pop("num_measured", None)
         part.observed = self.observed[index]
         part._cut = self._cut.segments(index)
         part._smoothed = self._smoothed.segments(index)
@@ -219,7 +220,7 @@ class SegmentModel:
             fewest: Least number of averages in a segment; a segment of fewer than twice as many
                 steps is not averaged.
         """
-        readings = int(self.inputs.mask.sum()) * len(self.measured)
+        readings = int(self.is_measured.expand(self.observed.shape).sum())
         part = copy.copy(self)
         part.steps_per_average = min(-(-readings // most), self.inputs.num_steps // fewest)
         return part if part.steps_per_average > 1 else self
@@ -247,6 +248,7 @@ class SegmentModel:
         if self.channel_names != before:
             self.observed = rollouts.observation(self._cut, channels=self.channel_names)
             self.__dict__.pop("least_scale", None)
+            self.__dict__.pop("num_measured", None)
         self._smoothed = _with_lagging_rates(self._cut, rollouts, box.simulator.rate_lag)
 
     def _start_from(self, starts: InitialStates | None) -> None:
@@ -257,10 +259,20 @@ class SegmentModel:
     @cached_property
     def least_scale(self) -> Tensor:
         """Least scale of each channel's residuals, in its unit, ``(C,)``."""
-        largest = (self.observed * self.inputs.mask[..., None]).abs().amax((0, 1)).double()
+        largest = (self.observed * self.is_measured).abs().amax((0, 1)).double()
         return (LINEARISATION.relative_scale_floor * largest).clamp_min(
             LINEARISATION.absolute_scale_floor
         )
+
+    @property
+    def is_measured(self) -> Tensor:
+        """Whether there is a measurement, ``(S, K, C)``, or ``(S, K, 1)`` for all channels."""
+        return self.inputs.measured(self.channel_names)
+
+    @cached_property
+    def num_measured(self) -> Tensor:
+        """Number of measurements of each channel in each segment, ``(S, C)``."""
+        return self.is_measured.expand(self.observed.shape).sum(1)
 
     @property
     def num_offsets(self) -> int:
@@ -341,6 +353,7 @@ class SegmentModel:
             offsets: Offsets of the initial states, ``(n, S, m)``.
         """
         simulated = simulator.simulate(parameters, self._shifted(offsets))[..., self._columns]
+        simulated = self.inputs.at_measured_times(simulated, self.channel_names)
         num = torch.broadcast_shapes(simulated.shape[:-3], offsets.shape[:1])
         return simulated.expand(*num, *self.observed.shape)
 
@@ -364,19 +377,19 @@ class SegmentModel:
     def whitened(self, difference: Tensor, scale: Tensor) -> Tensor:
         """Returns a difference of readings ``(…, S, K, C)`` in scales, as :meth:`residuals`."""
         # One product: of a long recording every copy takes a hundred megabytes.
-        whitened = difference.double() * (self.inputs.mask[..., None] / scale)
+        whitened = difference.double() * (self.is_measured / scale)
         width = self.steps_per_average
         if width > 1:
             missing = -self.inputs.num_steps % width
             steps = pad(whitened, (0, 0, 0, missing)).unflatten(-2, (-1, width))
-            counts = pad(self.inputs.mask.double(), (0, missing)).unflatten(-1, (-1, width))
-            whitened = steps.sum(-2) / counts.sum(-1).clamp_min(1.0).sqrt()[..., None]
+            counts = pad(self.is_measured.double(), (0, 0, 0, missing)).unflatten(-2, (-1, width))
+            whitened = steps.sum(-2) / counts.sum(-2).clamp_min(1.0).sqrt()
         return whitened.flatten(-2)
 
     def root_mean_square(self, difference: Tensor) -> Tensor:
         """Returns the size of a difference of readings ``(S, K, C)`` per channel, ``(C,)``."""
-        square = difference.double().square() * self.inputs.mask[..., None]
-        return (square.sum((0, 1)) / self.inputs.mask.sum()).sqrt()
+        square = difference.double().square() * self.is_measured
+        return (square.sum((0, 1)) / self.num_measured.sum(0).clamp_min(1)).sqrt()
 
     def scale_of(self, z: Tensor, offsets: Tensor) -> Tensor:
         """Returns the root-mean-square residual per channel, ``(C,)``, at ``(d,)``, ``(S, m)``."""
@@ -431,6 +444,23 @@ class SegmentModel:
             shift[..., column] = 1.0
             changed[name] = value + shift * (offsets[..., k] * error).to(value)[..., None]
         return replace(self.inputs, **changed, initial_value_errors=None, initial_rate_errors=None)
+
+
+def has_closest_fit(prior: Prior) -> bool:
+    """Returns whether a model has a closest fit: it has one deterministic simulator.
+
+    A simulator inside plates has several sets of parameters along the same recording.
+
+    Args:
+        prior: The model's prior along the recording.
+    """
+    boxes = [*prior.black_boxes.values()]
+    return (
+        len(boxes) == 1
+        and isinstance(boxes[0], SimulatorBlackBox)
+        and boxes[0].simulator.is_deterministic
+        and boxes[0].batch_shape == torch.Size()
+    )
 
 
 def _with_lagging_rates(inputs: Inputs, rollouts: Rollouts, lag: float) -> Inputs:

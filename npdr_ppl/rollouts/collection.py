@@ -9,13 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts import segments
 from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.recording import Recording
+from npdr_ppl.rollouts.sampling import Sampling
 
-__all__ = ["are_equal", "joined", "picked", "stacked", "summary", "with_channels"]
+__all__ = [
+    "are_equal",
+    "joined",
+    "picked",
+    "pieces",
+    "stacked",
+    "summary",
+    "with_channels",
+    "with_commands",
+    "without_duplicates",
+]
 
 Episodes = TypeVar("Episodes", bound=Recording)
+
+OPTIONAL = ("rewards", "samplings")
+"""Fields with one entry per rollout, or none at all."""
 
 COLUMNS = ("channel_names", "action_names", "channel_units", "action_units")
 """Fields that describe the columns."""
@@ -36,13 +51,27 @@ def stacked(rollouts: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:
 
 def picked(rollouts: Episodes, chosen: Sequence[int]) -> Episodes:
     """Returns the rollouts of these indices, in this order."""
-    rewards = rollouts.rewards
+    fields = ["readings", "actions", "time", "spans"]
+    fields += [name for name in OPTIONAL if getattr(rollouts, name)]
+    return replace(
+        rollouts, **{name: tuple(getattr(rollouts, name)[i] for i in chosen) for name in fields}
+    )
+
+
+def pieces(rollouts: Episodes) -> Episodes:
+    """Returns rollouts of which each is one usable stretch of the given ones."""
+    if rollouts.is_whole:
+        return rollouts
+    stretches = [(r, a, b) for r, spans in enumerate(rollouts.spans) for a, b in spans]
+    rewards, samplings = rollouts.rewards, rollouts.samplings
     return replace(
         rollouts,
-        readings=tuple(rollouts.readings[i] for i in chosen),
-        actions=tuple(rollouts.actions[i] for i in chosen),
-        time=tuple(rollouts.time[i] for i in chosen),
-        rewards=None if rewards is None else tuple(rewards[i] for i in chosen),
+        readings=tuple(rollouts.readings[r][a : b + 1] for r, a, b in stretches),
+        actions=tuple(rollouts.actions[r][a:b] for r, a, b in stretches),
+        time=tuple(rollouts.time[r][a : b + 1] for r, a, b in stretches),
+        rewards=rewards and tuple(rewards[r][a:b] for r, a, b in stretches),
+        samplings=samplings and tuple(samplings[r].rows(a, b + 1) for r, a, b in stretches),
+        spans=(),
     )
 
 
@@ -54,7 +83,60 @@ def with_channels(rollouts: Episodes, channels: Sequence[str]) -> Episodes:
         readings=tuple(values[:, columns] for values in rollouts.readings),
         channel_names=tuple(channels),
         channel_units=tuple(rollouts.channel_units[i] for i in columns),
+        samplings=tuple(sampling.channels(columns) for sampling in rollouts.samplings),
     )
+
+
+def with_commands(rollouts: Episodes, actions: Sequence[Channel]) -> Episodes:
+    """Returns rollouts with all actions of a simulator among their actions.
+
+    If none was recorded, the motion was free, and all commands are zero. An action that was read
+    as a measurement becomes an action.
+
+    Args:
+        rollouts: The rollouts.
+        actions: The simulator's actions.
+    """
+    missing = [action for action in actions if action.name not in rollouts.action_names]
+    if not missing:
+        return rollouts
+    as_channels = [a.name for a in missing if a.name in rollouts.channel_names]
+    if not as_channels and not rollouts.action_names:
+        names = ", ".join(action.name for action in actions)
+        return replace(
+            rollouts,
+            actions=tuple(np.zeros((length, len(actions))) for length in rollouts.lengths),
+            action_names=tuple(action.name for action in actions),
+            action_units=tuple(action.unit for action in actions),
+            notes=(*rollouts.notes, f"No commands were recorded: {names} is taken as zero."),
+        )
+    if not as_channels or len(as_channels) == len(rollouts.channel_names):
+        return rollouts
+    columns = segments.columns_of(as_channels, rollouts.channel_names)
+    left = [name for name in rollouts.channel_names if name not in as_channels]
+    return replace(
+        with_channels(rollouts, left),
+        actions=tuple(
+            np.concatenate((commands, readings[:-1, columns]), axis=1)
+            for commands, readings in zip(rollouts.actions, rollouts.readings, strict=True)
+        ),
+        action_names=(*rollouts.action_names, *as_channels),
+        action_units=(*rollouts.action_units, *(rollouts.channel_units[i] for i in columns)),
+    )
+
+
+def without_duplicates(rollouts: Episodes) -> Episodes:
+    """Returns rollouts of which those that are identical to an earlier one are not used."""
+    seen: dict[bytes, int] = {}
+    spans, notes = list(rollouts.spans), []
+    for index, (readings, actions) in enumerate(
+        zip(rollouts.readings, rollouts.actions, strict=True)
+    ):
+        first = seen.setdefault(readings.tobytes() + actions.tobytes(), index)
+        if first != index:
+            spans[index] = ()
+            notes.append(f"Rollout {index} is identical to rollout {first}; left out.")
+    return replace(rollouts, spans=tuple(spans), notes=(*rollouts.notes, *notes))
 
 
 def are_equal(one: Recording, other: Recording) -> bool:
@@ -63,7 +145,9 @@ def are_equal(one: Recording, other: Recording) -> bool:
         all(getattr(one, field) == getattr(other, field) for field in COLUMNS)
         and one.time_step == other.time_step
         and one.lengths == other.lengths
+        and one.spans == other.spans
         and (one.rewards is None) == (other.rewards is None)
+        and len(one.samplings) == len(other.samplings)
         and all(
             np.array_equal(a, b)
             for left, right in (
@@ -73,6 +157,11 @@ def are_equal(one: Recording, other: Recording) -> bool:
                 (one.rewards or (), other.rewards or ()),
             )
             for a, b in zip(left, right, strict=True)
+        )
+        and all(
+            np.array_equal(getattr(a, part), getattr(b, part))
+            for a, b in zip(one.samplings, other.samplings, strict=True)
+            for part in ("values", "lateness", "is_read")
         )
     )
 
@@ -98,15 +187,24 @@ def joined(parts: Sequence[Episodes]) -> Episodes:
             raise DataError(f"time steps differ: {first.time_step} and {other.time_step} s.")
         if (first.rewards is None) != (other.rewards is None):
             raise DataError("some of the rollouts have rewards and some have not.")
-    rewards = None
-    if first.rewards is not None:
-        rewards = tuple(values for part in parts for values in part.rewards or ())
+    if any(part.samplings for part in parts):
+        parts = [
+            part if part.samplings else replace(part, samplings=_at_rows(part)) for part in parts
+        ]
+    fields = ["readings", "actions", "time", "spans"]
+    fields += [name for name in OPTIONAL if getattr(parts[0], name)]
     return replace(
         first,
-        readings=tuple(values for part in parts for values in part.readings),
-        actions=tuple(values for part in parts for values in part.actions),
-        time=tuple(values for part in parts for values in part.time),
-        rewards=rewards,
+        **{name: tuple(v for part in parts for v in getattr(part, name)) for name in fields},
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+    )
+
+
+def _at_rows(recording: Recording) -> tuple[Sampling, ...]:
+    """Returns samplings of rollouts whose measurements were all taken at the rows' times."""
+    return tuple(
+        Sampling(values.copy(), np.zeros(values.shape), np.ones(values.shape, dtype=bool))
+        for values in recording.readings
     )
 
 

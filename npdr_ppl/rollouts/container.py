@@ -254,6 +254,7 @@ class Rollouts(Recording):
         actions: Sequence[Channel] = (),
         *,
         allow_extra: bool = False,
+        strict: bool = True,
     ) -> None:
         """Checks that the data fit a simulator: columns, units and no duplicate rollouts.
 
@@ -261,14 +262,19 @@ class Rollouts(Recording):
             channels: The simulator's state or sensor channels.
             actions: The simulator's actions.
             allow_extra: Accept channels that the simulator does not have.
+            strict: Refuse values that hint at wrong units or signs, and duplicates, too. Without
+                it, only columns and declared units are checked.
 
         Raises:
             DataError: A check failed; the message says which in one sentence.
         """
-        simulator_checks.check_duplicates(self)
+        if strict:
+            simulator_checks.check_duplicates(self)
         if channels or actions:
             simulator_checks.check_channels(self, channels, actions, allow_extra=allow_extra)
-            simulator_checks.check_units(self, (*channels, *actions))
+            simulator_checks.check_declared_units(self, (*channels, *actions))
+            if strict:
+                simulator_checks.check_units(self, (*channels, *actions))
 
     def inputs(
         self,
@@ -320,8 +326,17 @@ class Rollouts(Recording):
     def series(self, channels: Sequence[str] | None = None) -> list[Tensor]:
         """Returns the measurements *before* each step, ``(T, C)`` float64 per rollout.
 
-        These are the ground truth of the paper's metrics; see :func:`segments.stitch`.
+        Unusable stretches are left out. These are the ground truth of the paper's metrics; see
+        :func:`segments.stitch`.
         """
         names = self.channel_names if channels is None else tuple(channels)
         columns = segments.columns_of(names, self.channel_names)
-        return [torch.from_numpy(values[:-1, columns].copy()) for values in self.readings]
+        source = [sampling.values for sampling in self.samplings] or self.readings
+        used = [
+            np.concatenate([np.arange(first, end) for first, end in ((0, 0), *spans)])
+            for spans in self.spans
+        ]
+        return [
+            torch.from_numpy(values[rows][:, columns])
+            for values, rows in zip(source, used, strict=True)
+        ]

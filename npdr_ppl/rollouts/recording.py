@@ -13,6 +13,7 @@ from torch import Tensor
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import rollout_checks, states
 from npdr_ppl.rollouts.arrays import Array, as_arrays, frozen
+from npdr_ppl.rollouts.sampling import Sampling, Spans
 from npdr_ppl.rollouts.states import StateEstimate
 
 __all__ = ["Recording"]
@@ -36,10 +37,15 @@ class Recording:
         time: Time stamps in s, one ``(T + 1,)`` per rollout; ``k·time_step`` if not given.
         channel_units: Units of the channels, ``""`` where unknown.
         action_units: Units of the actions, ``""`` where unknown.
+        samplings: Of each rollout, its measurements as they were taken, if they were not all taken
+            at the times of the rows; ``readings`` are then interpolated.
+        spans: First step and end of the usable stretches of each rollout; all of it if not given.
+            Between them, measurements or commands are missing or wrong.
+        notes: What was left out or changed in the recording, a sentence each.
 
     Raises:
-        DataError: A column name is invalid, shapes do not match, values are not finite, or the
-            sampling is not constant.
+        DataError: A column name is invalid, shapes do not match, values are not finite, the
+            sampling is not constant, or no stretch is usable.
     """
 
     readings: tuple[Array, ...]
@@ -51,6 +57,9 @@ class Recording:
     time: tuple[Array, ...] = ()
     channel_units: tuple[str, ...] = ()
     action_units: tuple[str, ...] = ()
+    samplings: tuple[Sampling, ...] = ()
+    spans: tuple[Spans, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Copies the arrays, makes them read-only and checks them."""
@@ -68,6 +77,9 @@ class Recording:
         freeze(self, "channel_units", self.channel_units or ("",) * len(self.channel_names))
         freeze(self, "action_units", self.action_units or ("",) * len(self.action_names))
         _check_arrays(self)
+        if not self.spans:
+            freeze(self, "spans", tuple(((0, length),) for length in self.lengths))
+        _check_spans(self)
 
     @classmethod
     def from_arrays(
@@ -141,7 +153,63 @@ class Recording:
     @cached_property
     def rate_changes(self) -> Array:
         """Root-mean-square change of each channel's rate during a time step, ``(C,)``."""
-        return states.rate_changes(self.readings, self.time_step)
+        return states.rate_changes(self.usable_readings, self.time_step)
+
+    @property
+    def usable_readings(self) -> tuple[Array, ...]:
+        """The readings of every usable stretch of every rollout, ``(T + 1, C)`` each."""
+        return tuple(
+            readings[first : end + 1]
+            for readings, spans in zip(self.readings, self.spans, strict=True)
+            for first, end in spans
+        )
+
+    def measurements(self, column: int) -> tuple[Array, ...]:
+        """Returns one channel's measurements of every usable stretch, ``(N,)`` each."""
+        if not self.samplings:
+            return tuple(readings[:, column] for readings in self.usable_readings)
+        return tuple(
+            sampling.values[first : end + 1, column][sampling.is_read[first : end + 1, column]]
+            for sampling, spans in zip(self.samplings, self.spans, strict=True)
+            for first, end in spans
+        )
+
+    @property
+    def num_usable(self) -> int:
+        """Number of steps of all usable stretches."""
+        return sum(end - first for spans in self.spans for first, end in spans)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all of every rollout is usable."""
+        spans = zip(self.spans, self.lengths, strict=True)
+        return all(own == ((0, length),) for own, length in spans)
+
+
+def _check_spans(recording: "Recording") -> None:
+    """Raises a DataError if samplings or usable stretches do not fit the rollouts."""
+    shapes = [readings.shape for readings in recording.readings]
+    if recording.samplings and [s.values.shape for s in recording.samplings] != shapes:
+        raise DataError("samplings and readings have different shapes.")
+    if len(recording.spans) != len(recording.readings):
+        raise DataError(
+            f"there are {len(recording.readings)} rollouts, but usable stretches of "
+            f"{len(recording.spans)}."
+        )
+    for index, (spans, length) in enumerate(zip(recording.spans, recording.lengths, strict=True)):
+        edges = [edge for span in spans for edge in span]
+        if edges and not (
+            all(first < end for first, end in spans)
+            and edges == sorted(edges)
+            and edges[0] >= 0
+            and edges[-1] <= length
+        ):
+            raise DataError(f"the usable stretches of rollout {index} are {spans}.")
+    if not any(recording.spans):
+        raise DataError(
+            "no stretch of the recording is usable"
+            + (f": {recording.notes[-1]}" if recording.notes else ".")
+        )
 
 
 def _check_columns(recording: "Recording") -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ __all__ = [
     "columns_of",
     "cut",
     "inputs",
+    "layout_of",
     "observation",
     "stitch",
 ]
@@ -60,11 +61,9 @@ def inputs(
     if initial_state not in get_args(InitialState):
         known = ", ".join(repr(name) for name in get_args(InitialState))
         raise DataError(f"initial_state is one of {known}, not {initial_state!r}.")
-    if segment_length is not None and segment_length < 1:
-        raise DataError(f"a segment has at least one step, but {segment_length=}.")
     if history < 0:
         raise DataError(f"a history cannot be negative, but {history=}.")
-    layout = _layout(rollouts.lengths, segment_length)
+    layout = layout_of(rollouts, segment_length)
     return cut(rollouts, layout, initial_state=initial_state, history=history, dtype=dtype)
 
 
@@ -104,6 +103,14 @@ def cut(
         if initial_state == "uncertain":
             starts["initial_value_errors"] = estimate.value_errors
             starts["initial_rate_errors"] = estimate.rate_errors
+    sampling = {}
+    if rollouts.samplings:
+        sampling = {
+            "is_read": torch.tensor(_after_steps(rollouts, layout, num_steps, "is_read")),
+            "lateness": torch.tensor(
+                _after_steps(rollouts, layout, num_steps, "lateness"), dtype=dtype
+            ),
+        }
     return Inputs(
         actions=torch.tensor(actions, dtype=dtype),
         action_names=rollouts.action_names,
@@ -114,6 +121,7 @@ def cut(
         mask=torch.tensor(mask),
         rollout=torch.tensor([rollout for rollout, _, _ in layout]),
         start=torch.tensor([start for _, start, _ in layout]),
+        **sampling,
         **{name: torch.tensor(value, dtype=dtype) for name, value in starts.items()},
     )
 
@@ -133,12 +141,29 @@ def observation(
             if rollout >= len(rollouts) or stop > rollouts.lengths[rollout]:
                 raise DataError("the inputs were made of other rollouts than these.")
     else:
-        layout = _layout(rollouts.lengths, inputs)
+        layout = layout_of(rollouts, inputs)
         num_steps, dtype = max(stop - start for _, start, stop in layout), torch.float64
-    result = np.zeros((len(layout), num_steps, len(columns)))
-    for row, (rollout, start, stop) in enumerate(layout):
-        result[row, : stop - start] = rollouts.readings[rollout][start + 1 : stop + 1, columns]
+    result = _after_steps(rollouts, layout, num_steps, "values")[..., columns]
     return torch.tensor(result, dtype=dtype)
+
+
+def _after_steps(
+    rollouts: Recording,
+    layout: Sequence[tuple[int, int, int]],
+    num_steps: int,
+    part: Literal["values", "lateness", "is_read"],
+) -> NDArray[Any]:
+    """Returns a part of the sampling after each step, ``(S, K, C)``, zero beyond a segment."""
+    if rollouts.samplings:
+        source = [getattr(sampling, part) for sampling in rollouts.samplings]
+    else:
+        assert part == "values"
+        source = list(rollouts.readings)
+    shape = (len(layout), num_steps, len(rollouts.channel_names))
+    result = np.zeros(shape, dtype=source[0].dtype)
+    for row, (rollout, start, stop) in enumerate(layout):
+        result[row, : stop - start] = source[rollout][start + 1 : stop + 1]
+    return result
 
 
 def stitch(
@@ -180,14 +205,24 @@ def stitch(
     return result
 
 
-def _layout(lengths: Sequence[int], segment_length: int | None) -> list[tuple[int, int, int]]:
-    """Returns rollout, first step and end of every segment."""
+def layout_of(rollouts: Recording, segment_length: int | None) -> list[tuple[int, int, int]]:
+    """Returns rollout, first step and end of every segment of the usable stretches.
+
+    Args:
+        rollouts: The rollouts.
+        segment_length: Number of steps; ``None`` for whole stretches. The last segment of a
+            stretch may be shorter.
+
+    Raises:
+        DataError: The length is less than one.
+    """
     if segment_length is not None and segment_length < 1:
         raise DataError(f"a segment has at least one step, but {segment_length=}.")
     return [
-        (rollout, start, min(start + (segment_length or length), length))
-        for rollout, length in enumerate(lengths)
-        for start in range(0, length, segment_length or length)
+        (rollout, start, min(start + (segment_length or end - first), end))
+        for rollout, spans in enumerate(rollouts.spans)
+        for first, end in spans
+        for start in range(first, end, segment_length or end - first)
     ]
 
 
@@ -202,8 +237,15 @@ def _estimated(rollouts: Recording, layout: Sequence[tuple[int, int, int]]) -> S
 def _estimate(rollouts: Recording, layout: Sequence[tuple[int, int, int]]) -> StateEstimate:
     parts = []
     for index, readings in enumerate(rollouts.readings):
-        starts = np.array([start for rollout, start, _ in layout if rollout == index])
-        parts.append(estimate_states(readings, starts, rollouts.time_step))
+        is_read = rollouts.samplings[index].is_read if rollouts.samplings else None
+        own = [start for rollout, start, _ in layout if rollout == index]
+        for first, end in rollouts.spans[index]:
+            starts = np.array([start - first for start in own if first <= start < end], dtype=int)
+            if not len(starts):
+                continue
+            rows = slice(first, end + 1)
+            taken = None if is_read is None else is_read[rows]
+            parts.append(estimate_states(readings[rows], starts, rollouts.time_step, taken))
     return StateEstimate(
         *(
             np.concatenate([getattr(part, field.name) for part in parts])

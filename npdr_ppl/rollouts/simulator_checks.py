@@ -10,7 +10,13 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts.recording import Recording
 
-__all__ = ["OTHER_UNITS", "check_channels", "check_duplicates", "check_units"]
+__all__ = [
+    "OTHER_UNITS",
+    "check_channels",
+    "check_declared_units",
+    "check_duplicates",
+    "check_units",
+]
 
 OTHER_UNITS = {"rad": ("degrees", 180 / math.pi), "m": ("millimetres", 1000.0)}
 """Common units other than SI: by SI unit, the other unit's name and how many equal one SI unit."""
@@ -84,12 +90,27 @@ def check_channels(
         )
 
 
+def check_declared_units(recording: Recording, channels: Sequence[Channel]) -> None:
+    """Raises a DataError if the data state another unit than a simulator's channel has.
+
+    Args:
+        recording: The data.
+        channels: State, sensor or action channels with units.
+    """
+    units = dict(zip(recording.channel_names, recording.channel_units, strict=True))
+    units |= dict(zip(recording.action_names, recording.action_units, strict=True))
+    for channel in channels:
+        own = units.get(channel.name, "")
+        if own and channel.unit and own != channel.unit:
+            raise DataError(f"{channel.name} is in {own}, but {channel.unit} is expected.")
+
+
 def check_units(recording: Recording, channels: Sequence[Channel]) -> None:
     """Checks the units and signs of columns, e.g. finds degrees or millimetres instead of SI.
 
     Three symptoms show another unit. A range exceeds the declared bounds by the factor between the
     units, it is a tiny share of them, or a position's derivative differs from the measured rate by
-    this factor. If the data have units, these are compared with the declared ones.
+    this factor.
 
     Args:
         recording: The data.
@@ -100,10 +121,6 @@ def check_units(recording: Recording, channels: Sequence[Channel]) -> None:
     """
     units = dict(zip(recording.channel_names, recording.channel_units, strict=True))
     units |= dict(zip(recording.action_names, recording.action_units, strict=True))
-    for channel in channels:
-        own = units.get(channel.name, "")
-        if own and channel.unit and own != channel.unit:
-            raise DataError(f"{channel.name} is in {own}, but {channel.unit} is expected.")
     for channel in channels:
         if channel.name in units:
             _check_range(recording, channel)

@@ -68,7 +68,12 @@ class StateEstimate:
     rate_errors: Array
 
 
-def estimate_states(readings: Array, steps: NDArray[np.int64], time_step: float) -> StateEstimate:
+def estimate_states(
+    readings: Array,
+    steps: NDArray[np.int64],
+    time_step: float,
+    is_read: NDArray[np.bool_] | None = None,
+) -> StateEstimate:
     """Estimates every channel and its time derivative at chosen steps.
 
     A cubic is fitted to a window around each step. Each step and channel has one window for its
@@ -81,6 +86,8 @@ def estimate_states(readings: Array, steps: NDArray[np.int64], time_step: float)
         readings: ``(T + 1, C)``, constant sampling, in the channels' units.
         steps: Indices of the P rows wanted, ``(P,)``.
         time_step: Seconds between rows.
+        is_read: Where a measurement was taken, ``(T + 1, C)``; elsewhere the readings are
+            interpolated and carry no information. ``None`` for everywhere.
 
     References:
         A. Goldenshluger and A. Nemirovski, On spatially adaptive estimation of nonparametric
@@ -88,7 +95,7 @@ def estimate_states(readings: Array, steps: NDArray[np.int64], time_step: float)
         1999 (the rule).
     """
     value, rate, value_error, rate_error, _ = _adaptive(
-        readings, steps, _noises(readings), _num_changes(readings)
+        readings, steps, _noises(readings, is_read), _num_changes(readings, is_read)
     )
     value_error, rate_error = ERROR_RATIOS[0] * value_error, ERROR_RATIOS[1] * rate_error
     return StateEstimate(value, rate / time_step, value_error, rate_error / time_step)
@@ -100,6 +107,7 @@ def estimate_departures(
     first: NDArray[np.int64],
     steps: NDArray[np.int64],
     time_step: float,
+    is_read: NDArray[np.bool_] | None = None,
 ) -> StateEstimate:
     """Estimates the differences of measurements and rates from a prediction at chosen steps.
 
@@ -113,8 +121,9 @@ def estimate_departures(
         first: Index of the first row of each prediction, ``(P,)``.
         steps: Indices of the rows wanted, ``(P,)``.
         time_step: Seconds between rows.
+        is_read: As for :func:`estimate_states`.
     """
-    noises, num_changes = _noises(readings), _num_changes(readings)
+    noises, num_changes = _noises(readings, is_read), _num_changes(readings, is_read)
     num_channels = readings.shape[1]
     result = np.empty((4, len(steps), num_channels))
     shapes = [
@@ -181,13 +190,19 @@ def _adaptive(
     return value, rate, error[0], error[1], chosen < len(widths) - 1
 
 
-def _noises(readings: Array) -> Array:
-    return np.array([_noise(channel) for channel in readings.T])
+def _noises(readings: Array, is_read: NDArray[np.bool_] | None) -> Array:
+    if is_read is None:
+        return np.array([_noise(channel) for channel in readings.T])
+    return np.array(
+        [_noise(channel[taken]) for channel, taken in zip(readings.T, is_read.T, strict=True)]
+    )
 
 
-def _num_changes(readings: Array) -> NDArray[np.int64]:
-    """Returns how often each channel's value has changed up to each row, ``(T + 1, C)``."""
+def _num_changes(readings: Array, is_read: NDArray[np.bool_] | None) -> NDArray[np.int64]:
+    """Returns how often each channel's measurement has changed up to each row, ``(T + 1, C)``."""
     is_change = np.diff(readings, axis=0, prepend=readings[:1]) != 0
+    if is_read is not None:
+        is_change &= is_read
     return np.cumsum(is_change, axis=0)
 
 

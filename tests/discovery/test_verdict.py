@@ -14,14 +14,12 @@ def judge(proven):
     """Returns verdict and reason of the search that found the drag, with figures changed."""
     _, options, found = proven
 
-    def verdict(*, effects=None, problems=(), unexplained=0.0, **alarm):
+    def verdict(*, effects=None, unexplained=0.0, **alarm):
         search = found.search
         last = search.rounds[-1]
         last = replace(last, alarm=replace(last.alarm, **{"p_value": 0.5, "gain": 0.0, **alarm}))
         search = replace(search, rounds=[*search.rounds[:-1], last])
-        return _judge(
-            search, found.effects if effects is None else effects, problems, unexplained, options
-        )
+        return _judge(search, found.effects if effects is None else effects, unexplained, options)
 
     return verdict
 
@@ -35,10 +33,6 @@ def drag(proven):
 def test_a_certain_effect_that_explains_everything_is_named(judge, drag):
     assert drag.probability > 0.9
     assert judge() == ("named", "Missing: hinge.quadratic_drag.")
-
-
-def test_a_problem_of_the_recording_comes_before_any_effect(judge):
-    assert judge(problems=("Degrees.",)) == ("unknown", "The recording has a problem: Degrees.")
 
 
 def test_without_effects_only_the_alarm_decides(judge):

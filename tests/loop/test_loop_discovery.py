@@ -196,25 +196,6 @@ def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
     }
 
 
-def test_a_problem_in_the_recording_leaves_the_model_as_it_is(tmp_path):
-    look = LoopDiscovery(pendulum, SMALL_DATA, DiscoveryOptions(), seed=0)
-    problem = "The recording has a problem: Rollout 1 seems to have lost samples."
-    (tmp_path / "discovery.json").write_text(
-        json.dumps(
-            {
-                "reason": problem,
-                "data_problems": [problem],
-                "alarm": {"p_value": 1.0},
-                "finer_steps": 1,
-                "effects": [],
-                "parameters": {},
-            }
-        )
-    )
-    revision = look.look(None, tmp_path)  # type: ignore[arg-type]
-    assert revision.model is None and problem in revision.reason
-
-
 @pytest.mark.slow
 def test_a_run_that_discovers_survives_kills(tmp_path):
     # Of this seed's moments one is early in the search, the other near the end of the run.

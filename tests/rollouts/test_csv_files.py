@@ -59,8 +59,6 @@ def test_actions_by_name(tmp_path):
     assert read(tmp_path, GOOD, actions=["voltage"]) == read(tmp_path, GOOD)
     with pytest.raises(DataError, match="no column volts to be an action"):
         read(tmp_path, GOOD, actions=["volts"])
-    with pytest.raises(DataError, match="voltage is empty in line 4"):
-        read(tmp_path, GOOD, actions=["rate"])
 
 
 def edit(old, new):
@@ -85,7 +83,6 @@ def edit(old, new):
         (GOOD.replace(",", "\t"), "separated by tabs"),
         (edit("0.3", "0,3"), "line 4 has 6 cells, but the header has 5"),
         (edit("0.3,", ""), "line 4 has 4 cells"),
-        (edit("0.3", "nan"), "angle is 'nan' in line 4, which is not a finite number"),
         (edit("0.3", "-inf"), "angle is '-inf' in line 4"),
         (edit("0.3", "1e999"), "angle is too large in line 4"),
         (edit("0.3", "1e101"), "plausible size"),
@@ -96,16 +93,7 @@ def edit(old, new):
         (edit("0.3", "0x1F"), "angle is '0x1F' in line 4"),
         (edit("0.3", '"0\n3"'), r"angle is '0\\n3' in line 5"),
         (edit("0.3", '"0.3'), "is not valid CSV"),
-        (edit("0.1,0.2,", "0.1,,"), "angle is empty in line 3"),
-        (edit("1.5", ""), "voltage is empty in line 2"),
         (edit("1,0.1,0.6,1.0,", "1,0.1,0.6,1.0,3"), "last row of rollout 0 but not of rollout 1"),
-        (
-            edit("0,0.2", "0,0.25"),
-            "the step from 0.1 to 0.25 s in rollout 0 differs from the usual 0.1 s",
-        ),
-        (edit("0,0.2", "0,0.05"), "time goes from 0.1 to 0.05 s in rollout 0"),
-        (edit("0,0.2", "0,0.1"), "must increase"),
-        (edit("1,0.1", "1,0.2"), "rollout 1 has a time step of 0.2 s"),
         (edit("1,0.1", "2,0.1"), "rollout 1 has one row in line 5, but"),
         (edit("0,0.2", "0.5,0.2"), "rollout is 0.5 in line 4"),
         (edit("0,0.2", "-1,0.2"), "rollout is -1 in line 4"),
@@ -116,7 +104,6 @@ def edit(old, new):
         (edit("rate", "räte").encode("latin-1"), "line 1 is not UTF-8 text"),
         (GOOD.encode() + b"\x00", "NUL bytes"),
         (b"\x89HDF\r\n\x1a\n" + bytes(range(1, 256)), "is not UTF-8 text"),
-        (edit("0,0.1,", "0,1e-300,"), "differs from the usual"),
         (GOOD.replace("0.1,", "1e-300,").replace("0.2,", "2e-300,"), "implausible"),
         (edit("0.3", "x" * 200_000), "field larger than field limit"),
         (edit("angle", "a" * 101), "at most 100 characters"),

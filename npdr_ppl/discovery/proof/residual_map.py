@@ -69,7 +69,7 @@ def worst_windows(hypothesis: Hypothesis, rollouts: Rollouts) -> list[Spot]:
     inputs, names = hypothesis.segments.inputs, hypothesis.segments.channel_names
     residual = standardised(hypothesis, rollouts)
     count = inputs.mask.sum(-1).clamp_min(1)
-    z = (residual.square().sum(1) / count[:, None]).sqrt()
+    z = (residual.square().sum(1) / hypothesis.segments.num_measured.clamp_min(1)).sqrt()
     worst, channel = z.max(-1)
     spots = []
     for row in worst.argsort(descending=True)[:NUM_SPOTS].tolist():

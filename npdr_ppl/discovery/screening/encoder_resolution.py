@@ -45,7 +45,7 @@ def counts(hypothesis: Hypothesis, rollouts: Rollouts) -> dict[str, Count]:
     left = dict(zip(hypothesis.segments.channel_names, hypothesis.fit.scale.tolist(), strict=True))
     for name, scale in left.items():
         column = rollouts.channel_names.index(name)
-        size = count_of(np.concatenate([values[:, column] for values in rollouts.readings]))
+        size = count_of(np.concatenate(rollouts.measurements(column)))
         if size is not None:
             found[name] = Count(size, size**2 / 12.0 / scale**2)
     return found

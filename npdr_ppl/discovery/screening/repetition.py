@@ -31,7 +31,8 @@ def keeps_in_step(hypothesis: Hypothesis, effect: Effect, rollouts: Rollouts) ->
         return False
     frequency = float(hypothesis.parameters[f"{effect.name}.{effect.wave}"])
     return all(
-        _is_in_step(frequency, readings, rollouts.time_step) for readings in rollouts.readings
+        _is_in_step(frequency, readings, rollouts.time_step)
+        for readings in rollouts.usable_readings
     )
 
 

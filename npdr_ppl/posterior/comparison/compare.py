@@ -122,6 +122,10 @@ def compare(
             progress=report.stage("find the closest parameters"),
         )
         prepared = error_model.prepared
+        if prepared is not None:
+            train = judged_by = prepared.rollouts
+            if isinstance(test, Rollouts):
+                judged_by = prepared.repair.applied_to(test)
         # Posteriors are judged without features.
         exact = dataclasses.replace(options, precision="float64", embedding=PLAIN_FEATURES)
         likelihood = None

@@ -107,7 +107,8 @@ def _share_of_residuals(
     replayed = replay(model, train, closest.parameters, options)
     observed = train.observation(replayed.inputs, channels=replayed.channel_names)
     residual = (replayed.trajectory[0] - observed).double().cpu()
-    share = effective_share(residual, replayed.inputs.mask.cpu())
+    measured = replayed.inputs.measured(replayed.channel_names).cpu()
+    share = effective_share(residual, measured)
     return dict(zip(replayed.channel_names, share.tolist(), strict=True))
 
 
@@ -142,7 +143,7 @@ def _of_site(bound: BoundModel, name: str, z: Tensor, share: Mapping[str, float]
     if observation.inputs is None or observation.channels is None:
         return density.reshape(len(z), -1).sum(-1, keepdim=True)
     channels = list(observation.channels)
-    mask = observation.inputs.mask.cpu()[..., None]
+    mask = observation.inputs.measured(observation.inputs.channel_names).cpu()
     # Steps after a segment's end are made up and may be anything, infinite included.
     density = density[..., channels].where(mask, 0.0)
     weights = torch.tensor(

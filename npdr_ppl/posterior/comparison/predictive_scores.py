@@ -182,9 +182,12 @@ def _columns(observation: Observation) -> Iterator[tuple[int | None, Tensor, Ten
     if observation.inputs is None or observation.channels is None:
         yield None, observed.reshape(-1), torch.ones(observed.numel(), dtype=torch.bool)
         return
-    for column in observation.channels:
+    names = observation.inputs.channel_names
+    measured = observation.inputs.measured(names).cpu()
+    measured = measured.expand(*measured.shape[:-1], len(names))
+    for column, taken in zip(observation.channels, measured.unbind(-1), strict=True):
         readings = observed[..., column]
-        yield column, readings, observation.inputs.mask.cpu().expand(readings.shape)
+        yield column, readings, taken.expand(readings.shape)
 
 
 def _column(output: Tensor, column: int | None) -> Tensor:

@@ -29,14 +29,8 @@ _UNIT_IN_NAME = re.compile(r"\s*[\[(].*[\])]$")
 CELLS_PER_BLOCK = 100_000
 """Number of cells that are kept as text before they are converted; they take about 7 MB."""
 
-NOT_A_NUMBER = frozenset({"nan", "na", "n/a", "null", "none"})
+NOT_A_NUMBER = frozenset({"nan", "na", "n/a", "null", "none", "-"})
 """Words that programs write for a missing measurement, in lower case."""
-
-GAP = (
-    "; interpolate single missing values, and cut the rollout in two at longer gaps (the "
-    "actions of a rollout's last row stay empty)"
-)
-"""End of the message about a missing measurement: what to do."""
 
 
 def read_csv(path: str | PathLike[str], actions: Sequence[str] | None) -> Recording:
@@ -185,6 +179,7 @@ def _checked_header(row: list[str]) -> list[str]:
 def _numbers(name: str, cells: list[str], lines: Sequence[int]) -> NDArray[np.float64]:
     """Converts a column, NaN for empty cells."""
     cells = [cell.strip() for cell in cells]
+    cells = ["" if cell.lower() in NOT_A_NUMBER else cell for cell in cells]
     if _NUMBER_CHARACTERS.issuperset("".join(cells)):
         try:
             values = np.array([float(cell) if cell else math.nan for cell in cells])
@@ -200,7 +195,6 @@ def _numbers(name: str, cells: list[str], lines: Sequence[int]) -> NDArray[np.fl
         if cell and not _NUMBER.fullmatch(cell):
             raise DataError(
                 f"{name} is {rollout_checks.shown(cell)} in line {line}, "
-                "which is not a finite number"
-                f"{GAP if cell.lower() in NOT_A_NUMBER else ''}."
+                "which is not a finite number."
             )
     raise DataError(f"{name} has a cell that is not a finite number.")

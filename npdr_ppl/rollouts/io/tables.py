@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
+from npdr_ppl.rollouts.gridding import Track, recording_of, stamp_notes, without_restarts
 from npdr_ppl.rollouts.recording import Recording
 
 __all__ = ["from_table", "to_table"]
@@ -49,12 +50,6 @@ def from_table(
     last_rows = bounds[1:] - 1
     data = [name for name in names if name not in ("rollout", "time")]
     stepwise = _stepwise_columns(columns, data, last_rows, actions)
-    for name in ("time", *data):
-        is_empty = np.isnan(columns[name])
-        if name in stepwise:
-            is_empty[last_rows] = False
-        if is_empty.any():
-            raise DataError(f"{name} is empty{at(int(np.argmax(is_empty)))}.")
     rewards = ["reward"] if "reward" in stepwise else []
     if "reward" in data and not rewards:
         raise DataError("the column reward must be empty in the last row of each rollout.")
@@ -65,9 +60,9 @@ def from_table(
             raise DataError(f"{name} is a reserved name, not a channel's or an action's.")
     spans = [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
     times = [columns["time"][span] for span in spans]
-    for index, time in enumerate(times):
-        rollout_checks.check_time(time, f"rollout {index}")
     units = units or {}
+    if _is_uneven(columns, data, stepwise, times, last_rows):
+        return _uneven(columns, channel_names, action_names, spans, units, bool(rewards))
     stepwise_spans = [slice(span.start, span.stop - 1) for span in spans]
     return Recording(
         readings=tuple(_matrix(columns, channel_names, span) for span in spans),
@@ -98,6 +93,57 @@ def to_table(rollouts: Recording) -> dict[str, Array]:
             [part for values in rollouts.rewards for part in (values, [np.nan])]
         )
     return columns
+
+
+def _is_uneven(
+    columns: Mapping[str, Array],
+    data: Sequence[str],
+    stepwise: set[str],
+    times: Sequence[Array],
+    last_rows: NDArray[np.int64],
+) -> bool:
+    """Returns whether values are missing, or time stamps are not those of a constant sampling."""
+    for name in ("time", *data):
+        is_empty = np.isnan(columns[name])
+        if name in stepwise:
+            is_empty[last_rows] = False
+        if is_empty.any():
+            return True
+    try:
+        for index, time in enumerate(times):
+            rollout_checks.check_time(time, f"rollout {index}")
+        rollout_checks.canonical_time_step(times)
+    except DataError:
+        return True
+    return False
+
+
+def _uneven(
+    columns: Mapping[str, Array],
+    channel_names: Sequence[str],
+    action_names: Sequence[str],
+    spans: Sequence[slice],
+    units: Mapping[str, str],
+    has_rewards: bool,
+) -> Recording:
+    """Returns rollouts with missing values or uneven time stamps."""
+    notes = ["The time stamps are uneven; rewards are left out."] if has_rewards else []
+    rollouts, clocks, num_restarts = [], [], 0
+    for span in spans:
+        (time,), number = without_restarts((columns["time"][span],))
+        num_restarts += number
+        clocks.append(time)
+        channels, actions = (
+            [Track.of(time, columns[name][span]) for name in names]
+            for names in (channel_names, action_names)
+        )
+        rollouts.append((channels, actions))
+    return recording_of(
+        rollouts,
+        [(name, units.get(name, "")) for name in channel_names],
+        [(name, units.get(name, "")) for name in action_names],
+        notes=[*notes, *stamp_notes(clocks, num_restarts)],
+    )
 
 
 class _Location:

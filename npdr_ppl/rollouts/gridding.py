@@ -1,0 +1,311 @@
+"""Puts measurements and commands with time stamps of their own on a uniform grid."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import Akima1DInterpolator
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.reading_limits import LIMITS
+from npdr_ppl.rollouts.arrays import Array
+from npdr_ppl.rollouts.recording import Recording
+from npdr_ppl.rollouts.sampling import MOST_BRIDGED, Sampling, Spans, placed, spans_without_gaps
+
+__all__ = [
+    "Gridded",
+    "Track",
+    "grid_of",
+    "recording_of",
+    "stamp_notes",
+    "usual_step",
+    "without_restarts",
+]
+
+STEPS_TOGETHER = 5
+"""Steps over which the usual step is measured: jitter of single stamps averages out, and if one
+message in twenty is lost, most blocks are still complete."""
+
+FEWEST_SMOOTHED = 5
+"""Fewest measurements that are interpolated by cubic polynomials; Akima's method needs as many."""
+
+JITTER = 0.1
+"""Lateness, in steps, above which it is reported; less is compensated, too."""
+
+MOST_LOST = 0.9
+"""Share of the steps with a measurement below which a channel is reported as a slower one."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """One number over time.
+
+    Attributes:
+        time: Increasing time stamps in s, ``(N,)``.
+        values: Values, ``(N,)``.
+    """
+
+    time: Array
+    values: Array
+
+    @classmethod
+    def of(cls, time: Array, values: Array) -> "Track":
+        """Returns the values that are known, in the order of time; of equal stamps, the first.
+
+        Args:
+            time: Time stamps in s, ``(N,)``.
+            values: Values, NaN where one is missing, ``(N,)``.
+        """
+        is_known = np.isfinite(values) & np.isfinite(time)
+        time, first = np.unique(time[is_known], return_index=True)
+        return cls(time, values[is_known][first])
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def between(self, begin: float, end: float) -> "Track":
+        """Returns the values of a stretch of time."""
+        chosen = (self.time >= begin) & (self.time <= end)
+        return Track(self.time[chosen], self.values[chosen])
+
+    @property
+    def step(self) -> float:
+        """Usual time between two values in s."""
+        return usual_step(self.time)
+
+    @property
+    def last_known(self) -> float:
+        """Time in s until which a value that holds until the next one is known."""
+        longest = float(np.diff(self.time).max()) if len(self) > 1 else np.inf
+        return float(self.time[-1]) + longest
+
+
+@dataclass(frozen=True)
+class Gridded:
+    """One rollout on a grid of T steps; see :class:`~npdr_ppl.rollouts.recording.Recording`.
+
+    Attributes:
+        time: Times of the rows in s, from zero, ``(T + 1,)``.
+        readings: Interpolated measurements, ``(T + 1, C)``.
+        actions: Mean commands of the steps, ``(T, A)``.
+        sampling: The measurements as they were taken.
+        spans: The stretches without long gaps.
+    """
+
+    time: Array
+    readings: Array
+    actions: Array
+    sampling: Sampling
+    spans: Spans
+
+
+def without_restarts(times: Sequence[Array]) -> tuple[tuple[Array, ...], int]:
+    """Returns time stamps of clocks that were restarted together as those of one clock.
+
+    A stamp that lies more than ``MOST_BRIDGED`` usual steps before the last one shows a restart.
+    How long it took is not known, so what follows is placed behind a gap.
+
+    Args:
+        times: Time stamps of each signal in the order in which they were written, in s.
+
+    Returns:
+        The time stamps, and the number of restarts.
+    """
+    parts = [_between_restarts(time) for time in times]
+    num = max(len(part) for part in parts)
+    if num == 1:
+        return tuple(times), 0
+    moved: list[list[Array]] = [[] for _ in times]
+    end = -np.inf
+    for k in range(num):
+        present = [part[k] for part in parts if k < len(part) and len(part[k])]
+        gap = (MOST_BRIDGED + 2.0) * max(usual_step(time) for time in present)
+        shift = 0.0 if k == 0 else end + gap - min(float(time.min()) for time in present)
+        for own, part in zip(moved, parts, strict=True):
+            if k < len(part):
+                own.append(part[k] + shift)
+        end = shift + max(float(time.max()) for time in present)
+    return tuple(np.concatenate(own) for own in moved), num - 1
+
+
+def stamp_notes(times: Sequence[Array], num_restarts: int) -> list[str]:
+    """Returns what is wrong about time stamps, and what is done about it, a sentence each.
+
+    Args:
+        times: Time stamps of each signal in the order in which they were written, without
+            restarts, in s.
+        num_restarts: How often the clock was restarted.
+    """
+    notes = []
+    if num_restarts:
+        often = "once" if num_restarts == 1 else f"{num_restarts} times"
+        notes.append(f"The clock was restarted {often}; what follows is another stretch.")
+    steps = [np.diff(time[np.isfinite(time)]) for time in times]
+    repeated = max((int((step == 0).sum()) for step in steps), default=0)
+    swapped = max((int((step < 0).sum()) for step in steps), default=0)
+    if repeated:
+        notes.append(f"{repeated} time stamps are repeated; the first sample of each is used.")
+    if swapped:
+        notes.append(f"{swapped} samples are out of order and were sorted by their time stamps.")
+    return notes
+
+
+def _between_restarts(time: Array) -> list[Array]:
+    """Splits time stamps where the clock went back."""
+    steps = np.diff(time)
+    if not (steps < 0).any() or not (steps > 0).any():
+        return [time]
+    usual = float(np.median(steps[steps > 0]))
+    return np.split(time, np.flatnonzero(steps < -MOST_BRIDGED * usual) + 1)
+
+
+def usual_step(time: Array) -> float:
+    """Returns the mean step of time stamps ``(N,)`` in s; a gap counts as several steps."""
+    time = np.unique(time)
+    together = min(STEPS_TOGETHER, len(time) - 1)
+    if together < 1:
+        return np.inf
+    durations = time[together:] - time[:-together]
+    count = np.rint(durations / np.median(durations) * together).clip(1)
+    return float(durations[::together].sum() / count[::together].sum())
+
+
+def grid_of(channels: Sequence[Track], actions: Sequence[Track], step: float) -> Gridded | None:
+    """Returns a rollout on a grid that begins where everything is known for the first time.
+
+    Args:
+        channels: What was measured.
+        actions: What was commanded; each value holds until the next one.
+        step: Seconds between the rows.
+
+    Returns:
+        ``None`` if all is known for less than one step.
+
+    Raises:
+        DataError: The grid would have more numbers than may be read.
+    """
+    tracks = (*channels, *actions)
+    if any(len(track) < 1 for track in tracks) or any(len(track) < 2 for track in channels):
+        return None
+    begin = max(float(track.time[0]) for track in tracks)
+    end = min(float(track.time[-1]) for track in channels)
+    end = min((end, *(track.last_known for track in actions)))
+    # The last measurement may come a little before its row.
+    count = int((end - begin) / step + 0.5)
+    if count < 1:
+        return None
+    if count * len(tracks) > LIMITS.numbers:
+        raise DataError(f"{count} steps of {step:.6g} s are more than are read.")
+    grid: Array = begin + step * np.arange(count + 1, dtype=np.float64)
+    shape = (count + 1, len(channels))
+    readings, values, lateness = np.empty(shape), np.empty(shape), np.empty(shape)
+    is_read = np.empty(shape, dtype=bool)
+    for k, track in enumerate(channels):
+        found, late, taken = placed(track.time, track.values, grid)
+        exact = taken & (late == 0.0)
+        readings[:, k] = np.where(exact, found, _interpolated(track, grid))
+        values[:, k] = np.where(taken, found, readings[:, k])
+        lateness[:, k], is_read[:, k] = late, taken
+    commands = [_mean_held(track, grid) for track in actions]
+    return Gridded(
+        grid - begin,
+        readings,
+        np.stack(commands, axis=1) if commands else np.zeros((count, 0)),
+        Sampling(values, lateness, is_read),
+        spans_without_gaps(is_read),
+    )
+
+
+def _interpolated(track: Track, grid: Array) -> Array:
+    """Returns values at the times of a grid; beyond the ends, those of the ends."""
+    inside = np.clip(grid, track.time[0], track.time[-1])
+    if len(track) < FEWEST_SMOOTHED:
+        return np.interp(inside, track.time, track.values)
+    return np.asarray(Akima1DInterpolator(track.time, track.values)(inside), dtype=np.float64)
+
+
+def _mean_held(track: Track, grid: Array) -> NDArray[np.float64]:
+    """Returns the mean over each step of values that hold until the next one, ``(T,)``."""
+    area = np.concatenate(([0.0], np.cumsum(track.values[:-1] * np.diff(track.time))))
+    at = np.clip(np.searchsorted(track.time, grid, side="right") - 1, 0, None)
+    integral = area[at] + track.values[at] * (grid - track.time[at])
+    held = np.diff(integral) / np.diff(grid)
+    # Where one value holds for a whole step, it is kept to the last bit.
+    last = at[1:] - (track.time[at[1:]] >= grid[1:])
+    return np.where(last == at[:-1], track.values[at[:-1]], held)
+
+
+def recording_of(
+    rollouts: Sequence[tuple[Sequence[Track], Sequence[Track]]],
+    channels: Sequence[tuple[str, str]],
+    actions: Sequence[tuple[str, str]],
+    *,
+    time_step: float | None = None,
+    notes: Sequence[str] = (),
+) -> Recording:
+    """Returns the recording of rollouts with time stamps of their own.
+
+    Args:
+        rollouts: Channels and actions of each rollout. Rollouts that are shorter than a step are
+            left out.
+        channels: Name and unit of each channel.
+        actions: Name and unit of each action.
+        time_step: Seconds between the steps; ``None`` for the usual step of the fastest channel.
+        notes: What was left out or changed before, a sentence each.
+
+    Raises:
+        DataError: Nothing is left.
+    """
+    steps = [track.step for own, _ in rollouts for track in own if len(track) > 1]
+    if not steps:
+        raise DataError("less than two measurements were recorded.")
+    if len(rollouts) > LIMITS.rollouts:
+        raise DataError(f"it has {len(rollouts)} rollouts, more than {LIMITS.rollouts}.")
+    step = time_step or float(f"{min(steps):.9g}")
+    if not 1e-9 <= step <= 1e9:
+        raise DataError(f"the time step is {step:.6g} s, which is implausible.")
+    made = [grid_of(*tracks, step) for tracks in rollouts]
+    parts = [part for part in made if part is not None]
+    if not parts:
+        raise DataError("the channels and actions have no time in common.")
+    samplings = tuple(part.sampling for part in parts)
+    return Recording(
+        readings=tuple(part.readings for part in parts),
+        actions=tuple(part.actions for part in parts),
+        channel_names=tuple(name for name, _ in channels),
+        action_names=tuple(name for name, _ in actions),
+        time_step=step,
+        time=tuple(part.time for part in parts),
+        channel_units=tuple(unit for _, unit in channels),
+        action_units=tuple(unit for _, unit in actions),
+        samplings=() if all(part.is_regular for part in samplings) else samplings,
+        spans=tuple(part.spans for part in parts),
+        notes=(*notes, *_notes(parts, [name for name, _ in channels], len(made))),
+    )
+
+
+def _notes(parts: Sequence[Gridded], channels: Sequence[str], num_rollouts: int) -> list[str]:
+    """Returns what was found about the times of the measurements, a sentence each."""
+    notes = []
+    if num_rollouts > len(parts):
+        notes.append(f"{num_rollouts - len(parts)} rollouts are shorter than a step; left out.")
+    late = np.concatenate([np.abs(part.sampling.lateness).max(1) for part in parts])
+    if (late > JITTER).any():
+        notes.append(
+            "Time stamps are uneven: simulations are compared with measurements at the times at "
+            "which they were taken."
+        )
+    taken = np.concatenate([part.sampling.is_read for part in parts]).mean(0)
+    slow = [
+        f"{name} ({share:.0%})"
+        for name, share in zip(channels, taken, strict=True)
+        if share < MOST_LOST
+    ]
+    if slow:
+        notes.append(f"Not measured at every step: {', '.join(slow)}.")
+    cut = sum(len(part.actions) - sum(b - a for a, b in part.spans) for part in parts)
+    if cut:
+        total = sum(len(part.actions) for part in parts)
+        notes.append(f"Gaps: {cut} of {total} steps have no measurements nearby and are left out.")
+    return notes

@@ -1,0 +1,132 @@
+"""Faults that are visible without a model cost what they touch, and nothing else."""
+
+import numpy as np
+import pytest
+
+import npdr_ppl as npdr
+from npdr_ppl.errors import DataError
+from npdr_ppl.models.pendulum import Pendulum
+from npdr_ppl.rollouts.faults import without_faults
+
+STEP = 0.01
+CHANNELS = Pendulum().sensors
+
+
+def recording(angle, velocity):
+    readings = np.stack((angle, velocity), axis=1)
+    return npdr.Rollouts.from_arrays(
+        [readings],
+        [np.zeros((len(readings) - 1, 1))],
+        channel_names=("angle", "velocity"),
+        action_names=("torque",),
+        time_step=STEP,
+    )
+
+
+def swing(num_steps=600):
+    time = STEP * np.arange(num_steps)
+    noise = np.random.default_rng(0).normal(0.0, 1e-4, (2, num_steps))
+    return np.sin(3.0 * time) + noise[0], 3.0 * np.cos(3.0 * time) + 3.0 * noise[1]
+
+
+def test_the_step_across_lost_samples_is_not_used():
+    angle, velocity = (np.delete(values, slice(200, 230)) for values in swing())
+    found = without_faults(recording(angle, velocity), CHANNELS)
+    assert found.spans == (((0, 199), (200, 569)),)
+    (note,) = found.notes
+    assert "number of gaps: 1," in note and "1.99 s" in note
+
+
+def test_a_broken_last_row_costs_the_last_step():
+    angle, velocity = swing()
+    angle[-1], velocity[-1] = angle[-1] + 0.5, velocity[-1] - 4.0
+    found = without_faults(recording(angle, velocity), CHANNELS)
+    assert found.spans == (((0, 598),),)
+
+
+def test_a_sample_that_was_written_twice_costs_the_step_between():
+    angle, velocity = (np.insert(values, 300, values[300]) for values in swing())
+    found = without_faults(recording(angle, velocity), CHANNELS)
+    assert found.spans == (((0, 300), (301, 600)),)
+
+
+def test_two_samples_in_the_wrong_order_are_not_used():
+    angle, velocity = swing()
+    for values in (angle, velocity):
+        values[[300, 301]] = values[[301, 300]]
+    found = without_faults(recording(angle, velocity), CHANNELS)
+    assert np.argwhere(~found.samplings[0].is_read[:, 0]).ravel().tolist() == [300, 301]
+    assert found.spans == (((0, 599),),) and "swapped" in found.notes[0]
+
+
+def test_a_spike_costs_one_measurement_of_one_channel():
+    angle, velocity = swing()
+    velocity[250] += 2.0
+    found = without_faults(recording(angle, velocity), CHANNELS)
+    (sampling,) = found.samplings
+    assert np.argwhere(~sampling.is_read).tolist() == [[250, 1]]
+    assert found.spans == (((0, 599),),)
+    assert found.readings[0][250, 1] == pytest.approx(swing()[1][250], abs=0.05)
+    assert "one measurement of velocity" in found.notes[0] and "2.5 s" in found.notes[0]
+
+
+def test_a_frozen_channel_is_not_used_while_it_is_frozen():
+    angle, velocity = swing()
+    angle[100:200] = angle[100]
+    found = without_faults(recording(angle, velocity), CHANNELS)
+    (sampling,) = found.samplings
+    assert not sampling.is_read[101:200, 0].any() and sampling.is_read[:, 1].all()
+    assert found.spans == (((0, 100), (200, 599)),)
+    assert found.notes == ("Rollout 0: angle is frozen from 1 s to 2 s; left out.",)
+
+
+def test_a_device_that_rests_most_of_the_time_has_no_fault():
+    angle, velocity = swing()
+    creep = 1e-9 * np.arange(1200)
+    resting = recording(
+        np.concatenate((angle, angle[-1] + creep)), np.concatenate((velocity, 1e2 * creep))
+    )
+    assert without_faults(resting, CHANNELS) is resting
+
+
+def test_an_encoder_that_stands_while_the_device_rests_is_not_frozen():
+    angle, velocity = swing()
+    still = np.concatenate((np.round(angle / 0.01) * 0.01, np.full(900, 0.3)))
+    noise = np.random.default_rng(1).normal(0.0, 1e-3, 900)
+    rested = recording(still, np.concatenate((velocity, noise)))
+    assert not without_faults(rested, CHANNELS).notes
+
+
+def test_fast_motion_before_slow_motion_is_no_gap():
+    """The swing-up before seconds of slow motion, which determine the median change."""
+    time = STEP * np.arange(3000)
+    angle = 0.03 * time + np.exp(-np.square(time / 0.2)) * np.sin(20.0 * time)
+    velocity = np.gradient(angle, STEP) + 1e-3 * np.sin(50.0 * time)
+    assert not without_faults(recording(angle, velocity), CHANNELS).notes
+
+
+def test_impacts_are_neither_spikes_nor_gaps():
+    height, speed, heights, speeds = 1.0, 0.0, [], []
+    for _ in range(600):
+        heights.append(height)
+        speeds.append(speed)
+        speed -= 9.81 * STEP
+        height += STEP * speed
+        if height < 0.0:
+            height, speed = -height, -0.9 * speed
+    found = without_faults(recording(np.array(heights), np.array(speeds)), CHANNELS)
+    assert not found.notes
+
+
+def test_a_recording_without_a_usable_stretch_is_refused_in_a_sentence():
+    with pytest.raises(DataError, match="no stretch of the recording is usable"):
+        npdr.Rollouts.from_arrays(
+            [np.array([[0.0], [1.0]])], channel_names=("x",), time_step=1.0
+        ).__class__(
+            readings=(np.zeros((2, 1)),),
+            actions=(np.zeros((1, 0)),),
+            channel_names=("x",),
+            action_names=(),
+            time_step=1.0,
+            spans=((),),
+        )
