@@ -18,7 +18,7 @@ from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.io.tables import from_table, to_table
 from npdr_ppl.rollouts.recording import Recording
 
-__all__ = ["read_csv", "write_csv"]
+__all__ = ["BoundedLines", "check_encoding", "read_csv", "undecodable", "write_csv"]
 
 # float() also accepts underscores, digits of other scripts and "nan", which are mistakes here.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -47,7 +47,7 @@ def read_csv(path: str | PathLike[str], actions: Sequence[str] | None) -> Record
             data = path.read_bytes()
         except OSError as error:
             raise DataError(f"cannot be read ({error.strerror}).") from None
-        _check_encoding(data)
+        check_encoding(data)
         columns, lines = _parse(data)
         return from_table(columns, actions, lines=lines)
 
@@ -64,7 +64,8 @@ def write_csv(rollouts: Recording, path: str | PathLike[str]) -> None:
         file.write("\n".join([",".join(columns), *rows, ""]))
 
 
-def _check_encoding(data: bytes) -> None:
+def check_encoding(data: bytes) -> None:
+    """Raises a DataError if a text file is visibly not UTF-8."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise DataError("the text is encoded as UTF-16, but UTF-8 is needed.")
     if b"\0" in data:
@@ -76,7 +77,7 @@ def _parse(data: bytes) -> tuple[dict[str, NDArray[np.float64]], "array[int]"]:
 
     Cells are converted in blocks of rows, because as text they take several times the memory.
     """
-    source = _Lines(data)
+    source = BoundedLines(data)
     reader = csv.reader(source, strict=True)
     header: list[str] = []
     rows: list[list[str]] = []
@@ -112,7 +113,7 @@ def _parse(data: bytes) -> tuple[dict[str, NDArray[np.float64]], "array[int]"]:
     except csv.Error as error:
         raise DataError(f"line {reader.line_num} is not valid CSV ({error}).") from None
     except UnicodeDecodeError:
-        raise DataError(_undecodable(data)) from None
+        raise DataError(undecodable(data)) from None
     if not header:
         raise DataError("the file has no header line.")
     convert()
@@ -121,7 +122,7 @@ def _parse(data: bytes) -> tuple[dict[str, NDArray[np.float64]], "array[int]"]:
     }, lines
 
 
-class _Lines:
+class BoundedLines:
     """The lines of a text, decoded block by block; no row may be longer than a limit.
 
     Attributes:
@@ -134,7 +135,7 @@ class _Lines:
         self.number = 0
         self.row_length = 0
 
-    def __iter__(self) -> "_Lines":
+    def __iter__(self) -> "BoundedLines":
         return self
 
     def __next__(self) -> str:
@@ -150,7 +151,7 @@ class _Lines:
         return line
 
 
-def _undecodable(data: bytes) -> str:
+def undecodable(data: bytes) -> str:
     """Returns a sentence about the first byte that is not UTF-8."""
     try:
         data.decode("utf-8-sig")

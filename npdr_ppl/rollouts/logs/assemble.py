@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
-from npdr_ppl.rollouts.container import Rollouts
 from npdr_ppl.rollouts.logs.log import Signal
+from npdr_ppl.rollouts.recording import Recording
 
 __all__ = ["rollouts_of"]
 
@@ -21,7 +21,7 @@ def rollouts_of(
     *,
     episodes: Signal | None = None,
     time_step: float | None = None,
-) -> Rollouts:
+) -> Recording:
     """Makes rollouts of signals, each with time stamps of its own.
 
     Args:
@@ -54,7 +54,7 @@ def rollouts_of(
         times.append(grid - begin)
     if not readings:
         raise DataError("the mapped signals have no time in common.")
-    return Rollouts.from_arrays(
+    return Recording.from_arrays(
         readings,
         commands,
         channel_names=[s.name for s in channels],
@@ -86,9 +86,7 @@ def _spans(known: Sequence[Signal], episodes: Signal | None) -> list[tuple[float
     changes = np.flatnonzero(np.diff(value) != 0) + 1
     begins = np.concatenate(([0], changes))
     ends = np.concatenate((changes - 1, [len(time) - 1]))
-    spans = [
-        (max(first, time[a]), min(last, time[b])) for a, b in zip(begins, ends, strict=True)
-    ]
+    spans = [(max(first, time[a]), min(last, time[b])) for a, b in zip(begins, ends, strict=True)]
     return [(a, b) for a, b in spans if a < b]
 
 
