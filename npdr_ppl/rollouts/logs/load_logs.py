@@ -1,5 +1,6 @@
 """From a log and its mapping to rollouts, in one call."""
 
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,6 +9,8 @@ import msgspec
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import rollout_checks
+from npdr_ppl.rollouts.collection import joined
+from npdr_ppl.rollouts.io.file_formats import load
 from npdr_ppl.rollouts.io.tables import from_table
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.mapping import Mapping, SignalMapping
@@ -15,11 +18,18 @@ from npdr_ppl.rollouts.logs.parquet_logs import columns_of_frame, read_frame_log
 from npdr_ppl.rollouts.logs.read import is_log, read_log
 from npdr_ppl.rollouts.logs.signal_names import plain_names
 from npdr_ppl.rollouts.recording import Recording
+from npdr_ppl.rollouts.rollout_checks import MAX_RATE_DIFFERENCE
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["is_log", "lerobot_mapping", "recording_of_frame", "recording_of_log"]
+__all__ = [
+    "is_log",
+    "lerobot_mapping",
+    "recording_of_frame",
+    "recording_of_log",
+    "recording_of_logs",
+]
 
 AnyMapping = Mapping | dict[str, Any] | str | PathLike[str] | None
 
@@ -40,6 +50,37 @@ def recording_of_log(path: str | PathLike[str], mapping: AnyMapping) -> Recordin
             )
     chosen = Mapping.of(mapping)
     return chosen.apply(read_log(path, chosen.log))
+
+
+def recording_of_logs(paths: Sequence[str | PathLike[str]], mapping: AnyMapping) -> Recording:
+    """Reads several logs or files of rollouts, one after another.
+
+    Clocks differ from log to log. A log whose own time step is within one percent of the first
+    one's therefore gets the first one's.
+
+    Args:
+        paths: The logs, at least one.
+        mapping: As for :meth:`Rollouts.load`; ``None`` for files of rollouts.
+
+    Raises:
+        DataError: A log cannot be read, or columns or time steps differ.
+    """
+    parts: list[Recording] = []
+    chosen = None if mapping is None else Mapping.of(mapping)
+    for path in paths:
+        if chosen is None and not is_log(path):
+            part = load(path)
+        elif chosen is None:
+            part = recording_of_log(path, None)
+        else:
+            log = read_log(path, chosen.log)
+            part = chosen.apply(log)
+            step = parts[0].time_step if parts else part.time_step
+            if 0 < abs(part.time_step - step) <= MAX_RATE_DIFFERENCE * step:
+                settings = msgspec.structs.replace(chosen.log, time_step=step)
+                part = msgspec.structs.replace(chosen, log=settings).apply(log)
+        parts.append(part)
+    return joined(parts)
 
 
 def recording_of_frame(frame: "pd.DataFrame", mapping: AnyMapping) -> Recording:

@@ -17,6 +17,7 @@ _ROLES: tuple[tuple[Role, re.Pattern[str]], ...] = (
             r"control|ctrl|voltage|u|effort_control|pwm|input)([^a-z]|$)|_(control|command)s?\b"
         ),
     ),
+    ("other", re.compile(r"(^|[^a-z])(effort|torques?|loads?|currents?|forces?|power)([^a-z]|$)")),
     (
         "velocity",
         re.compile(
@@ -27,7 +28,7 @@ _ROLES: tuple[tuple[Role, re.Pattern[str]], ...] = (
     (
         "position",
         re.compile(
-            r"(^|[^a-z])(positions?|pos|qpos|q|angle|theta|alpha|phi|joint|encoder|height|state|"
+            r"(^|[^a-z])(positions?|pos|qpos|q|angle|theta|alpha|phi|encoder|height|observation[._]state|"
             r"pose|deg)([^a-z]|$)"
         ),
     ),
@@ -39,7 +40,10 @@ def role_of(name: str) -> Role:
     """Returns what a signal probably is, by its name: a command before a position."""
     word = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
     word = re.sub(r"\d+", "_", word)
-    return next((role for role, pattern in _ROLES if pattern.search(word)), "other")
+    for role, pattern in _ROLES:
+        if pattern.search(word):
+            return role
+    return "other"
 
 
 def plain_names(signals: Sequence[str]) -> list[str]:
