@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from npdr_ppl.atomic_files import replacing
 from npdr_ppl.cli.manners import AsJson
-from npdr_ppl.cli.options import MappingOption
+from npdr_ppl.cli.options import MappingOption, OutOption
 from npdr_ppl.errors import DataError
 
 if TYPE_CHECKING:
@@ -67,7 +68,8 @@ def inspect(
         if not as_json:
             typer.echo(f"\nWith {mapping}:\n{_wrapped(repr(rollouts))}")
     if write is not None:
-        write.write_text(mapping_to_start_from(found), encoding="utf-8")
+        with replacing(write) as temporary:
+            temporary.write_text(mapping_to_start_from(found), encoding="utf-8")
         if not as_json:
             typer.echo(
                 f"\nWrote {write}. Check its names and units, then:\n"
@@ -79,10 +81,10 @@ def convert(
     logs: Annotated[
         list[Path], typer.Argument(help="Logs; each becomes one or several rollouts.")
     ],
-    out: Annotated[Path, typer.Option(help="File for the rollouts: .parquet, .csv, .npz or .nc.")],
+    out: OutOption,
     mapping: MappingOption = None,
 ) -> None:
-    """Make rollouts of logs, and write them in a format of this program.
+    """Make rollouts of logs, and write them to a .parquet, .csv, .npz or .nc file.
 
     Example: npdr convert monday.mcap tuesday.mcap --mapping mapping.toml --out rollouts.parquet
     """
