@@ -15,7 +15,7 @@ from npdr_ppl.atomic_files import replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.io.tables import from_table, to_table
+from npdr_ppl.rollouts.io.tables import READ_AS_LOG, from_table, to_table
 from npdr_ppl.rollouts.recording import Recording
 
 __all__ = ["BoundedLines", "check_encoding", "read_csv", "undecodable", "write_csv"]
@@ -175,7 +175,11 @@ def _checked_header(row: list[str]) -> list[str]:
     for required in ("rollout", "time"):
         if required not in header:
             told = [n for n in header if _UNIT_IN_NAME.sub("", n) == required]
-            hint = f"; units are SI and no part of names, so rename {told[0]!r}" if told else ""
+            hint = (
+                f"; units are SI and no part of names, so rename {told[0]!r}"
+                if told
+                else READ_AS_LOG
+            )
             raise DataError(
                 f"there is no column {required}; the header is "
                 f"{rollout_checks.shown(','.join(header))}{hint}."

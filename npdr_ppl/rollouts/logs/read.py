@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from os import PathLike
 from pathlib import Path
 
 from npdr_ppl.errors import DataError, NpdrError
+from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
@@ -19,10 +21,21 @@ Reader = Callable[[Path, LogSettings], Log]
 
 
 def is_log(path: str | PathLike[str]) -> bool:
-    """Returns whether a path is a folder, or a file of a format that only logs have."""
+    """Returns whether a path has a format that only logs have; tables may be rollouts, too."""
     path = Path(path)
+    if path.is_dir():
+        return (path / "meta" / "info.json").is_file() or _is_bag(path)
     suffix = path.suffix.lower()
-    return path.is_dir() or (suffix in LOG_SUFFIXES and suffix not in (".csv", ".parquet"))
+    return suffix in LOG_SUFFIXES and suffix not in (".csv", ".parquet")
+
+
+def _is_bag(folder: Path) -> bool:
+    return (folder / "metadata.yaml").is_file() or bool(_suffixes(folder) & {".db3", ".mcap"})
+
+
+def _suffixes(folder: Path) -> set[str]:
+    """Returns the suffixes of the first files of a folder."""
+    return {file.suffix.lower() for file in islice(folder.iterdir(), LIMITS.parts)}
 
 
 def read_log(path: str | PathLike[str], settings: LogSettings | None = None) -> Log:
@@ -86,10 +99,9 @@ def _reader(path: Path) -> tuple[Reader, str]:
     if path.is_dir():
         if (path / "meta" / "info.json").is_file():
             return read_lerobot, "LeRobot"
-        suffixes = {file.suffix.lower() for _, file in zip(range(1000), path.iterdir())}  # noqa: B905
-        if (path / "metadata.yaml").is_file() or suffixes & {".db3", ".mcap"}:
+        if _is_bag(path):
             return read_bag_folder, "ROS bag"
-        if ".csv" in suffixes:
+        if ".csv" in _suffixes(path):
             return read_csv_folder, "CSV"
         raise DataError(
             "the folder is neither a ROS 2 bag, nor a LeRobot data set, nor are there CSV files "
