@@ -120,7 +120,7 @@ def outcome(kind: str, path: Path) -> tuple[str, str]:
             message = str(error)
             is_sentence = (
                 message.isprintable()
-                and message.endswith(".")
+                and message.endswith((".", "?"))
                 and len(message) <= MAX_SENTENCE
                 and not re.search(r"\. [A-Z]", kind_of(message))
             )

@@ -20,13 +20,22 @@ from npdr_ppl.rollouts.logs.folders import files_in
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
 from npdr_ppl.rollouts.logs.messages import Messages
-from npdr_ppl.rollouts.logs.ros_messages import decode, definitions
+from npdr_ppl.rollouts.logs.ros_messages import (
+    MAX_VALUES,
+    TooManyValuesError,
+    decode,
+    definitions,
+)
 
 __all__ = ["read_bag_folder", "read_db3_log", "read_mcap_log"]
 
-Decoder = Callable[[bytes], Any]
+Decoder = Callable[[bytes], tuple[Any, int]]
+"""Returns the fields of a message, and how many values were read."""
 
 INSTALL = "install the readers of ROS bags with pip install npdr-ppl[logs]."
+
+BYTES_OF_JSON = 16
+"""Bytes of JSON text per value, roughly; the work of reading it is counted by this."""
 
 MAX_TYPES = 500
 """Largest count of message types in a log."""
@@ -87,9 +96,14 @@ def read_bag_folder(path: Path, settings: LogSettings) -> Log:
 
 
 class _Decoders:
-    """Decoders of the message types of a log."""
+    """Decoders of the message types of a log.
+
+    Attributes:
+        skipped: Topics whose messages have too many values.
+    """
 
     def __init__(self, messages: Messages) -> None:
+        self.skipped: set[str] = set()
         self._messages = messages
         self._known: dict[tuple[str, str, str, bytes], Decoder | None] = {}
 
@@ -120,7 +134,8 @@ class _Decoders:
 
     def _made(self, encoding: str, kind: str, schema: str, text: bytes) -> Decoder | None:
         if encoding == "json":
-            return msgspec.json.Decoder().decode
+            read = msgspec.json.Decoder().decode
+            return lambda data: (read(data), len(data) // BYTES_OF_JSON)
         if encoding != "cdr" or schema != "ros2msg":
             return None
         if len(text) > LIMITS.text_bytes:
@@ -143,14 +158,32 @@ def _standard(kind: str) -> str | None:
 
 
 def _add(
-    messages: Messages, decoder: Decoder, topic: str, kind: str, nanoseconds: int, data: bytes
+    messages: Messages,
+    decoders: _Decoders,
+    topic: str,
+    decoder: Decoder | None,
+    kind: str,
+    nanoseconds: int,
+    data: bytes,
 ) -> None:
+    """Adds a message, unless messages of its topic are not read."""
+    messages.charge(1)
+    if decoder is None or topic in decoders.skipped:
+        return
     if len(topic) > 200 or not topic.isprintable():
         raise DataError(f"a topic is called {rollout_checks.shown(topic)}.")
     try:
-        message = decoder(data)
+        message, count = decoder(data)
+    except TooManyValuesError:
+        decoders.skipped.add(topic)
+        messages.note(
+            f"{rollout_checks.shown(topic)} was left out: a message has more than {MAX_VALUES} "
+            "values."
+        )
+        return
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         raise DataError(f"a message of {rollout_checks.shown(topic)} is not valid JSON.") from None
+    messages.charge(count)
     messages.add(topic.rstrip("/"), kind, nanoseconds, message)
 
 
@@ -160,7 +193,7 @@ def _add(
 def _add_mcap(path: Path, messages: Messages) -> None:
     """Adds the messages of an MCAP file, also of one whose end is missing."""
     try:
-        from mcap.exceptions import EndOfFile
+        from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
         from mcap.records import Channel, Chunk, Message, Schema
         from mcap.stream_reader import StreamReader
     except ImportError:
@@ -185,8 +218,8 @@ def _add_mcap(path: Path, messages: Messages) -> None:
             text = schema.data if schema else b""
             encoding = channel.message_encoding
             decoder = decoders.find(channel.topic, encoding, kind, language, text)
-            if decoder is not None:
-                _add(messages, decoder, channel.topic, kind, record.log_time, record.data)
+            nanoseconds, data = record.log_time, record.data
+            _add(messages, decoders, channel.topic, decoder, kind, nanoseconds, data)
         if len(schemas) > LIMITS.parts or len(channels) > LIMITS.parts:
             raise DataError(f"it has more than {LIMITS.parts} channels.")
 
@@ -205,7 +238,7 @@ def _add_mcap(path: Path, messages: Messages) -> None:
                     raise DataError("its chunks decompress to much more than such a log holds.")
                 for inner in _records(data):
                     take(inner)
-        except EndOfFile:
+        except (EndOfFile, RecordLengthLimitExceeded):
             messages.note("the file ends in the middle; what comes before was read.")
 
 
@@ -226,16 +259,32 @@ class _WholeReads:
 
 
 def _records(data: bytes) -> Iterator[Any]:
-    """Yields the records in a decompressed chunk."""
-    from mcap.stream_reader import StreamReader
+    """Yields the schemas, channels and messages in a decompressed chunk."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.opcode import Opcode
+    from mcap.records import Channel, Message, Schema
 
-    stream = io.BytesIO(data)
-    records = StreamReader(stream, skip_magic=True, record_size_limit=len(data)).records
-    while stream.tell() < len(data):
-        try:
-            yield next(records)
-        except StopIteration:
-            return
+    position = others = 0
+    while position + 9 <= len(data):
+        opcode, length = (
+            data[position],
+            int.from_bytes(data[position + 1 : position + 9], "little"),
+        )
+        position += 9
+        if position + length > len(data):
+            raise DataError("a chunk ends within a record.")
+        stream = ReadDataStream(io.BytesIO(data[position : position + length]))
+        if opcode == Opcode.MESSAGE:
+            yield Message.read(stream, length)
+        elif opcode == Opcode.CHANNEL:
+            yield Channel.read(stream)
+        elif opcode == Opcode.SCHEMA:
+            yield Schema.read(stream)
+        else:
+            others += 1
+            if others > LIMITS.parts:
+                raise DataError(f"a chunk has more than {LIMITS.parts} unknown records.")
+        position += length
 
 
 def _decompressed(chunk: Any, file_bytes: int) -> bytes:
@@ -365,5 +414,4 @@ def _add_rows(
         if size < 0:
             raise DataError("its messages have more bytes than the file.")
         name, kind, decoder = topics[topic]
-        if decoder is not None:
-            _add(messages, decoder, name, kind, nanoseconds, data)
+        _add(messages, decoders, name, decoder, kind, nanoseconds, data)

@@ -103,6 +103,8 @@ class Mapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise DataError("it is not UTF-8 text.") from None
             except tomllib.TOMLDecodeError as error:
                 raise DataError(f"it is not valid TOML ({_plain(str(error))}).") from None
+            except ValueError:
+                raise DataError("it is not valid TOML (a number is too long).") from None
             except RecursionError:
                 raise DataError("its tables are nested too deeply.") from None
             return _checked(content)

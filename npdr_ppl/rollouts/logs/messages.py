@@ -116,8 +116,15 @@ class Messages:
                 series = entry.series[name] = _Series()
             series.at.append(row)
             series.values.append(value)
-            self._numbers += 1
-        self._numbers += 1
+            self.charge(1)
+
+    def charge(self, count: int) -> None:
+        """Counts numbers that were read.
+
+        Raises:
+            DataError: There are more than the size of the log allows.
+        """
+        self._numbers += count
         if self._numbers > self._allowed:
             raise DataError(
                 f"its messages have more than the {self._allowed} numbers that are read from a "

@@ -54,12 +54,16 @@ def read_parquet_columns(
             raise DataError(f"it has {len(schema)} columns, more than {LIMITS.columns}.")
         if len(set(schema.names)) < len(schema.names):
             raise DataError("two of its columns have the same name.")
-        check_expansion(8.0 * metadata.num_rows * metadata.num_columns, path.stat().st_size)
+        size = path.stat().st_size
+        # Lists have more numbers than rows.
+        groups = [metadata.row_group(k) for k in range(min(metadata.num_row_groups, LIMITS.parts))]
+        numbers = sum(g.column(k).num_values for g in groups for k in range(g.num_columns))
+        numbers = max(numbers, metadata.num_rows * metadata.num_columns)
+        check_expansion(8.0 * numbers, size)
         names = [f.name for f in schema if _is_readable(f.type)]
         if wanted is not None:
             names = [name for name in names if name in wanted]
         table = parquet.read(columns=names, use_threads=False)
-        size = path.stat().st_size
         return {n: _column(n, table.column(n), size) for n in names if n in table.column_names}
 
 

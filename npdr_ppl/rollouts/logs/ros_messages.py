@@ -16,11 +16,22 @@ from typing import Any
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import rollout_checks
 
-__all__ = ["MAX_ARRAY", "Definitions", "decode", "definitions"]
+__all__ = [
+    "MAX_ARRAY",
+    "MAX_NESTING",
+    "Definitions",
+    "TooManyValuesError",
+    "decode",
+    "definitions",
+]
 
 MAX_ARRAY = 100
 """Longest array of numbers whose elements become signals. Humanoids have fifty joints; longer
 arrays are images, point clouds and scans."""
+
+MAX_VALUES = 10_000
+"""Largest count of values of a message, apart from arrays that are left out; a robot's state has a
+hundred."""
 
 MAX_NESTING = 16
 """Deepest nesting of message types; ROS's own reach six."""
@@ -137,7 +148,11 @@ def _fields(name: str, text: str) -> tuple[Field, ...]:
     return tuple(found)
 
 
-def decode(data: bytes, name: str, types: Definitions) -> dict[str, Any]:
+class TooManyValuesError(Exception):
+    """A message has more than ``MAX_VALUES`` values, so it describes no motion of a robot."""
+
+
+def decode(data: bytes, name: str, types: Definitions) -> tuple[dict[str, Any], int]:
     """Returns the fields of a message; arrays of numbers above ``MAX_ARRAY`` are ``None``.
 
     Args:
@@ -145,14 +160,19 @@ def decode(data: bytes, name: str, types: Definitions) -> dict[str, Any]:
         name: Name of its type.
         types: The definitions of this type and of those that it needs.
 
+    Returns:
+        The fields by name, and how many values were read, which measures the work.
+
     Raises:
         DataError: The bytes do not hold such a message.
+        TooManyValuesError: It has more than ``MAX_VALUES`` values.
     """
     if len(data) < 4 or data[0] != 0 or data[1] not in (0, 1, 6, 7):
         raise DataError("a message is not encoded in plain CDR.")
     reader = _Reader(memoryview(data)[4:], "<" if data[1] & 1 else ">", 8 if data[1] < 2 else 4)
     try:
-        return reader.message(short_name(name), types, 0)
+        message = reader.message(short_name(name), types, 0)
+        return message, reader.count
     except struct.error:
         raise DataError("a message ends too early.") from None
 
@@ -164,6 +184,9 @@ class _Reader:
         data: The message without its header.
         order: Byte order, as in :mod:`struct`.
         widest: Largest alignment in bytes.
+
+    Attributes:
+        count: Number of values read.
     """
 
     def __init__(self, data: memoryview, order: str, widest: int) -> None:
@@ -171,6 +194,7 @@ class _Reader:
         self._order = order
         self._widest = widest
         self._position = 0
+        self.count = 0
 
     def message(self, name: str, types: Definitions, depth: int) -> dict[str, Any]:
         """Reads the fields of a message."""
@@ -221,6 +245,9 @@ class _Reader:
         return None
 
     def _numbers(self, code: str, count: int) -> tuple[Any, ...]:
+        self.count += count
+        if self.count > MAX_VALUES:
+            raise TooManyValuesError
         self._align(code)
         numbers = struct.unpack_from(f"{self._order}{count}{code}", self._data, self._position)
         self._position += count * struct.calcsize(code)

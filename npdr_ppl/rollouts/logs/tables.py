@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +37,8 @@ _WORDS = {
 
 _VECTOR = re.compile(r"\s*[\[(]([-+.\deE,;\snaifNI]*)[\])]\s*")
 
+_NUMBER_CHARACTERS = frozenset("0123456789+-.eE")
+
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
@@ -48,6 +51,13 @@ def numbers_of(cells: Sequence[str], *, comma: bool = False) -> Array | None:
     """
     if comma:
         cells = [cell.replace(",", ".") for cell in cells]
+    if _NUMBER_CHARACTERS.issuperset("".join(cells)):
+        try:
+            values = np.array([float(cell) if cell else np.nan for cell in cells])
+        except ValueError:
+            return None  # e.g. 1-2, or a date
+        values[np.isinf(values)] = np.nan
+        return values
     values = np.empty(len(cells))
     for row, cell in enumerate(cells):
         if _NUMBER.fullmatch(cell):
@@ -241,14 +251,13 @@ def _vectors(cells: Texts) -> Array | None:
         if not cell.strip():
             rows.append(None)
             continue
-        found = _VECTOR.fullmatch(cell)
-        if found is None:
-            return None
-        words = re.split(r"\s*[,;]\s*|\s+", found[1].strip())
-        values = numbers_of(words)
+        try:
+            values = _DECODER.decode(cell)
+        except msgspec.DecodeError:
+            values = _unusual_vector(cell)
         if values is None:
             return None
-        rows.append(values.tolist())
+        rows.append(values)
     longest = max((len(row) for row in rows if row is not None), default=0)
     if longest == 0 or longest > LIMITS.columns or longest * len(rows) > LIMITS.numbers:
         return None
@@ -257,3 +266,15 @@ def _vectors(cells: Texts) -> Array | None:
         if row is not None:
             result[index, : len(row)] = row
     return result
+
+
+_DECODER = msgspec.json.Decoder(list[float])
+
+
+def _unusual_vector(cell: str) -> list[float] | None:
+    """Returns the numbers of a vector that is not written as in JSON, e.g. ``(1; nan)``."""
+    found = _VECTOR.fullmatch(cell)
+    if found is None:
+        return None
+    values = numbers_of(re.split(r"\s*[,;]\s*|\s+", found[1].strip()))
+    return None if values is None else values.tolist()
