@@ -166,12 +166,15 @@ def _checked_header(row: list[str]) -> list[str]:
     if len(header) == 1:
         for separator, word in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
             if separator in header[0]:
-                raise DataError(f"cells are separated by {word}, but commas are needed.")
+                raise DataError(
+                    f"cells are separated by {word}, but commas are needed{READ_AS_LOG}."
+                )
     if all(_NUMBER.fullmatch(cell) for cell in header):
-        raise DataError("the first line holds numbers, but it should name the columns.")
+        raise DataError(
+            "the first line holds numbers, but it should name the columns" + READ_AS_LOG + "."
+        )
     if len(header) > LIMITS.columns:
         raise DataError(f"it has {len(header)} columns, more than {LIMITS.columns}.")
-    rollout_checks.check_names(header)
     for required in ("rollout", "time"):
         if required not in header:
             told = [n for n in header if _UNIT_IN_NAME.sub("", n) == required]
@@ -184,6 +187,7 @@ def _checked_header(row: list[str]) -> list[str]:
                 f"there is no column {required}; the header is "
                 f"{rollout_checks.shown(','.join(header))}{hint}."
             )
+    rollout_checks.check_names(header)
     return header
 
 

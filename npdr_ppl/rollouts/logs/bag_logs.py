@@ -152,7 +152,9 @@ def _standard(kind: str) -> str | None:
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise DependencyError(f"A bag without definitions of its messages: {INSTALL}") from None
+        raise DependencyError(
+            f"A bag that does not define its messages needs the package rosbags; {INSTALL}"
+        ) from None
     store = get_typestore(Stores.ROS2_HUMBLE)
     return store.generate_msgdef(kind, ros_version=2)[0] if kind in store.fielddefs else None
 
@@ -197,7 +199,7 @@ def _add_mcap(path: Path, messages: Messages) -> None:
         from mcap.records import Channel, Chunk, Message, Schema
         from mcap.stream_reader import StreamReader
     except ImportError:
-        raise DependencyError(f"MCAP files: {INSTALL}") from None
+        raise DependencyError(f"MCAP files need the package mcap; {INSTALL}") from None
     size = path.stat().st_size
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from npdr_ppl.errors import DataError
+from npdr_ppl.errors import DataError, DependencyError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.logs import read_log
 
@@ -288,6 +288,84 @@ def typed(types, kind, content):
             value = np.array(value, dtype=np.float64)
         values[name] = value
     return cls(**values)
+
+
+def test_a_missing_library_is_named(monkeypatch, tmp_path):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "mcap.stream_reader", None)
+    (tmp_path / "log.mcap").write_bytes(b"x" * 99)
+    with pytest.raises(DependencyError, match=r"pip install npdr-ppl\[logs\]"):
+        read_log(tmp_path / "log.mcap")
+
+
+def test_a_clock_of_its_own_is_noticed(tmp_path):
+    from mcap.writer import Writer
+
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/state", "json", 0)
+        for index, ns in enumerate(NS.tolist()):
+            stamp = {"sec": index // 100 + 1, "nanosec": index % 100 * 10**7}
+            data = json.dumps({"header": {"stamp": stamp}, "x": index, "long": [0.0] * 500})
+            writer.add_message(channel, ns, data.encode(), ns)
+        writer.finish()
+    log = read_log(tmp_path / "log.mcap")
+    np.testing.assert_array_equal(log.by_name["/state/x"].time, TIME)
+    assert any("differ from the recorder's clock" in note for note in log.notes)
+    assert any("arrays of more than 100 numbers" in note for note in log.notes)
+
+
+def test_all_types_of_numbers_are_decoded():
+    """The decoder agrees with the library's encoder for every type, byte order and nesting."""
+    from npdr_ppl.rollouts.logs.ros_messages import decode, definitions
+
+    types = store()
+    text = """# a comment
+uint8 LIMIT=3  # a constant
+string WORD = "a # b"
+bool is_on
+int8 a
+uint16[3] b
+wstring w
+char c
+float32 d
+int64[<=4] e
+Inner[] inner
+builtin_interfaces/Time when
+string<=9 word "default"
+Empty nothing
+uint64 last 7
+================================================================================
+MSG: pkg/Inner
+float64 x
+string[] names
+================================================================================
+MSG: pkg/Empty
+"""
+    from rosbags.typesys import get_types_from_msg
+
+    # The library has neither texts of two bytes nor bounded ones with comments in the values.
+    text = text.replace("wstring w\n", "").replace('string WORD = "a # b"\n', "")
+    types.register(get_types_from_msg(text, "pkg/msg/Outer"))
+    made = types.types
+    time = made["builtin_interfaces/msg/Time"](sec=-3, nanosec=5)
+    inner = [made["pkg/msg/Inner"](x=0.5 * k, names=["a" * k]) for k in range(3)]
+    message = made["pkg/msg/Outer"](
+        is_on=True, a=-5, b=np.array([1, 2, 65535], np.uint16), c=7, d=0.25,
+        e=np.array([2**62, -1]), inner=inner, when=time, word="hi",
+        nothing=made["pkg/msg/Empty"](), last=2**64 - 1,
+    )  # fmt: skip
+    expected = {
+        "is_on": True, "a": -5, "b": [1, 2, 65535], "c": 7, "d": 0.25, "e": [2**62, -1],
+        "inner": [{"x": 0.5 * k, "names": ["a" * k]} for k in range(3)],
+        "when": {"sec": -3, "nanosec": 5}, "word": "hi", "nothing": {}, "last": 2**64 - 1,
+    }  # fmt: skip
+    known = definitions("pkg/msg/Outer", text)
+    for is_little in (True, False):
+        data = bytes(types.serialize_cdr(message, "pkg/msg/Outer", little_endian=is_little))
+        assert decode(data, "pkg/msg/Outer", known)[0] == expected
 
 
 # -- Folders ---------------------------------------------------------------------------------
