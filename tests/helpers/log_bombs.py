@@ -125,7 +125,7 @@ def mcap_of_types_that_grow(path):
 
 
 def mcap_of_many_numbers(path):
-    _mcap(path, "uint8[100] x", HEAD + b"\0" * 100, count=20_000)
+    _mcap(path, "uint8[100] x", HEAD + b"\0" * 100, count=12_000)
 
 
 def mcap_of_many_topics(path):

@@ -34,8 +34,8 @@ Decoder = Callable[[bytes], tuple[Any, int]]
 
 INSTALL = "install the readers of ROS bags with pip install npdr-ppl[logs]."
 
-BYTES_OF_JSON = 16
-"""Bytes of JSON text per value, roughly; the work of reading it is counted by this."""
+BYTES_OF_JSON = 4
+"""Bytes of JSON text that count as one value; the work of reading a message is counted by this."""
 
 MAX_TYPES = 500
 """Largest count of message types in a log."""

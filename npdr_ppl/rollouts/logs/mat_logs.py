@@ -11,6 +11,7 @@ References:
 import math
 import zlib
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,9 +72,10 @@ class _Arrays:
         leaves: Arrays by path.
     """
 
-    def __init__(self, order: str, file_bytes: int) -> None:
+    def __init__(self, order: Literal["<", ">"], file_bytes: int) -> None:
         self.leaves: dict[str, Leaf] = {}
-        self._order = order
+        self._order: Literal["<", ">"] = order
+        self._endianness: Literal["little", "big"] = "little" if order == "<" else "big"
         self._file_bytes = file_bytes
         self._bytes = 0.0
         self._parts = 0
@@ -116,10 +118,6 @@ class _Arrays:
             int.from_bytes(data[position + 4 : position + 8], self._endianness),
             (position + 8),
         )
-
-    @property
-    def _endianness(self) -> "str":
-        return "little" if self._order == "<" else "big"
 
     def _element(self, data: bytes, position: int) -> tuple[int, bytes, int]:
         """Returns type and bytes of an element, and where the next one begins."""

@@ -96,7 +96,8 @@ def _series(series: Any) -> Array | Texts:
 
     if isinstance(series.dtype, pd.DatetimeTZDtype) or series.dtype.kind in "mM":
         ticks = series.astype("int64").to_numpy()
-        unit = getattr(series.dtype, "unit", None) or np.datetime_data(series.dtype)[0]
+        kind: Any = series.dtype
+        unit = getattr(kind, "unit", None) or np.datetime_data(kind)[0]
         return np.where(series.isna(), np.nan, in_seconds(ticks, _PER_SECOND[unit]))
     if pd.api.types.is_numeric_dtype(series.dtype) and series.dtype.kind != "c":
         return _without_infinities(series.to_numpy(dtype=np.float64, na_value=np.nan))
@@ -130,9 +131,10 @@ def _is_number(kind: Any) -> bool:
 def _column(name: str, column: Any, size: int) -> Array | Texts:
     """Returns a column of a Parquet table: numbers, vectors, times in s, or text."""
     import pyarrow as pa
-    import pyarrow.compute as pc
+    import pyarrow.compute
     import pyarrow.types as kinds
 
+    pc: Any = pyarrow.compute  # its functions are made at import
     kind = column.type
     if kinds.is_string(kind) or kinds.is_large_string(kind):
         if column.nbytes > LIMITS.free_bytes:

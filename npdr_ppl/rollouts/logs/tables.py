@@ -14,7 +14,12 @@ from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.logs.log import Log, Signal
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
 from npdr_ppl.rollouts.logs.nearest_names import missing
-from npdr_ppl.rollouts.logs.time_stamps import is_stamp, seconds_of, time_name
+from npdr_ppl.rollouts.logs.time_stamps import (
+    MAX_CLOCK_DIFFERENCE,
+    is_stamp,
+    seconds_of,
+    time_name,
+)
 
 __all__ = ["Columns", "Texts", "log_of_columns", "numbers_of"]
 
@@ -109,7 +114,7 @@ def log_of_columns(
         time, note = _seconds(chosen, columns[chosen], settings)
         notes += [f"{about}{note}."] if note else []
     elif settings.time_step is not None:
-        time = settings.time_step * np.arange(rows)
+        time = np.arange(rows) * np.float64(settings.time_step)
         notes.append(f"there is no time column; rows are {settings.time_step:g} s apart.")
     else:
         raise DataError(
@@ -136,7 +141,14 @@ def log_of_columns(
     episodes = settings.episodes or next((n for n in EPISODE_NAMES if n in numbers), "")
     if episodes in numbers:
         time = _continued(time, numbers[episodes])
-    stamps = {} if settings.time else _stamps(numbers, settings)
+    stamps: dict[str, Array] = {}
+    if not settings.time:
+        stamps, different = _stamps(numbers, time, settings)
+        notes += [
+            f"{rollout_checks.shown(name)} differs from the time of the table by "
+            f"{difference:.3g} s and is not used."
+            for name, difference in different.items()
+        ]
     signals = []
     for name, values in numbers.items():
         if name in stamps:
@@ -201,13 +213,31 @@ def _seconds(name: str, values: Array | Texts, settings: LogSettings) -> tuple[A
     return seconds_of(name, values, settings)
 
 
-def _stamps(numbers: Mapping[str, Array], settings: LogSettings) -> dict[str, Array]:
-    """Returns the time stamps in s that messages have of their own, by column."""
-    found = {}
+def _stamps(
+    numbers: Mapping[str, Array], time: Array, settings: LogSettings
+) -> tuple[dict[str, Array], dict[str, float]]:
+    """Returns the stamps of messages that can be used, and the differences of the others.
+
+    Args:
+        numbers: Columns by name.
+        time: Time stamps of the rows in s, ``(N,)``.
+        settings: How the log is read.
+
+    Returns:
+        Stamps in s by column, and the median difference in s between the two clocks by column.
+    """
+    found, different = {}, {}
     for name, values in numbers.items():
-        if is_stamp(name) and np.isfinite(values).any():
-            found[name] = seconds_of(name, values, settings)[0]
-    return found
+        if not is_stamp(name) or not np.isfinite(values).any():
+            continue
+        stamps = seconds_of(name, values, settings)[0]
+        is_known = np.isfinite(stamps) & np.isfinite(time)
+        difference = float(np.median((time - stamps)[is_known])) if is_known.any() else np.nan
+        if abs(difference) <= MAX_CLOCK_DIFFERENCE:
+            found[name] = stamps
+        else:
+            different[name] = difference
+    return found, different
 
 
 def _continued(time: Array, episodes: Array) -> Array:

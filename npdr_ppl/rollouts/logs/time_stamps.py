@@ -10,7 +10,15 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.logs.log_settings import TIME_UNITS, LogSettings, TimeUnit
 
-__all__ = ["guessed_unit", "in_seconds", "is_stamp", "is_time_name", "seconds_of", "time_name"]
+__all__ = [
+    "MAX_CLOCK_DIFFERENCE",
+    "guessed_unit",
+    "in_seconds",
+    "is_stamp",
+    "is_time_name",
+    "seconds_of",
+    "time_name",
+]
 
 Array = NDArray[np.float64]
 
@@ -26,6 +34,10 @@ _UNIT_WORDS: dict[str, TimeUnit] = {
     **{"us": "us", "µs": "us", "usec": "us", "microseconds": "us"},
     **{"ns": "ns", "nsec": "ns", "nanoseconds": "ns"},
 }
+
+MAX_CLOCK_DIFFERENCE = 1.0
+"""Largest median difference, in s, between the stamps of messages and the recorder's clock. Above
+it the two clocks differ, and signals with and without stamps would not fit together."""
 
 _EPOCH: tuple[tuple[float, TimeUnit], ...] = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """Smallest time stamps since 1970 in these units: 1973 or later."""

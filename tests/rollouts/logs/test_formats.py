@@ -440,3 +440,26 @@ def test_a_folder_of_csv_files(expected, tmp_path):
     assert set(names) == {"state/values/angle", "state/values/rate", "command/values.0"}
     chosen["actions"]["voltage"]["signal"] = "command/values.0"
     assert Rollouts.load(tmp_path, chosen) == expected
+
+
+def test_a_robot_that_stands_still_is_not_taken_for_a_bomb(tmp_path):
+    from mcap_ros2.writer import Writer
+
+    kind = "sensor_msgs/msg/JointState"
+    names = [f"joint{k}" for k in range(7)]
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        schema = writer.register_msgdef(kind, store().generate_msgdef(kind, ros_version=2)[0])
+        for index in range(2_000):
+            stamp = {"sec": 1, "nanosec": 400_000 * index}
+            message = {
+                "header": {"stamp": stamp, "frame_id": ""}, "name": names, "position": [0.5] * 7,
+                "velocity": [0.0] * 7, "effort": [0.0] * 7,
+            }  # fmt: skip
+            writer.write_message("/joints", schema, message, log_time=10**9 + 400_000 * index)
+        writer.finish()
+    size = (tmp_path / "log.mcap").stat().st_size
+    # Numbers that such a log charges, compared with those that its size would allow if it were
+    # large enough for the free ones not to matter.
+    assert 2_000 * 30 < 4 * size
+    assert len(read_log(tmp_path / "log.mcap").signals) == 21
