@@ -20,8 +20,8 @@ FREE_NUMBERS = 1_000_000
 """Count of numbers that the messages of any log may have."""
 
 NUMBERS_PER_BYTE = 4
-"""Numbers per byte that a larger log may have. A number takes eight bytes before compression, which
-gains a factor of twenty for a robot that stands still."""
+"""Numbers per byte that a larger log may have. A number takes eight bytes before compression,
+which gains a factor of twenty for a robot that stands still."""
 
 _NAMES = ("name", "names", "joint_names")
 """Fields that name the elements of the other arrays, as in ``sensor_msgs/JointState``."""

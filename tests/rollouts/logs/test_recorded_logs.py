@@ -11,8 +11,6 @@ from npdr_ppl.rollouts.logs import read_log
 from npdr_ppl.rollouts.logs.inspection import described
 
 DATA = Path(__file__).parents[4] / "shared/data"
-if not DATA.is_dir():
-    DATA = Path("/work/shared/data")
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the recordings are not here")
 
