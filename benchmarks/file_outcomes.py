@@ -14,7 +14,10 @@ MAX_SENTENCE = 600
 """Characters of the longest message that a person would still read."""
 
 RECORDINGS = ("csv", "parquet", "npz", "nc")
-FORMATS = (*RECORDINGS, "pickle", "mjcf", "urdf", "run", "resume")
+LOGS = ("log_csv", "log_parquet", "h5", "mat", "mcap", "db3", "bag", "lerobot", "folder", "toml")
+"""Logs of robots, and the mapping that says what they mean."""
+
+FORMATS = (*RECORDINGS, "pickle", "mjcf", "urdf", "run", "resume", *LOGS)
 
 
 def read(kind: str, path: Path) -> None:
@@ -23,6 +26,15 @@ def read(kind: str, path: Path) -> None:
 
     if kind in RECORDINGS:
         Rollouts.load(path)
+    elif kind == "toml":
+        from npdr_ppl.rollouts.logs import Mapping
+
+        Mapping.of(path)
+    elif kind in LOGS:
+        from npdr_ppl.rollouts.logs import read_log
+        from npdr_ppl.rollouts.logs.inspection import described, mapping_to_start_from
+
+        mapping_to_start_from(described(read_log(path)))
     elif kind == "pickle":
         Rollouts.from_simurlacra(path)
     elif kind == "mjcf":
@@ -108,7 +120,7 @@ def outcome(kind: str, path: Path) -> tuple[str, str]:
             message = str(error)
             is_sentence = (
                 message.isprintable()
-                and message.endswith(".")
+                and message.endswith((".", "?"))
                 and len(message) <= MAX_SENTENCE
                 and not re.search(r"\. [A-Z]", kind_of(message))
             )

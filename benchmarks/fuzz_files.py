@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import file_outcomes
+import fuzz_logs
 import numpy as np
 import torch
 from fuzz_csv_edits import BYTE_EDITS, NUMBERS, malformed
@@ -177,12 +178,14 @@ def originals(folder: Path) -> dict[str, list[Path]]:
     shutil.copy(models / "two_link_arm.xml", folder / "x.mjcf")
     (folder / "runs").mkdir()
     file_outcomes.resume(folder / "begun")
+    logs = fuzz_logs.write_logs(folder / "logs")
     found = {kind: [folder / f"x.{kind}"] for kind in ("parquet", "npz", "nc", "pickle")}
     return found | {
         "mjcf": [folder / "x.mjcf"],
         "urdf": [folder / "x.urdf"],
         "run": write_runs(folder / "runs"),
         "resume": [folder / "begun"],
+        **logs,
     }
 
 
@@ -253,13 +256,13 @@ def one(kind: str, seed: int, index: int, folder: Path) -> tuple[str, str]:
         path.write_bytes(malformed(rng))
         return file_outcomes.outcome(kind, path)
     original = rng.choice(originals(folder / "originals")[kind])
-    path = folder / f"fuzz.{kind}"
+    path = folder / f"fuzz.{kind.removeprefix('log_')}"
     if original.is_dir():
         damaged_folder(rng, original, path)
         return file_outcomes.outcome(kind, path)
     data = original.read_bytes()
     edits: tuple[Callable[[Rng, bytes], bytes], ...] = (damage,)
-    if kind in ("mjcf", "urdf"):
+    if kind in ("mjcf", "urdf", "log_csv", "toml"):
         edits = (damage, replace_number, replace_number)
     path.write_bytes(rng.choice(edits)(rng, data))
     return file_outcomes.outcome(kind, path)

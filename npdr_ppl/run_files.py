@@ -250,8 +250,8 @@ def reading_back(path: Path) -> Iterator[None]:
 
 
 def shown_sentence(text: str, limit: int = 200) -> str:
-    """Returns the beginning of a library's message as part of a sentence on one line."""
-    line = " ".join(text.split()).rstrip(".")
+    """Returns the first sentence of a library's message, without its end, on one line."""
+    line = re.split(r"\.\s+(?=[A-Z])", " ".join(text.split()))[0].rstrip(".")
     line = line if line.isprintable() else ascii(line)
     return line if len(line) <= limit else f"{line[:limit]}…"
 

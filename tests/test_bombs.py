@@ -8,10 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers import cost_server, robot_bombs, run_bombs, table_bombs, tree_bombs
+from tests.helpers import (
+    cost_server,
+    log_bombs,
+    robot_bombs,
+    run_bombs,
+    table_bombs,
+    tree_bombs,
+)
 
 BOMBS = table_bombs.BOMBS | tree_bombs.BOMBS | robot_bombs.BOMBS | run_bombs.BOMBS
-CASES = [(kind, name) for kind, bombs in BOMBS.items() for name in bombs]
+ALL = BOMBS | log_bombs.BOMBS
+CASES = [(kind, name) for kind, bombs in ALL.items() for name in bombs]
 
 MAX_SECONDS = 2.0
 MAX_MEGABYTES = 500.0
@@ -45,12 +53,19 @@ def cost():
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "name"), CASES)
 def test_bombs_cost_little(kind, name, cost, tmp_path):
-    path = tmp_path / f"bomb.{kind}"
-    BOMBS[kind][name](path)
+    path = tmp_path / f"bomb.{kind.removeprefix('log_')}"
+    ALL[kind][name](path)
     answer = cost(kind, path)
     assert answer["outcome"] in ("read", "refused"), answer
     assert answer["seconds"] < MAX_SECONDS, answer
     assert answer["megabytes"] < MAX_MEGABYTES, answer
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "folder"])
+def test_links_out_of_a_folder_are_not_followed(kind, cost, tmp_path):
+    log_bombs.BOMBS[kind][f"{kind}_of_a_link"](tmp_path / "set")
+    answer = cost(kind, tmp_path / "set")
+    assert answer["outcome"] == "refused" and "is a link out of the folder" in answer["message"]
 
 
 def test_there_are_at_least_eight_of_each_format():

@@ -12,6 +12,7 @@ from npdr_ppl.cli.options import (
     HoldoutOption,
     InitialState,
     InitialStateOption,
+    MappingOption,
     ModelArgument,
     Noise,
     NoiseOption,
@@ -44,6 +45,7 @@ def compare(
     rounds: RoundsOption = 2,
     simulations: SimulationsOption = 2_000,
     seed: SeedOption = 0,
+    mapping: MappingOption = None,
     holdout: HoldoutOption = "",
     effect: EffectOption = None,
     embedding: EmbeddingOption = "score",
@@ -85,7 +87,7 @@ def compare(
     chosen = resolve_effects(resolve_model(model), effect or [])
     named = candidates(split_candidates(backends))
     options = data_options(embedding, segment_length, initial_state, precision, noise, strict)
-    train, test = resolve_rollouts(data, holdout)
+    train, test = resolve_rollouts(data, holdout, mapping)
     with (
         resumable(f"the same command again continues the comparison in {out}."),
         reporter(False if quiet else None) as report,

@@ -14,6 +14,7 @@ from npdr_ppl.cli.options import (
     HoldoutOption,
     InitialState,
     InitialStateOption,
+    MappingOption,
     ModelArgument,
     Noise,
     NoiseOption,
@@ -50,6 +51,7 @@ def discover(
     model: ModelArgument,
     data: DataOption,
     out: OutOption,
+    mapping: MappingOption = None,
     holdout: HoldoutOption = "",
     holdout_data: Annotated[
         Path | None,
@@ -111,7 +113,7 @@ def discover(
     from npdr_ppl.run_files import claimed, reading_back
 
     chosen = resolve_effects(resolve_model(model), effect or [])
-    train, test = resolve_holdout(data, holdout, holdout_data)
+    train, test = resolve_holdout(data, holdout, holdout_data, mapping)
     options = data_options(None, segment_length, initial_state, precision, noise, strict)
     search = DiscoveryOptions(
         effects=tuple(named_effects([candidates])) if candidates else None,

@@ -14,6 +14,7 @@ from npdr_ppl.cli.options import (
     HoldoutOption,
     InitialState,
     InitialStateOption,
+    MappingOption,
     ModelArgument,
     Noise,
     NoiseOption,
@@ -49,6 +50,7 @@ def fit(
     ] = 2,
     simulations: SimulationsOption = 1_000,
     seed: SeedOption = 0,
+    mapping: MappingOption = None,
     holdout: HoldoutOption = "",
     effect: EffectOption = None,
     embedding: EmbeddingOption = "score",
@@ -88,7 +90,7 @@ def fit(
     chosen = resolve_effects(resolve_model(model), effect or [])
     method, features = resolve_backend(backend, embedding)
     options = data_options(features, segment_length, initial_state, precision, noise, strict)
-    train, test = resolve_rollouts(data, holdout)
+    train, test = resolve_rollouts(data, holdout, mapping)
     with (
         resumable(f"the same command again continues the run in {out}."),
         reporter(False if quiet else None) as report,

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from npdr_ppl.cli import compare, demo, discover, fit, listings, report, reproduce, train
+from npdr_ppl.cli import compare, demo, discover, fit, listings, logs, report, reproduce, train
 from npdr_ppl.cli.manners import INTERRUPTIONS, Stopped, stop_on_signals
 from npdr_ppl.errors import NpdrError
 
@@ -28,6 +28,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 app.command(rich_help_panel="See it work")(demo.demo)
+app.command(rich_help_panel="Read logs")(logs.inspect)
+app.command(rich_help_panel="Read logs")(logs.convert)
 app.command(rich_help_panel="Infer parameters")(fit.fit)
 app.command(rich_help_panel="Infer parameters")(compare.compare)
 app.command(rich_help_panel="Find what is missing")(discover.discover)

@@ -34,6 +34,7 @@ __all__ = [
     "HoldoutOption",
     "InitialState",
     "InitialStateOption",
+    "MappingOption",
     "ModelArgument",
     "Noise",
     "NoiseOption",
@@ -75,7 +76,9 @@ class Noise(StrEnum):
     MODEL = "model"
 
 
-_DATA = typer.Option(help="Rollouts: CSV, Parquet, NPZ or NetCDF.")
+_DATA = typer.Option(
+    help="Rollouts: CSV, Parquet, NPZ or NetCDF; a log with --mapping. May be repeated."
+)
 _ROUNDS = typer.Option(min=1, help="Rounds of simulating and training.")
 _SIMULATIONS = typer.Option(min=10, help="Simulations per round.")
 
@@ -83,11 +86,15 @@ ModelArgument = Annotated[
     str,
     typer.Argument(help="Zoo name, or path/to/file.py:function.", autocompletion=complete_model),
 ]
-DataOption = Annotated[Path, _DATA]
-OptionalDataOption = Annotated[Path | None, _DATA]
+DataOption = Annotated[list[Path], _DATA]
+OptionalDataOption = Annotated[list[Path] | None, _DATA]
+MappingOption = Annotated[
+    Path | None,
+    typer.Option(help="TOML file that maps the signals of logs; see npdr inspect --write."),
+]
 OutOption = Annotated[
     Path,
-    typer.Option(help="Folder for results."),
+    typer.Option(help="Folder for results; file for the rollouts of convert."),
 ]
 HoldoutOption = Annotated[
     str, typer.Option(help="Rollouts to hold out and to test on, e.g. 3,4; counted from 0.")

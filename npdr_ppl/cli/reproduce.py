@@ -70,13 +70,14 @@ def reproduce(
     }
     _check_flags(experiment, [flag for flag, is_given in given.items() if is_given])
     if experiment is Experiment.MISSING_EFFECT:
-        _reproduce_missing_effect(data, out / experiment.value, seed, as_json, quiet)
+        _reproduce_missing_effect(_only(data), out / experiment.value, seed, as_json, quiet)
         return
     from npdr_ppl.cli.show import show_rows
     from npdr_ppl.errors import DataError
     from npdr_ppl.posterior.comparison.compared_backends import split_candidates
 
     progress = False if quiet else None
+    file = _only(data)
     out = out / experiment.value
     chosen = split_candidates(backends) if backends else None
     with resumable(f"the same command again continues the experiment in {out}."):
@@ -91,10 +92,10 @@ def reproduce(
             from npdr_ppl.reproduction.mini_golf_table import reproduce_mini_golf
             from npdr_ppl.rollouts import Rollouts
 
-            if data is None:
+            if file is None:
                 raise DataError("mini-golf needs the paper's recordings: pass --data FILE.")
             posteriors, result = reproduce_mini_golf(
-                Rollouts.load(data),
+                Rollouts.load(file),
                 out,
                 backends=chosen,
                 rounds=rounds,
@@ -111,9 +112,9 @@ def reproduce(
             from npdr_ppl.reproduction.table2 import add_returns, reproduce_table2
             from npdr_ppl.rollouts import Rollouts
 
-            if data is None:
+            if file is None:
                 raise DataError("table2 needs the paper's recordings: pass --data FILE.")
-            rollouts = Rollouts.load(data)
+            rollouts = Rollouts.load(file)
             comparison, result = reproduce_table2(
                 rollouts,
                 out,
@@ -130,6 +131,15 @@ def reproduce(
         typer.echo((out / f"{experiment.value}.json").read_text(), nl=False)
     elif not quiet:
         show_rows(experiment.value, result)
+
+
+def _only(data: Sequence[Path] | None) -> Path | None:
+    """Returns the only file or folder that was given, ``None`` if none was."""
+    from npdr_ppl.errors import DataError
+
+    if data and len(data) > 1:
+        raise DataError("an experiment takes --data once; a folder may hold several recordings.")
+    return data[0] if data else None
 
 
 def _check_flags(experiment: Experiment, given: Sequence[str]) -> None:

@@ -18,9 +18,11 @@ if TYPE_CHECKING:
     from npdr_ppl.language.effects import Effect
     from npdr_ppl.loop.control_task import ControlTask
     from npdr_ppl.policies.policy_search import PolicySearch
+    from npdr_ppl.rollouts import Rollouts
     from npdr_ppl.targets.base import TargetDomain
 
 __all__ = [
+    "load_all",
     "named_effects",
     "resolve_backend",
     "resolve_device",
@@ -152,48 +154,71 @@ def _split_effects(text: str, known: Collection[str]) -> list[str]:
     return parts
 
 
-def resolve_rollouts(path: Path, holdout: str = "") -> tuple[Any, Any]:
+def resolve_rollouts(
+    paths: Sequence[Path], holdout: str = "", mapping: Path | None = None
+) -> tuple[Any, Any]:
     """Loads rollouts and splits off the held-out ones.
 
     Args:
-        path: CSV, Parquet, NPZ or NetCDF.
-        holdout: Positions of held-out rollouts, e.g. ``"3,4"``.
+        paths: CSV, Parquet, NPZ, NetCDF, or logs of any format that a mapping describes.
+        holdout: Positions of held-out rollouts over all files, e.g. ``"3,4"``.
+        mapping: Which signals of the logs are channels and actions.
 
     Returns:
         Rollouts to fit, and held-out rollouts or ``None``.
 
     Raises:
-        DataError: The file is bad, or a position does not exist.
+        DataError: A file is bad, files do not fit together, or a position does not exist.
     """
-    from npdr_ppl.rollouts import Rollouts
-
-    rollouts = Rollouts.load(path)
+    rollouts = load_all(paths, mapping)
     if not holdout:
         return rollouts, None
+    told = paths[0] if len(paths) == 1 else f"all {len(paths)} files together"
     try:
         test = sorted({int(part) for part in holdout.split(",")})
     except ValueError:
         raise DataError(f"--holdout takes positions such as 3,4; got {holdout!r}.") from None
     if test[0] < 0 or test[-1] >= len(rollouts):
         raise DataError(
-            f"--holdout {holdout} names rollouts that do not exist: {path} has "
+            f"--holdout {holdout} names rollouts that do not exist: {told} has "
             f"{len(rollouts)}, counted from 0, so the last is {len(rollouts) - 1}."
         )
     if len(test) == len(rollouts):
         raise DataError(
-            f"--holdout {holdout} leaves no rollouts to fit: {path} has {len(rollouts)} in all."
+            f"--holdout {holdout} leaves no rollouts to fit: {told} has {len(rollouts)} in all."
         )
     train = [i for i in range(len(rollouts)) if i not in test]
     return rollouts[train], rollouts[test]
 
 
-def resolve_holdout(path: Path, holdout: str, file: Path | None) -> tuple[Any, Any]:
-    """Loads rollouts, and held-out ones from the same file or from another.
+def load_all(paths: Sequence[Path], mapping: Path | None = None) -> "Rollouts":
+    """Loads the rollouts of several files, one file after another.
 
     Args:
-        path: CSV, Parquet, NPZ or NetCDF.
-        holdout: Positions of held-out rollouts, e.g. ``"3,4"``.
+        paths: The files, at least one.
+        mapping: Which signals of logs are channels and actions.
+
+    Raises:
+        DataError: A file is bad, or columns or time steps differ.
+    """
+    from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.rollouts.logs.load_logs import recording_of_logs
+
+    if len(paths) == 1:
+        return Rollouts.load(paths[0], mapping)
+    return Rollouts.of(recording_of_logs(paths, mapping))
+
+
+def resolve_holdout(
+    paths: Sequence[Path], holdout: str, file: Path | None, mapping: Path | None = None
+) -> tuple[Any, Any]:
+    """Loads rollouts, and held-out ones from the same files or from another.
+
+    Args:
+        paths: CSV, Parquet, NPZ, NetCDF, or logs of any format that a mapping describes.
+        holdout: Positions of held-out rollouts over all files, e.g. ``"3,4"``.
         file: Another file, all of whose rollouts are held out.
+        mapping: Which signals of the logs are channels and actions.
 
     Returns:
         Rollouts to fit, and held-out rollouts or ``None``.
@@ -201,13 +226,11 @@ def resolve_holdout(path: Path, holdout: str, file: Path | None) -> tuple[Any, A
     Raises:
         DataError: A file is bad, a position does not exist, or both were given.
     """
-    from npdr_ppl.rollouts import Rollouts
-
     if file is None:
-        return resolve_rollouts(path, holdout)
+        return resolve_rollouts(paths, holdout, mapping)
     if holdout:
         raise DataError("--holdout and --holdout-data exclude each other; give one.")
-    return Rollouts.load(path), Rollouts.load(file)
+    return load_all(paths, mapping), load_all([file], mapping)
 
 
 def resolve_device(word: str) -> str:

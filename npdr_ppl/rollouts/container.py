@@ -22,7 +22,10 @@ from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.recording import Recording
 
 if TYPE_CHECKING:
+    import pandas as pd
     import xarray as xr
+
+    from npdr_ppl.rollouts.logs.mapping import Mapping as LogMapping
 
 __all__ = ["Rollouts"]
 
@@ -118,15 +121,51 @@ class Rollouts(Recording):
         return cls.of(read_simurlacra(path, names))
 
     @classmethod
-    def load(cls, path: Path) -> "Rollouts":
-        """Reads ``.csv``, ``.parquet``, ``.npz`` or ``.nc``, chosen by the suffix.
+    def load(
+        cls, path: Path, mapping: "LogMapping | dict[str, Any] | Path | None" = None
+    ) -> "Rollouts":
+        """Reads rollouts from a file or folder.
+
+        Without a mapping, ``.csv``, ``.parquet``, ``.npz`` and ``.nc`` files have the layout of
+        this class. With one, the path is a log of any format that robots write; see
+        :func:`npdr_ppl.rollouts.logs.read_log`. LeRobot data sets need no mapping: components of
+        ``observation.state`` are channels, those of ``action`` are actions.
+
+        Args:
+            path: The file or folder.
+            mapping: Which signals of the log are channels and actions: a TOML file as written by
+                ``npdr inspect``, a dictionary with its content, or a ``Mapping``.
 
         Raises:
-            DataError: The suffix is unknown or the file cannot be read.
+            DataError: The format is unknown, the file cannot be read, or a log has no mapping.
+            DependencyError: A log needs a package that is not installed.
         """
+        from npdr_ppl.rollouts.logs.load_logs import is_log, recording_of_log
+
+        if mapping is not None or is_log(path):
+            return cls.of(recording_of_log(path, mapping))
         from npdr_ppl.rollouts.io.file_formats import load
 
         return cls.of(load(path))
+
+    @classmethod
+    def from_dataframe(
+        cls, frame: "pd.DataFrame", mapping: "LogMapping | dict[str, Any] | Path | None" = None
+    ) -> "Rollouts":
+        """Makes rollouts of a pandas data frame.
+
+        Args:
+            frame: One row per time stamp; a value that was not recorded is NaN. A column or the
+                index holds the time.
+            mapping: Which columns are channels and actions, as for :meth:`load`; ``None`` for the
+                columns of :meth:`from_csv`.
+
+        Raises:
+            DataError: A column is missing or has no numbers.
+        """
+        from npdr_ppl.rollouts.logs.load_logs import recording_of_frame
+
+        return cls.of(recording_of_frame(frame, mapping))
 
     # -- Export ------------------------------------------------------------------------------
 

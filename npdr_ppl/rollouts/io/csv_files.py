@@ -15,10 +15,10 @@ from npdr_ppl.atomic_files import replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.io.tables import from_table, to_table
+from npdr_ppl.rollouts.io.tables import READ_AS_LOG, from_table, to_table
 from npdr_ppl.rollouts.recording import Recording
 
-__all__ = ["read_csv", "write_csv"]
+__all__ = ["BoundedLines", "check_encoding", "read_csv", "undecodable", "write_csv"]
 
 # float() also accepts underscores, digits of other scripts and "nan", which are mistakes here.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -41,7 +41,7 @@ def read_csv(path: str | PathLike[str], actions: Sequence[str] | None) -> Record
             data = path.read_bytes()
         except OSError as error:
             raise DataError(f"cannot be read ({error.strerror}).") from None
-        _check_encoding(data)
+        check_encoding(data)
         columns, lines = _parse(data)
         return from_table(columns, actions, lines=lines)
 
@@ -58,7 +58,8 @@ def write_csv(rollouts: Recording, path: str | PathLike[str]) -> None:
         file.write("\n".join([",".join(columns), *rows, ""]))
 
 
-def _check_encoding(data: bytes) -> None:
+def check_encoding(data: bytes) -> None:
+    """Raises a DataError if a text file is visibly not UTF-8."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise DataError("the text is encoded as UTF-16, but UTF-8 is needed.")
     if b"\0" in data:
@@ -70,7 +71,7 @@ def _parse(data: bytes) -> tuple[dict[str, NDArray[np.float64]], "array[int]"]:
 
     Cells are converted in blocks of rows, because as text they take several times the memory.
     """
-    source = _Lines(data)
+    source = BoundedLines(data)
     reader = csv.reader(source, strict=True)
     header: list[str] = []
     rows: list[list[str]] = []
@@ -106,7 +107,7 @@ def _parse(data: bytes) -> tuple[dict[str, NDArray[np.float64]], "array[int]"]:
     except csv.Error as error:
         raise DataError(f"line {reader.line_num} is not valid CSV ({error}).") from None
     except UnicodeDecodeError:
-        raise DataError(_undecodable(data)) from None
+        raise DataError(undecodable(data)) from None
     if not header:
         raise DataError("the file has no header line.")
     convert()
@@ -115,7 +116,7 @@ def _parse(data: bytes) -> tuple[dict[str, NDArray[np.float64]], "array[int]"]:
     }, lines
 
 
-class _Lines:
+class BoundedLines:
     """The lines of a text, decoded block by block; no row may be longer than a limit.
 
     Attributes:
@@ -128,7 +129,7 @@ class _Lines:
         self.number = 0
         self.row_length = 0
 
-    def __iter__(self) -> "_Lines":
+    def __iter__(self) -> "BoundedLines":
         return self
 
     def __next__(self) -> str:
@@ -144,7 +145,7 @@ class _Lines:
         return line
 
 
-def _undecodable(data: bytes) -> str:
+def undecodable(data: bytes) -> str:
     """Returns a sentence about the first byte that is not UTF-8."""
     try:
         data.decode("utf-8-sig")
@@ -159,20 +160,28 @@ def _checked_header(row: list[str]) -> list[str]:
     if len(header) == 1:
         for separator, word in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
             if separator in header[0]:
-                raise DataError(f"cells are separated by {word}, but commas are needed.")
+                raise DataError(
+                    f"cells are separated by {word}, but commas are needed{READ_AS_LOG}."
+                )
     if all(_NUMBER.fullmatch(cell) for cell in header):
-        raise DataError("the first line holds numbers, but it should name the columns.")
+        raise DataError(
+            "the first line holds numbers, but it should name the columns" + READ_AS_LOG + "."
+        )
     if len(header) > LIMITS.columns:
         raise DataError(f"it has {len(header)} columns, more than {LIMITS.columns}.")
-    rollout_checks.check_names(header)
     for required in ("rollout", "time"):
         if required not in header:
             told = [n for n in header if _UNIT_IN_NAME.sub("", n) == required]
-            hint = f"; units are SI and no part of names, so rename {told[0]!r}" if told else ""
+            hint = (
+                f"; units are SI and no part of names, so rename {told[0]!r}"
+                if told
+                else READ_AS_LOG
+            )
             raise DataError(
                 f"there is no column {required}; the header is "
                 f"{rollout_checks.shown(','.join(header))}{hint}."
             )
+    rollout_checks.check_names(header)
     return header
 
 

@@ -15,6 +15,9 @@ __all__ = ["from_table", "to_table"]
 
 Array = NDArray[np.float64]
 
+READ_AS_LOG = "; to read another layout, run npdr inspect FILE --write mapping.toml"
+"""End of the message about a table that has other columns than ours: what to do."""
+
 
 def from_table(
     columns: Mapping[str, Array],
@@ -40,7 +43,7 @@ def from_table(
         if required not in columns:
             raise DataError(
                 f"there is no column {required}; the columns are "
-                f"{rollout_checks.shown(', '.join(names))}."
+                f"{rollout_checks.shown(', '.join(names))}{READ_AS_LOG}."
             )
     num_rows = len(columns["rollout"])
     if num_rows < 2:

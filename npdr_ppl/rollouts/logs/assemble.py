@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.rollouts.container import Rollouts
 from npdr_ppl.rollouts.gridding import Track, recording_of, stamp_notes, without_restarts
 from npdr_ppl.rollouts.logs.log import Signal
+from npdr_ppl.rollouts.recording import Recording
 
 __all__ = ["rollouts_of"]
 
@@ -18,7 +18,7 @@ def rollouts_of(
     *,
     episodes: Signal | None = None,
     time_step: float | None = None,
-) -> Rollouts:
+) -> Recording:
     """Makes rollouts of signals, each with time stamps of its own.
 
     Args:
@@ -45,14 +45,12 @@ def rollouts_of(
         ([t.between(*span) for t in tracks[:num]], [t.between(*span) for t in tracks[num:]])
         for span in _spans(None if episodes is None else Track.of(times[-1], episodes.values))
     ]
-    return Rollouts.of(
-        recording_of(
-            parts,
-            [(signal.name, signal.unit) for signal in channels],
-            [(signal.name, signal.unit) for signal in actions],
-            time_step=time_step,
-            notes=stamp_notes(times, num_restarts),
-        )
+    return recording_of(
+        parts,
+        [(signal.name, signal.unit) for signal in channels],
+        [(signal.name, signal.unit) for signal in actions],
+        time_step=time_step,
+        notes=stamp_notes(times, num_restarts),
     )
 
 

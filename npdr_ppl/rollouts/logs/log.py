@@ -46,10 +46,15 @@ class Log:
     Attributes:
         source: Name of the file or folder, for messages.
         signals: The signals, in the order of the log; their names differ.
+        notes: What the reader guessed or left out, one sentence each.
+        episodes: Name of the signal whose every change begins a new episode; ``""`` if the reader
+            found none.
     """
 
     source: str
     signals: tuple[Signal, ...]
+    notes: tuple[str, ...] = ()
+    episodes: str = ""
 
     @cached_property
     def by_name(self) -> dict[str, Signal]:

@@ -1,0 +1,173 @@
+"""`npdr inspect` shows what a log contains; `npdr convert` makes rollouts of logs."""
+
+import dataclasses
+import json
+import math
+import shutil
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from npdr_ppl.atomic_files import replacing
+from npdr_ppl.cli.manners import AsJson
+from npdr_ppl.cli.options import MappingOption, OutOption
+from npdr_ppl.errors import DataError
+
+if TYPE_CHECKING:
+    from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.rollouts.logs.inspection import Description, SignalSummary, Timing
+
+__all__ = ["convert", "inspect"]
+
+WIDTH = 80
+"""Largest width of what is printed, in characters."""
+
+NAME_WIDTH = 42
+"""Width of the column of names in characters; a longer name gets a line of its own."""
+
+
+def inspect(
+    log: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV, Parquet, HDF5, MAT, MCAP, a ROS 2 bag, a LeRobot data set, or a folder "
+            "of CSV files."
+        ),
+    ],
+    mapping: MappingOption = None,
+    write: Annotated[
+        Path | None, typer.Option(help="Write a mapping to start from to this TOML file.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the signals of a log: rate, largest gap, jitter, range, unit, and what they may be.
+
+    Example: npdr inspect bag_folder --write mapping.toml
+    """
+    from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.rollouts.logs.inspection import described, mapping_to_start_from
+    from npdr_ppl.rollouts.logs.mapping import Mapping
+    from npdr_ppl.rollouts.logs.read import read_log
+
+    if write is not None and write.exists():
+        raise DataError(f"{write} exists already; choose another name or remove it first.")
+    chosen = None if mapping is None else Mapping.of(mapping)
+    content = read_log(log, None if chosen is None else chosen.log)
+    found = described(content)
+    if as_json:
+        told = _without_nan(dataclasses.asdict(found))
+        typer.echo(json.dumps(told, indent=2, ensure_ascii=False))
+    else:
+        for line in _lines(found):
+            typer.echo(line)
+    if chosen is not None:
+        rollouts = Rollouts.of(chosen.apply(content))
+        if not as_json:
+            typer.echo(f"\nWith {mapping}:\n{_wrapped(repr(rollouts))}")
+    if write is not None:
+        with replacing(write) as temporary:
+            temporary.write_text(mapping_to_start_from(found), encoding="utf-8")
+        if not as_json:
+            typer.echo(
+                f"\nWrote {write}. Check its names and units, then:\n"
+                f"    npdr fit MODEL --data {log} --mapping {write} --out fit"
+            )
+
+
+def convert(
+    logs: Annotated[
+        list[Path], typer.Argument(help="Logs; each becomes one or several rollouts.")
+    ],
+    out: OutOption,
+    mapping: MappingOption = None,
+) -> None:
+    """Make rollouts of logs, and write them to a .parquet, .csv, .npz or .nc file.
+
+    Example: npdr convert monday.mcap tuesday.mcap --mapping mapping.toml --out rollouts.parquet
+    """
+    from npdr_ppl.cli.resolve import load_all
+
+    writers = {".parquet": "to_parquet", ".csv": "to_csv", ".npz": "to_npz", ".nc": "to_netcdf"}
+    writer = writers.get(out.suffix.lower())
+    if writer is None:
+        raise DataError(f"--out should end in {', '.join(writers)}; got {out}.")
+    rollouts: Rollouts = load_all(logs, mapping)
+    getattr(rollouts, writer)(out)
+    typer.echo(_wrapped(repr(rollouts)))
+    typer.echo(f"Wrote {out}.")
+
+
+def _lines(found: "Description") -> Sequence[str]:
+    """Returns the description of a log, line by line."""
+    count = sum(len(timing.signals) for timing in found.timings)
+    lines = [_cut(f"{found.source}: {count} signals, {found.duration:.4g} s")]
+    for timing in found.timings:
+        lines += ["", *_timing_lines(timing)]
+        lines += [line for signal in timing.signals for line in _signal_lines(signal)]
+    if found.notes or found.episodes:
+        lines.append("")
+    if found.episodes:
+        lines.append(_wrapped(f"episodes: {found.episodes}", "  "))
+    return [*lines, *(_wrapped(note, "  ") for note in found.notes)]
+
+
+def _timing_lines(timing: "Timing") -> list[str]:
+    if not math.isfinite(timing.step):
+        return [f"{timing.count} samples"]
+    lines = [
+        f"{timing.count} samples from {timing.begin:.6g} to {timing.end:.6g} s, "
+        f"{1 / timing.step:.4g} Hz",
+        f"  usual step {_duration(timing.step)}, 95 % of steps within "
+        f"± {_duration(timing.jitter)}",
+        f"  largest gap {_duration(timing.largest)} at {timing.largest_at:.6g} s"
+        + (f"; {timing.gaps} steps lack samples" if timing.gaps else ""),
+    ]
+    if timing.backwards:
+        lines.append(f"  {timing.backwards} time stamps repeat or go back")
+    return lines
+
+
+def _signal_lines(signal: "SignalSummary") -> list[str]:
+    if math.isnan(signal.least):
+        span = "no values"
+    elif signal.is_constant:
+        span = f"always {signal.least:.4g}"
+    else:
+        span = f"{signal.least:.4g} … {signal.greatest:.4g}"
+    span = f"{span} {signal.unit}".strip()
+    role = "" if signal.role == "other" else f"{signal.role}?"
+    name = f"    {signal.name}"
+    if len(name) > NAME_WIDTH:
+        return [_cut(name), _cut(f"{'':{NAME_WIDTH}} {span:25} {role}".rstrip())]
+    return [_cut(f"{name:{NAME_WIDTH}} {span:25} {role}".rstrip())]
+
+
+def _duration(seconds: float) -> str:
+    """Returns a short time in the unit that suits it."""
+    for factor, unit in ((1.0, "s"), (1e3, "ms"), (1e6, "µs")):
+        if seconds * factor >= 1:
+            return f"{seconds * factor:.4g} {unit}"
+    return f"{seconds * 1e9:.3g} ns" if seconds >= 1e-9 else "0 s"
+
+
+def _cut(line: str) -> str:
+    line = "".join(c if c.isprintable() else "?" for c in line)
+    return line if len(line) <= WIDTH else f"{line[: WIDTH - 1]}…"
+
+
+def _wrapped(text: str, indent: str = "") -> str:
+    width = min(WIDTH, max(40, shutil.get_terminal_size().columns))
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return textwrap.fill(text, width, initial_indent=indent, subsequent_indent=f"{indent}  ")
+
+
+def _without_nan(value: Any) -> Any:
+    """Returns a value in which ``None`` stands for NaN, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _without_nan(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,209 @@
+"""Describes a log: which signals it has, when they were recorded, and what they look like."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.rollouts.logs.log import Log, Signal
+from npdr_ppl.rollouts.logs.mapping import toml_text
+from npdr_ppl.rollouts.logs.signal_names import Role, plain_names, role_of
+
+__all__ = ["Description", "SignalSummary", "Timing", "described", "mapping_to_start_from"]
+
+Array = NDArray[np.float64]
+
+GAP = 2.0
+"""Smallest step that counts as a gap, in usual steps: at least one sample is missing."""
+
+USUAL_SHARE = 95
+"""Share of the steps, in percent, that the jitter describes."""
+
+_UNITS_IN_NAMES = {
+    **{"deg": "deg", "degrees": "deg", "rad": "rad", "rpm": "rpm", "dps": "deg/s"},
+    **{"mm": "mm", "cm": "cm", "volt": "V", "volts": "V", "mv": "mV", "ma": "mA", "amp": "A"},
+    **{"nm": "N m", "percent": "percent"},
+}
+"""Units by the last word of a signal's name, in lower case."""
+
+
+@dataclass(frozen=True)
+class SignalSummary:
+    """What is known of a signal.
+
+    Attributes:
+        name: Its name in the log.
+        unit: The unit that the log or its name states, ``""`` if none.
+        least: Smallest value in ``unit``, NaN if there is no value.
+        greatest: Largest value in ``unit``, NaN if there is no value.
+        role: What its name usually means.
+    """
+
+    name: str
+    unit: str
+    least: float
+    greatest: float
+    role: Role
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether it never changes, or has no values."""
+        return not self.least < self.greatest
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The signals that share their time stamps, and these time stamps.
+
+    Attributes:
+        signals: The signals.
+        count: Number of time stamps.
+        begin: First time stamp in s after the log's begin.
+        end: Last time stamp in s after the log's begin.
+        step: Median step between time stamps in s, NaN if there is none.
+        jitter: ``USUAL_SHARE`` percent of the steps are within this of the median step, in s.
+        largest: Largest step in s.
+        largest_at: Begin of the largest step in s after the log's begin.
+        gaps: Number of steps of at least ``GAP`` median steps.
+        backwards: Number of time stamps that repeat the one before or go back.
+    """
+
+    signals: tuple[SignalSummary, ...]
+    count: int
+    begin: float
+    end: float
+    step: float
+    jitter: float
+    largest: float
+    largest_at: float
+    gaps: int
+    backwards: int
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a log contains.
+
+    Attributes:
+        source: Name of the log.
+        timings: Groups of signals with the same time stamps.
+        duration: Time from the first to the last time stamp in s.
+        notes: What the reader guessed or left out.
+        episodes: Name of the signal whose every change begins an episode, or ``""``.
+    """
+
+    source: str
+    timings: tuple[Timing, ...]
+    duration: float
+    notes: tuple[str, ...]
+    episodes: str
+
+
+def described(log: Log) -> Description:
+    """Describes a log."""
+    groups: dict[bytes, list[Signal]] = {}
+    for signal in log.signals:
+        groups.setdefault(_known_time(signal).tobytes(), []).append(signal)
+    times = [_known_time(group[0]) for group in groups.values()]
+    first = min((float(t.min()) for t in times if len(t)), default=0.0)
+    last = max((float(t.max()) for t in times if len(t)), default=0.0)
+    timings = [
+        _timing(time - first, group) for time, group in zip(times, groups.values(), strict=True)
+    ]
+    return Description(log.source, tuple(timings), last - first, log.notes, log.episodes)
+
+
+def _known_time(signal: Signal) -> Array:
+    return signal.time[np.isfinite(signal.values) & np.isfinite(signal.time)]
+
+
+def _timing(time: Array, signals: list[Signal]) -> Timing:
+    """Describes the signals that share time stamps ``(N,)``, in s after the log's begin."""
+    steps = np.diff(time)
+    forward = steps[steps > 0]
+    step = jitter = largest = at = float("nan")
+    if len(forward):
+        step = float(np.median(forward))
+        jitter = float(np.percentile(np.abs(forward - step), USUAL_SHARE))
+        largest, at = float(steps.max()), float(time[np.argmax(steps)])
+    return Timing(
+        signals=tuple(_summary(signal) for signal in signals),
+        count=len(time),
+        begin=float(time[0]) if len(time) else 0.0,
+        end=float(time[-1]) if len(time) else 0.0,
+        step=step,
+        jitter=jitter,
+        largest=largest,
+        largest_at=at,
+        gaps=int((steps > GAP * step * (1 - 0.1)).sum()) if len(forward) else 0,
+        backwards=int((steps <= 0).sum()),
+    )
+
+
+def _summary(signal: Signal) -> SignalSummary:
+    known = signal.values[np.isfinite(signal.values)]
+    word = re.split(r"[^a-z]+", signal.name.lower())[-1]
+    return SignalSummary(
+        name=signal.name,
+        unit=signal.unit or _UNITS_IN_NAMES.get(word, ""),
+        least=float(known.min()) if len(known) else float("nan"),
+        greatest=float(known.max()) if len(known) else float("nan"),
+        role=role_of(signal.name),
+    )
+
+
+# -- A mapping to start from -------------------------------------------------------------------
+
+_HEAD = """\
+# Which signals of the log {source} are channels and actions of the rollouts.
+# Rename the tables as your model names its sensors and actions, state the units, and delete what
+# you do not need. A value is sign * scale * (signal in SI units) + offset, the offset in SI units.
+"""
+
+_ROLE_WORDS = {"position": "channels", "velocity": "channels", "command": "actions"}
+
+_UNIT_HINTS = {
+    "position": '"rad", "deg", "m", "mm", ...',
+    "velocity": '"rad/s", "deg/s", "rpm", "m/s", ...',
+    "command": '"V", "A", "N m", "rad", "percent", ...',
+}
+
+
+def mapping_to_start_from(description: Description) -> str:
+    """Returns a mapping in TOML; signals whose meaning is not clear are commented out."""
+    lines = _HEAD.format(source=toml_text(description.source)).splitlines()
+    lines += ["", *(_comment(note) for note in description.notes)]
+    lines += ["[log]"]
+    if description.episodes:
+        lines.append(f"episodes = {toml_text(description.episodes)}")
+    else:
+        lines.append('# episodes = "..."      # a signal whose every change begins a new rollout')
+    lines += ["# time_step = 0.01      # s between the steps of the rollouts", ""]
+    signals = [s for timing in description.timings for s in timing.signals]
+    signals = [s for s in signals if s.name != description.episodes]
+    names = plain_names([s.name for s in signals])
+    unclear = []
+    for signal, name in zip(signals, names, strict=True):
+        entry = _entry(signal, name)
+        if signal.role == "other" or signal.is_constant:
+            why = "does not change" if signal.is_constant else "meaning not clear from its name"
+            unclear += [f"# {why}:", *(_comment(line) for line in entry), ""]
+        else:
+            lines += [*entry, ""]
+    return "\n".join([*lines, *unclear]).rstrip() + "\n"
+
+
+def _entry(signal: SignalSummary, name: str) -> list[str]:
+    """Returns the lines of a channel or an action."""
+    lines = [f"[{_ROLE_WORDS.get(signal.role, 'channels')}.{name}]"]
+    lines.append(f"signal = {toml_text(signal.name)}")
+    if signal.unit:
+        lines.append(f"unit = {toml_text(signal.unit)}")
+    else:
+        lines.append(f"# unit = {_UNIT_HINTS.get(signal.role, '...')}")
+    return lines
+
+
+def _comment(text: str) -> str:
+    return f"# {''.join(c if c.isprintable() else ' ' for c in text)}"

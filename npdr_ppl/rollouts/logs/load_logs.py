@@ -1,0 +1,119 @@
+"""From a log and its mapping to rollouts, in one call."""
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.rollouts import rollout_checks
+from npdr_ppl.rollouts.collection import joined
+from npdr_ppl.rollouts.io.file_formats import load
+from npdr_ppl.rollouts.io.tables import from_table
+from npdr_ppl.rollouts.logs.log import Log
+from npdr_ppl.rollouts.logs.mapping import Mapping, SignalMapping
+from npdr_ppl.rollouts.logs.parquet_logs import columns_of_frame, read_frame_log
+from npdr_ppl.rollouts.logs.read import is_log, read_log
+from npdr_ppl.rollouts.logs.signal_names import plain_names
+from npdr_ppl.rollouts.recording import Recording
+from npdr_ppl.rollouts.rollout_checks import MAX_RATE_DIFFERENCE
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = [
+    "is_log",
+    "lerobot_mapping",
+    "recording_of_frame",
+    "recording_of_log",
+    "recording_of_logs",
+]
+
+AnyMapping = Mapping | dict[str, Any] | str | PathLike[str] | None
+
+
+def recording_of_log(path: str | PathLike[str], mapping: AnyMapping) -> Recording:
+    """Reads a log; see :meth:`Rollouts.load`."""
+    if mapping is None:
+        folder = Path(path)
+        if (folder / "meta" / "info.json").is_file():
+            log = read_log(folder)
+            return lerobot_mapping(log).apply(log)
+        if not folder.is_dir():
+            rollout_checks.check_file(folder)
+        with rollout_checks.named(path):
+            raise DataError(
+                "a log needs a mapping that says which signals are channels and actions; run "
+                "`npdr inspect LOG --write mapping.toml` to begin one."
+            )
+    chosen = Mapping.of(mapping)
+    return chosen.apply(read_log(path, chosen.log))
+
+
+def recording_of_logs(paths: Sequence[str | PathLike[str]], mapping: AnyMapping) -> Recording:
+    """Reads several logs or files of rollouts, one after another.
+
+    Clocks differ from log to log. A log whose own time step is within one percent of the first
+    one's therefore gets the first one's.
+
+    Args:
+        paths: The logs, at least one.
+        mapping: As for :meth:`Rollouts.load`; ``None`` for files of rollouts.
+
+    Raises:
+        DataError: A log cannot be read, or columns or time steps differ.
+    """
+    parts: list[Recording] = []
+    chosen = None if mapping is None else Mapping.of(mapping)
+    for path in paths:
+        if chosen is None and not is_log(path):
+            part = load(path)
+        elif chosen is None:
+            part = recording_of_log(path, None)
+        else:
+            log = read_log(path, chosen.log)
+            part = chosen.apply(log)
+            step = parts[0].time_step if parts else part.time_step
+            if 0 < abs(part.time_step - step) <= MAX_RATE_DIFFERENCE * step:
+                settings = msgspec.structs.replace(chosen.log, time_step=step)
+                part = msgspec.structs.replace(chosen, log=settings).apply(log)
+        parts.append(part)
+    return joined(parts)
+
+
+def recording_of_frame(frame: "pd.DataFrame", mapping: AnyMapping) -> Recording:
+    """Reads a data frame; see :meth:`Rollouts.from_dataframe`."""
+    if mapping is None:
+        columns = columns_of_frame(frame)
+        for name, values in columns.items():
+            if isinstance(values, list) or values.ndim != 1:
+                raise DataError(f"{rollout_checks.shown(name)} does not hold numbers.")
+        return from_table({n: v for n, v in columns.items() if not isinstance(v, list)}, None)
+    chosen = Mapping.of(mapping)
+    return chosen.apply(read_frame_log(frame, chosen.log))
+
+
+def lerobot_mapping(log: Log) -> Mapping:
+    """Returns the mapping of a LeRobot data set: its states are channels, its actions actions.
+
+    Raises:
+        DataError: The data set has no ``observation.state``.
+    """
+    states = [n for n in log.by_name if n.startswith("observation.state")]
+    actions = [n for n in log.by_name if n == "action" or n.startswith("action.")]
+    if not states:
+        with rollout_checks.named(log.source):
+            raise DataError(
+                "it has no observation.state; run `npdr inspect LOG --write mapping.toml` and "
+                "choose its channels."
+            )
+    names = plain_names([*states, *actions])
+    entries = {n: SignalMapping(s) for n, s in zip(names, [*states, *actions], strict=True)}
+    keys = list(entries)
+    return Mapping(
+        log=msgspec.structs.replace(Mapping().log, episodes=log.episodes or None),
+        channels={n: entries[n] for n in keys[: len(states)]},
+        actions={n: entries[n] for n in keys[len(states) :]},
+    )

@@ -1,0 +1,32 @@
+"""How a log is read: the table ``[log]`` of a mapping."""
+
+from typing import Literal
+
+import msgspec
+
+__all__ = ["TIME_UNITS", "LogSettings", "TimeUnit"]
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+
+TIME_UNITS: dict[TimeUnit, int] = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
+"""Ticks in a second, by unit of time stamps."""
+
+
+class LogSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a log is read; whatever is ``None`` is guessed from the log.
+
+    Attributes:
+        time: Name of the column or data set with the time stamps; ``"log"`` in a ROS bag takes
+            the recorder's time stamps where messages have stamps of their own.
+        time_unit: Unit of the time stamps.
+        header: Whether the first line of a CSV file names the columns.
+        episodes: Signal whose every change begins a new rollout.
+        time_step: Seconds between the steps of the rollouts. In a table without time stamps, also
+            the seconds between rows.
+    """
+
+    time: str | None = None
+    time_unit: TimeUnit | None = None
+    header: bool | None = None
+    episodes: str | None = None
+    time_step: float | None = None
