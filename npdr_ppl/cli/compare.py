@@ -106,7 +106,10 @@ def compare(
             out=out,
             progress=report,
         )
+        prepared = comparison.error_model.prepared
         shown = train if test is None else test
+        if prepared is not None:
+            shown = prepared.rollouts if test is None else prepared.repair.applied_to(test)
         step = report.stage("draw figures")
         write_comparison_figures(comparison, chosen, shown, out, seed=seed, progress=step)
     if as_json:

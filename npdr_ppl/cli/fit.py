@@ -110,7 +110,10 @@ def fit(
             device=device,
             progress=report,
         )
+        prepared = posterior.preparation
         shown = train if test is None else test
+        if prepared is not None:
+            shown = prepared.rollouts if test is None else prepared.repair.applied_to(test)
         step = report.stage("draw figures")
         write_fit_figures(posterior, chosen, shown, out, seed=seed, progress=step)
     if as_json:

@@ -111,7 +111,18 @@ class Investigation:
     @cached_property
     def _repair(self) -> Repair:
         with self._stage("check data"):
-            return repair(self.model, self.recorded, self._data_options)
+            found = repair(self.model, self.recorded, self._data_options)
+        simulator = found.simulator
+        for effect in self.settings.effects or ():
+            # Screening skips effects that the simulator cannot have; requested ones raise errors.
+            if simulator is not None:
+                simulator.with_effects(effect)
+            if effect.is_noise:
+                raise ModelError(
+                    f"{effect.name} only scatters measurements, so no fit can find it; the "
+                    "encoder resolution is read from the recording."
+                )
+        return found
 
     @property
     def rollouts(self) -> Rollouts:
@@ -146,14 +157,6 @@ class Investigation:
         searcher = self._searcher
         with self._stage("fit"):
             fitted = searcher.fit_base()
-        for effect in self.settings.effects or ():
-            # Screening skips effects that the simulator cannot have; requested ones raise errors.
-            fitted.simulator.with_effects(effect)
-            if effect.is_noise:
-                raise ModelError(
-                    f"{effect.name} only scatters measurements, so no fit can find it; the "
-                    "encoder resolution is read from the recording."
-                )
         return fitted
 
     @cached_property

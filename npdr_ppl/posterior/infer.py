@@ -151,7 +151,7 @@ def infer(
             if store is not None:
                 store.save_round(index, *method.tensors(state), infos, seconds)
         provenance = Provenance(seed, num_simulations, tuple(infos), seconds)
-        learnt = Posterior(bound, method, problem, states[1:], provenance, preparation=prepared)
+        learnt = Posterior(bound, method, problem, states[1:], provenance, preparation=preparation)
         if bound.likelihood is None:
             return learnt
         report.stage("compare with the simulator")(0.0, "")

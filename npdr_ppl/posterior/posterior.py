@@ -203,7 +203,7 @@ class Posterior(PosteriorBase):
         )
         tensors, values = self.backend.tensors(self.states[-1])
         folder.save_round(rounds - 1, tensors, values, own.rounds, own.seconds)
-        if self.preparation is not None:
+        if self.preparation is not None and self.preparation.hypothesis is not None:
             folder.save_preparation(self.preparation)
         folder.save_correction(self.correction, self.checks())
 

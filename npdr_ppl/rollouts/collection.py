@@ -20,6 +20,7 @@ __all__ = [
     "joined",
     "picked",
     "pieces",
+    "shortened",
     "stacked",
     "summary",
     "with_channels",
@@ -72,6 +73,27 @@ def pieces(rollouts: Episodes) -> Episodes:
         rewards=rewards and tuple(rewards[r][a:b] for r, a, b in stretches),
         samplings=samplings and tuple(samplings[r].rows(a, b + 1) for r, a, b in stretches),
         spans=(),
+    )
+
+
+def shortened(rollouts: Episodes, num_steps: int) -> Episodes:
+    """Returns rollouts without the steps after the first ones.
+
+    Args:
+        rollouts: The rollouts.
+        num_steps: Most steps of each rollout that are kept.
+    """
+    return replace(
+        rollouts,
+        readings=tuple(values[: num_steps + 1] for values in rollouts.readings),
+        actions=tuple(values[:num_steps] for values in rollouts.actions),
+        time=tuple(values[: num_steps + 1] for values in rollouts.time),
+        rewards=rollouts.rewards and tuple(values[:num_steps] for values in rollouts.rewards),
+        samplings=tuple(sampling.rows(0, num_steps + 1) for sampling in rollouts.samplings),
+        spans=tuple(
+            tuple((first, min(end, num_steps)) for first, end in spans if first < num_steps)
+            for spans in rollouts.spans
+        ),
     )
 
 

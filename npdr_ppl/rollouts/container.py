@@ -19,6 +19,7 @@ from npdr_ppl.rollouts import (
     simulator_checks,
 )
 from npdr_ppl.rollouts.arrays import Array
+from npdr_ppl.rollouts.gridding import at_one_rate
 from npdr_ppl.rollouts.recording import Recording
 
 if TYPE_CHECKING:
@@ -274,12 +275,15 @@ class Rollouts(Recording):
         return self[left], self[right]
 
     def concatenate(self, *others: "Rollouts") -> "Rollouts":
-        """Returns these rollouts followed by others with the same columns and time step.
+        """Returns these rollouts followed by others with the same columns.
+
+        If rates differ, all get the smallest time step; measurements keep their own times.
 
         Raises:
-            DataError: Columns or time steps differ.
+            DataError: Columns differ.
         """
-        return collection.joined((self, *others))
+        parts = [Rollouts.of(part) for part in at_one_rate((self, *others))]
+        return collection.joined(parts)
 
     def select(self, channels: Sequence[str]) -> "Rollouts":
         """Returns the rollouts with only these channels, in this order."""

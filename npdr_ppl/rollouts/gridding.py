@@ -1,5 +1,6 @@
 """Puts measurements and commands with time stamps of their own on a uniform grid."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,11 +15,13 @@ from npdr_ppl.rollouts.recording import Recording
 from npdr_ppl.rollouts.sampling import MOST_BRIDGED, Sampling, Spans, placed, spans_without_gaps
 
 __all__ = [
+    "at_one_rate",
     "Gridded",
     "Track",
     "grid_of",
     "recording_of",
     "stamp_notes",
+    "tracks_of",
     "usual_step",
     "without_restarts",
 ]
@@ -283,6 +286,45 @@ def recording_of(
         spans=tuple(part.spans for part in parts),
         notes=(*notes, *_notes(parts, [name for name, _ in channels], len(made))),
     )
+
+
+def at_one_rate(recordings: Sequence[Recording]) -> list[Recording]:
+    """Returns recordings with the time step of the fastest one.
+
+    Args:
+        recordings: Recordings with the same columns.
+    """
+    step = min(recording.time_step for recording in recordings)
+    if all(math.isclose(r.time_step, step, rel_tol=1e-6) for r in recordings):
+        return list(recordings)
+    return [
+        recording_of(
+            [tracks_of(recording, index) for index in range(len(recording))],
+            list(zip(recording.channel_names, recording.channel_units, strict=True)),
+            list(zip(recording.action_names, recording.action_units, strict=True)),
+            time_step=step,
+            notes=(
+                *recording.notes,
+                *["Rates differ; rewards are left out."] * (recording.rewards is not None),
+            ),
+        )
+        for recording in recordings
+    ]
+
+
+def tracks_of(recording: Recording, index: int) -> tuple[list[Track], list[Track]]:
+    """Returns the measurements and the commands of one rollout with their times."""
+    time, readings = recording.time[index], recording.readings[index]
+    channels = []
+    for k in range(readings.shape[1]):
+        if recording.samplings:
+            sampling = recording.samplings[index]
+            taken = sampling.is_read[:, k]
+            late = recording.time_step * sampling.lateness[taken, k]
+            channels.append(Track.of(time[taken] + late, sampling.values[taken, k]))
+        else:
+            channels.append(Track.of(time, readings[:, k]))
+    return channels, [Track.of(time[:-1], values) for values in recording.actions[index].T]
 
 
 def _notes(parts: Sequence[Gridded], channels: Sequence[str], num_rollouts: int) -> list[str]:

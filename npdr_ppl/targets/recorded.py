@@ -1,10 +1,9 @@
 """Recorded data as a target domain, for devices that are not available."""
 
-from dataclasses import replace
-
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.collection import shortened
 from npdr_ppl.targets.base import Controller, TargetDomain
 
 __all__ = ["RecordedTarget"]
@@ -48,14 +47,7 @@ class RecordedTarget(TargetDomain):
                 "record more, or ask for fewer iterations."
             )
         chosen = self._rollouts[episode]
-        rewards = chosen.rewards
-        return replace(
-            chosen,
-            readings=tuple(values[: num_steps + 1] for values in chosen.readings),
-            actions=tuple(values[:num_steps] for values in chosen.actions),
-            time=tuple(values[: num_steps + 1] for values in chosen.time),
-            rewards=rewards and tuple(values[:num_steps] for values in rewards),
-        )
+        return shortened(chosen, num_steps)
 
 
 def _channels(names: tuple[str, ...], units: tuple[str, ...]) -> tuple[Channel, ...]:

@@ -1,5 +1,6 @@
 """What newcomers get wrong in a recording is answered with one sentence that says what to do."""
 
+import json
 import math
 import sys
 
@@ -16,7 +17,7 @@ def rows():
     time = 0.02 * np.arange(101)
     angle = 0.3 * np.sin(2 * math.pi * time)
     velocity = 0.6 * math.pi * np.cos(2 * math.pi * time)
-    torque = [f"{value:.4f}" for value in np.sin(2 * math.pi * time[:-1])] + [""]
+    torque = [f"{value:.4f}" for value in -np.sin(2 * math.pi * time[:-1])] + [""]
     cells = zip(time, angle, velocity, torque, strict=True)
     return [["0", f"{t:.2f}", f"{a:.5f}", f"{v:.5f}", u] for t, a, v, u in cells]
 
@@ -47,17 +48,11 @@ def degrees(text):
 
 
 MISTAKES = {
-    "wrong names": (renamed("angle,velocity", "q,dq"), "q, dq is a sensor of the model"),
+    "wrong names": (renamed("angle,velocity", "q,dq"), "angle, velocity is missing; the data have q, dq"),
     "wrong name of time": (renamed("time", "t"), "there is no column time; the header is"),
     "a unit behind time": (renamed("time", "time [s]"), "no part of names, so rename 'time [s]'"),
     "wrong name of an action": (renamed("torque", "tau"), "the column torque is missing"),
     "milliseconds": (column(1, lambda t: f"{1000 * float(t):.0f}"), "is it in milliseconds?"),
-    "no last row": (lambda header, cells: (header, cells[:-1]), "otherwise append such a row"),
-    "a full last row": (cell(-1, 4, "0.0"), "empty them if that row is the"),
-    "NaN": (cell(50, 2, "NaN"), "not a finite number; interpolate single missing"),
-    "an empty cell": (cell(50, 2, ""), "angle is empty in line 52"),
-    "irregular time": (cell(50, 1, "1.007"), "resample the data to constant sampling"),
-    "degrees": (column(2, degrees), "angle seems to be in degrees"),
     "semicolons": (
         lambda header, cells: (header.replace(",", ";"), [[";".join(r)] for r in cells]),
         "cells are separated by semicolons, but commas are needed",
@@ -66,6 +61,16 @@ MISTAKES = {
         lambda header, cells: (header + ",current", [[*r, "1.0" if r[-1] else ""] for r in cells]),
         "the column current is not expected; remove it",
     ),
+}  # fmt: skip
+
+
+FAULTS = {
+    "no last row": (lambda header, cells: (header, cells[:-1]), []),
+    "a full last row": (cell(-1, 4, "0.0"), []),
+    "NaN": (cell(50, 2, "NaN"), []),
+    "an empty cell": (cell(50, 2, ""), []),
+    "irregular time": (cell(50, 1, "1.007"), ["Time stamps are uneven"]),
+    "degrees": (column(2, degrees), ["angle looks recorded in degrees"]),
 }  # fmt: skip
 
 
@@ -91,6 +96,23 @@ def test_a_mistake_in_a_recording(monkeypatch, capsys, tmp_path, name):
     assert sentence in err
     assert err.startswith("npdr: ") and err.count("\n") == 1, err
     assert not (tmp_path / "fit").exists()
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_in_a_recording_is_repaired_and_said(monkeypatch, capsys, tmp_path, name):
+    fault, notes = FAULTS[name]
+    header, cells = fault(HEADER, rows())
+    data, out = tmp_path / "measured.csv", tmp_path / "found"
+    data.write_text("\n".join([header, *map(",".join, cells)]) + "\n")
+    words = ["discover", "pendulum", "--data", data, "--segment-length", 10, "--stage", "check"]
+    code, err = answered(monkeypatch, capsys, *words, "--out", out)
+    assert code == 0, err
+    told = json.loads((out / "discovery.json").read_text())["data_problems"]
+    assert len(told) == len(notes), told
+    assert all(expected in note for expected, note in zip(notes, told, strict=True))
+    if notes:
+        code, err = answered(monkeypatch, capsys, *words, "--out", tmp_path / "no", "--strict")
+        assert code == 2 and err.count("\n") == 1, err
 
 
 @pytest.mark.parametrize(
@@ -157,7 +179,7 @@ def test_the_same_command_works_once_the_recording_is_repaired(monkeypatch, caps
     words += ["--segment-length", 10]
     data.write_text("\n".join([HEADER.replace("angle,velocity", "q,dq"), *map(",".join, rows())]))
     code, err = answered(monkeypatch, capsys, *words)
-    assert code == 2 and "q, dq is a sensor of the model, angle, velocity; rename them" in err
+    assert code == 2 and "angle, velocity is missing; the data have q, dq" in err
     data.write_text("\n".join([HEADER, *map(",".join, rows())]))
     code, err = answered(monkeypatch, capsys, *words)
     assert code == 0, err

@@ -42,7 +42,7 @@ def calls(monkeypatch):
     counted(SegmentModel, "_trace")
     counted(prepare_module, "bind")
 
-    def place(readings, steps, time_step):
+    def place(readings, steps, time_step, *_):
         return readings.tobytes(), steps.tobytes(), time_step
 
     for module in (segments, states):

@@ -1,5 +1,6 @@
 """infer and Posterior: the right answer, the same answer again, and after a restart."""
 
+import numpy as np
 import pyro
 import pyro.distributions as dist
 import pytest
@@ -272,13 +273,23 @@ def test_bad_settings_are_refused(linear, recording):
         npdr.infer(pendulum, replace(recording, action_names=("voltage",)), progress=False)
 
 
-def test_data_in_degrees_and_recordings_added_twice_are_refused(recording):
+def test_data_in_degrees_are_converted_and_recordings_added_twice_are_used_once(recording):
     from dataclasses import replace
+
+    from npdr_ppl.posterior.prepare import prepare
 
     degrees = replace(
         recording, readings=tuple(values * [57.2958, 1.0] for values in recording.readings)
     )
+    prepared = prepare(pendulum, degrees, npdr.DataOptions())
+    assert prepared.rollouts.notes == (
+        "angle looks recorded in degrees, not in SI units; converted.",
+    )
+    assert np.allclose(prepared.rollouts.readings[0], recording.readings[0], atol=1e-5)
+    strict = npdr.DataOptions(strict=True)
     with pytest.raises(DataError, match="angle"):
-        npdr.infer(pendulum, degrees, progress=False)
+        prepare(pendulum, degrees, strict)
+    twice = prepare(pendulum, recording[[0, 0]], npdr.DataOptions())
+    assert twice.rollouts.spans[1] == () and "identical to rollout 0" in twice.rollouts.notes[0]
     with pytest.raises(DataError, match="identical"):
-        npdr.infer(pendulum, recording[[0, 0]], progress=False)
+        prepare(pendulum, recording[[0, 0]], strict)

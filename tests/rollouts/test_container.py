@@ -108,8 +108,9 @@ def test_concatenate(small):
         action_units=small.action_units,
         time_step=0.01,
     )
-    with pytest.raises(DataError, match="time steps differ"):
-        small.concatenate(other)
+    both = small.concatenate(other)
+    assert both.time_step == 0.01 and len(both) == 2 * len(small)
+    assert both.samplings[0].is_read.mean() < 0.6 and both.samplings[-1].is_read.all()
 
 
 def test_select_orders_channels(small):

@@ -23,6 +23,7 @@ from npdr_ppl.rollouts.io.npz_arrays import read_arrays
 from npdr_ppl.rollouts.io.parquet_sizes import check_footer, check_parquet
 from npdr_ppl.rollouts.io.tables import from_table, to_table
 from npdr_ppl.rollouts.recording import Recording
+from npdr_ppl.rollouts.sampling import Sampling
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -159,6 +160,11 @@ def write_npz(rollouts: Recording, path: AnyPath) -> None:
     }
     if rollouts.rewards is not None:
         arrays["rewards"] = _padded(rollouts.rewards, 0.0)
+    if rollouts.samplings:
+        arrays["measured"] = _padded([_measured(s) for s in rollouts.samplings], np.nan)
+        arrays["lateness"] = _padded([s.lateness for s in rollouts.samplings], 0.0)
+    if not rollouts.is_whole:
+        arrays["usable"] = _padded(_usable(rollouts), 0.0)
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **arrays)
 
@@ -167,7 +173,8 @@ def read_npz(path: AnyPath) -> Recording:
     """Reads padded arrays; see :meth:`Rollouts.from_npz`."""
     path = rollout_checks.check_file(path)
     with rollout_checks.named(path), _refusing("NPZ"):
-        arrays = read_arrays(path, _NPZ_ARRAYS, {"rewards": 2})
+        optional = {"rewards": 2, "measured": 3, "lateness": 3, "usable": 2}
+        arrays = read_arrays(path, _NPZ_ARRAYS, optional)
         lengths = arrays["lengths"].tolist()
         if any(not 1 <= n < arrays["readings"].shape[1] for n in lengths):
             raise DataError("the array lengths does not fit the array readings.")
@@ -178,7 +185,7 @@ def read_npz(path: AnyPath) -> Recording:
         def words(name: str) -> list[str]:
             return [str(word) for word in arrays[name].tolist()]
 
-        return Recording.from_arrays(
+        recording = Recording.from_arrays(
             cut("readings", 1),
             cut("actions", 0),
             channel_names=words("channel_names"),
@@ -189,6 +196,53 @@ def read_npz(path: AnyPath) -> Recording:
             channel_units=words("channel_units"),
             action_units=words("action_units"),
         )
+        is_sampled = "measured" in arrays and "lateness" in arrays
+        return _with_sampling(
+            recording,
+            cut("measured", 1) if is_sampled else (),
+            cut("lateness", 1) if is_sampled else (),
+            cut("usable", 0) if "usable" in arrays else (),
+        )
+
+
+def _measured(sampling: Sampling) -> NDArray[np.float64]:
+    """Returns the measurements as they were taken, NaN where there is none, ``(T + 1, C)``."""
+    return np.where(sampling.is_read, sampling.values, np.nan)
+
+
+def _usable(rollouts: Recording) -> list[NDArray[np.float64]]:
+    """Returns one for each usable step of each rollout, zero for the others, ``(T,)`` each."""
+    result = []
+    for length, spans in zip(rollouts.lengths, rollouts.spans, strict=True):
+        steps = np.zeros(length)
+        for first, end in spans:
+            steps[first:end] = 1.0
+            # Stretches that touch each other are kept apart.
+            steps[end - 1] = 2.0
+        result.append(steps)
+    return result
+
+
+def _with_sampling(
+    recording: Recording,
+    measured: Sequence[NDArray[np.float64]],
+    lateness: Sequence[NDArray[np.float64]],
+    usable: Sequence[NDArray[np.float64]],
+) -> Recording:
+    """Returns a recording with what the functions above have written; empty if nothing was."""
+    samplings = tuple(
+        Sampling(np.where(np.isnan(m), r, m), np.where(np.isnan(m), 0.0, late), ~np.isnan(m))
+        for m, late, r in zip(measured, lateness, recording.readings, strict=False)
+    )
+    spans = []
+    for steps in usable:
+        ends = np.flatnonzero(steps == 2.0) + 1
+        begins = [
+            int(np.flatnonzero(steps[a:end] > 0)[0] + a)
+            for a, end in zip([0, *ends[:-1]], ends, strict=True)
+        ]
+        spans.append(tuple(zip(begins, ends.tolist(), strict=True)))
+    return replace(recording, samplings=samplings, spans=tuple(spans) or recording.spans)
 
 
 # -- xarray and NetCDF -----------------------------------------------------------------------
@@ -219,6 +273,18 @@ def to_xarray(rollouts: Recording) -> "xr.Dataset":
         for index, values in enumerate(rollouts.rewards):
             rewards[index, : len(values)] = values
         variables["reward"] = (dimensions, rewards, {"kind": "reward"})
+    if rollouts.samplings:
+        measured = _padded([_measured(s) for s in rollouts.samplings], np.nan)
+        lateness = _padded([s.lateness for s in rollouts.samplings], 0.0)
+        for kind, parts in (("measured", measured), ("lateness", lateness)):
+            for index, name in enumerate(rollouts.channel_names):
+                attributes = {"kind": kind, "position": index}
+                variables[f"{name}.{kind}"] = (dimensions, parts[:, :, index], attributes)
+    if not rollouts.is_whole:
+        usable = np.zeros((len(rollouts), longest + 1))
+        for index, steps in enumerate(_usable(rollouts)):
+            usable[index, : len(steps)] = steps
+        variables["usable"] = (dimensions, usable, {"kind": "usable"})
     return xr.Dataset(
         variables,
         coords={
@@ -241,7 +307,8 @@ def from_xarray(dataset: "xr.Dataset") -> Recording:
             f"{lengths.size} of type {lengths.dtype}."
         )
     lengths = lengths.ravel().tolist()
-    columns: dict[str, list[tuple[int, str]]] = {"channel": [], "action": [], "reward": []}
+    kinds = ("channel", "action", "reward", "measured", "lateness", "usable")
+    columns: dict[str, list[tuple[int, str]]] = {kind: [] for kind in kinds}
     arrays: dict[str, NDArray[np.float64]] = {}
     for name, variable in dataset.variables.items():
         name = str(name)
@@ -276,7 +343,7 @@ def from_xarray(dataset: "xr.Dataset") -> Recording:
     units = {name: str(dataset[name].attrs.get("units", "")) for name in arrays}
     rewards = [values[:, 0] for values in matrices("reward", 0)] if names["reward"] else None
     time_step = dataset.attrs.get("time_step")
-    return Recording.from_arrays(
+    recording = Recording.from_arrays(
         matrices("channel", 1),
         matrices("action", 0),
         channel_names=names["channel"],
@@ -286,6 +353,13 @@ def from_xarray(dataset: "xr.Dataset") -> Recording:
         time=[values[: n + 1] for values, n in zip(arrays["time"], lengths, strict=True)],
         channel_units=[units[name] for name in names["channel"]],
         action_units=[units[name] for name in names["action"]],
+    )
+    is_sampled = len(names["measured"]) == len(names["lateness"]) == len(names["channel"])
+    return _with_sampling(
+        recording,
+        matrices("measured", 1) if is_sampled else (),
+        matrices("lateness", 1) if is_sampled else (),
+        [values[:, 0] for values in matrices("usable", 0)] if names["usable"] else (),
     )
 
 

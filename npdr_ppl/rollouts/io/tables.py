@@ -8,7 +8,13 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.gridding import Track, recording_of, stamp_notes, without_restarts
+from npdr_ppl.rollouts.gridding import (
+    Track,
+    recording_of,
+    stamp_notes,
+    tracks_of,
+    without_restarts,
+)
 from npdr_ppl.rollouts.recording import Recording
 
 __all__ = ["from_table", "to_table"]
@@ -81,7 +87,12 @@ def from_table(
 
 
 def to_table(rollouts: Recording) -> dict[str, Array]:
-    """Returns the columns that :func:`from_table` reads, NaN where a cell is empty."""
+    """Returns the columns that :func:`from_table` reads, NaN where a cell is empty.
+
+    Measurements that were not taken at the times of the rows get rows of their own.
+    """
+    if rollouts.samplings:
+        return _uneven_table(rollouts)
     empty = np.full((1, len(rollouts.action_names)), np.nan)
     readings = np.concatenate(rollouts.readings)
     actions = np.concatenate([part for values in rollouts.actions for part in (values, empty)])
@@ -149,6 +160,25 @@ def _uneven(
     )
 
 
+def _uneven_table(rollouts: Recording) -> dict[str, Array]:
+    """Returns one row for each time at which a channel was measured or a step begins."""
+    tables: list[dict[str, Array]] = []
+    for index in range(len(rollouts)):
+        channels, _ = tracks_of(rollouts, index)
+        grid, actions = rollouts.time[index], rollouts.actions[index]
+        time = np.unique(np.concatenate([grid, *(track.time for track in channels)]))
+        table = {"rollout": np.full(len(time), float(index)), "time": time}
+        for name, track in zip(rollouts.channel_names, channels, strict=True):
+            table[name] = np.full(len(time), np.nan)
+            table[name][np.searchsorted(time, track.time)] = track.values
+        step = np.clip(np.searchsorted(grid, time, side="right") - 1, 0, len(actions) - 1)
+        for name, values in zip(rollouts.action_names, actions.T, strict=True):
+            table[name] = values[step]
+            table[name][-1] = np.nan
+        tables.append(table)
+    return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+
 class _Location:
     """Describes the position of a row in a message."""
 
@@ -206,7 +236,10 @@ def _stepwise_columns(
                 f"{name} is empty in the last row of rollout {int(np.argmax(empty))} but not of "
                 f"rollout {int(np.argmin(empty))}."
             )
-    return {name for name, empty in is_empty.items() if empty.all()}
+    stepwise = {name for name, empty in is_empty.items() if empty.all()}
+    # A channel that was not always measured may be empty in the last rows, too.
+    always = {name for name in stepwise if np.isnan(columns[name]).sum() == len(last_rows)}
+    return always or stepwise
 
 
 def _matrix(columns: Mapping[str, Array], names: Sequence[str], span: slice) -> Array:

@@ -10,15 +10,15 @@ import msgspec
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.collection import joined
+from npdr_ppl.rollouts.gridding import at_one_rate
 from npdr_ppl.rollouts.io.file_formats import load
 from npdr_ppl.rollouts.io.tables import from_table
+from npdr_ppl.rollouts.logs.formats.parquet_logs import columns_of_frame, read_frame_log
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.mapping import Mapping, SignalMapping
-from npdr_ppl.rollouts.logs.parquet_logs import columns_of_frame, read_frame_log
 from npdr_ppl.rollouts.logs.read import is_log, read_log
 from npdr_ppl.rollouts.logs.signal_names import plain_names
 from npdr_ppl.rollouts.recording import Recording
-from npdr_ppl.rollouts.rollout_checks import MAX_RATE_DIFFERENCE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,15 +55,15 @@ def recording_of_log(path: str | PathLike[str], mapping: AnyMapping) -> Recordin
 def recording_of_logs(paths: Sequence[str | PathLike[str]], mapping: AnyMapping) -> Recording:
     """Reads several logs or files of rollouts, one after another.
 
-    Clocks differ from log to log. A log whose own time step is within one percent of the first
-    one's therefore gets the first one's.
+    Clocks differ from log to log, and so may rates. All get the time step of the fastest one;
+    measurements keep their own times.
 
     Args:
         paths: The logs, at least one.
         mapping: As for :meth:`Rollouts.load`; ``None`` for files of rollouts.
 
     Raises:
-        DataError: A log cannot be read, or columns or time steps differ.
+        DataError: A log cannot be read, or their columns differ.
     """
     parts: list[Recording] = []
     chosen = None if mapping is None else Mapping.of(mapping)
@@ -73,14 +73,9 @@ def recording_of_logs(paths: Sequence[str | PathLike[str]], mapping: AnyMapping)
         elif chosen is None:
             part = recording_of_log(path, None)
         else:
-            log = read_log(path, chosen.log)
-            part = chosen.apply(log)
-            step = parts[0].time_step if parts else part.time_step
-            if 0 < abs(part.time_step - step) <= MAX_RATE_DIFFERENCE * step:
-                settings = msgspec.structs.replace(chosen.log, time_step=step)
-                part = msgspec.structs.replace(chosen, log=settings).apply(log)
+            part = chosen.apply(read_log(path, chosen.log))
         parts.append(part)
-    return joined(parts)
+    return joined(at_one_rate(parts))
 
 
 def recording_of_frame(frame: "pd.DataFrame", mapping: AnyMapping) -> Recording:

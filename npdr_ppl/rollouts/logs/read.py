@@ -77,13 +77,17 @@ def read_log(path: str | PathLike[str], settings: LogSettings | None = None) -> 
 
 def _reader(path: Path) -> tuple[Reader, str]:
     """Returns the function that reads a path, and a word for its format."""
-    from npdr_ppl.rollouts.logs.bag_logs import read_bag_folder, read_db3_log, read_mcap_log
-    from npdr_ppl.rollouts.logs.csv_folders import read_csv_folder
-    from npdr_ppl.rollouts.logs.csv_logs import read_csv_log
-    from npdr_ppl.rollouts.logs.hdf5_logs import read_hdf5_log
-    from npdr_ppl.rollouts.logs.lerobot import read_lerobot
-    from npdr_ppl.rollouts.logs.mat_logs import read_mat_log
-    from npdr_ppl.rollouts.logs.parquet_logs import read_parquet_log
+    from npdr_ppl.rollouts.logs.formats.bag_logs import (
+        read_bag_folder,
+        read_db3_log,
+        read_mcap_log,
+    )
+    from npdr_ppl.rollouts.logs.formats.csv_folders import read_csv_folder
+    from npdr_ppl.rollouts.logs.formats.csv_logs import read_csv_log
+    from npdr_ppl.rollouts.logs.formats.hdf5_logs import read_hdf5_log
+    from npdr_ppl.rollouts.logs.formats.lerobot import read_lerobot
+    from npdr_ppl.rollouts.logs.formats.mat_logs import read_mat_log
+    from npdr_ppl.rollouts.logs.formats.parquet_logs import read_parquet_log
 
     by_suffix: dict[str, tuple[Reader, str]] = {
         ".csv": (read_csv_log, "CSV"),

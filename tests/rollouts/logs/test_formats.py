@@ -319,7 +319,7 @@ def test_a_clock_of_its_own_is_noticed(tmp_path):
 
 def test_all_types_of_numbers_are_decoded():
     """The decoder agrees with the library's encoder for every type, byte order and nesting."""
-    from npdr_ppl.rollouts.logs.ros_messages import decode, definitions
+    from npdr_ppl.rollouts.logs.formats.ros_messages import decode, definitions
 
     types = store()
     text = """# a comment

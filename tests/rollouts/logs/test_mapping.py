@@ -9,7 +9,7 @@ import pytest
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.logs import Log, Mapping, Signal, read_log
-from npdr_ppl.rollouts.logs.time_stamps import guessed_unit, in_seconds, time_name
+from npdr_ppl.rollouts.logs.formats.time_stamps import guessed_unit, in_seconds, time_name
 from npdr_ppl.rollouts.logs.units import si_unit
 
 TIME = 0.25 * np.arange(9)

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
+from npdr_ppl.rollouts.logs.formats.tables import EPISODE_NAMES
+from npdr_ppl.rollouts.logs.formats.time_stamps import is_time_name, seconds_of
 from npdr_ppl.rollouts.logs.log import Log, Signal
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
 from npdr_ppl.rollouts.logs.nearest_names import missing
-from npdr_ppl.rollouts.logs.tables import EPISODE_NAMES
-from npdr_ppl.rollouts.logs.time_stamps import is_time_name, seconds_of
 
 __all__ = ["Leaf", "log_of_tree"]
 

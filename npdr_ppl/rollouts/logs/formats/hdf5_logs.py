@@ -7,9 +7,9 @@ import numpy as np
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.hdf5_checks import check_self_contained
+from npdr_ppl.rollouts.logs.formats.trees import Leaf, log_of_tree
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
-from npdr_ppl.rollouts.logs.trees import Leaf, log_of_tree
 
 __all__ = ["is_hdf5", "read_hdf5_log"]
 

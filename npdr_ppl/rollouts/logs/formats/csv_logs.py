@@ -16,9 +16,9 @@ from npdr_ppl.rollouts.io.csv_files import (
     check_encoding,
     undecodable,
 )
+from npdr_ppl.rollouts.logs.formats.tables import Texts, log_of_columns, numbers_of
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
-from npdr_ppl.rollouts.logs.tables import Texts, log_of_columns, numbers_of
 
 __all__ = ["read_csv_columns", "read_csv_log"]
 

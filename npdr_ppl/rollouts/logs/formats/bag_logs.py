@@ -16,16 +16,16 @@ import msgspec
 from npdr_ppl.errors import DataError, DependencyError
 from npdr_ppl.reading_limits import LIMITS, check_expansion
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.logs.folders import files_in
-from npdr_ppl.rollouts.logs.log import Log
-from npdr_ppl.rollouts.logs.log_settings import LogSettings
-from npdr_ppl.rollouts.logs.messages import Messages
-from npdr_ppl.rollouts.logs.ros_messages import (
+from npdr_ppl.rollouts.logs.formats.folders import files_in
+from npdr_ppl.rollouts.logs.formats.messages import Messages
+from npdr_ppl.rollouts.logs.formats.ros_messages import (
     MAX_VALUES,
     TooManyValuesError,
     decode,
     definitions,
 )
+from npdr_ppl.rollouts.logs.log import Log
+from npdr_ppl.rollouts.logs.log_settings import LogSettings
 
 __all__ = ["read_bag_folder", "read_db3_log", "read_mcap_log"]
 

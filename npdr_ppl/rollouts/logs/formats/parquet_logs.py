@@ -11,10 +11,10 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS, check_expansion
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.io.parquet_sizes import check_footer
+from npdr_ppl.rollouts.logs.formats.tables import Texts, log_of_columns
+from npdr_ppl.rollouts.logs.formats.time_stamps import in_seconds
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
-from npdr_ppl.rollouts.logs.tables import Texts, log_of_columns
-from npdr_ppl.rollouts.logs.time_stamps import in_seconds
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,11 +7,11 @@ import numpy as np
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.logs.csv_logs import read_csv_columns
-from npdr_ppl.rollouts.logs.folders import files_in
+from npdr_ppl.rollouts.logs.formats.csv_logs import read_csv_columns
+from npdr_ppl.rollouts.logs.formats.folders import files_in
+from npdr_ppl.rollouts.logs.formats.tables import log_of_columns
 from npdr_ppl.rollouts.logs.log import Log, Signal
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
-from npdr_ppl.rollouts.logs.tables import log_of_columns
 
 __all__ = ["read_csv_folder"]
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.logs.folders import check_inside, files_in
+from npdr_ppl.rollouts.logs.formats.folders import check_inside, files_in
+from npdr_ppl.rollouts.logs.formats.parquet_logs import read_parquet_columns
+from npdr_ppl.rollouts.logs.formats.tables import Texts, log_of_columns
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
-from npdr_ppl.rollouts.logs.parquet_logs import read_parquet_columns
-from npdr_ppl.rollouts.logs.tables import Texts, log_of_columns
 
 __all__ = ["read_lerobot"]
 

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.logs.log import Log, Signal
-from npdr_ppl.rollouts.logs.log_settings import LogSettings
-from npdr_ppl.rollouts.logs.nearest_names import missing
-from npdr_ppl.rollouts.logs.time_stamps import (
+from npdr_ppl.rollouts.logs.formats.time_stamps import (
     MAX_CLOCK_DIFFERENCE,
     is_stamp,
     seconds_of,
     time_name,
 )
+from npdr_ppl.rollouts.logs.log import Log, Signal
+from npdr_ppl.rollouts.logs.log_settings import LogSettings
+from npdr_ppl.rollouts.logs.nearest_names import missing
 
 __all__ = ["Columns", "Texts", "log_of_columns", "numbers_of"]
 

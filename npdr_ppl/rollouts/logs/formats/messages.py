@@ -10,9 +10,9 @@ import numpy as np
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
+from npdr_ppl.rollouts.logs.formats.ros_messages import MAX_ARRAY, MAX_NESTING
+from npdr_ppl.rollouts.logs.formats.time_stamps import MAX_CLOCK_DIFFERENCE, in_seconds
 from npdr_ppl.rollouts.logs.log import Log, Signal
-from npdr_ppl.rollouts.logs.ros_messages import MAX_ARRAY, MAX_NESTING
-from npdr_ppl.rollouts.logs.time_stamps import MAX_CLOCK_DIFFERENCE, in_seconds
 
 __all__ = ["Messages"]
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS, check_expansion
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.logs.hdf5_logs import is_hdf5, read_hdf5_log
+from npdr_ppl.rollouts.logs.formats.hdf5_logs import is_hdf5, read_hdf5_log
+from npdr_ppl.rollouts.logs.formats.trees import Leaf, log_of_tree
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
-from npdr_ppl.rollouts.logs.trees import Leaf, log_of_tree
 
 __all__ = ["read_mat_log"]
 

@@ -1,0 +1,172 @@
+"""Measurements and commands with time stamps of their own, on a uniform grid."""
+
+import numpy as np
+import pytest
+import torch
+
+import npdr_ppl as npdr
+from npdr_ppl.models.pendulum import Pendulum, pendulum
+from npdr_ppl.posterior.prepare import prepare
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.gridding import Track, recording_of, usual_step, without_restarts
+
+STEP = 0.02
+
+
+def track(time, function=np.sin):
+    return Track.of(np.asarray(time), function(np.asarray(time)))
+
+
+def made(channels, actions=(), **options):
+    names = [(f"channel_{k}", "") for k in range(len(channels))]
+    commands = [(f"action_{k}", "") for k in range(len(actions))]
+    return Rollouts.of(recording_of([(channels, actions)], names, commands, **options))
+
+
+def jittered(num=300, *, seed=0, size=0.005):
+    noise = np.random.default_rng(seed).uniform(-size, size, num)
+    return STEP * np.arange(num) + noise
+
+
+def test_the_usual_step_survives_jitter_and_losses():
+    time = jittered(1000)
+    assert usual_step(time) == pytest.approx(STEP, rel=2e-3)
+    kept = np.random.default_rng(1).random(1000) > 0.05
+    assert usual_step(time[kept]) == pytest.approx(STEP, rel=1e-2)
+
+
+def test_regular_stamps_give_a_recording_without_sampling():
+    rollouts = made([track(STEP * np.arange(100))])
+    assert rollouts.samplings == () and rollouts.is_whole and rollouts.lengths == (99,)
+    assert np.array_equal(rollouts.readings[0][:, 0], np.sin(STEP * np.arange(100)))
+
+
+def test_measurements_keep_their_own_times_and_values():
+    time = jittered()
+    rollouts = made([track(time)])
+    (sampling,) = rollouts.samplings
+    own = rollouts.time[0] + rollouts.time_step * sampling.lateness[:, 0] + time[0]
+    taken = sampling.is_read[:, 0]
+    assert taken.mean() > 0.9
+    assert np.allclose(sampling.values[taken, 0], np.sin(own[taken]), atol=1e-12)
+    # Between them, readings are interpolated.
+    grid = rollouts.time[0] + time[0]
+    assert np.allclose(rollouts.readings[0][:, 0], np.sin(grid), atol=1e-5)
+
+
+def test_a_parabola_gives_simulations_at_the_times_of_the_measurements():
+    rollouts = made([track(jittered())])
+    inputs = rollouts.inputs(50)
+    start = float(jittered()[0])
+    ends = torch.arange(1, 51) + inputs.start[:, None]
+    simulated = torch.sin(start + rollouts.time_step * ends.double())[..., None]
+    simulated = torch.where(inputs.mask[..., None], simulated, 0.0)
+    moved = inputs.at_measured_times(simulated, ["channel_0"])
+    observed = rollouts.observation(inputs)
+    assert float((moved - observed).abs().max()) < 5e-6
+    assert float((simulated - observed).abs().max()) > 1e-3
+
+
+def test_a_slow_channel_is_compared_where_it_was_measured():
+    rollouts = made([track(STEP * np.arange(300)), track(10 * STEP * np.arange(30), np.cos)])
+    (sampling,) = rollouts.samplings
+    assert sampling.is_read.sum(0).tolist() == [291, 30]
+    inputs = rollouts.inputs(50)
+    measured = inputs.measured(["channel_0", "channel_1", "other"])
+    assert measured.shape == (6, 50, 3)
+    assert measured.sum((0, 1)).tolist() == [290, 29, 290]
+    assert "channel_1 (10%)" in rollouts.notes[0]
+
+
+def test_short_gaps_are_bridged_and_long_ones_cut():
+    time = np.delete(STEP * np.arange(300), [100, 101, *range(200, 210)])
+    rollouts = made([track(time)])
+    assert rollouts.spans == (((0, 199), (210, 299)),)
+    assert "11 of 299 steps" in rollouts.notes[0]
+    inputs = rollouts.inputs(60)
+    assert inputs.start.tolist() == [0, 60, 120, 180, 210, 270]
+    assert inputs.mask.sum(-1).tolist() == [60, 60, 60, 19, 60, 29]
+
+
+def test_commands_are_averaged_over_the_steps_they_hold_in():
+    command = Track(np.array([0.0, 0.5, 0.75]), np.array([1.0, 3.0, 5.0]))
+    rollouts = made([Track(np.arange(3.0), np.zeros(3))], [command])
+    assert rollouts.actions[0][0].tolist() == [0.5 * 1 + 0.25 * 3 + 0.25 * 5]
+
+
+def test_a_restarted_clock_goes_on_behind_a_gap():
+    time = np.concatenate((STEP * np.arange(100), 0.013 + STEP * np.arange(80)))
+    (moved,), number = without_restarts((time,))
+    assert number == 1 and np.diff(moved).min() > 0
+    assert np.diff(moved)[99] == pytest.approx(5 * STEP, abs=1e-9)
+    swapped = STEP * np.array([0, 1, 3, 2, 4])
+    assert without_restarts((swapped,)) == ((swapped,), 0)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "nc"])
+def test_every_format_keeps_times_and_gaps(tmp_path, suffix):
+    time = np.delete(jittered(), [50, *range(200, 210)])
+    rollouts = made([track(time), track(time[::3], np.cos)], [track(STEP * np.arange(300))])
+    path = tmp_path / f"data.{suffix}"
+    getattr(rollouts, {"nc": "to_netcdf"}.get(suffix, f"to_{suffix}"))(path)
+    again = Rollouts.load(path)
+    assert again.action_names == ("action_0",)
+    for one, two in zip(rollouts.samplings, again.samplings, strict=True):
+        for k in range(2):
+            assert np.array_equal(
+                one.values[one.is_read[:, k], k], two.values[two.is_read[:, k], k]
+            )
+    if suffix in ("npz", "nc"):
+        assert again == rollouts
+    else:
+        assert again.time_step == pytest.approx(rollouts.time_step, rel=0.01)
+
+
+def test_cells_without_a_number_are_missing_measurements(tmp_path):
+    rows = [f"0,{STEP * k:.2f},{np.sin(STEP * k):.6f},{k % 3}" for k in range(100)]
+    rows[30] = "0,0.60,NaN,0"
+    rows[31] = "0,0.62,,1"
+    path = tmp_path / "data.csv"
+    path.write_text("\n".join(["rollout,time,angle,torque", *rows[:-1], "0,1.98,0.9,", ""]))
+    rollouts = Rollouts.load(path)
+    assert np.flatnonzero(~rollouts.samplings[0].is_read[:, 0]).tolist() == [30, 31]
+    assert rollouts.action_names == ("torque",) and rollouts.is_whole
+
+
+@pytest.mark.parametrize("kind", ["jitter", "loss"])
+def test_parameters_of_an_unevenly_sampled_pendulum_are_found(kind):
+    """Truth by another integrator: Runge-Kutta at 1 ms; 5 ms of jitter, or every tenth lost."""
+    time = jittered(600)
+    held = np.sort(STEP * np.arange(600) + np.random.default_rng(2).uniform(-0.005, 0.005, 600))
+    torque = 2.0 * np.sin(3.1 * held) + np.sign(np.sin(5.7 * held))
+    fine = np.arange(0.0, 600 * STEP, 1e-3)
+    state, states = np.array([0.3, 0.0]), []
+
+    def slope(t, x):
+        value = torque[max(0, np.searchsorted(held, t, side="right") - 1)]
+        return np.array([x[1], (value - 1.1 * 9.81 * 0.45 * np.sin(x[0])) / (1.1 * 0.27)])
+
+    for t in fine:
+        states.append(state)
+        k1 = slope(t, state)
+        k2 = slope(t + 5e-4, state + 5e-4 * k1)
+        k3 = slope(t + 5e-4, state + 5e-4 * k2)
+        k4 = slope(t + 1e-3 - 1e-9, state + 1e-3 * k3)
+        state = state + 1e-3 / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    if kind == "loss":
+        time = np.delete(STEP * np.arange(600), np.arange(5, 600, 10))
+    time = np.clip(time, 0.0, fine[-1])
+    noise = np.random.default_rng(3).normal(0.0, 1e-3, (2, len(time)))
+    channels = [
+        Track.of(time, np.interp(time, fine, np.array(states)[:, k]) + 10**k * noise[k])
+        for k in range(2)
+    ]
+    sensors = [(s.name, s.unit) for s in Pendulum.sensors]
+    actions = [(a.name, a.unit) for a in Pendulum.actions]
+    rollouts = Rollouts.of(recording_of([(channels, [Track.of(held, torque)])], sensors, actions))
+    fitted = prepare(pendulum, rollouts, npdr.DataOptions()).hypothesis
+    assert fitted is not None
+    found = {name: float(value) for name, value in fitted.parameters.items()}
+    assert found["mass"] == pytest.approx(1.1, rel=0.01)
+    assert found["length"] == pytest.approx(0.9, rel=0.005)
+    assert fitted.fit.scale.tolist() == pytest.approx([1e-3, 1e-2], rel=0.3)
