@@ -9,7 +9,7 @@ the recording and the recording as it is cannot be explained. What was done is s
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +33,9 @@ from npdr_ppl.rollouts.sampling import Sampling, spans_without_gaps
 from npdr_ppl.rollouts.simulator_checks import OTHER_UNITS
 
 __all__ = ["Remedy", "Repair", "repair"]
+
+SIGN_WINDOW = 4
+"""Steps on each side of a zero crossing over which an absolute value falls and rises."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +138,12 @@ def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollout
             f"None of the recording's columns {', '.join(rollouts.channel_names)} is a sensor of "
             f"the model, {names}; rename them."
         )
-    return without_faults(rollouts, measured)
+    rollouts = without_faults(rollouts, measured)
+    try:
+        rollouts.check(simulator.sensors, simulator.actions, allow_extra=True, strict=False)
+    except DataError as error:
+        raise DataError(" ".join((*rollouts.notes[-1:], str(error)))) from None
+    return rollouts
 
 
 def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remedy | None:
@@ -149,18 +157,40 @@ def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remed
     if as_read is not None and _mean(_misfits(as_read)) < REPAIR.large_residual:
         return None
     present = {} if as_read is None else _misfits(as_read)
-    best, least = None, REPAIR.remedy_factor
-    for remedy in _remedies(model, rollouts, options):
+
+    def ratio(remedy: Remedy) -> float:
+        """Returns the misfit with a remedy, relative to that of the same channels without it."""
         try:
             tried = _fitted(model, remedy.apply(rollouts), options)
         except NpdrError:
-            continue
+            return math.inf
         if tried is None:
-            continue
-        ratio = _mean(_misfits(tried)) / (_mean(present) if present else 1.0)
-        if ratio < least:
-            best, least = remedy, ratio
-    return best
+            return math.inf
+        found = _misfits(tried)
+        before = {name: present[name] for name in found if name in present}
+        return _mean(found) / (_mean(before) if before else 1.0)
+
+    best, least = _best(_remedies(model, rollouts, options), ratio)
+    if best is not None and isinstance(best.apply, _Shift):
+        near = [best.apply.by(steps) for steps in range(-2, 3)]
+        best, least = _best([best, *near], ratio)
+    if least < REPAIR.remedy_factor:
+        return best
+    # A channel is given up only if nothing else helps.
+    best, least = _best(_without_one(model, rollouts, options), ratio)
+    return best if least < REPAIR.remedy_factor else None
+
+
+def _best(
+    remedies: Iterable[Remedy], ratio: Callable[[Remedy], float]
+) -> tuple[Remedy | None, float]:
+    """Returns the remedy with the least ratio, and the ratio."""
+    best, least = None, math.inf
+    for remedy in remedies:
+        found = ratio(remedy)
+        if found < least:
+            best, least = remedy, found
+    return best, least
 
 
 def _fitted(model: Model, rollouts: Rollouts, options: DataOptions) -> Hypothesis | None:
@@ -216,14 +246,10 @@ def _remedies(model: Model, rollouts: Rollouts, options: DataOptions) -> Iterato
     for name in rollouts.action_names:
         text = f"The sign of {name} looks inverted; it was changed."
         yield Remedy(text, _ScaledAction(name, -1.0))
-    for steps in REPAIR.shifts:
-        if 4 * steps >= min(rollouts.lengths):
-            continue
-        text = f"The time stamps of the commands look about {steps} steps too late; shifted."
-        yield Remedy(text, _ShiftedActions(steps))
-        if steps * rollouts.time_step > REPAIR.longest_delay:
-            text = f"The time stamps of the commands look about {steps} steps too early; shifted."
-            yield Remedy(text, _ShiftedActions(-steps))
+    shifts = [steps for steps in REPAIR.shifts if 4 * steps < min(rollouts.lengths)]
+    long = [steps for steps in shifts if steps * rollouts.time_step > REPAIR.longest_delay]
+    for steps in (*shifts, *(-steps for steps in long)):
+        yield _Shift(None, steps).remedy
     for sensor in sensors:
         column = rollouts.channel_names.index(sensor.name)
         values = np.concatenate(rollouts.measurements(column))
@@ -235,16 +261,16 @@ def _remedies(model: Model, rollouts: Rollouts, options: DataOptions) -> Iterato
         if limits:
             text = f"{sensor.name} looks clipped; measurements at its limit are left out."
             yield Remedy(text, _WithoutLimits(sensor.name, limits))
-        for steps in REPAIR.column_shifts:
-            if 4 * steps < min(rollouts.lengths):
-                text = f"{sensor.name} looks about {steps} steps too early; shifted."
-                yield Remedy(text, _ShiftedChannel(sensor.name, -steps))
-                if steps * rollouts.time_step > REPAIR.longest_delay:
-                    text = f"{sensor.name} looks about {steps} steps too late; shifted."
-                    yield Remedy(text, _ShiftedChannel(sensor.name, steps))
         if len(sensors) > 1:
-            text = f"{sensor.name} does not fit the other channels at all; it is not used."
-            yield Remedy(text, _Without(sensor.name))
+            for steps in (*(-steps for steps in shifts[2:]), *long):
+                yield _Shift(sensor.name, steps).remedy
+
+
+def _without_one(model: Model, rollouts: Rollouts, options: DataOptions) -> Iterator[Remedy]:
+    sensors = SegmentModel(model, rollouts, options).measured
+    for sensor in sensors if len(sensors) > 1 else ():
+        text = f"{sensor.name} does not fit the other channels; it is not used."
+        yield Remedy(text, _Without(sensor.name))
 
 
 @dataclass(frozen=True)
@@ -273,25 +299,22 @@ class _ScaledAction:
 
 
 @dataclass(frozen=True)
-class _ShiftedActions:
-    """Moves all commands some steps earlier, or later if negative."""
+class _Shift:
+    """Moves a channel, or all commands, some steps earlier, or later if negative.
 
+    Attributes:
+        channel: Name of the channel; ``None`` for the commands.
+        steps: Number of steps.
+    """
+
+    channel: str | None
     steps: int
 
     def __call__(self, rollouts: Rollouts) -> Rollouts:
-        moved = tuple(_shifted(actions, self.steps) for actions in rollouts.actions)
-        return replace(rollouts, actions=moved)
-
-
-@dataclass(frozen=True)
-class _ShiftedChannel:
-    """Moves a channel some steps earlier, or later if negative."""
-
-    name: str
-    steps: int
-
-    def __call__(self, rollouts: Rollouts) -> Rollouts:
-        column = rollouts.channel_names.index(self.name)
+        if self.channel is None:
+            moved = tuple(_shifted(actions, self.steps) for actions in rollouts.actions)
+            return replace(rollouts, actions=moved)
+        column = rollouts.channel_names.index(self.channel)
 
         def change(values: Array, _: int) -> Array:
             result = values.copy()
@@ -299,6 +322,19 @@ class _ShiftedChannel:
             return result
 
         return _changed(rollouts, change)
+
+    @property
+    def remedy(self) -> Remedy:
+        """The remedy, with its sentence."""
+        name = f"{self.channel} looks"
+        if self.channel is None:
+            name = "The time stamps of the commands look"
+        when = "late" if self.steps > 0 else "early"
+        return Remedy(f"{name} about {abs(self.steps)} steps too {when}; shifted.", self)
+
+    def by(self, steps: int) -> Remedy:
+        """Returns the remedy that moves some steps more."""
+        return _Shift(self.channel, self.steps + steps).remedy
 
 
 @dataclass(frozen=True)
@@ -377,17 +413,20 @@ def _shifted(values: Array, steps: int) -> Array:
 
 
 def _with_signs(values: Array) -> Array:
-    """Returns values ``(N,)`` with a change of sign at each minimum where this is smoother."""
-    signs, sign = np.ones(len(values)), 1.0
-    for k in range(1, len(values) - 2):
-        a, b, c, d = values[k - 1], values[k], values[k + 1], values[k + 2]
-        # Between b and c: straight on, or reflected at zero.
-        if b <= a and c <= d:
-            kept = abs(a - 2 * b + c) + abs(b - 2 * c + d)
-            turned = abs(a - 2 * b - c) + abs(b + 2 * c - d)
-            if turned < kept:
-                sign = -sign
-        signs[k + 1 :] = sign
+    """Returns absolute values ``(N,)`` with a change of sign wherever they turn at zero."""
+    reach = SIGN_WINDOW
+    noise = float(np.median(np.abs(np.diff(values, n=2)))) / 0.6745
+    signs, sign, last = np.ones(len(values)), 1.0, -reach
+    for k in range(reach, len(values) - reach):
+        falls, rises = values[k - reach] - values[k], values[k + reach] - values[k]
+        is_least = values[k] <= values[k - reach : k + reach + 1].min()
+        turns = min(falls, rises) > 3.0 * noise and values[k] < 0.5 * min(falls, rises)
+        if is_least and turns and k - last >= reach:
+            # The sign changes on the side on which the value is already rising.
+            sign, last = -sign, k
+            signs[k + (values[k + 1] > values[k - 1]) :] = sign
+        else:
+            signs[k + 1 :] = sign
     return signs * values
 
 

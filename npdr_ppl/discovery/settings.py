@@ -24,8 +24,7 @@ class RepairSettings:
             remedies are tried.
         remedy_factor: A remedy is applied if it reduces the residual to less than this fraction.
         most_remedies: Greatest number of remedies of one recording.
-        shifts: Shifts of the commands' time stamps that are tried, in steps.
-        column_shifts: Shifts of one channel that are tried, in steps.
+        shifts: Shifts of the commands, and of one channel, that are tried first, in steps.
         longest_delay: Longest time in seconds that a device takes to answer a command. Early time
             stamps of commands look the same, so only larger shifts are tried for them.
         fewest_clipped: Fewest repeated measurements at the end of a range that can be a limit.
@@ -34,15 +33,14 @@ class RepairSettings:
     large_residual: float = 0.1
     remedy_factor: float = 0.5
     most_remedies: int = 3
-    shifts: tuple[int, ...] = (1, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20)
-    column_shifts: tuple[int, ...] = (1, 2, 4, 8, 16)
+    shifts: tuple[int, ...] = (1, 2, 4, 7, 10, 13, 16, 19)
     longest_delay: float = 0.04
     fewest_clipped: int = 10
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 0.0, 1.0, "large_residual", "remedy_factor", "longest_delay")
-        check_range(self, 1, 1000, "most_remedies", "shifts", "column_shifts", "fewest_clipped")
+        check_range(self, 1, 1000, "most_remedies", "shifts", "fewest_clipped")
 
 
 @dataclass(frozen=True)

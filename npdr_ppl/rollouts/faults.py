@@ -98,6 +98,7 @@ def without_faults(rollouts: Rollouts, channels: Sequence[Channel]) -> Rollouts:
     Raises:
         DataError: Nothing usable is left.
     """
+    rollouts, channels = _without_dead_channels(rollouts, channels)
     columns = {channel.name: rollouts.channel_names.index(channel.name) for channel in channels}
     partners = {
         columns[rate.name]: columns[rate.rate_of] for rate in channels if rate.rate_of in columns
@@ -121,6 +122,46 @@ def without_faults(rollouts: Rollouts, channels: Sequence[Channel]) -> Rollouts:
         spans=tuple(spans),
         notes=(*rollouts.notes, *notes),
     )
+
+
+def _without_dead_channels(
+    rollouts: Rollouts, channels: Sequence[Channel]
+) -> tuple[Rollouts, Sequence[Channel]]:
+    """Leaves out channels that never change, although their rate or their position does."""
+
+    def values(name: str) -> list[Array]:
+        column = rollouts.channel_names.index(name)
+        return [v for v in rollouts.measurements(column) if len(v)]
+
+    names = [channel.name for channel in channels]
+    pairs = [(c.name, c.rate_of) for c in channels if c.rate_of in names]
+    notes, dead = [], set()
+    for pair in pairs:
+        for name, other in (pair, pair[::-1]):
+            if other is None or name is None:
+                continue
+            if _is_constant(values(name)) and any(map(_moves_clearly, values(other))):
+                dead.add(name)
+                notes.append(f"{name} never changes, although {other} does; it is not used.")
+    if not dead:
+        return rollouts, channels
+    left = rollouts.select([name for name in rollouts.channel_names if name not in dead])
+    left = replace(left, notes=(*left.notes, *notes))
+    return left, [channel for channel in channels if channel.name not in dead]
+
+
+def _is_constant(stretches: Sequence[Array]) -> bool:
+    """Returns whether a channel has the same value everywhere in each stretch."""
+    return all(np.ptp(values) == 0.0 for values in stretches)
+
+
+def _moves_clearly(values: Array) -> bool:
+    """Returns whether a channel changes by more than its noise, and not only by encoder steps."""
+    if len(values) < FAULTS.least_steps:
+        return False
+    noise = np.sqrt(np.square(np.diff(values, n=2)).mean() / 6.0)
+    num_levels = len(np.unique(values))
+    return bool(np.ptp(values) > FAULTS.jump_size * noise and num_levels > FAULTS.least_steps)
 
 
 def _at_rows(readings: Array) -> Sampling:
@@ -147,6 +188,7 @@ class _Faults:
     ) -> None:
         self.notes: list[str] = []
         self._position_of = position_of
+        self._limits = {column: _limits(rollouts, column) for column in columns}
         self._rate_of = {position: rate for rate, position in position_of.items()}
         self._where = f"Rollout {index}"
         self._step = rollouts.time_step
@@ -213,6 +255,8 @@ class _Faults:
             found = self._frozen_rates(rows, column, self._position_of[column])
         else:
             return
+        if self._leave_out_limits(rows, column, found):
+            return
         for begin, stop in found:
             # The first of the equal values is still right.
             self._is_read[first + begin + 1 : first + stop, column] = False
@@ -220,6 +264,22 @@ class _Faults:
                 f"{self._where}: {self._names[column]} is frozen from "
                 f"{self._time(first + begin)} to {self._time(first + stop)}; left out."
             )
+
+    def _leave_out_limits(
+        self, rows: slice, column: int, found: Sequence[tuple[int, int]]
+    ) -> bool:
+        """Leaves out plateaus at the ends of a channel's range, if one is certainly wrong."""
+        values = self._values[rows, column]
+        limits = self._limits[column]
+        if not any(values[begin] in limits for begin, _ in found):
+            return False
+        at_limit = np.isin(values, limits)
+        self._is_read[rows, column] &= ~at_limit
+        self.notes.append(
+            f"{self._where}: {self._names[column]} looks clipped; {int(at_limit.sum())} "
+            "measurements at its limit are left out."
+        )
+        return True
 
     def _frozen_positions(self, rows: slice, column: int, rate: int) -> list[tuple[int, int]]:
         """Returns stretches in which a position stays, but its rate says that it moves."""
@@ -307,6 +367,18 @@ def _spikes(values: Array) -> NDArray[np.int64]:
     if len(rows) > FAULTS.most_lost * len(values):
         return np.array([], dtype=np.int64)
     return np.array(rows, dtype=np.int64)
+
+
+def _limits(rollouts: Rollouts, column: int) -> list[float]:
+    """Returns the ends of a channel's range at which it stays more than once."""
+    values = [readings[:, column] for readings in rollouts.usable_readings]
+    ends = min(v.min() for v in values), max(v.max() for v in values)
+    return [
+        float(end)
+        for end in ends
+        if ends[0] < ends[1]
+        and sum(v[begin] == end for v in values for begin, _ in _constant(v)) > 1
+    ]
 
 
 def _constant(values: Array) -> list[tuple[int, int]]:

@@ -30,6 +30,14 @@ STEPS_TOGETHER = 5
 """Steps over which the usual step is measured: jitter of single stamps averages out, and if one
 message in twenty is lost, most blocks are still complete."""
 
+REGULAR_SHARE = 0.5
+"""Share of steps that are usual, and largest departure from it as a share of the step, of a
+stream that is written at a rate. Jitter of 5 ms at 50 Hz departs by a quarter."""
+
+CLOCK_DIFFERENCES = 2e-5, 1e-2
+"""Relative differences between two rates that are taken for those of two clocks: quartz errs by
+1e-5 to 1e-4. Larger ones are other rates."""
+
 FEWEST_SMOOTHED = 5
 """Fewest measurements that are interpolated by cubic polynomials; Akima's method needs as many."""
 
@@ -210,7 +218,7 @@ def grid_of(channels: Sequence[Track], actions: Sequence[Track], step: float) ->
         readings[:, k] = np.where(exact, found, _interpolated(track, grid))
         values[:, k] = np.where(taken, found, readings[:, k])
         lateness[:, k], is_read[:, k] = late, taken
-    commands = [_mean_held(track, grid) for track in actions]
+    commands = [_mean_held(_bridged(track), grid) for track in actions]
     return Gridded(
         grid - begin,
         readings,
@@ -226,6 +234,32 @@ def _interpolated(track: Track, grid: Array) -> Array:
     if len(track) < FEWEST_SMOOTHED:
         return np.interp(inside, track.time, track.values)
     return np.asarray(Akima1DInterpolator(track.time, track.values)(inside), dtype=np.float64)
+
+
+def _bridged(track: Track) -> Track:
+    """Returns a regular stream of commands with its short gaps filled by straight lines.
+
+    Commands that were written only when they changed are left as they are.
+    """
+    steps = np.diff(track.time)
+    if len(steps) < 2:
+        return track
+    usual = float(np.median(steps))
+    if np.mean(np.abs(steps - usual) < REGULAR_SHARE * usual) < REGULAR_SHARE:
+        usual = float(np.min(steps))
+        count = np.rint(steps / usual)
+        if np.mean(np.abs(steps - count * usual) < REGULAR_SHARE * usual) < REGULAR_SHARE:
+            return track
+    count = np.rint(steps / usual)
+    short = np.flatnonzero((count > 1) & (count <= MOST_BRIDGED))
+    if not len(short):
+        return track
+    time = [track.time[k] + steps[k] * np.arange(1, int(count[k])) / count[k] for k in short]
+    added = np.concatenate(time)
+    every = np.concatenate((track.time, added))
+    order = np.argsort(every, kind="stable")
+    values = np.concatenate((track.values, np.interp(added, track.time, track.values)))
+    return Track(every[order], values[order])
 
 
 def _mean_held(track: Track, grid: Array) -> NDArray[np.float64]:
@@ -269,6 +303,7 @@ def recording_of(
     if not 1e-9 <= step <= 1e9:
         raise DataError(f"the time step is {step:.6g} s, which is implausible.")
     made = [grid_of(*tracks, step) for tracks in rollouts]
+    notes = (*notes, *_clock_notes(rollouts))
     parts = [part for part in made if part is not None]
     if not parts:
         raise DataError("the channels and actions have no time in common.")
@@ -286,6 +321,23 @@ def recording_of(
         spans=tuple(part.spans for part in parts),
         notes=(*notes, *_notes(parts, [name for name, _ in channels], len(made))),
     )
+
+
+def _clock_notes(rollouts: Sequence[tuple[Sequence[Track], Sequence[Track]]]) -> list[str]:
+    """Returns a sentence if commands and measurements were stamped by clocks that differ."""
+    ratios = [
+        (commands.time[-1] - commands.time[0])
+        / (len(commands) - 1)
+        / ((channel.time[-1] - channel.time[0]) / (len(channel) - 1))
+        for channels, actions in rollouts
+        for channel, commands in zip(channels[:1], actions[:1], strict=False)
+        if min(len(channel), len(commands)) > 1 and len(channel) - len(commands) in (0, 1)
+    ]
+    least, most = CLOCK_DIFFERENCES
+    difference = abs(float(np.median(ratios)) - 1.0) if ratios else 0.0
+    if not least < difference < most:
+        return []
+    return [f"The clocks of commands and measurements differ by {100 * difference:.2g} %."]
 
 
 def at_one_rate(recordings: Sequence[Recording]) -> list[Recording]:

@@ -48,7 +48,7 @@ def degrees(text):
 
 
 MISTAKES = {
-    "wrong names": (renamed("angle,velocity", "q,dq"), "angle, velocity is missing; the data have q, dq"),
+    "wrong names": (renamed("angle,velocity", "q,dq"), "velocity is missing; the data have q, dq"),
     "wrong name of time": (renamed("time", "t"), "there is no column time; the header is"),
     "a unit behind time": (renamed("time", "time [s]"), "no part of names, so rename 'time [s]'"),
     "wrong name of an action": (renamed("torque", "tau"), "the column torque is missing"),
