@@ -312,7 +312,9 @@ def run(case: Case, kind: str, channel: str, seed: int) -> dict[str, Any]:
             rollouts = Rollouts.load(file)
             found = npdr.discover(case.model, rollouts, seed=0, progress=False)
         except npdr.NpdrError as error:
-            return {"error": str(error), "cpu": time.process_time() - begun}
+            is_said = any(word in str(error) for word in KINDS.get(kind, (None, ""))[1].split("|"))
+            spent = time.process_time() - begun
+            return {"error": str(error), "is_said": is_said, "cpu": spent}
     effects = [e.effect.name for e in found.effects]
     text = " ".join(found.problems) + " " + " ".join(effects)
     expected = KINDS[kind][1].split("|") if kind != "none" else []

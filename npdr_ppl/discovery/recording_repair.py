@@ -8,6 +8,7 @@ the recording and the recording as it is cannot be explained. What was done is s
 ``Recording.notes``.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -254,9 +255,10 @@ def _remedies(model: Model, rollouts: Rollouts, options: DataOptions) -> Iterato
         column = rollouts.channel_names.index(sensor.name)
         values = np.concatenate(rollouts.measurements(column))
         if len(values) and values.min() >= 0.0 and values.max() > 0.0:
-            for sign in (1.0, -1.0):
-                text = f"{sensor.name} looks recorded without its sign, which was restored."
-                yield Remedy(text, _Signed(sensor.name, sign))
+            text = f"{sensor.name} looks recorded without its sign, which was restored."
+            rates = [other.name for other in sensors if other.rate_of == sensor.name]
+            position = sensor.rate_of if sensor.rate_of in units else None
+            yield Remedy(text, _Signed(sensor.name, position, rates[0] if rates else None))
         limits = _plateaus(rollouts, column)
         if limits:
             text = f"{sensor.name} looks clipped; measurements at its limit are left out."
@@ -339,17 +341,31 @@ class _Shift:
 
 @dataclass(frozen=True)
 class _Signed:
-    """Gives a channel of absolute values the sign with which it is smoothest."""
+    """Gives a channel of absolute values its sign.
+
+    Attributes:
+        name: The channel.
+        position: The channel whose rate it is, if that was recorded.
+        rate: Its own rate, if that was recorded.
+    """
 
     name: str
-    first_sign: float
+    position: str | None
+    rate: str | None
 
     def __call__(self, rollouts: Rollouts) -> Rollouts:
-        column = rollouts.channel_names.index(self.name)
+        names = rollouts.channel_names
+        column = names.index(self.name)
 
         def change(values: Array, _: int) -> Array:
             result = values.copy()
-            result[:, column] = self.first_sign * _with_signs(values[:, column])
+            size = values[:, column]
+            evidence = None
+            if self.position is not None:
+                evidence = np.gradient(values[:, names.index(self.position)])
+            elif self.rate is not None:
+                evidence = np.gradient(size) * values[:, names.index(self.rate)]
+            result[:, column] = _with_signs(size, evidence)
             return result
 
         return _changed(rollouts, change)
@@ -412,22 +428,29 @@ def _shifted(values: Array, steps: int) -> Array:
     return np.concatenate((np.repeat(values[:1], size, 0), values[:-size]))
 
 
-def _with_signs(values: Array) -> Array:
-    """Returns absolute values ``(N,)`` with a change of sign wherever they turn at zero."""
+def _with_signs(size: Array, evidence: Array | None) -> Array:
+    """Returns absolute values ``(N,)`` with signs that change only where they turn near zero.
+
+    Args:
+        size: The absolute values.
+        evidence: A curve that has the sign on average; ``None`` if there is none, and the sign
+            alternates.
+    """
     reach = SIGN_WINDOW
-    noise = float(np.median(np.abs(np.diff(values, n=2)))) / 0.6745
-    signs, sign, last = np.ones(len(values)), 1.0, -reach
-    for k in range(reach, len(values) - reach):
-        falls, rises = values[k - reach] - values[k], values[k + reach] - values[k]
-        is_least = values[k] <= values[k - reach : k + reach + 1].min()
-        turns = min(falls, rises) > 3.0 * noise and values[k] < 0.5 * min(falls, rises)
-        if is_least and turns and k - last >= reach:
+    turns = [0]
+    for k in range(reach, len(size) - reach):
+        falls, rises = size[k - reach] - size[k], size[k + reach] - size[k]
+        is_least = size[k] <= size[k - reach : k + reach + 1].min()
+        if is_least and size[k] < 0.5 * min(falls, rises) and k - turns[-1] >= reach:
             # The sign changes on the side on which the value is already rising.
-            sign, last = -sign, k
-            signs[k + (values[k + 1] > values[k - 1]) :] = sign
-        else:
-            signs[k + 1 :] = sign
-    return signs * values
+            turns.append(k + int(size[k + 1] > size[k - 1]))
+    result = size.copy()
+    for number, (begin, end) in enumerate(itertools.pairwise((*turns, len(size)))):
+        sign = (-1.0) ** number
+        if evidence is not None:
+            sign = float(np.sign(size[begin:end] @ evidence[begin:end])) or 1.0
+        result[begin:end] *= sign
+    return result
 
 
 def _plateaus(rollouts: Rollouts, column: int) -> list[float]:

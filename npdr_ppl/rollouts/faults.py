@@ -54,7 +54,7 @@ class FaultSettings:
     mended_share: float = 0.1
     largest_loss: int = 10
     left_over: float = 0.3
-    joint_departure: float = 6.0
+    joint_departure: float = 5.0
     rest_change: float = 0.01
     least_steps: int = 20
     most_lost: float = 0.02
@@ -81,8 +81,9 @@ class FaultSettings:
 
 FAULTS = FaultSettings()
 
-WINDOW = 6
-"""Samples on each side of a step to which a parabola is fitted."""
+WINDOWS = 6, 4
+"""Samples on each side of a step to which a parabola is fitted: more average the noise, fewer
+follow fast motion."""
 
 ENCODER_NOISE = 0.3
 """Standard deviation of rounding, in steps of the encoder: 1/√12."""
@@ -305,9 +306,15 @@ class _Faults:
 
         return [span for span in _constant(values) if departure(*span) > least]
 
+    def _pairs_in(self, columns: Sequence[int]) -> list[tuple[int, int]]:
+        """Returns places of positions and of their rates among columns."""
+        place = {column: k for k, column in enumerate(columns)}
+        return [(place[position], place[rate]) for rate, position in self._position_of.items()]
+
     def _lost_samples(self, first: int, end: int, columns: Sequence[int]) -> list[int]:
         values = self._values[first : end + 1, columns]
-        swapped = _swapped_rows(values)
+        pairs = self._pairs_in(columns)
+        swapped = _swapped_rows(values, pairs, self._step)
         if swapped:
             for row in swapped:
                 self._is_read[first + row : first + row + 2] = False
@@ -319,7 +326,7 @@ class _Faults:
             self._is_read[end] = False
             self.notes.append(f"{self._where}: the last sample is wrong; left out.")
             values = values[:-1]
-        found = set(_lost_steps(values)) | set(_time_jumps(values))
+        found = set(_lost_steps(values)) | set(_time_jumps(values, pairs, self._step))
         found -= {row + shift for row in swapped for shift in range(-2, 4)}
         steps = [first + step for step in sorted(found)]
         if steps:
@@ -369,16 +376,10 @@ def _spikes(values: Array) -> NDArray[np.int64]:
     return np.array(rows, dtype=np.int64)
 
 
-def _limits(rollouts: Rollouts, column: int) -> list[float]:
-    """Returns the ends of a channel's range at which it stays more than once."""
+def _limits(rollouts: Rollouts, column: int) -> tuple[float, float]:
+    """Returns the ends of a channel's range. A channel hardly ever freezes exactly there."""
     values = [readings[:, column] for readings in rollouts.usable_readings]
-    ends = min(v.min() for v in values), max(v.max() for v in values)
-    return [
-        float(end)
-        for end in ends
-        if ends[0] < ends[1]
-        and sum(v[begin] == end for v in values for begin, _ in _constant(v)) > 1
-    ]
+    return min(float(v.min()) for v in values), max(float(v.max()) for v in values)
 
 
 def _constant(values: Array) -> list[tuple[int, int]]:
@@ -429,39 +430,64 @@ def _lost_steps(readings: Array) -> list[int]:
     return sorted(steps)
 
 
-def _time_jumps(readings: Array) -> list[int]:
+def _time_jumps(readings: Array, pairs: Sequence[tuple[int, int]], time_step: float) -> list[int]:
     """Returns the steps across which a jump in time explains what channels do, ``(N, C)``.
 
     On both sides of a step, parabolas are fitted. Extended to the middle of the step, they meet,
     if the step has its usual duration. If n samples were lost, they meet when the step is n + 1
-    times as long; if a sample was written twice, when it has no duration. Channels that move
-    steadily across the step decide, at least two of them.
+    times as long; if a sample was written twice, when it has no duration. At least two channels
+    have to agree, or a position with its rate: a position cannot jump.
+
+    Args:
+        readings: The readings.
+        pairs: Columns of positions and of their rates.
+        time_step: Seconds between rows.
     """
-    num, last = len(readings) - 2 * WINDOW + 1, WINDOW - 1
+    found: set[int] = set()
+    for size in WINDOWS:
+        steps = _jumps_between(readings, size, pairs, time_step)
+        # Windows of different sizes may put a jump one step apart.
+        found |= {step for step in steps if not found & {step - 1, step, step + 1}}
+    return sorted(found)
+
+
+def _jumps_between(
+    readings: Array, size: int, pairs: Sequence[tuple[int, int]], time_step: float
+) -> list[int]:
+    """Returns the steps of :func:`_time_jumps` for windows of one size."""
+    num, last = len(readings) - 2 * size + 1, size - 1
     if num < FAULTS.least_steps or readings.shape[1] < 2:
         return []
-    windows = np.lib.stride_tricks.sliding_window_view(readings, WINDOW, axis=0)
-    left, right = windows[:num], windows[WINDOW : WINDOW + num]
+    windows = np.lib.stride_tricks.sliding_window_view(readings, size, axis=0)
+    left, right = windows[:num], windows[size : size + num]
 
     def gap(length: float) -> Array:
         """Returns the distance between the parabolas in the middle of a step, ``(N', C)``."""
-        return left @ _parabola(last + length / 2.0) - right @ _parabola(-length / 2.0)
+        before, after = last + length / 2.0, -length / 2.0
+        return left @ _parabola(size, before) - right @ _parabola(size, after)
 
     usual = gap(1.0)
     noise = _noise(np.abs(usual), readings)
-    slopes = left @ _parabola(last + 0.5, 1), right @ _parabola(-0.5, 1)
-    is_steady = np.abs(slopes[0] - slopes[1]) < 0.25 * np.abs(slopes[0] + slopes[1])
     jumps = np.abs(usual) > FAULTS.joint_departure * noise
+    slopes = left @ _parabola(size, last + 0.5, 1), right @ _parabola(size, -0.5, 1)
+    is_steady = np.abs(slopes[0] - slopes[1]) < 0.25 * np.abs(slopes[0] + slopes[1])
+    rates = 0.5 * (left @ _parabola(size, last + 0.5) + right @ _parabola(size, -0.5))
     votes = np.zeros(num, dtype=bool)
     for length in (0, *range(2, FAULTS.largest_loss + 2)):
-        left_over = np.abs(gap(float(length)))
-        mended = is_steady & jumps & (left_over < FAULTS.left_over * np.abs(usual))
-        votes |= (mended.sum(1) >= 2) & (mended.sum(1) > 0.7 * jumps.sum(1))
+        mended = jumps & (np.abs(gap(float(length))) < FAULTS.left_over * np.abs(usual))
+        support = (mended & is_steady).sum(1)
+        for position, rate in pairs:
+            # What the rate says that the position moves in the samples that are missing.
+            moved = (1 - length) * time_step * rates[:, rate]
+            agrees = np.abs(usual[:, position] - moved) < FAULTS.left_over * np.abs(moved)
+            support += mended[:, position] & agrees
+        against = jumps.sum(1) - mended.sum(1)
+        votes |= (support >= 2) & (support > 2 * against)
     strength = np.where(jumps, np.abs(usual) / noise, 0.0).sum(1)
     # Windows that contain a jump do not meet either.
-    is_jump = votes & (strength >= ndimage.maximum_filter1d(strength, 2 * WINDOW + 1))
+    is_jump = votes & (strength >= ndimage.maximum_filter1d(strength, 2 * size + 1))
     steps = np.flatnonzero(is_jump)
-    return [] if len(steps) > FAULTS.most_lost * num else (steps + WINDOW - 1).tolist()
+    return [] if len(steps) > FAULTS.most_lost * num else (steps + size - 1).tolist()
 
 
 def _noise(departures: Array, readings: Array) -> Array:
@@ -478,20 +504,26 @@ def _noise(departures: Array, readings: Array) -> Array:
 
 
 @functools.cache
-def _parabola(row: float, derivative: int = 0) -> Array:
+def _parabola(size: int, row: float, derivative: int = 0) -> Array:
     """Returns the weights with which a window gives its parabola, or the slope, at a row.
 
     Args:
+        size: Rows of the window.
         row: Row of the window, from 0; it may lie outside.
         derivative: 0 for the value, 1 for the slope per row.
     """
     at = ([1.0, row, row**2], [0.0, 1.0, 2.0 * row])[derivative]
-    powers = np.vander(np.arange(WINDOW, dtype=np.float64), 3, increasing=True)
+    powers = np.vander(np.arange(size, dtype=np.float64), 3, increasing=True)
     return np.asarray(np.array(at) @ np.linalg.pinv(powers), dtype=np.float64)
 
 
-def _swapped_rows(readings: Array) -> list[int]:
-    """Returns the first rows of neighbouring samples that were written in the wrong order."""
+def _swapped_rows(
+    readings: Array, pairs: Sequence[tuple[int, int]], time_step: float
+) -> list[int]:
+    """Returns the first rows of neighbouring samples that were written in the wrong order.
+
+    Arguments and votes are those of :func:`_time_jumps`.
+    """
     num = len(readings) - 3
     if num < FAULTS.least_steps or readings.shape[1] < 2:
         return []
@@ -499,9 +531,14 @@ def _swapped_rows(readings: Array) -> list[int]:
     usual = (readings[3:] - readings[:-3]) / 3.0
     middle = readings[2:-1] - readings[1:-2]
     noise = _noise(np.abs(middle - usual), readings)
-    moves = np.abs(usual) > FAULTS.joint_departure * noise
+    moves = np.abs(usual) > 0.5 * FAULTS.joint_departure * noise
     goes_back = moves & (np.abs(middle + usual) < FAULTS.left_over * np.abs(usual))
-    is_swapped = (goes_back.sum(1) >= 2) & (goes_back.sum(1) > 0.7 * moves.sum(1))
+    support = goes_back.sum(1)
+    for position, rate in pairs:
+        moved = time_step * 0.5 * (readings[2:-1, rate] + readings[1:-2, rate])
+        agrees = np.abs(middle[:, position] + moved) < FAULTS.left_over * np.abs(moved)
+        support += goes_back[:, position] & agrees
+    is_swapped = (support >= 2) & (support > 2 * (moves.sum(1) - goes_back.sum(1)))
     rows = np.flatnonzero(is_swapped)
     return [] if len(rows) > FAULTS.most_lost * num else (rows + 1).tolist()
 
@@ -510,8 +547,8 @@ def _is_last_row_wrong(readings: Array) -> bool:
     """Returns whether a channel of the last row lies far from where its motion leads."""
     if len(readings) < FAULTS.least_steps:
         return False
-    windows = np.lib.stride_tricks.sliding_window_view(readings, WINDOW, axis=0)[:-1]
-    departure = np.abs(readings[WINDOW:] - windows @ _parabola(float(WINDOW)))
+    windows = np.lib.stride_tricks.sliding_window_view(readings, WINDOWS[0], axis=0)[:-1]
+    departure = np.abs(readings[WINDOWS[0] :] - windows @ _parabola(WINDOWS[0], float(WINDOWS[0])))
     usual = np.maximum(np.median(departure, axis=0), _near(departure)[-1]) / 0.6745
     changes = np.abs(np.diff(readings, axis=0))
     largest = changes[:-1].max(0)

@@ -324,20 +324,26 @@ def recording_of(
 
 
 def _clock_notes(rollouts: Sequence[tuple[Sequence[Track], Sequence[Track]]]) -> list[str]:
-    """Returns a sentence if commands and measurements were stamped by clocks that differ."""
-    ratios = [
-        (commands.time[-1] - commands.time[0])
-        / (len(commands) - 1)
-        / ((channel.time[-1] - channel.time[0]) / (len(channel) - 1))
-        for channels, actions in rollouts
-        for channel, commands in zip(channels[:1], actions[:1], strict=False)
-        if min(len(channel), len(commands)) > 1 and len(channel) - len(commands) in (0, 1)
-    ]
-    least, most = CLOCK_DIFFERENCES
-    difference = abs(float(np.median(ratios)) - 1.0) if ratios else 0.0
-    if not least < difference < most:
+    """Returns a sentence if commands and measurements were stamped by clocks that differ.
+
+    They are compared if there is one command for each measurement.
+    """
+    drifts = []
+    for channels, actions in rollouts:
+        for channel, commands in zip(channels[:1], actions[:1], strict=False):
+            num = min(len(channel), len(commands))
+            if num > STEPS_TOGETHER and abs(len(channel) - len(commands)) <= 1:
+                time = channel.time[:num] - channel.time[0]
+                lag = commands.time[:num] - channel.time[:num]
+                (slope, _), covariance = np.polyfit(time, lag, 1, cov=True)
+                drifts.append((float(slope), float(covariance[0, 0]) ** 0.5))
+    if not drifts:
         return []
-    return [f"The clocks of commands and measurements differ by {100 * difference:.2g} %."]
+    drift, error = np.median(np.abs(drifts), axis=0).tolist()
+    least, most = CLOCK_DIFFERENCES
+    if not max(least, 5.0 * error) < drift < most:
+        return []
+    return [f"The clocks of commands and measurements differ by {100 * drift:.2g} %."]
 
 
 def at_one_rate(recordings: Sequence[Recording]) -> list[Recording]:
