@@ -22,6 +22,7 @@ __all__ = [
     "Discovery",
     "DiscoveryOptions",
     "Effect",
+    "FunctionSimulator",
     "GymnasiumSimulator",
     "HardwareTarget",
     "Inputs",
@@ -57,6 +58,7 @@ __all__ = [
 if TYPE_CHECKING:
     from npdr_ppl.discovery import Discovery, DiscoveryOptions, discover
     from npdr_ppl.engines.bullet import BulletSimulator
+    from npdr_ppl.engines.functions import FunctionSimulator
     from npdr_ppl.engines.gymnasium import GymnasiumSimulator
     from npdr_ppl.engines.mujoco import MujocoSimulator
     from npdr_ppl.engines.ode.simulator import ODESimulator
@@ -98,6 +100,7 @@ _HOMES = {
     "Discovery": "discovery",
     "DiscoveryOptions": "discovery",
     "Effect": "language.effects",
+    "FunctionSimulator": "engines.functions",
     "GymnasiumSimulator": "engines.gymnasium",
     "HardwareTarget": "targets",
     "Inputs": "language.inputs",

@@ -41,7 +41,7 @@ def inputs(simulator, num_steps=5):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["arm", "lever", "falling", "pendulum", "cart_pole"])
+@pytest.mark.parametrize("name", ["arm", "lever", "falling", "pendulum", "cart_pole", "swinging"])
 def test_every_simulator_of_the_page_depends_on_its_parameters(scope, name):
     simulator = scope[name]
     given = inputs(simulator, num_steps=60)

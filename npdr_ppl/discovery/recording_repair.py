@@ -8,6 +8,7 @@ the recording and the recording as it is cannot be explained. What was done is s
 ``Recording.notes``.
 """
 
+import inspect
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -96,6 +97,14 @@ def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
     Raises:
         DataError: The recording does not fit the model, or nothing usable is left of it.
     """
+    try:
+        inspect.signature(model).bind(rollouts)
+    except TypeError:
+        raise DataError(
+            "The model takes no inputs, so its simulator cannot replay rollouts; write "
+            "model(inputs) with a simulator that takes initial states and actions, such as an "
+            "npdr.FunctionSimulator."
+        ) from None
     prior = Prior(with_noise(model, None), (rollouts.inputs(None, "recorded"),))
     boxes = [*prior.black_boxes.values()]
     simulators = [box.simulator for box in boxes if isinstance(box, SimulatorBlackBox)]

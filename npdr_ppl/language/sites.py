@@ -66,7 +66,10 @@ def simulate(
         black_box = SimulatorBlackBox(name, simulator, parameters, inputs, noise)
     else:
         if inputs is not None:
-            raise ModelError(f"Site {name!r}: a plain function takes no inputs.")
+            raise ModelError(
+                f"Site {name!r}: a function without inputs was given inputs; declare one that "
+                "takes initial states and actions with npdr.FunctionSimulator."
+            )
         depth = max((-plate.dim for plate in get_plates() if plate.dim is not None), default=0)
         black_box = FunctionBlackBox(name, simulator, parameters, noise, plate_depth=depth)
     return pyro.sample(name, black_box)

@@ -260,7 +260,11 @@ def _observe(
 ) -> Observation:
     if not isinstance(box, SimulatorBlackBox):
         if isinstance(data, Rollouts):
-            raise DataError(f"Site {name!r} is a plain function; give a tensor, not rollouts.")
+            raise DataError(
+                f"Site {name!r} is a function without inputs, so its observation is a tensor; for "
+                "rollouts, write f(parameters, initial_state, actions, time_step) and declare it "
+                "with npdr.FunctionSimulator(f, states=[...], ...)."
+            )
         value = torch.as_tensor(data, dtype=torch.get_default_dtype())
         with seeded(0, "bind", name):
             simulated = prior.execute(prior.sample(2))[name].shape[1:]

@@ -90,6 +90,9 @@ class Signals:
 
     def actions(self) -> Tensor:
         """Returns the actions for the engine after all effects, ``(N, steps, actions)``."""
+        if not self._records:
+            shape = len(self.start_times), self._inputs.num_steps, 0
+            return torch.zeros(shape, dtype=torch.float64)
         chain, tables = self._action_chain, Tables(None, self._action_parameters)
         past = self._inputs.past_actions.shape[-2]
         settled = commands_at(self._records, -1 - past)

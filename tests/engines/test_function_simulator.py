@@ -1,0 +1,148 @@
+"""A plain function of a batch takes rollouts, as any simulator does."""
+
+import math
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
+import pytest
+import torch
+
+import npdr_ppl as npdr
+from npdr_ppl.errors import DataError, ModelError, SimulationError
+from npdr_ppl.language.handlers import add_effect
+from npdr_ppl.models.effects import InputDelay
+from npdr_ppl.models.pendulum import Pendulum
+from npdr_ppl.posterior.prepare import prepare
+
+STEP = 0.02
+
+
+def rod(parameters, initial_state, actions, time_step):
+    """The zoo's pendulum, written out: semi-implicit Euler steps."""
+    angle, velocity = initial_state.unbind(-1)
+    mass, length = parameters["mass"], parameters["length"]
+    states = []
+    for torque in actions[..., 0].unbind(-1):
+        weight = 0.5 * mass * length * 9.81 * torch.sin(angle)
+        velocity = velocity + time_step * (torque - weight) / (mass * length**2 / 3.0)
+        angle = angle + time_step * velocity
+        states.append(torch.stack([angle, velocity], dim=-1))
+    return torch.stack(states, dim=-2)
+
+
+def simulator(function=rod, **changed):
+    declared = {
+        "states": Pendulum.sensors,
+        "actions": [npdr.Channel("torque", "N m", -4.5, 4.5)],
+        "parameters": [npdr.Parameter("mass", "kg", 1.0), npdr.Parameter("length", "m", 1.0)],
+        "time_step": STEP,
+    }
+    return npdr.FunctionSimulator(function, **(declared | changed))
+
+
+def model(inputs):
+    mass = pyro.sample("mass", dist.Uniform(0.5, 2.0))
+    length = pyro.sample("length", dist.Uniform(0.5, 1.5))
+    return npdr.simulate("swing", simulator(), {"mass": mass, "length": length}, inputs)
+
+
+def recording(num_steps=400, *, delay=0):
+    rng = np.random.default_rng(0)
+    time = STEP * np.arange(num_steps)
+    torque = 2.0 * np.sin(3.1 * time) + np.sign(np.sin(5.7 * time))
+    late = np.concatenate((np.zeros(delay), torque[: num_steps - delay]))
+    values = {"mass": torch.tensor([1.1]), "length": torch.tensor([0.9])}
+    start = torch.tensor([[0.3, 0.0]], dtype=torch.float64)
+    states = rod(values, start, torch.tensor(late)[None, :, None], STEP)[0].numpy()
+    readings = np.concatenate((start.numpy(), states))
+    readings += rng.normal(0.0, [1e-3, 1e-2], readings.shape)
+    return npdr.Rollouts.from_arrays(
+        [readings], [torque[:, None]], channel_names=("angle", "velocity"),
+        action_names=("torque",), time_step=STEP,
+    )  # fmt: skip
+
+
+def test_it_simulates_all_draws_and_segments_in_one_call():
+    calls = []
+
+    def noting(parameters, initial_state, actions, time_step):
+        calls.append((initial_state.shape, actions.shape, parameters["mass"].shape, time_step))
+        return rod(parameters, initial_state, actions, time_step)
+
+    inputs = recording().inputs(100)
+    masses = torch.tensor([0.8, 1.0, 1.2])
+    found = simulator(noting).simulate({"mass": masses}, inputs)
+    assert found.shape == (3, 4, 100, 2)
+    assert calls == [((12, 2), (12, 100, 1), (12,), STEP)]
+    assert not torch.equal(found[0], found[1])
+
+
+def test_parameters_and_a_hidden_delay_are_found():
+    fitted = prepare(model, recording(), npdr.DataOptions()).hypothesis
+    assert fitted is not None
+    found = {name: float(value) for name, value in fitted.parameters.items()}
+    assert found == pytest.approx({"mass": 1.1, "length": 0.9}, rel=0.01)
+    late = prepare(add_effect(model, InputDelay("torque")), recording(delay=1), npdr.DataOptions())
+    assert late.hypothesis is not None
+    delay = float(late.hypothesis.parameters["torque.input_delay.delay"])
+    assert delay == pytest.approx(STEP, abs=1e-3)
+
+
+def test_commands_are_clamped_and_free_motion_needs_none():
+    inputs = recording().inputs(100)
+    strong = simulator(actions=[npdr.Channel("torque", "N m", -0.1, 0.1)])
+    assert not torch.equal(strong.simulate({}, inputs)[0], simulator().simulate({}, inputs)[0])
+
+    def fall(parameters, initial_state, actions, time_step):
+        time = time_step * torch.arange(1, actions.shape[1] + 1)
+        height = initial_state[:, :1] - 0.5 * parameters["gravity"][:, None] * time**2
+        return height[..., None]
+
+    falling = npdr.FunctionSimulator(
+        fall, states=[npdr.Channel("height", "m")],
+        parameters=[npdr.Parameter("gravity", "m/s²", 9.81)], time_step=0.1,
+    )  # fmt: skip
+    drop = npdr.Rollouts.from_arrays(
+        [1.0 - 4.905 * (0.1 * np.arange(5)[:, None]) ** 2],
+        channel_names=("height",), time_step=0.1,
+    )  # fmt: skip
+    inputs = drop.inputs(None, "recorded")
+    assert torch.allclose(falling.simulate({}, inputs), drop.observation(inputs))
+
+
+def test_a_zoo_pendulum_takes_a_free_swing():
+    """Recordings without actions work with any model; the truth is a pendulum without torque."""
+    time = STEP * np.arange(300)
+    angle = 0.1 * np.cos(math.sqrt(1.5 * 9.81 / 0.9) * time)
+    noise = np.random.default_rng(1).normal(0.0, 1e-4, len(time))
+    swing = npdr.Rollouts.from_arrays(
+        [(angle + noise)[:, None]], channel_names=("angle",), time_step=STEP
+    )
+
+    def free(inputs):
+        length = pyro.sample("length", dist.Uniform(0.5, 1.5))
+        return npdr.simulate("swing", Pendulum(), {"length": length}, inputs)
+
+    prepared = prepare(free, swing, npdr.DataOptions())
+    assert prepared.rollouts.notes == ("No commands were recorded: torque is taken as zero.",)
+    assert prepared.hypothesis is not None
+    # The small swing's frequency; at 0.1 rad it is 0.06 % lower.
+    assert float(prepared.hypothesis.parameters["length"]) == pytest.approx(0.9, rel=5e-3)
+
+
+def test_mistakes_get_one_sentence():
+    with pytest.raises(ModelError, match="mass has two meanings"):
+        simulator(states=[npdr.Channel("mass", "kg")])
+    with pytest.raises(ModelError, match="has no states"):
+        simulator(states=[])
+    wrong = simulator(lambda *_: torch.zeros(3))
+    with pytest.raises(SimulationError, match=r"a tensor of shape \(4, 100, 2\); got \(3,\)"):
+        wrong.simulate({}, recording().inputs(100))
+
+    def without_inputs():
+        mean = pyro.sample("mean", dist.Normal(0.0, 1.0))
+        return npdr.simulate("x", lambda mean: mean, {"mean": mean})
+
+    with pytest.raises(DataError, match=r"npdr\.FunctionSimulator"):
+        npdr.infer(without_inputs, recording(), progress=False)
