@@ -97,14 +97,12 @@ def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
     Raises:
         DataError: The recording does not fit the model, or nothing usable is left of it.
     """
-    try:
-        inspect.signature(model).bind(rollouts)
-    except TypeError:
+    if not _takes_inputs(model):
         raise DataError(
             "The model takes no inputs, so its simulator cannot replay rollouts; write "
             "model(inputs) with a simulator that takes initial states and actions, such as an "
             "npdr.FunctionSimulator."
-        ) from None
+        )
     prior = Prior(with_noise(model, None), (rollouts.inputs(None, "recorded"),))
     boxes = [*prior.black_boxes.values()]
     simulators = [box.simulator for box in boxes if isinstance(box, SimulatorBlackBox)]
@@ -129,6 +127,17 @@ def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
         rollouts = replace(rollouts, notes=(*rollouts.notes, remedy.sentence))
         _refuse_if_strict(rollouts, options)
     return Repair(rollouts, simulator, tuple(applied))
+
+
+def _takes_inputs(model: Model) -> bool:
+    """Returns whether a model can be called with inputs, as far as its signature tells."""
+    try:
+        inspect.signature(model).bind(None)
+    except TypeError:
+        return False
+    except ValueError:  # Pyro's handlers wrap a model in a callable without a signature.
+        return True
+    return True
 
 
 def _refuse_if_strict(rollouts: Rollouts, options: DataOptions) -> None:
