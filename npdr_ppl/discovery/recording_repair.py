@@ -27,6 +27,7 @@ from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel, has_closest_fit
+from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.collection import with_commands, without_duplicates
@@ -118,6 +119,10 @@ def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
         return Repair(rollouts, simulator)
     length = options.steps(rollouts) or max(rollouts.lengths)
     options = replace(options, embedding=None, segment_length=length)
+    with seeded(0, "try out"):
+        # Run as inference will run it, so that the model's own mistakes are reported first.
+        tried = Prior(model, (options.with_certain_start().inputs(rollouts),))
+        tried.execute(tried.sample(2))
     while len(applied) < REPAIR.most_remedies:
         remedy = _remedy_for(model, rollouts, options)
         if remedy is None:
@@ -406,7 +411,7 @@ class _WithoutLimits:
             is_read[at_limit, column] = False
             samplings.append(Sampling(known.values.copy(), known.lateness.copy(), is_read))
             spans.append(spans_without_gaps(is_read[:, [column]]))
-        return replace(rollouts, samplings=tuple(samplings), spans=tuple(spans))
+        return replace(rollouts, samplings=tuple(samplings), stretches=tuple(spans))
 
 
 @dataclass(frozen=True)

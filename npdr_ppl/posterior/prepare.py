@@ -35,7 +35,6 @@ from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.segment_model import SegmentModel, has_closest_fit
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
-from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Preparation", "held_out", "prepare", "score_embedding"]
@@ -235,9 +234,6 @@ def prepare(
         data_options=data_options,
         seed=seed,
     )
-    with seeded(0, "try out"):
-        # Run as inference will run it, so that the model's own mistakes are reported first.
-        prior.execute(prior.sample(2))
     closest = searcher.with_finer_steps(searcher.fit_base(near=near, progress=progress))
     base = BaseFit(searcher.base, closest, searcher.are_steps_coarse)
     wider = searcher.with_wider_priors(closest)

@@ -30,7 +30,7 @@ __all__ = [
 
 Episodes = TypeVar("Episodes", bound=Recording)
 
-OPTIONAL = ("rewards", "samplings")
+OPTIONAL = ("rewards", "samplings", "stretches")
 """Fields with one entry per rollout, or none at all."""
 
 COLUMNS = ("channel_names", "action_names", "channel_units", "action_units")
@@ -52,7 +52,7 @@ def stacked(rollouts: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:
 
 def picked(rollouts: Episodes, chosen: Sequence[int]) -> Episodes:
     """Returns the rollouts of these indices, in this order."""
-    fields = ["readings", "actions", "time", "spans"]
+    fields = ["readings", "actions", "time"]
     fields += [name for name in OPTIONAL if getattr(rollouts, name)]
     return replace(
         rollouts, **{name: tuple(getattr(rollouts, name)[i] for i in chosen) for name in fields}
@@ -72,7 +72,7 @@ def pieces(rollouts: Episodes) -> Episodes:
         time=tuple(rollouts.time[r][a : b + 1] for r, a, b in stretches),
         rewards=rewards and tuple(rewards[r][a:b] for r, a, b in stretches),
         samplings=samplings and tuple(samplings[r].rows(a, b + 1) for r, a, b in stretches),
-        spans=(),
+        stretches=(),
     )
 
 
@@ -90,7 +90,7 @@ def shortened(rollouts: Episodes, num_steps: int) -> Episodes:
         time=tuple(values[: num_steps + 1] for values in rollouts.time),
         rewards=rollouts.rewards and tuple(values[:num_steps] for values in rollouts.rewards),
         samplings=tuple(sampling.rows(0, num_steps + 1) for sampling in rollouts.samplings),
-        spans=tuple(
+        stretches=tuple(
             tuple((first, min(end, num_steps)) for first, end in spans if first < num_steps)
             for spans in rollouts.spans
         ),
@@ -158,7 +158,7 @@ def without_duplicates(rollouts: Episodes) -> Episodes:
         if first != index:
             spans[index] = ()
             notes.append(f"Rollout {index} is identical to rollout {first}; left out.")
-    return replace(rollouts, spans=tuple(spans), notes=(*rollouts.notes, *notes))
+    return replace(rollouts, stretches=tuple(spans), notes=(*rollouts.notes, *notes))
 
 
 def are_equal(one: Recording, other: Recording) -> bool:
@@ -213,11 +213,12 @@ def joined(parts: Sequence[Episodes]) -> Episodes:
         parts = [
             part if part.samplings else replace(part, samplings=_at_rows(part)) for part in parts
         ]
-    fields = ["readings", "actions", "time", "spans"]
-    fields += [name for name in OPTIONAL if getattr(parts[0], name)]
+    fields = ["readings", "actions", "time"]
+    fields += [name for name in ("rewards", "samplings") if getattr(parts[0], name)]
     return replace(
         first,
         **{name: tuple(v for part in parts for v in getattr(part, name)) for name in fields},
+        stretches=tuple(spans for part in parts for spans in part.spans),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
     )
 

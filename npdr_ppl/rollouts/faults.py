@@ -120,7 +120,7 @@ def without_faults(rollouts: Rollouts, channels: Sequence[Channel]) -> Rollouts:
             for sampling, readings in zip(samplings, rollouts.readings, strict=True)
         ),
         samplings=tuple(samplings),
-        spans=tuple(spans),
+        stretches=tuple(spans),
         notes=(*rollouts.notes, *notes),
     )
 

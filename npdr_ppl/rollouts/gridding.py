@@ -318,7 +318,7 @@ def recording_of(
         channel_units=tuple(unit for _, unit in channels),
         action_units=tuple(unit for _, unit in actions),
         samplings=() if all(part.is_regular for part in samplings) else samplings,
-        spans=tuple(part.spans for part in parts),
+        stretches=tuple(part.spans for part in parts),
         notes=(*notes, *_notes(parts, [name for name, _ in channels], len(made))),
     )
 

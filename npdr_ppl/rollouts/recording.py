@@ -39,8 +39,8 @@ class Recording:
         action_units: Units of the actions, ``""`` where unknown.
         samplings: Of each rollout, its measurements as they were taken, if they were not all taken
             at the times of the rows; ``readings`` are then interpolated.
-        spans: First step and end of the usable stretches of each rollout; all of it if not given.
-            Between them, measurements or commands are missing or wrong.
+        stretches: First step and end of the usable stretches of each rollout; empty if all of
+            every rollout is usable. Between them, measurements or commands are missing or wrong.
         notes: What was left out or changed in the recording, a sentence each.
 
     Raises:
@@ -58,7 +58,7 @@ class Recording:
     channel_units: tuple[str, ...] = ()
     action_units: tuple[str, ...] = ()
     samplings: tuple[Sampling, ...] = ()
-    spans: tuple[Spans, ...] = ()
+    stretches: tuple[Spans, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -77,9 +77,9 @@ class Recording:
         freeze(self, "channel_units", self.channel_units or ("",) * len(self.channel_names))
         freeze(self, "action_units", self.action_units or ("",) * len(self.action_names))
         _check_arrays(self)
-        if not self.spans:
-            freeze(self, "spans", tuple(((0, length),) for length in self.lengths))
-        _check_spans(self)
+        _check_stretches(self)
+        if self.stretches == _whole(self.lengths):
+            freeze(self, "stretches", ())
 
     @classmethod
     def from_arrays(
@@ -156,6 +156,11 @@ class Recording:
         return states.rate_changes(self.usable_readings, self.time_step)
 
     @property
+    def spans(self) -> tuple[Spans, ...]:
+        """First step and end of every usable stretch of each rollout."""
+        return self.stretches or _whole(self.lengths)
+
+    @property
     def usable_readings(self) -> tuple[Array, ...]:
         """The readings of every usable stretch of every rollout, ``(T + 1, C)`` each."""
         return tuple(
@@ -182,11 +187,15 @@ class Recording:
     @property
     def is_whole(self) -> bool:
         """Whether all of every rollout is usable."""
-        spans = zip(self.spans, self.lengths, strict=True)
-        return all(own == ((0, length),) for own, length in spans)
+        return not self.stretches
 
 
-def _check_spans(recording: "Recording") -> None:
+def _whole(lengths: Sequence[int]) -> tuple[Spans, ...]:
+    """Returns the stretches of rollouts that are usable as a whole."""
+    return tuple(((0, length),) for length in lengths)
+
+
+def _check_stretches(recording: "Recording") -> None:
     """Raises a DataError if samplings or usable stretches do not fit the rollouts."""
     shapes = [readings.shape for readings in recording.readings]
     if recording.samplings and [s.values.shape for s in recording.samplings] != shapes:

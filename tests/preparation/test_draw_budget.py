@@ -73,7 +73,7 @@ def test_parts_have_the_likelihood_of_the_whole(posterior, monkeypatch):
     assert (share > 0).all() and (share <= 1 + 1e-9).all()
     if predicted is not None:
         left = (predicted - observation.value).mean(0)
-        expected_share = effective_share(left, observation.inputs.mask)
+        expected_share = effective_share(left, observation.inputs.mask[..., None])
         np.testing.assert_allclose(share, expected_share, rtol=1e-6)
 
 

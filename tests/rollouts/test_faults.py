@@ -128,5 +128,5 @@ def test_a_recording_without_a_usable_stretch_is_refused_in_a_sentence():
             channel_names=("x",),
             action_names=(),
             time_step=1.0,
-            spans=((),),
+            stretches=((),),
         )

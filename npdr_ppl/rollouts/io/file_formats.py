@@ -242,7 +242,7 @@ def _with_sampling(
             for a, end in zip([0, *ends[:-1]], ends, strict=True)
         ]
         spans.append(tuple(zip(begins, ends.tolist(), strict=True)))
-    return replace(recording, samplings=samplings, spans=tuple(spans) or recording.spans)
+    return replace(recording, samplings=samplings, stretches=tuple(spans))
 
 
 # -- xarray and NetCDF -----------------------------------------------------------------------
