@@ -85,6 +85,9 @@ WINDOWS = 6, 4
 """Samples on each side of a step to which a parabola is fitted: more average the noise, fewer
 follow fast motion."""
 
+LONGER_STEP = 1.5
+"""Length of a step across a lost sample in steps beside it: two, less some noise."""
+
 ENCODER_NOISE = 0.3
 """Standard deviation of rounding, in steps of the encoder: 1/√12."""
 
@@ -427,7 +430,10 @@ def _lost_steps(readings: Array) -> list[int]:
         # The second difference k compares the steps k and k + 1. A wrong step shows in two.
         inner = range(begin + 1, stop)
         steps |= set(inner) if len(inner) else {begin, begin + 1}
-    return sorted(steps)
+    # Across lost samples channels go on; at an impact a position turns, and its step is small.
+    around = np.maximum(first[:-2], first[2:])[:, moving]
+    goes_on = (first[1:-1][:, moving] > LONGER_STEP * around).mean(1) > 0.5
+    return sorted(k for k in steps if 0 < k <= len(goes_on) and goes_on[k - 1])
 
 
 def _time_jumps(readings: Array, pairs: Sequence[tuple[int, int]], time_step: float) -> list[int]:
@@ -480,7 +486,7 @@ def _jumps_between(
             # What the rate says that the position moves in the samples that are missing.
             moved = (1 - length) * time_step * rates[:, rate]
             agrees = np.abs(usual[:, position] - moved) < FAULTS.left_over * np.abs(moved)
-            support += mended[:, position] & agrees
+            support += mended[:, position] & is_steady[:, position] & agrees
         against = jumps.sum(1) - mended.sum(1)
         votes |= (support >= 2) & (support > 2 * against)
     strength = np.where(jumps, np.abs(usual) / noise, 0.0).sum(1)

@@ -20,14 +20,9 @@ def test_the_same_seed_gives_the_same_result():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("place", "seed"),
-    [(0, 1040), (1, 1040), (1, 1041)],
-    ids=["infinite starts", "infinite derivatives", "derivatives with infinite squares"],
-)
-def test_angles_in_degrees_from_which_simulations_fail_are_converted(place, seed):
-    spoilt = places("cart_pole", "bad_data", seed)[place]
-    case = make_case("cart_pole", "bad_data", spoilt, seed=seed)
+def test_angles_in_degrees_from_which_simulations_fail_are_converted():
+    spoilt = places("cart_pole", "bad_data", 1040)[1]
+    case = make_case("cart_pole", "bad_data", spoilt, seed=1040)
     found = npdr.discover(case.model, case.fit)
     (note,) = found.problems
     assert "recorded in degrees" in note

@@ -39,8 +39,8 @@ from npdr_ppl.rollouts.recording import Recording
 
 __all__ = ["Mapping", "SignalMapping", "toml_text"]
 
-MAX_BYTES = 2**18
-"""Largest mapping in bytes; one of fifty joints takes a fiftieth of it."""
+MAX_BYTES = 2**16
+"""Largest mapping in bytes; one of fifty joints takes a tenth of it."""
 
 
 class SignalMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
