@@ -112,8 +112,9 @@ def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
     (simulator,) = simulators
     if options.strict:
         rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
+    told = rollouts.notes
     rollouts = _without_visible_faults(rollouts, simulator)
-    _refuse_if_strict(rollouts, options)
+    _refuse_if_strict(rollouts, options, told)
     applied: list[Remedy] = []
     if options.initial_state != "uncertain" or not has_closest_fit(prior):
         return Repair(rollouts, simulator)
@@ -130,7 +131,7 @@ def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
         applied.append(remedy)
         rollouts = remedy.apply(rollouts)
         rollouts = replace(rollouts, notes=(*rollouts.notes, remedy.sentence))
-        _refuse_if_strict(rollouts, options)
+        _refuse_if_strict(rollouts, options, told)
     return Repair(rollouts, simulator, tuple(applied))
 
 
@@ -145,10 +146,16 @@ def _takes_inputs(model: Model) -> bool:
     return True
 
 
-def _refuse_if_strict(rollouts: Rollouts, options: DataOptions) -> None:
-    """Raises a DataError with the first fault, if faults are to be refused."""
-    if options.strict and rollouts.notes:
-        raise DataError(rollouts.notes[0])
+def _refuse_if_strict(rollouts: Rollouts, options: DataOptions, told: Sequence[str]) -> None:
+    """Raises a DataError with the first fault, if faults are to be refused.
+
+    Args:
+        rollouts: The repaired recording.
+        options: Its options.
+        told: Notes that the recording had before, about times, which are no faults.
+    """
+    if options.strict and len(rollouts.notes) > len(told):
+        raise DataError(rollouts.notes[len(told)])
 
 
 def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollouts:

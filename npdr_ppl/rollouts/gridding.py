@@ -127,11 +127,12 @@ def without_restarts(times: Sequence[Array]) -> tuple[tuple[Array, ...], int]:
     num = max(len(part) for part in parts)
     if num == 1:
         return tuple(times), 0
+    forward = [np.diff(time)[np.diff(time) > 0] for time in times]
+    gap = (MOST_BRIDGED + 2.0) * max(float(np.median(s)) for s in forward if len(s))
     moved: list[list[Array]] = [[] for _ in times]
     end = -np.inf
     for k in range(num):
         present = [part[k] for part in parts if k < len(part) and len(part[k])]
-        gap = (MOST_BRIDGED + 2.0) * max(usual_step(time) for time in present)
         shift = 0.0 if k == 0 else end + gap - min(float(time.min()) for time in present)
         for own, part in zip(moved, parts, strict=True):
             if k < len(part):
@@ -168,7 +169,9 @@ def _between_restarts(time: Array) -> list[Array]:
     if not (steps < 0).any() or not (steps > 0).any():
         return [time]
     usual = float(np.median(steps[steps > 0]))
-    return np.split(time, np.flatnonzero(steps < -MOST_BRIDGED * usual) + 1)
+    back = np.flatnonzero(steps[:-1] < -MOST_BRIDGED * usual)
+    # After a single late message the clock is where it was before.
+    return np.split(time, back[time[back + 2] <= time[back]] + 1)
 
 
 def usual_step(time: Array) -> float:

@@ -80,7 +80,8 @@ def placed(time: Array, values: Array, grid: Array) -> tuple[Array, Array, NDArr
     """
     step = (grid[-1] - grid[0]) / (len(grid) - 1)
     place = (time - grid[0]) / step
-    row = np.rint(place).astype(np.int64)
+    # Halves are rounded up, so that a clock that runs between the rows meets each of them.
+    row = np.floor(place + 0.5 + 1e-9).astype(np.int64)
     inside = (row >= 0) & (row < len(grid))
     place, row, values = place[inside], row[inside], values[inside]
     late = place - row

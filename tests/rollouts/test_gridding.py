@@ -99,6 +99,8 @@ def test_a_restarted_clock_goes_on_behind_a_gap():
     (moved,), number = without_restarts((time,))
     assert number == 1 and np.diff(moved).min() > 0
     assert np.diff(moved)[99] == pytest.approx(5 * STEP, abs=1e-9)
+    late = np.concatenate((STEP * np.arange(51), [0.9], STEP * np.arange(51, 99)))
+    assert without_restarts((late,))[1] == 0, "one message that came late"
     swapped = STEP * np.array([0, 1, 3, 2, 4])
     assert without_restarts((swapped,)) == ((swapped,), 0)
 
