@@ -1,5 +1,6 @@
 """Rollouts as a collection: stack, pick, join, compare, and summarise in a line."""
 
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,7 +14,6 @@ from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts import segments
 from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.recording import Recording
-from npdr_ppl.rollouts.sampling import Sampling
 
 __all__ = [
     "are_equal",
@@ -130,14 +130,16 @@ def with_commands(rollouts: Episodes, actions: Sequence[Channel]) -> Episodes:
             actions=tuple(np.zeros((length, len(actions))) for length in rollouts.lengths),
             action_names=tuple(action.name for action in actions),
             action_units=tuple(action.unit for action in actions),
-            notes=(*rollouts.notes, f"No commands were recorded: {names} is taken as zero."),
+            notes=(*rollouts.notes, f"No commands were recorded; zero is assumed for {names}."),
         )
     if not as_channels or len(as_channels) == len(rollouts.channel_names):
         return rollouts
     columns = segments.columns_of(as_channels, rollouts.channel_names)
     left = [name for name in rollouts.channel_names if name not in as_channels]
+    names = ", ".join(as_channels)
     return replace(
         with_channels(rollouts, left),
+        notes=(*rollouts.notes, f"Recorded as measurements, but used as commands: {names}."),
         actions=tuple(
             np.concatenate((commands, readings[:-1, columns]), axis=1)
             for commands, readings in zip(rollouts.actions, rollouts.readings, strict=True)
@@ -154,10 +156,14 @@ def without_duplicates(rollouts: Episodes) -> Episodes:
     for index, (readings, actions) in enumerate(
         zip(rollouts.readings, rollouts.actions, strict=True)
     ):
-        first = seen.setdefault(readings.tobytes() + actions.tobytes(), index)
-        if first != index:
+        digest = hashlib.sha256(readings.tobytes())
+        digest.update(actions.tobytes())
+        first = seen.setdefault(digest.digest(), index)
+        if first != index and spans[index]:
             spans[index] = ()
             notes.append(f"Rollout {index} is identical to rollout {first}; left out.")
+    if not notes:
+        return rollouts
     return replace(rollouts, stretches=tuple(spans), notes=(*rollouts.notes, *notes))
 
 
@@ -211,7 +217,7 @@ def joined(parts: Sequence[Episodes]) -> Episodes:
             raise DataError("some of the rollouts have rewards and some have not.")
     if any(part.samplings for part in parts):
         parts = [
-            part if part.samplings else replace(part, samplings=_at_rows(part)) for part in parts
+            replace(part, samplings=tuple(map(part.sampling, range(len(part))))) for part in parts
         ]
     fields = ["readings", "actions", "time"]
     fields += [name for name in ("rewards", "samplings") if getattr(parts[0], name)]
@@ -220,14 +226,6 @@ def joined(parts: Sequence[Episodes]) -> Episodes:
         **{name: tuple(v for part in parts for v in getattr(part, name)) for name in fields},
         stretches=tuple(spans for part in parts for spans in part.spans),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
-    )
-
-
-def _at_rows(recording: Recording) -> tuple[Sampling, ...]:
-    """Returns samplings of rollouts whose measurements were all taken at the rows' times."""
-    return tuple(
-        Sampling(values.copy(), np.zeros(values.shape), np.ones(values.shape, dtype=bool))
-        for values in recording.readings
     )
 
 

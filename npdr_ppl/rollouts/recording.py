@@ -169,6 +169,10 @@ class Recording:
             for first, end in spans
         )
 
+    def sampling(self, index: int) -> Sampling:
+        """Returns the measurements of one rollout as they were taken."""
+        return self.samplings[index] if self.samplings else Sampling.at_rows(self.readings[index])
+
     def measurements(self, column: int) -> tuple[Array, ...]:
         """Returns one channel's measurements of every usable stretch, ``(N,)`` each."""
         if not self.samplings:

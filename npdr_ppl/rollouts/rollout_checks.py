@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from npdr_ppl.errors import DataError
+from npdr_ppl.errors import DataError, NpdrError
 from npdr_ppl.reading_limits import LIMITS
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "check_time",
     "check_unit_texts",
     "named",
+    "refusing",
     "shown",
 ]
 
@@ -73,6 +74,24 @@ def named(path: str | PathLike[str]) -> Iterator[None]:
         # The folder "." has no name.
         name = Path(path).name or str(path)
         raise DataError(f"{name if name.isprintable() else ascii(name)}: {error}") from None
+
+
+@contextmanager
+def refusing(kind: str) -> Iterator[None]:
+    """Turns any error that a library raises for a malformed file into a DataError.
+
+    Args:
+        kind: What the file should be, e.g. ``"Parquet file"``.
+    """
+    try:
+        yield
+    except NpdrError:
+        raise
+    except MemoryError:
+        raise DataError(f"the {kind} does not fit into memory.") from None
+    # Decoders raise nearly any error for corrupt bytes; for the caller all mean the same.
+    except Exception as error:
+        raise DataError(f"not a readable {kind} ({type(error).__name__}).") from None
 
 
 def check_file(path: str | PathLike[str]) -> Path:

@@ -1,6 +1,6 @@
 """When measurements were taken, where that was not on the uniform grid of a recording."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts.arrays import Array
 
-__all__ = ["Sampling", "Spans", "placed", "spans_without_gaps"]
+__all__ = ["Sampling", "Spans", "common", "placed", "spans_without_gaps", "split"]
 
 Spans = tuple[tuple[int, int], ...]
 """First step and end of each usable stretch of a rollout."""
 
 MOST_BRIDGED = 3.0
-"""Longest gap between two measurements of a channel over which a simulation continues, in its
-usual intervals: one or two lost messages. What was commanded in a longer gap is not known either,
-if one program wrote both."""
+"""Longest gap between two measurements that is bridged, in usual intervals of the channel: three,
+or two lost messages. In longer gaps the commands are usually missing, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +26,8 @@ class Sampling:
     Attributes:
         values: Measurements at their own times; where none was taken, the recording's reading,
             which is interpolated there.
-        lateness: Time of each measurement after the row's own, in time steps, from −0.5 to 0.5;
-            zero where none was taken.
+        lateness: Time of each measurement minus the time of its row, in time steps, from −0.5 to
+            0.5; zero where none was taken.
         is_read: Whether a measurement was taken.
     """
 
@@ -45,6 +44,12 @@ class Sampling:
             raise DataError("a measurement is more than half a step away from its row.")
         for part in (self.values, self.lateness, self.is_read):
             part.flags.writeable = False
+
+    @classmethod
+    def at_rows(cls, readings: Array) -> "Sampling":
+        """Returns the sampling of readings that were all taken at the times of their rows."""
+        shape = readings.shape
+        return cls(readings.copy(), np.zeros(shape), np.ones(shape, dtype=bool))
 
     @property
     def is_regular(self) -> bool:
@@ -94,6 +99,33 @@ def placed(time: Array, values: Array, grid: Array) -> tuple[Array, Array, NDArr
     # Stamps are rounded; a billionth of a step is no lateness.
     lateness[np.abs(lateness) < 1e-9] = 0.0
     return found, lateness, is_read
+
+
+def split(spans: Spans, steps: Iterable[int]) -> Spans:
+    """Returns stretches without some of their steps.
+
+    Args:
+        spans: The stretches.
+        steps: The steps that are not usable.
+    """
+    wrong = set(steps)
+    result = []
+    for first, end in spans:
+        begin = first
+        for step in range(first, end):
+            if step in wrong:
+                if step > begin:
+                    result.append((begin, step))
+                begin = step + 1
+        if end > begin:
+            result.append((begin, end))
+    return tuple(result)
+
+
+def common(one: Spans, other: Spans) -> Spans:
+    """Returns what two sets of stretches have in common."""
+    both = [(max(a, c), min(b, d)) for a, b in one for c, d in other]
+    return tuple((a, b) for a, b in both if a < b)
 
 
 def spans_without_gaps(is_read: NDArray[np.bool_]) -> Spans:

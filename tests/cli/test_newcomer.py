@@ -65,8 +65,8 @@ MISTAKES = {
 
 
 FAULTS = {
-    "no last row": (lambda header, cells: (header, cells[:-1]), []),
-    "a full last row": (cell(-1, 4, "0.0"), []),
+    "no last row": (lambda header, cells: (header, cells[:-1]), ["used as commands: torque"]),
+    "a full last row": (cell(-1, 4, "0.0"), ["used as commands: torque"]),
     "NaN": (cell(50, 2, "NaN"), []),
     "an empty cell": (cell(50, 2, ""), []),
     "irregular time": (cell(50, 1, "1.007"), ["Time stamps are uneven"]),

@@ -125,7 +125,7 @@ def test_a_zoo_pendulum_takes_a_free_swing():
         return npdr.simulate("swing", Pendulum(), {"length": length}, inputs)
 
     prepared = prepare(free, swing, npdr.DataOptions())
-    assert prepared.rollouts.notes == ("No commands were recorded: torque is taken as zero.",)
+    assert prepared.rollouts.notes == ("No commands were recorded; zero is assumed for torque.",)
     assert prepared.hypothesis is not None
     # The small swing's frequency; at 0.1 rad it is 0.06 % lower.
     assert float(prepared.hypothesis.parameters["length"]) == pytest.approx(0.9, rel=5e-3)

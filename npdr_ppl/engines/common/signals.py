@@ -26,12 +26,32 @@ from npdr_ppl.language.effects import ActionEffect, SensorEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 
-__all__ = ["Signals", "needs_accelerations"]
+__all__ = ["Signals", "domain_by_segment", "needs_accelerations"]
 
 
 def needs_accelerations(effect: SensorEffect) -> bool:
     """Returns whether an effect needs states at other times, i.e. the engine's accelerations."""
     return effect.needs_past or type(effect).lead is not SensorEffect.lead
+
+
+def domain_by_segment(
+    simulator: Simulator, parameters: Mapping[str, Tensor], inputs: Inputs
+) -> tuple[dict[str, Tensor], torch.Size]:
+    """Returns all parameters as they are in each segment, and their shape with the segments.
+
+    Args:
+        simulator: The simulator, whose parameter effects are applied.
+        parameters: Parameters by name; missing ones are nominal.
+        inputs: The segments, float64.
+    """
+    domain = simulator.complete(parameters, torch.float64, inputs.actions.device)
+    batch_shape = torch.broadcast_shapes(
+        inputs.batch_shape, *(value.shape for value in domain.values())
+    )
+    shape = torch.Size((*batch_shape, inputs.num_segments))
+    middle = (inputs.start.to(torch.float64) + 0.5 * inputs.num_steps) * inputs.time_step
+    by_segment = {name: value[..., None] for name, value in domain.items()}
+    return simulator.changed(by_segment, middle), shape
 
 
 class Signals:

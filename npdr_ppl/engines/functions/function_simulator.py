@@ -6,7 +6,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.common.signals import Signals, needs_accelerations
+from npdr_ppl.engines.common.signals import Signals, domain_by_segment, needs_accelerations
 from npdr_ppl.errors import ModelError, SimulationError
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.language.effects import Effect, SensorEffect
@@ -115,16 +115,9 @@ class FunctionSimulator(Simulator):
         """
         self.check_parameters(parameters)
         self.check_inputs(inputs)
-        dtype, device = inputs.actions.dtype, inputs.actions.device
+        dtype = inputs.actions.dtype
         inputs = inputs.to(dtype=torch.float64)
-        domain = self.complete(parameters, torch.float64, device)
-        batch_shape = torch.broadcast_shapes(
-            inputs.batch_shape, *(value.shape for value in domain.values())
-        )
-        shape = torch.Size((*batch_shape, inputs.num_segments))
-        domain = {name: value[..., None] for name, value in domain.items()}
-        begin = inputs.start.to(torch.float64) * inputs.time_step
-        domain = self.changed(domain, begin + 0.5 * inputs.num_steps * inputs.time_step)
+        domain, shape = domain_by_segment(self, parameters, inputs)
         signals = Signals(self, domain, inputs, shape)
         initial_states = signals.initial_states()
         own = {p.name: domain[p.name].expand(shape).reshape(-1) for p in self.parameters}

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.common.signals import Signals, needs_accelerations
+from npdr_ppl.engines.common.signals import Signals, domain_by_segment, needs_accelerations
 from npdr_ppl.engines.workers.session import run_on_workers
 from npdr_ppl.engines.workers.task import Draw, Task
 from npdr_ppl.errors import ModelError, SimulationError
@@ -173,14 +173,7 @@ def _simulate(
         if value.is_floating_point():
             dtype = torch.promote_types(dtype, value.dtype)
     inputs = inputs.to(dtype=torch.float64, device="cpu")
-    domain = simulator.complete(parameters, torch.float64, torch.device("cpu"))
-    batch_shape = torch.broadcast_shapes(
-        inputs.batch_shape, *(value.shape for value in domain.values())
-    )
-    shape = torch.Size((*batch_shape, inputs.num_segments))
-    domain = {name: value[..., None] for name, value in domain.items()}
-    begin = inputs.start.to(torch.float64) * inputs.time_step
-    domain = simulator.changed(domain, begin + 0.5 * inputs.num_steps * inputs.time_step)
+    domain, shape = domain_by_segment(simulator, parameters, inputs)
     signals = Signals(simulator, domain, inputs, shape)
     initial_states = signals.initial_states()
     task, payloads = _task_and_payloads(simulator, domain, inputs, shape, signals, initial_states)

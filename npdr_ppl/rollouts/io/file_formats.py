@@ -1,8 +1,7 @@
 """Reads and writes Parquet, NPZ, NetCDF and xarray: exact, with units and without pickles."""
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -84,20 +83,6 @@ def load(path: AnyPath) -> Recording:
     return readers[suffix](path)
 
 
-@contextmanager
-def _refusing(format_name: str) -> Iterator[None]:
-    """Turns any error that a file library raises for a malformed file into a DataError."""
-    try:
-        yield
-    except DataError:
-        raise
-    except MemoryError:
-        raise DataError(f"the {format_name} file does not fit into memory.") from None
-    # Decoders raise nearly any error for corrupt bytes; for the caller all mean the same.
-    except Exception as error:
-        raise DataError(f"not a readable {format_name} file ({type(error).__name__}).") from None
-
-
 # -- Parquet ---------------------------------------------------------------------------------
 
 
@@ -122,7 +107,7 @@ def read_parquet(path: AnyPath, actions: Sequence[str] | None) -> Recording:
 
     path = rollout_checks.check_file(path)
     with rollout_checks.named(path):
-        with _refusing("Parquet"):
+        with rollout_checks.refusing("Parquet file"):
             # A file object, because pyarrow may take a path for a data set of many files.
             with path.open("rb") as file:
                 check_footer(file)
@@ -172,7 +157,7 @@ def write_npz(rollouts: Recording, path: AnyPath) -> None:
 def read_npz(path: AnyPath) -> Recording:
     """Reads padded arrays; see :meth:`Rollouts.from_npz`."""
     path = rollout_checks.check_file(path)
-    with rollout_checks.named(path), _refusing("NPZ"):
+    with rollout_checks.named(path), rollout_checks.refusing("NPZ file"):
         optional = {"rewards": 2, "measured": 3, "lateness": 3, "usable": 2}
         arrays = read_arrays(path, _NPZ_ARRAYS, optional)
         lengths = arrays["lengths"].tolist()
@@ -378,7 +363,7 @@ def read_netcdf(path: AnyPath) -> Recording:
     import xarray as xr
 
     path = rollout_checks.check_file(path)
-    with rollout_checks.named(path), _refusing("NetCDF"):
+    with rollout_checks.named(path), rollout_checks.refusing("NetCDF file"):
         # If h5netcdf failed to open it, its half-made object would report a second error when it
         # is deleted.
         check_self_contained(path)

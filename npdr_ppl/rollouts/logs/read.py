@@ -1,12 +1,11 @@
 """Reads a log of any known format, chosen by its suffix or by what a folder contains."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from itertools import islice
 from os import PathLike
 from pathlib import Path
 
-from npdr_ppl.errors import DataError, NpdrError
+from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.logs.log import Log
@@ -66,7 +65,7 @@ def read_log(path: str | PathLike[str], settings: LogSettings | None = None) -> 
         rollout_checks.check_file(path)
     with rollout_checks.named(path):
         reader, kind = _reader(path)
-        with _refusing(kind):
+        with rollout_checks.refusing(f"{kind} log"):
             log = reader(path, settings)
         if not log.signals:
             raise DataError("it has no signals.")
@@ -118,17 +117,3 @@ def _reader(path: Path) -> tuple[Reader, str]:
             f"{', '.join(by_suffix)} files."
         )
     return by_suffix[suffix]
-
-
-@contextmanager
-def _refusing(kind: str) -> Iterator[None]:
-    """Turns any error that a library raises for a malformed file into a DataError."""
-    try:
-        yield
-    except NpdrError:
-        raise
-    except MemoryError:
-        raise DataError(f"the {kind} log does not fit into memory.") from None
-    # Decoders raise nearly any error for corrupt bytes; for the caller all mean the same.
-    except Exception as error:
-        raise DataError(f"not a readable {kind} log ({type(error).__name__}).") from None

@@ -80,7 +80,7 @@ def read_bag_folder(path: Path, settings: LogSettings) -> Log:
     if not files:
         compressed = [f.name for f in path.iterdir() if f.suffix == ".zstd"]
         raise DataError(
-            "its files are compressed as a whole; run `ros2 bag convert` to store them plainly."
+            "its files are compressed; run `ros2 bag convert` to store them without compression."
             if compressed
             else "the bag has no .db3 or .mcap files."
         )
