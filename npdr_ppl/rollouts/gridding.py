@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,14 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.recording import Recording
-from npdr_ppl.rollouts.sampling import MOST_BRIDGED, Sampling, Spans, placed, spans_without_gaps
+from npdr_ppl.rollouts.sampling import (
+    MOST_BRIDGED,
+    Sampling,
+    Spans,
+    common,
+    placed,
+    spans_without_gaps,
+)
 
 __all__ = [
     "at_one_rate",
@@ -31,12 +38,22 @@ STEPS_TOGETHER = 5
 message in twenty is lost, most blocks are still complete."""
 
 REGULAR_SHARE = 0.5
-"""Share of steps that are usual, and largest departure from it as a share of the step, of a
-stream that is written at a rate. Jitter of 5 ms at 50 Hz departs by a quarter."""
+"""Share of the steps of a stream that have to be usual if it is written at a rate."""
+
+MOST_JITTER = 0.4
+"""Largest departure of a usual step, as a share of it. Stamps with 5 ms of jitter at 50 Hz have
+steps that depart by up to a half, but most of them by less than a third."""
+
+MULTIPLE_ERROR = 0.1
+"""Largest departure from a multiple of the shortest step, as a share of it, in a stream that was
+written at two rates."""
 
 CLOCK_DIFFERENCES = 2e-5, 1e-2
 """Relative differences between two rates that are taken for those of two clocks: quartz errs by
 1e-5 to 1e-4. Larger ones are other rates."""
+
+FEWEST_STEPS = 10
+"""Fewest steps of a stream that can be called regular."""
 
 FEWEST_SMOOTHED = 5
 """Fewest measurements that are interpolated by cubic polynomials; Akima's method needs as many."""
@@ -80,16 +97,46 @@ class Track:
         chosen = (self.time >= begin) & (self.time <= end)
         return Track(self.time[chosen], self.values[chosen])
 
+    def held_between(self, begin: float, end: float) -> "Track":
+        """Returns values that hold until the next one, with the one that holds at the begin."""
+        part = self.between(begin, end)
+        before = int(np.searchsorted(self.time, begin)) - 1
+        if before < 0 or (len(part) and part.time[0] == begin):
+            return part
+        return Track(
+            np.concatenate(([begin], part.time)),
+            np.concatenate((self.values[before : before + 1], part.values)),
+        )
+
     @property
     def step(self) -> float:
         """Usual time between two values in s."""
         return usual_step(self.time)
 
     @property
+    def rate(self) -> float | None:
+        """Seconds between the values of a regular stream; ``None`` if they were written on change.
+
+        A stream is regular if at least half of its steps are usual, or are multiples of its
+        shortest one.
+        """
+        steps = np.diff(self.time)
+        if len(steps) < FEWEST_STEPS:
+            return None
+        usual = float(np.median(steps))
+        if np.mean(np.abs(steps - usual) < MOST_JITTER * usual) >= REGULAR_SHARE:
+            return usual
+        shortest = float(np.min(steps))
+        departure = np.abs(steps - np.rint(steps / shortest) * shortest)
+        is_multiple = np.mean(departure < MULTIPLE_ERROR * shortest) >= REGULAR_SHARE
+        return shortest if is_multiple else None
+
+    @property
     def last_known(self) -> float:
         """Time in s until which a value that holds until the next one is known."""
-        longest = float(np.diff(self.time).max()) if len(self) > 1 else np.inf
-        return float(self.time[-1]) + longest
+        if self.rate is None:
+            return np.inf
+        return float(self.time[-1]) + float(np.diff(self.time).max())
 
 
 @dataclass(frozen=True)
@@ -152,14 +199,14 @@ def stamp_notes(times: Sequence[Array], num_restarts: int) -> list[str]:
     notes = []
     if num_restarts:
         often = "once" if num_restarts == 1 else f"{num_restarts} times"
-        notes.append(f"The clock was restarted {often}; what follows is another stretch.")
+        notes.append(f"The clock was restarted {often}; the data after it are another stretch.")
     steps = [np.diff(time[np.isfinite(time)]) for time in times]
     repeated = max((int((step == 0).sum()) for step in steps), default=0)
     swapped = max((int((step < 0).sum()) for step in steps), default=0)
     if repeated:
-        notes.append(f"{repeated} time stamps are repeated; the first sample of each is used.")
+        notes.append(f"Repeated time stamps: {repeated}; the first sample of each is used.")
     if swapped:
-        notes.append(f"{swapped} samples are out of order and were sorted by their time stamps.")
+        notes.append(f"Samples out of order: {swapped}; sorted by their time stamps.")
     return notes
 
 
@@ -244,15 +291,9 @@ def _bridged(track: Track) -> Track:
 
     Commands that were written only when they changed are left as they are.
     """
-    steps = np.diff(track.time)
-    if len(steps) < 2:
+    usual, steps = track.rate, np.diff(track.time)
+    if usual is None:
         return track
-    usual = float(np.median(steps))
-    if np.mean(np.abs(steps - usual) < REGULAR_SHARE * usual) < REGULAR_SHARE:
-        usual = float(np.min(steps))
-        count = np.rint(steps / usual)
-        if np.mean(np.abs(steps - count * usual) < REGULAR_SHARE * usual) < REGULAR_SHARE:
-            return track
     count = np.rint(steps / usual)
     short = np.flatnonzero((count > 1) & (count <= MOST_BRIDGED))
     if not len(short):
@@ -297,12 +338,16 @@ def recording_of(
     Raises:
         DataError: Nothing is left.
     """
-    steps = [track.step for own, _ in rollouts for track in own if len(track) > 1]
+    by_channel = [
+        [own[k].step for own, _ in rollouts if len(own[k]) > 1] for k in range(len(channels))
+    ]
+    # The median over rollouts, so that an odd one does not decide.
+    steps = [float(np.median(own)) for own in by_channel if own]
     if not steps:
         raise DataError("less than two measurements were recorded.")
     if len(rollouts) > LIMITS.rollouts:
         raise DataError(f"it has {len(rollouts)} rollouts, more than {LIMITS.rollouts}.")
-    step = time_step or float(f"{min(steps):.9g}")
+    step = float(f"{min(steps):.9g}") if time_step is None else time_step
     if not 1e-9 <= step <= 1e9:
         raise DataError(f"the time step is {step:.6g} s, which is implausible.")
     made = [grid_of(*tracks, step) for tracks in rollouts]
@@ -346,7 +391,10 @@ def _clock_notes(rollouts: Sequence[tuple[Sequence[Track], Sequence[Track]]]) ->
     least, most = CLOCK_DIFFERENCES
     if not max(least, 5.0 * error) < drift < most:
         return []
-    return [f"The clocks of commands and measurements differ by {100 * drift:.2g} %."]
+    return [
+        f"The clocks of commands and measurements differ by {100 * drift:.2g} %, which looks "
+        f"like a delay that changes by {6e4 * drift:.2g} ms per minute."
+    ]
 
 
 def at_one_rate(recordings: Sequence[Recording]) -> list[Recording]:
@@ -358,19 +406,29 @@ def at_one_rate(recordings: Sequence[Recording]) -> list[Recording]:
     step = min(recording.time_step for recording in recordings)
     if all(math.isclose(r.time_step, step, rel_tol=1e-6) for r in recordings):
         return list(recordings)
-    return [
-        recording_of(
-            [tracks_of(recording, index) for index in range(len(recording))],
-            list(zip(recording.channel_names, recording.channel_units, strict=True)),
-            list(zip(recording.action_names, recording.action_units, strict=True)),
-            time_step=step,
-            notes=(
-                *recording.notes,
-                *["Rates differ; rewards are left out."] * (recording.rewards is not None),
-            ),
-        )
-        for recording in recordings
+    return [_at_step(recording, step) for recording in recordings]
+
+
+def _at_step(recording: Recording, step: float) -> Recording:
+    """Returns a recording with another, smaller time step."""
+    notes = recording.notes
+    if recording.rewards is not None:
+        notes = (*notes, "Rates differ; rewards are left out.")
+    made = recording_of(
+        [tracks_of(recording, index) for index in range(len(recording))],
+        list(zip(recording.channel_names, recording.channel_units, strict=True)),
+        list(zip(recording.action_names, recording.action_units, strict=True)),
+        time_step=step,
+        notes=notes,
+    )
+    ratio = recording.time_step / step
+    usable = [
+        tuple((math.ceil(first * ratio), math.floor(end * ratio)) for first, end in spans)
+        for spans in recording.spans
     ]
+    if recording.is_whole or len(made) < len(recording):
+        return made
+    return replace(made, stretches=tuple(map(common, made.spans, usable)))
 
 
 def tracks_of(recording: Recording, index: int) -> tuple[list[Track], list[Track]]:
@@ -392,7 +450,7 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str], num_rollouts: int)
     """Returns what was found about the times of the measurements, a sentence each."""
     notes = []
     if num_rollouts > len(parts):
-        notes.append(f"{num_rollouts - len(parts)} rollouts are shorter than a step; left out.")
+        notes.append(f"Rollouts shorter than a step: {num_rollouts - len(parts)}; left out.")
     late = np.concatenate([np.abs(part.sampling.lateness).max(1) for part in parts])
     if (late > JITTER).any():
         notes.append(

@@ -208,3 +208,8 @@ def test_time_step_is_found_exactly(time_step):
 def test_rounded_time_stamps_are_constant_sampling():
     times = [np.round(np.arange(301) / 30, 3)]
     assert make((300,), time=times, time_step=None).time_step == pytest.approx(1 / 30, rel=1e-9)
+
+
+def test_a_recording_without_a_usable_stretch_is_refused_in_a_sentence():
+    with pytest.raises(DataError, match="no stretch of the recording is usable"):
+        Rollouts((np.zeros((2, 1)),), (np.zeros((1, 0)),), ("x",), (), 1.0, stretches=((),))

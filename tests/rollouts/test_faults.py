@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import npdr_ppl as npdr
-from npdr_ppl.errors import DataError
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.rollouts.faults import without_faults
 
@@ -118,15 +117,25 @@ def test_impacts_are_neither_spikes_nor_gaps():
     assert not found.notes
 
 
-def test_a_recording_without_a_usable_stretch_is_refused_in_a_sentence():
-    with pytest.raises(DataError, match="no stretch of the recording is usable"):
-        npdr.Rollouts.from_arrays(
-            [np.array([[0.0], [1.0]])], channel_names=("x",), time_step=1.0
-        ).__class__(
-            readings=(np.zeros((2, 1)),),
-            actions=(np.zeros((1, 0)),),
-            channel_names=("x",),
-            action_names=(),
-            time_step=1.0,
-            stretches=((),),
-        )
+def test_an_exactly_constant_speed_is_no_dead_channel():
+    time = STEP * np.arange(600)
+    steady = recording(2.0 * time, np.full(600, 2.0))
+    assert without_faults(steady, CHANNELS) is steady
+
+
+def test_a_dead_rate_is_not_used():
+    angle, _ = swing()
+    found = without_faults(recording(angle, np.zeros(600)), CHANNELS)
+    assert found.channel_names == ("angle",)
+    assert found.notes == ("velocity never changes, although angle does; it is not used.",)
+
+
+def test_a_clipped_channel_can_freeze_as_well():
+    angle, velocity = swing()
+    angle[100:200] = angle[100]
+    clipped = np.minimum(angle, 0.7)
+    found = without_faults(recording(clipped, velocity), CHANNELS)
+    is_read = found.samplings[0].is_read[:, 0]
+    assert not is_read[101:200].any() and not is_read[clipped == 0.7].any()
+    assert [note.split(" ", 3)[3] for note in found.notes][0].startswith("looks clipped")
+    assert "is frozen from" in found.notes[1]

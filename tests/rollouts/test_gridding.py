@@ -1,5 +1,7 @@
 """Measurements and commands with time stamps of their own, on a uniform grid."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -92,6 +94,53 @@ def test_commands_are_averaged_over_the_steps_they_hold_in():
     command = Track(np.array([0.0, 0.5, 0.75]), np.array([1.0, 3.0, 5.0]))
     rollouts = made([Track(np.arange(3.0), np.zeros(3))], [command])
     assert rollouts.actions[0][0].tolist() == [0.5 * 1 + 0.25 * 3 + 0.25 * 5]
+
+
+def test_a_command_that_is_written_once_holds_to_the_end():
+    step = Track(np.array([0.0, 1.0]), np.array([0.0, 5.0]))
+    rollouts = made([track(STEP * np.arange(1501))], [step])
+    assert rollouts.lengths == (1500,)
+    assert rollouts.actions[0][[0, 49, 50, -1], 0].tolist() == [0.0, 0.0, 5.0, 5.0]
+
+
+def test_commands_that_are_written_on_change_become_no_ramps():
+    time = np.cumsum([0.0, 0.1, 0.2, 0.3, 0.7, 1.5, 3.0])
+    command = Track(time, np.arange(7.0))
+    rollouts = made([track(STEP * np.arange(400))], [command])
+    # Ramps would have values between the whole numbers; sums over a step are rounded.
+    assert set(rollouts.actions[0][:, 0].round(12).tolist()) == set(range(7))
+
+
+def test_commands_that_a_log_has_lost_are_filled_by_straight_lines():
+    kept = np.delete(STEP * np.arange(200), [50, 120, 121])
+    rollouts = made([track(STEP * np.arange(200))], [Track(kept, kept)])
+    assert np.allclose(rollouts.actions[0][[50, 120, 121], 0], STEP * np.array([50, 120, 121]))
+
+
+def test_one_odd_rollout_does_not_set_the_time_step():
+    normal = [([track(STEP * np.arange(100))], [])] * 5
+    odd = ([track(np.array([0.0, 0.001]))], [])
+    recording = recording_of([*normal, odd], [("x", "")], [])
+    assert recording.time_step == pytest.approx(STEP) and len(recording) == 5
+    assert "Rollouts shorter than a step: 1" in recording.notes[0]
+
+
+def test_clocks_that_run_between_each_others_rows_lose_nothing():
+    rollouts = made([track(0.25 * np.arange(50)), track(0.125 + 0.25 * np.arange(50))])
+    assert rollouts.samplings[0].is_read.mean() > 0.95
+
+
+def test_joining_rates_keeps_what_was_left_out():
+    slow = made([track(STEP * np.arange(100))])
+    slow = dataclasses.replace(slow, stretches=(((0, 40), (41, 99)),))
+    fast = made([track(0.5 * STEP * np.arange(100))])
+    assert slow.concatenate(fast).spans == (((0, 80), (82, 198)), ((0, 99),))
+
+
+def test_clocks_that_drift_apart_are_said():
+    time = STEP * np.arange(1000)
+    rollouts = made([track(time * (1.0 + 1e-4))], [Track(time, np.sin(time))])
+    assert "differ by 0.01 %" in rollouts.notes[0]
 
 
 def test_a_restarted_clock_goes_on_behind_a_gap():

@@ -37,12 +37,13 @@ def rollouts_of(
     clocks = [signal.time for signal in signals] + ([episodes.time] if episodes else [])
     times, num_restarts = without_restarts(clocks)
     tracks = [Track.of(t, signal.values) for t, signal in zip(times, signals, strict=False)]
-    for signal, track in zip(signals, tracks, strict=True):
-        if len(track) < 2:
-            raise DataError(f"{signal.name} has {len(track)} values, but at least two are needed.")
     num = len(channels)
+    for k, (signal, track) in enumerate(zip(signals, tracks, strict=True)):
+        fewest = 2 if k < num else 1
+        if len(track) < fewest:
+            raise DataError(f"{signal.name} has {len(track)} values; at least {fewest} is needed.")
     parts = [
-        ([t.between(*span) for t in tracks[:num]], [t.between(*span) for t in tracks[num:]])
+        ([t.between(*span) for t in tracks[:num]], [t.held_between(*span) for t in tracks[num:]])
         for span in _spans(None if episodes is None else Track.of(times[-1], episodes.values))
     ]
     return recording_of(
@@ -55,12 +56,16 @@ def rollouts_of(
 
 
 def _spans(track: Track | None) -> list[tuple[float, float]]:
-    """Returns begin and end of each rollout in s, where the values of a track change."""
+    """Returns begin and end of each rollout in s; each value holds until the next one.
+
+    Raises:
+        DataError: The track has no values.
+    """
     if track is None:
         return [(-np.inf, np.inf)]
+    if not len(track):
+        raise DataError("the signal of the episodes has no values.")
     changes = np.flatnonzero(np.diff(track.values) != 0) + 1
-    begins = np.concatenate(([0], changes))
-    ends = np.concatenate((changes - 1, [len(track) - 1]))
-    return [
-        (float(track.time[a]), float(track.time[b])) for a, b in zip(begins, ends, strict=True)
-    ]
+    begins = track.time[np.concatenate(([0], changes))]
+    ends = np.append(np.nextafter(track.time[changes], -np.inf), np.inf)
+    return list(zip(begins.tolist(), ends.tolist(), strict=True))

@@ -1,0 +1,91 @@
+"""Remedies change what they say, and keep apart what was not measured."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import npdr_ppl as npdr
+from npdr_ppl.discovery.recording_repair import repair
+from npdr_ppl.discovery.remedies import Shift, remedies
+from npdr_ppl.errors import DataError
+from npdr_ppl.models.pendulum import Pendulum, pendulum
+
+STEP = 0.02
+
+
+def recording(angle, velocity=None, torque=None):
+    velocity = np.gradient(angle, STEP) if velocity is None else velocity
+    torque = np.zeros(len(angle) - 1) if torque is None else torque
+    return npdr.Rollouts.from_arrays(
+        [np.stack((angle, velocity), axis=1)], [torque[:, None]],
+        channel_names=("angle", "velocity"), action_names=("torque",), time_step=STEP,
+    )  # fmt: skip
+
+
+SWING = np.sin(3.0 * STEP * np.arange(400))
+
+
+def remedy(rollouts, words):
+    (found,) = [r for r in remedies(Pendulum.sensors, rollouts) if words in r.sentence]
+    return found.apply(rollouts)
+
+
+@pytest.mark.parametrize("steps", [7, -7])
+def test_a_shifted_channel_has_no_measurements_at_one_end(steps):
+    rollouts = recording(SWING)
+    moved = Shift("angle", steps)(rollouts)
+    end, inner = (slice(-7, None), slice(0, -7)) if steps > 0 else (slice(0, 7), slice(7, None))
+    assert not moved.samplings[0].is_read[end, 0].any()
+    assert moved.samplings[0].is_read[inner, 0].all() and moved.samplings[0].is_read[:, 1].all()
+    source = SWING[7:] if steps > 0 else SWING[:-7]
+    assert np.array_equal(moved.readings[0][inner, 0], source)
+    assert moved.spans == (((0, 392),),) if steps > 0 else moved.spans == (((7, 399),),)
+
+
+@pytest.mark.parametrize("steps", [7, -7])
+def test_where_shifted_commands_are_not_known_the_recording_is_not_usable(steps):
+    torque = np.arange(399.0)
+    moved = Shift(None, steps)(recording(SWING, torque=torque))
+    ((span,),) = moved.spans
+    assert span == ((0, 392) if steps > 0 else (7, 399))
+    inner = moved.actions[0][slice(*span), 0]
+    assert np.array_equal(inner, torque[slice(*span)] + steps)
+
+
+def test_limits_are_left_out_and_what_was_left_out_before_stays_so():
+    rollouts = recording(np.clip(SWING, -0.8, 0.8), 3.0 * np.cos(3.0 * STEP * np.arange(400)))
+    rollouts = dataclasses.replace(rollouts, stretches=(((0, 20), (21, 399)),))
+    found = remedy(rollouts, "angle looks clipped")
+    is_read = found.samplings[0].is_read[:, 0]
+    assert np.array_equal(~is_read, np.abs(rollouts.readings[0][:, 0]) == 0.8)
+    assert not any(first <= 20 < end for first, end in found.spans[0])
+    assert np.abs(found.readings[0][~is_read, 0]).max() < 0.8
+
+
+@pytest.mark.parametrize("name", ["angle", "velocity"])
+def test_signs_are_restored_from_the_other_channel(name):
+    true = recording(SWING, 3.0 * np.cos(3.0 * STEP * np.arange(400)))
+    column = true.channel_names.index(name)
+    values = [readings.copy() for readings in true.readings]
+    values[0][:, column] = np.abs(values[0][:, column])
+    found = remedy(dataclasses.replace(true, readings=tuple(values)), f"{name} looks recorded wi")
+    same = np.sign(found.readings[0][:, column]) == np.sign(true.readings[0][:, column])
+    # 8 s at 3 rad/s have eight zero crossings; the sample beside each may fall on either side.
+    assert (~same).sum() <= 8
+
+
+def test_strict_refuses_faults_and_nothing_else():
+    rng = np.random.default_rng(0)
+    angle = SWING + rng.normal(0.0, 1e-4, 400)
+    velocity = 3.0 * np.cos(3.0 * STEP * np.arange(400)) + rng.normal(0.0, 1e-3, 400)
+    # The torque that makes a rod of 1 kg and 1 m swing like this.
+    torque = -9.0 / 3.0 * SWING[:-1] + 0.5 * 9.81 * np.sin(SWING[:-1])
+    sound = dataclasses.replace(recording(angle, velocity, torque), notes=("Rates differ.",))
+    strict = npdr.DataOptions(strict=True)
+    assert repair(pendulum, sound, strict).rollouts.notes == ("Rates differ.",)
+    velocity[200] += 3.0
+    spoilt = recording(angle, velocity, torque)
+    with pytest.raises(DataError, match="one measurement of velocity left out"):
+        repair(pendulum, spoilt, strict)
+    assert len(repair(pendulum, spoilt, npdr.DataOptions()).rollouts.notes) == 1
