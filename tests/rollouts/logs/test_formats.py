@@ -365,7 +365,7 @@ MSG: pkg/Empty
     known = definitions("pkg/msg/Outer", text)
     for is_little in (True, False):
         data = bytes(types.serialize_cdr(message, "pkg/msg/Outer", little_endian=is_little))
-        assert decode(data, "pkg/msg/Outer", known)[0] == expected
+        assert decode(data, "pkg/Outer", known)[0] == expected
 
 
 # -- Folders ---------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ two tables of topics and messages are read.
 import io
 import sqlite3
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 from urllib.parse import quote
@@ -23,6 +24,7 @@ from npdr_ppl.rollouts.logs.formats.ros_messages import (
     TooManyValuesError,
     decode,
     definitions,
+    short_name,
 )
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
@@ -95,30 +97,40 @@ def read_bag_folder(path: Path, settings: LogSettings) -> Log:
 # -- Messages --------------------------------------------------------------------------------
 
 
-class _Decoders:
-    """Decoders of the message types of a log.
+@dataclass
+class _Topic:
+    """A topic of a log.
 
     Attributes:
-        skipped: Topics whose messages have too many values.
+        name: Its name.
+        kind: Name of the type of its messages.
+        decoder: Reads a message; ``None`` if its messages are not read.
     """
 
+    name: str
+    kind: str
+    decoder: Decoder | None
+
+
+class _Topics:
+    """Makes the topics of a log; those with messages of the same type share a decoder."""
+
     def __init__(self, messages: Messages) -> None:
-        self.skipped: set[str] = set()
         self._messages = messages
         self._known: dict[tuple[str, str, str, bytes], Decoder | None] = {}
 
-    def find(
-        self, topic: str, encoding: str, kind: str, schema: str, text: bytes
-    ) -> Decoder | None:
-        """Returns the decoder of a topic, ``None`` if its messages are not read.
+    def make(self, name: str, encoding: str, kind: str, schema: str, text: bytes) -> _Topic:
+        """Returns a topic.
 
         Args:
-            topic: Name of the topic, for the note that it is left out.
+            name: Its name.
             encoding: How messages are encoded, ``"cdr"`` or ``"json"``.
-            kind: Name of the type.
+            kind: Name of their type.
             schema: Language of its definition, ``"ros2msg"``.
             text: Its definition; empty for a type that comes with ROS.
         """
+        if len(name) > 200 or not name.isprintable():
+            raise DataError(f"a topic is called {rollout_checks.shown(name)}.")
         key = (encoding, kind, schema, text)
         if key not in self._known:
             if len(self._known) >= MAX_TYPES:
@@ -127,10 +139,10 @@ class _Decoders:
         found = self._known[key]
         if found is None:
             self._messages.note(
-                f"{rollout_checks.shown(topic)} was left out: messages of the type "
+                f"{rollout_checks.shown(name)} was left out: messages of the type "
                 f"{rollout_checks.shown(kind)} in {rollout_checks.shown(encoding)} are not read."
             )
-        return found
+        return _Topic(name.rstrip("/"), kind, found)
 
     def _made(self, encoding: str, kind: str, schema: str, text: bytes) -> Decoder | None:
         if encoding == "json":
@@ -143,8 +155,8 @@ class _Decoders:
         written = text.decode(errors="replace") if text.strip() else _standard(kind)
         if written is None:
             return None
-        types = definitions(kind, written)
-        return lambda data: decode(data, kind, types)
+        types, name = definitions(kind, written), short_name(kind)
+        return lambda data: decode(data, name, types)
 
 
 def _standard(kind: str) -> str | None:
@@ -159,34 +171,26 @@ def _standard(kind: str) -> str | None:
     return store.generate_msgdef(kind, ros_version=2)[0] if kind in store.fielddefs else None
 
 
-def _add(
-    messages: Messages,
-    decoders: _Decoders,
-    topic: str,
-    decoder: Decoder | None,
-    kind: str,
-    nanoseconds: int,
-    data: bytes,
-) -> None:
+def _add(messages: Messages, topic: _Topic, nanoseconds: int, data: bytes) -> None:
     """Adds a message, unless messages of its topic are not read."""
-    messages.charge(1)
-    if decoder is None or topic in decoders.skipped:
+    if topic.decoder is None:
+        messages.charge(1)
         return
-    if len(topic) > 200 or not topic.isprintable():
-        raise DataError(f"a topic is called {rollout_checks.shown(topic)}.")
     try:
-        message, count = decoder(data)
+        message, count = topic.decoder(data)
     except TooManyValuesError:
-        decoders.skipped.add(topic)
+        topic.decoder = None
         messages.note(
-            f"{rollout_checks.shown(topic)} was left out: a message has more than {MAX_VALUES} "
-            "values."
+            f"{rollout_checks.shown(topic.name)} was left out: a message has more than "
+            f"{MAX_VALUES} values."
         )
         return
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        raise DataError(f"a message of {rollout_checks.shown(topic)} is not valid JSON.") from None
-    messages.charge(count)
-    messages.add(topic.rstrip("/"), kind, nanoseconds, message)
+        raise DataError(
+            f"a message of {rollout_checks.shown(topic.name)} is not valid JSON."
+        ) from None
+    messages.charge(1 + count)
+    messages.add(topic.name, topic.kind, nanoseconds, message)
 
 
 # -- MCAP ------------------------------------------------------------------------------------
@@ -203,7 +207,8 @@ def _add_mcap(path: Path, messages: Messages) -> None:
     size = path.stat().st_size
     schemas: dict[int, Any] = {}
     channels: dict[int, Any] = {}
-    decoders = _Decoders(messages)
+    makes = _Topics(messages)
+    topics: dict[int, _Topic] = {}
     total = 0
 
     def take(record: Any) -> None:
@@ -211,17 +216,20 @@ def _add_mcap(path: Path, messages: Messages) -> None:
             schemas[record.id] = record
         elif isinstance(record, Channel):
             channels[record.id] = record
+            topics.pop(record.id, None)
         elif isinstance(record, Message):
-            channel = channels.get(record.channel_id)
-            if channel is None:
-                raise DataError("a message belongs to no channel.")
-            schema = schemas.get(channel.schema_id)
-            kind, language = (schema.name, schema.encoding) if schema else ("", "")
-            text = schema.data if schema else b""
-            encoding = channel.message_encoding
-            decoder = decoders.find(channel.topic, encoding, kind, language, text)
-            nanoseconds, data = record.log_time, record.data
-            _add(messages, decoders, channel.topic, decoder, kind, nanoseconds, data)
+            topic = topics.get(record.channel_id)
+            if topic is None:
+                channel = channels.get(record.channel_id)
+                if channel is None:
+                    raise DataError("a message belongs to no channel.")
+                schema = schemas.get(channel.schema_id)
+                kind, language = (schema.name, schema.encoding) if schema else ("", "")
+                text = schema.data if schema else b""
+                encoding = channel.message_encoding
+                topic = makes.make(channel.topic, encoding, kind, language, text)
+                topics[record.channel_id] = topic
+            _add(messages, topic, record.log_time, record.data)
         if len(schemas) > LIMITS.parts or len(channels) > LIMITS.parts:
             raise DataError(f"it has more than {LIMITS.parts} channels.")
 
@@ -401,19 +409,18 @@ def _add_rows(
                 raise DataError(f"it has more than {MAX_TYPES} types of messages.")
             if language == "ros2msg" and isinstance(text, str):
                 texts[str(kind)] = ("ros2msg", text.encode(errors="replace"))
-    decoders = _Decoders(messages)
-    topics: dict[int, tuple[str, str, Decoder | None]] = {}
+    makes = _Topics(messages)
+    topics: dict[int, _Topic] = {}
     for number, name, kind, encoding in _rows(connection, "topics"):
         if len(topics) >= LIMITS.parts:
             raise DataError(f"it has more than {LIMITS.parts} topics.")
         language, text = texts.get(str(kind), ("ros2msg", b""))
-        decoder = decoders.find(str(name), str(encoding), str(kind), language, text)
-        topics[number] = (str(name), str(kind), decoder)
-    for _, topic, nanoseconds, data in _rows(connection, "messages"):
-        if topic not in topics or type(nanoseconds) is not int or not isinstance(data, bytes):
+        topics[number] = makes.make(str(name), str(encoding), str(kind), language, text)
+    for _, number, nanoseconds, data in _rows(connection, "messages"):
+        topic = topics.get(number)
+        if topic is None or type(nanoseconds) is not int or not isinstance(data, bytes):
             raise DataError("a row of its messages is damaged.")
         size -= len(data)
         if size < 0:
             raise DataError("its messages have more bytes than the file.")
-        name, kind, decoder = topics[topic]
-        _add(messages, decoders, name, decoder, kind, nanoseconds, data)
+        _add(messages, topic, nanoseconds, data)

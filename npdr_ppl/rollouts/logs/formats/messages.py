@@ -1,7 +1,7 @@
 """Collects the numbers of messages as signals, one signal for each number of a topic."""
 
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,6 +22,9 @@ FREE_NUMBERS = 1_000_000
 NUMBERS_PER_BYTE = 4
 """Numbers per byte that a larger log may have. A number takes eight bytes before compression,
 which gains a factor of twenty for a robot that stands still."""
+
+_Numbers = list[tuple[str, float | None]]
+"""Numbers with their names; ``None`` for an array left out."""
 
 _NAMES = ("name", "names", "joint_names")
 """Fields that name the elements of the other arrays, as in ``sensor_msgs/JointState``."""
@@ -99,8 +102,9 @@ class Messages:
             raise DataError("a time stamp is out of range.")
         entry.received.append(nanoseconds)
         entry.stamped.append(_stamp(message))
-        names = _element_names(message)
-        for name, value in _numbers(message, names, 0):
+        numbers: _Numbers = []
+        _numbers(message, _element_names(message), 0, "", numbers)
+        for name, value in numbers:
             if value is None:
                 entry.has_long = True
                 continue
@@ -193,38 +197,38 @@ def _element_names(message: Any) -> list[str] | None:
         return None
     for key in _NAMES:
         names = message.get(key)
-        if isinstance(names, list) and names and all(isinstance(n, str) and n for n in names):
+        if names and isinstance(names, list) and all(isinstance(n, str) and n for n in names):
             is_plain = all(len(n) <= 100 and n.isprintable() for n in names)
             return names if is_plain and len(set(names)) == len(names) else None
     return None
 
 
-def _numbers(
-    value: Any, names: list[str] | None, depth: int, path: str = ""
-) -> Iterator[tuple[str, float | None]]:
-    """Yields the numbers of a message with their names; ``None`` for an array left out."""
+def _numbers(value: Any, names: list[str] | None, depth: int, path: str, found: _Numbers) -> None:
+    """Adds the numbers of a message with their names; ``None`` for an array left out."""
     if depth > MAX_NESTING:
         raise DataError(f"messages are nested more than {MAX_NESTING} deep.")
-    if isinstance(value, bool | int | float):
+    if isinstance(value, float):
+        found.append((path or "value", value))
+    elif isinstance(value, int):
         try:
-            yield path or "value", float(value)
+            found.append((path or "value", float(value)))
         except OverflowError:
-            yield path or "value", float("nan")
+            found.append((path or "value", float("nan")))
     elif isinstance(value, dict):
         for key, inner in value.items():
             if key == "header" or (key in ("stamp", "timestamp") and isinstance(inner, dict)):
                 continue
             word = str(key)[:100]
-            yield from _numbers(inner, names, depth + 1, f"{path}/{word}" if path else word)
+            _numbers(inner, names, depth + 1, f"{path}/{word}" if path else word, found)
     elif isinstance(value, list):
         if len(value) > MAX_ARRAY:
-            yield path, None
+            found.append((path, None))
             return
         is_named = names is not None and len(names) == len(value)
         for index, inner in enumerate(value):
-            if is_named and isinstance(inner, int | float):
-                yield f"{names[index]}/{path}" if names else path, float(inner)
+            if names is not None and is_named and isinstance(inner, int | float):
+                _numbers(inner, None, depth, f"{names[index]}/{path}", found)
             else:
-                yield from _numbers(inner, names, depth + 1, f"{path}.{index}")
+                _numbers(inner, names, depth + 1, f"{path}.{index}", found)
     elif value is None and path:
-        yield path, None
+        found.append((path, None))

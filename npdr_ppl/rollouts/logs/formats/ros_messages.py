@@ -23,6 +23,7 @@ __all__ = [
     "TooManyValuesError",
     "decode",
     "definitions",
+    "short_name",
 ]
 
 MAX_ARRAY = 100
@@ -45,6 +46,9 @@ _PRIMITIVES = {
     "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
     "float32": "f", "float64": "d",
 }  # fmt: skip
+
+_SIZES = {code: struct.calcsize(f"={code}") for code in _PRIMITIVES.values()}
+"""Bytes of a number by its code."""
 
 _TEXTS = ("string", "wstring")
 
@@ -157,7 +161,7 @@ def decode(data: bytes, name: str, types: Definitions) -> tuple[dict[str, Any], 
 
     Args:
         data: The message in CDR, with its header of four bytes.
-        name: Name of its type.
+        name: Name of its type, ``package/Type``.
         types: The definitions of this type and of those that it needs.
 
     Returns:
@@ -171,7 +175,7 @@ def decode(data: bytes, name: str, types: Definitions) -> tuple[dict[str, Any], 
         raise DataError("a message is not encoded in plain CDR.")
     reader = _Reader(memoryview(data)[4:], "<" if data[1] & 1 else ">", 8 if data[1] < 2 else 4)
     try:
-        message = reader.message(short_name(name), types, 0)
+        message = reader.message(name, types, 0)
         return message, reader.count
     except struct.error:
         raise DataError("a message ends too early.") from None
@@ -239,7 +243,7 @@ class _Reader:
         if count <= MAX_ARRAY:
             return list(self._numbers(code, count))
         self._align(code)
-        self._position += count * struct.calcsize(code)
+        self._position += count * _SIZES[code]
         if self._position > len(self._data):
             raise DataError("a message ends too early.")
         return None
@@ -250,9 +254,9 @@ class _Reader:
             raise TooManyValuesError
         self._align(code)
         numbers = struct.unpack_from(f"{self._order}{count}{code}", self._data, self._position)
-        self._position += count * struct.calcsize(code)
+        self._position += count * _SIZES[code]
         return numbers
 
     def _align(self, code: str) -> None:
-        size = min(struct.calcsize(code), self._widest)
+        size = min(_SIZES[code], self._widest)
         self._position += -self._position % size
