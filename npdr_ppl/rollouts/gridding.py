@@ -58,6 +58,10 @@ FEWEST_STEPS = 10
 FEWEST_SMOOTHED = 5
 """Fewest measurements that are interpolated by cubic polynomials; Akima's method needs as many."""
 
+LARGEST = 1e100
+"""Magnitude from which a number is taken for damaged bytes: nothing is measured in so small a unit,
+and products of two such numbers would overflow."""
+
 JITTER = 0.1
 """Lateness, in steps, above which it is reported; less is compensated, too."""
 
@@ -84,8 +88,9 @@ class Track:
         Args:
             time: Time stamps in s, ``(N,)``.
             values: Values, NaN where one is missing, ``(N,)``.
+                Values from ``LARGEST`` on count as missing.
         """
-        is_known = np.isfinite(values) & np.isfinite(time)
+        is_known = (np.abs(values) < LARGEST) & np.isfinite(time)
         time, first = np.unique(time[is_known], return_index=True)
         return cls(time, values[is_known][first])
 

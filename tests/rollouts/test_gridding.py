@@ -221,3 +221,14 @@ def test_parameters_of_an_unevenly_sampled_pendulum_are_found(kind):
     assert found["mass"] == pytest.approx(1.1, rel=0.01)
     assert found["length"] == pytest.approx(0.9, rel=0.005)
     assert fitted.fit.scale.tolist() == pytest.approx([1e-3, 1e-2], rel=0.3)
+
+
+def test_measurements_near_the_largest_float_count_as_missing():
+    def glitch(time):
+        values = np.sin(time)
+        values[7:9] = 1.7e308, -1.7e308
+        return values
+
+    rollouts = made([track(jittered(30), glitch)])
+    assert rollouts.samplings[0].is_read.sum() == 28
+    assert np.abs(rollouts.readings[0]).max() < 2.0
