@@ -6,11 +6,14 @@ NetCDF4 uses none of these.
 
 A small file can also describe much data: by shapes whose chunks are not stored, by chunks that
 inflate to more than they should, by texts that many elements share, and by groups that contain
-each other. All of this is refused before anything is loaded.
+each other. All of this is refused before anything is loaded. So are lists of texts whose end is
+damaged, which the HDF5 library would read for ever.
 """
 
 import math
+import mmap
 import os
+import struct
 import zlib
 from collections.abc import Iterator
 from os import PathLike
@@ -31,6 +34,14 @@ _FILTERS = (1, 2, 3)
 
 _DEFLATE = 1
 
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+_HEAP = struct.Struct("<4sB3xQ")
+"""Head of a global heap collection: its mark, version and size (HDF5 file format, III.E)."""
+
+_HEAP_OBJECT = struct.Struct("<HHIQ")
+"""Head of an object in it: index, number of references, nothing, and size."""
+
 
 def check_self_contained(path: str | PathLike[str]) -> None:
     """Checks an HDF5 file before any of its data are read.
@@ -43,6 +54,7 @@ def check_self_contained(path: str | PathLike[str]) -> None:
     import h5py
 
     size = os.stat(path).st_size
+    _check_heaps(path, size)
     needed = text = 0.0
     with h5py.File(path, "r") as file:
         for name, entry in _entries(file["/"]):
@@ -59,6 +71,42 @@ def check_self_contained(path: str | PathLike[str]) -> None:
                 _check_chunks(entry, name)
                 if _varies(entry.id.get_type()):
                     text += _text_bytes(entry, name)
+
+
+def _check_heaps(path: str | PathLike[str], size: int) -> None:
+    """Checks that reading the global heap collections, which hold the texts, comes to an end.
+
+    Free space has the index 0 and a size with its head. The library goes on by that size, so it
+    does not come to an end if the size is 0.
+    """
+    if size < 8:
+        return
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        _check_lengths(data)
+        left = size // _HEAP_OBJECT.size
+        start = data.find(b"GCOL")
+        while start >= 0 and start + _HEAP.size <= size:
+            _, version, length = _HEAP.unpack_from(data, start)
+            position, end = start + _HEAP.size, min(start + length, size)
+            while version == 1 and position + _HEAP_OBJECT.size <= end:
+                index, _, _, length = _HEAP_OBJECT.unpack_from(data, position)
+                position += length if index == 0 else _HEAP_OBJECT.size + (length + 7) // 8 * 8
+                left -= 1
+                if (index == 0 and length == 0) or left < 0:
+                    raise DataError("its texts are damaged.")
+            start = data.find(b"GCOL", start + 4)
+
+
+def _check_lengths(data: mmap.mmap) -> None:
+    """Checks that lengths take eight bytes, as in all files of NetCDF and MATLAB."""
+    start = 0
+    while start + 16 <= len(data):
+        if data[start : start + 8] == _SIGNATURE:
+            lengths = data[start + (14 if data[start + 8] < 2 else 10)]
+            if lengths in (2, 4, 16, 32):  # the library refuses all others itself
+                raise DataError(f"its lengths take {lengths} bytes instead of 8.")
+            return
+        start = 2 * start or 512
 
 
 def _entries(root: Any) -> Iterator[tuple[str, Any]]:

@@ -69,3 +69,17 @@ def test_a_damaged_posterior_gets_one_sentence(tmp_path):
     (tmp_path / "posterior.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     with pytest.raises(DataError, match="not a readable NetCDF file"):
         from_netcdf(tmp_path / "posterior.nc")
+
+
+@pytest.mark.parametrize("size", [0, 8])
+def test_texts_that_the_library_would_read_for_ever_are_refused(tmp_path, size):
+    path = tmp_path / "x.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["names"] = np.array(["a", "b"], dtype=h5py.string_dtype())
+    data = bytearray(path.read_bytes())
+    free = data.index(b"GCOL") + 16 + 2 * 24
+    assert data[free : free + 2] == b"\0\0"
+    data[free + 8 : free + 16] = size.to_bytes(8, "little")
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="texts are damaged"):
+        check_self_contained(path)

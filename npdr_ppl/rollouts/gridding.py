@@ -59,8 +59,8 @@ FEWEST_SMOOTHED = 5
 """Fewest measurements that are interpolated by cubic polynomials; Akima's method needs as many."""
 
 LARGEST = 1e100
-"""Magnitude from which a number is taken for damaged bytes: nothing is measured in so small a unit,
-and products of two such numbers would overflow."""
+"""Magnitude from which a number is taken for damaged bytes: nothing is measured in so small a
+unit, and products of two such numbers would overflow."""
 
 JITTER = 0.1
 """Lateness, in steps, above which it is reported; less is compensated, too."""
