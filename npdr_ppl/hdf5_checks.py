@@ -24,7 +24,7 @@ import numpy as np
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS, check_expansion
 
-__all__ = ["check_self_contained"]
+__all__ = ["check_self_contained", "holds_lists"]
 
 MAX_SHARED_TEXTS = 64
 """Largest number of texts in one attribute; each can be as long as the file."""
@@ -43,8 +43,14 @@ _HEAP_OBJECT = struct.Struct("<HHIQ")
 """Head of an object in it: index, number of references, nothing, and size."""
 
 
-def check_self_contained(path: str | PathLike[str]) -> None:
+def check_self_contained(path: str | PathLike[str], *, may_hold_lists: bool = False) -> None:
     """Checks an HDF5 file before any of its data are read.
+
+    Args:
+        path: The file.
+        may_hold_lists: Whether data sets and attributes may hold lists of any length, such as
+            compressed images or MATLAB's names of fields. These must not be read, since a damaged
+            list can end the process; see :func:`holds_lists`.
 
     Raises:
         DataError: The file refers to another file, has too many parts, or describes more data
@@ -58,7 +64,7 @@ def check_self_contained(path: str | PathLike[str]) -> None:
     needed = text = 0.0
     with h5py.File(path, "r") as file:
         for name, entry in _entries(file["/"]):
-            text += _attribute_bytes(entry, name, size)
+            text += _attribute_bytes(entry, name, size, may_hold_lists)
             if text > LIMITS.text_bytes:
                 raise DataError(f"its attributes take more than {LIMITS.text_bytes} bytes.")
             if isinstance(entry, h5py.Dataset):
@@ -69,7 +75,11 @@ def check_self_contained(path: str | PathLike[str]) -> None:
                 needed += _described_bytes(entry)
                 check_expansion(needed, size)
                 _check_chunks(entry, name)
-                if _varies(entry.id.get_type()):
+                kind = entry.id.get_type()
+                if holds_lists(kind):
+                    if not may_hold_lists:
+                        raise DataError(f"{_shown(name)} holds lists, which are not read.")
+                elif _varies(kind):
                     text += _text_bytes(entry, name)
 
 
@@ -141,7 +151,7 @@ def _described_bytes(entry: Any) -> float:
     return math.prod(float(n) for n in entry.shape or ()) * max(8, entry.dtype.itemsize)
 
 
-def _attribute_bytes(entry: Any, name: str, size: int) -> float:
+def _attribute_bytes(entry: Any, name: str, size: int, may_hold_lists: bool) -> float:
     """Returns the bytes of an entry's attributes, after checking that each may be read."""
     if len(entry.attrs) > LIMITS.parts:
         raise DataError(f"{_shown(name)} has more than {LIMITS.parts} attributes.")
@@ -149,6 +159,10 @@ def _attribute_bytes(entry: Any, name: str, size: int) -> float:
     for key in entry.attrs:
         attribute = entry.attrs.get_id(key)
         count = math.prod(float(n) for n in attribute.shape or ())
+        if holds_lists(attribute.get_type()):
+            if may_hold_lists:
+                continue
+            raise DataError(f"the attribute {_shown(key)} holds lists, which are not read.")
         if not _varies(attribute.get_type()):
             total += count * attribute.dtype.itemsize
         elif count > MAX_SHARED_TEXTS:
@@ -210,6 +224,22 @@ def _varies(kind: Any) -> bool:
         return _varies(kind.get_super())
     is_text = isinstance(kind, h5t.TypeStringID)
     return isinstance(kind, h5t.TypeVlenID) or (is_text and kind.is_variable_str())
+
+
+def holds_lists(kind: Any) -> bool:
+    """Returns whether values of an HDF5 type hold lists of anything but references.
+
+    Args:
+        kind: The type, as returned by ``get_type()`` of a data set's or attribute's ``id``.
+    """
+    from h5py import h5t
+
+    if isinstance(kind, h5t.TypeCompoundID):
+        return any(holds_lists(kind.get_member_type(i)) for i in range(kind.get_nmembers()))
+    if isinstance(kind, h5t.TypeArrayID):
+        return holds_lists(kind.get_super())
+    is_list = isinstance(kind, h5t.TypeVlenID)
+    return is_list and not isinstance(kind.get_super(), h5t.TypeReferenceID)
 
 
 def _lengths(value: Any) -> float:

@@ -8,6 +8,7 @@ from npdr_ppl.arviz_module import from_netcdf
 from npdr_ppl.errors import DataError
 from npdr_ppl.hdf5_checks import check_self_contained
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.logs import read_log
 
 SECRET = np.arange(21.0)
 
@@ -83,3 +84,20 @@ def test_texts_that_the_library_would_read_for_ever_are_refused(tmp_path, size):
     path.write_bytes(data)
     with pytest.raises(DataError, match="texts are damaged"):
         check_self_contained(path)
+
+
+def test_lists_are_refused_in_netcdf_and_left_out_of_logs(tmp_path):
+    path = tmp_path / "x.h5"
+    lists = h5py.vlen_dtype(np.uint8)
+    with h5py.File(path, "w") as file:
+        file["time"], file["angle"] = np.arange(20) * 0.1, np.arange(20.0)
+        ragged = np.array([np.zeros(2, "u1"), np.zeros(3, "u1")], dtype=object)
+        file["angle"].attrs.create("units", ragged, dtype=lists)
+    with pytest.raises(DataError, match="the attribute 'units' holds lists"):
+        check_self_contained(path)
+    with h5py.File(path, "a") as file:
+        del file["angle"].attrs["units"]
+        file.create_dataset("lists", (3,), lists)[0] = np.arange(4)
+    with pytest.raises(DataError, match="'lists' holds lists"):
+        check_self_contained(path)
+    assert [signal.name for signal in read_log(path).signals] == ["angle"]

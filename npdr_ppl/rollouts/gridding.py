@@ -62,6 +62,9 @@ LARGEST = 1e100
 """Magnitude from which a number is taken for damaged bytes: nothing is measured in so small a
 unit, and products of two such numbers would overflow."""
 
+RESOLUTION = 1e-9
+"""Smallest difference in s between two time stamps; logs count in nanoseconds at the finest."""
+
 JITTER = 0.1
 """Lateness, in steps, above which it is reported; less is compensated, too."""
 
@@ -83,7 +86,9 @@ class Track:
 
     @classmethod
     def of(cls, time: Array, values: Array) -> "Track":
-        """Returns the values that are known, in the order of time; of equal stamps, the first.
+        """Returns the values that are known, in the order of time.
+
+        Of stamps that differ by less than ``RESOLUTION``, only the first is taken.
 
         Args:
             time: Time stamps in s, ``(N,)``.
@@ -92,7 +97,8 @@ class Track:
         """
         is_known = (np.abs(values) < LARGEST) & np.isfinite(time)
         time, first = np.unique(time[is_known], return_index=True)
-        return cls(time, values[is_known][first])
+        is_new = np.diff(time, prepend=-np.inf) >= RESOLUTION
+        return cls(time[is_new], values[is_known][first][is_new])
 
     def __len__(self) -> int:
         return len(self.time)

@@ -104,7 +104,7 @@ def edit(old, new):
         (edit("rate", "räte").encode("latin-1"), "line 1 is not UTF-8 text"),
         (GOOD.encode() + b"\x00", "NUL bytes"),
         (b"\x89HDF\r\n\x1a\n" + bytes(range(1, 256)), "is not UTF-8 text"),
-        (GOOD.replace("0.1,", "1e-300,").replace("0.2,", "2e-300,"), "implausible"),
+        (GOOD.replace("0.1,", "1e-300,").replace("0.2,", "2e-300,"), "less than two measurements"),
         (edit("0.3", "x" * 200_000), "field larger than field limit"),
         (edit("angle", "a" * 101), "at most 100 characters"),
     ],

@@ -223,6 +223,12 @@ def test_parameters_of_an_unevenly_sampled_pendulum_are_found(kind):
     assert fitted.fit.scale.tolist() == pytest.approx([1e-3, 1e-2], rel=0.3)
 
 
+def test_stamps_that_differ_by_less_than_a_nanosecond_are_one():
+    time = jittered(30)
+    rollouts = made([track(np.sort(np.append(time, [5e-324, 1e-310])))])
+    assert rollouts.lengths == made([track(np.append(time, 0.0))]).lengths
+
+
 def test_measurements_near_the_largest_float_count_as_missing():
     def glitch(time):
         values = np.sin(time)

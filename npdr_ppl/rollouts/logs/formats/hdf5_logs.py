@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.hdf5_checks import check_self_contained
+from npdr_ppl.hdf5_checks import check_self_contained, holds_lists
 from npdr_ppl.rollouts.logs.formats.trees import Leaf, log_of_tree
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
@@ -39,7 +39,7 @@ def read_hdf5_log(path: Path, settings: LogSettings) -> Log:
     """
     import h5py
 
-    check_self_contained(path)
+    check_self_contained(path, may_hold_lists=True)
     leaves: dict[str, Leaf] = {}
 
     def visit(name: str, entry: Any) -> None:
@@ -48,7 +48,7 @@ def read_hdf5_log(path: Path, settings: LogSettings) -> Log:
             return
         if entry.dtype.kind not in "fiub" or entry.ndim not in (1, 2) or not entry.size:
             return
-        matlab = entry.attrs.get("MATLAB_class")
+        matlab = _attribute(entry, "MATLAB_class")
         if matlab is not None and bytes(np.bytes_(matlab)) not in _MATLAB_NUMBERS:
             return
         values = np.asarray(entry[()], dtype=np.float64)
@@ -62,10 +62,17 @@ def read_hdf5_log(path: Path, settings: LogSettings) -> Log:
     return log_of_tree(path.name, leaves, settings)
 
 
+def _attribute(entry: Any, key: str) -> Any:
+    """Returns an attribute; ``None`` if there is none, or if it holds lists."""
+    if key not in entry.attrs or holds_lists(entry.attrs.get_id(key).get_type()):
+        return None
+    return entry.attrs[key]
+
+
 def _unit(entry: Any) -> str:
     """Returns the unit that a data set states, ``""`` if none or no text."""
     for key in ("units", "unit"):
-        word = entry.attrs.get(key)
+        word = _attribute(entry, key)
         if isinstance(word, bytes):
             word = word.decode(errors="replace")
         if isinstance(word, str):
