@@ -84,10 +84,10 @@ def check_self_contained(path: str | PathLike[str], *, may_hold_lists: bool = Fa
 
 
 def _check_heaps(path: str | PathLike[str], size: int) -> None:
-    """Checks that reading the global heap collections, which hold the texts, comes to an end.
+    """Checks the lists of texts (global heap collections) of a file.
 
-    Free space has the index 0 and a size with its head. The library goes on by that size, so it
-    does not come to an end if the size is 0.
+    Free space in such a list has the index 0, and a size that includes its head. The library moves
+    on by this size; if it is 0, the library reads the same place for ever.
     """
     if size < 8:
         return

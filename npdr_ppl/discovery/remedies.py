@@ -136,7 +136,7 @@ class Shift:
         column = rollouts.channel_names.index(self.channel)
         # At one end the last value is repeated, which was not measured there.
         end = slice(-self.steps, None) if self.steps > 0 else slice(0, -self.steps)
-        readings, samplings, spans = [], [], []
+        readings, samplings = [], []
         for index, values in enumerate(rollouts.readings):
             known = rollouts.sampling(index)
             is_read = self._moved(known.is_read, column)
@@ -144,14 +144,7 @@ class Shift:
             lateness = np.where(is_read, self._moved(known.lateness, column), 0.0)
             readings.append(self._moved(values, column))
             samplings.append(Sampling(self._moved(known.values, column), lateness, is_read))
-            usable = spans_without_gaps(is_read[:, [column]])
-            spans.append(common(rollouts.spans[index], usable))
-        return replace(
-            rollouts,
-            readings=tuple(readings),
-            samplings=tuple(samplings),
-            stretches=tuple(spans),
-        )
+        return _with_measurements(rollouts, column, readings, samplings)
 
     def _of_commands(self, rollouts: Rollouts) -> Rollouts:
         """Returns rollouts with shifted commands; where these are not known, it is not usable."""
@@ -223,7 +216,7 @@ class _WithoutLimits:
 
     def __call__(self, rollouts: Rollouts) -> Rollouts:
         column = rollouts.channel_names.index(self.name)
-        readings, samplings, spans = [], [], []
+        readings, samplings = [], []
         for index, values in enumerate(rollouts.readings):
             known = rollouts.sampling(index)
             is_read = known.is_read.copy()
@@ -235,14 +228,7 @@ class _WithoutLimits:
             taken = np.where(is_read, known.values, filled)
             readings.append(filled)
             samplings.append(Sampling(taken, np.where(is_read, known.lateness, 0.0), is_read))
-            usable = spans_without_gaps(is_read[:, [column]])
-            spans.append(common(rollouts.spans[index], usable))
-        return replace(
-            rollouts,
-            readings=tuple(readings),
-            samplings=tuple(samplings),
-            stretches=tuple(spans),
-        )
+        return _with_measurements(rollouts, column, readings, samplings)
 
 
 @dataclass(frozen=True)
@@ -314,3 +300,19 @@ def _plateaus(rollouts: Rollouts, column: int) -> list[float]:
         if stays.sum() >= REPAIR.fewest_clipped and stays.sum() > 2 * usual * at_end.sum():
             limits.append(end)
     return limits if ends[0] < ends[1] else []
+
+
+def _with_measurements(
+    rollouts: Rollouts, column: int, readings: Sequence[np.ndarray], samplings: Sequence[Sampling]
+) -> Rollouts:
+    """Returns rollouts with other measurements; gaps of the changed column split them."""
+    spans = [
+        common(known, spans_without_gaps(sampling.is_read[:, [column]]))
+        for known, sampling in zip(rollouts.spans, samplings, strict=True)
+    ]
+    return replace(
+        rollouts,
+        readings=tuple(readings),
+        samplings=tuple(samplings),
+        stretches=tuple(spans),
+    )
