@@ -18,7 +18,8 @@ from npdr_ppl.models.effects import InputDelay
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.gridding import Track, recording_of
+from npdr_ppl.rollouts.gridding import recording_of
+from npdr_ppl.rollouts.tracks import Track
 
 DURATION = 20.0
 FINE_STEP = 0.001

@@ -10,7 +10,8 @@ import npdr_ppl as npdr
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.gridding import Track, recording_of, usual_step, without_restarts
+from npdr_ppl.rollouts.gridding import recording_of
+from npdr_ppl.rollouts.tracks import Track, usual_step, without_restarts
 
 STEP = 0.02
 
@@ -141,6 +142,24 @@ def test_clocks_that_drift_apart_are_said():
     time = STEP * np.arange(1000)
     rollouts = made([track(time * (1.0 + 1e-4))], [Track(time, np.sin(time))])
     assert "differ by 0.01 %" in rollouts.notes[0]
+
+
+@pytest.mark.parametrize("drift", [1e-4, -1e-4, 0.0])
+def test_clocks_that_drift_apart_are_said_where_a_table_repeats_commands(drift):
+    time = STEP * np.arange(1000)
+    commands = np.clip(np.sin(time), -0.9, 0.9)
+    stamps = time * (1.0 + drift)
+    every = np.unique(np.concatenate((time, stamps)))
+    held = commands[np.searchsorted(time, every, side="right") - 1]
+    said = [note for note in made([track(stamps)], [Track(every, held)]).notes if "clock" in note]
+    assert len(said) == (drift != 0.0)
+    assert not said or "differ by 0.01 %" in said[0]
+
+
+def test_commands_at_another_rate_are_not_taken_for_a_drift():
+    time = STEP * np.arange(2000)
+    slow = np.arange(0.0, time[-1], 20.83 * STEP)
+    assert not made([track(time)], [Track(slow, np.sin(slow))]).notes
 
 
 def test_a_restarted_clock_goes_on_behind_a_gap():

@@ -8,14 +8,9 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.gridding import (
-    Track,
-    recording_of,
-    stamp_notes,
-    tracks_of,
-    without_restarts,
-)
+from npdr_ppl.rollouts.gridding import recording_of, tracks_of
 from npdr_ppl.rollouts.recording import Recording
+from npdr_ppl.rollouts.tracks import Track, stamp_notes, without_restarts
 
 __all__ = ["from_table", "to_table"]
 

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.rollouts.gridding import Track, recording_of, stamp_notes, without_restarts
+from npdr_ppl.rollouts.gridding import recording_of
 from npdr_ppl.rollouts.logs.log import Signal
 from npdr_ppl.rollouts.recording import Recording
+from npdr_ppl.rollouts.tracks import Track, stamp_notes, without_restarts
 
 __all__ = ["rollouts_of"]
 
