@@ -6,8 +6,10 @@
 
 Each recording is made by another integrator than the model's, with one hidden effect. It is
 written as a CSV file with a fault, read again, and discovered with the whole catalogue. A fault is
-*said* if a note of the recording names its kind. An effect is *kept* if discovery names what it
-names without the fault. Rows that the file holds are not run again.
+*said* if a note of the recording names its kind. An effect is *kept* if discovery still names it,
+or a class that holds it, as it does without the fault; late or early stamps of the commands absorb
+a hidden delay, which nothing can tell from them, so there the shift counts as its name. Rows that
+the file holds are not run again.
 """
 
 import argparse
@@ -21,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from discovery_rows import found_names, has_all_classes
 from hidden_rigs.cases import Case, make_case
 from hidden_rigs.rigs import RIGS
 from scipy.interpolate import CubicSpline
@@ -316,20 +319,22 @@ def run(case: Case, kind: str, channel: str, seed: int) -> dict[str, Any]:
             spent = time.process_time() - begun
             return {"error": str(error), "is_said": is_said, "cpu": spent}
     effects = [e.effect.name for e in found.effects]
+    judged = {
+        "truth": list(case.names),
+        "alternatives": [list(names) for names in case.alternatives],
+        "effects": [finding.to_dict() for finding in found.effects],
+    }
+    is_absorbed = kind in ("late", "early") and "torque.input_delay" in case.names
     text = " ".join(found.problems) + " " + " ".join(effects)
     expected = KINDS[kind][1].split("|") if kind != "none" else []
     return {
-        "effects": effects,
+        **judged,
         "verdict": found.verdict,
         "notes": list(found.problems),
         "is_said": any(word in text for word in expected) if expected else not found.problems,
-        "is_found": bool(set(case.names) & set(effects)) or _is_alternative(case, effects),
+        "is_found": has_all_classes(judged) or (is_absorbed and "commands look" in text),
         "cpu": time.process_time() - begun,
     }
-
-
-def _is_alternative(case: Case, effects: list[str]) -> bool:
-    return any(set(names) <= set(effects) for names in case.alternatives)
 
 
 def summary(rows: list[dict]) -> str:
@@ -386,7 +391,7 @@ def main() -> None:
                     key,
                     channel,
                     row.get("is_said"),
-                    row.get("effects"),
+                    found_names(row),
                     row.get("notes", row.get("error")),
                     f"{row['cpu']:.0f} s",
                     flush=True,

@@ -55,7 +55,7 @@ def main() -> int:
                 cells += [row["exit_code"], row["workers_seconds"], row["seconds"]]
                 cells.append(len(row["left"]))
                 print(f"| {' | '.join(map(str, cells))} |", *row["left"], flush=True)
-                if not says:
+                if not says or row["left"]:
                     print(row["errors"], flush=True)
     return int(is_wrong or run.returncode != 0)
 

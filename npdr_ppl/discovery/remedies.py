@@ -5,6 +5,7 @@ changed in the same way.
 """
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,7 +17,7 @@ from npdr_ppl.discovery.settings import REPAIR
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.arrays import Array
-from npdr_ppl.rollouts.sampling import Sampling, common, spans_without_gaps
+from npdr_ppl.rollouts.sampling import Sampling, common, placed, spans_without_gaps
 from npdr_ppl.rollouts.simulator_checks import OTHER_UNITS
 
 __all__ = ["Remedy", "Shift", "remedies", "without_one"]
@@ -123,43 +124,48 @@ class Shift:
 
     Attributes:
         channel: Name of the channel; ``None`` for the commands.
-        steps: Number of steps.
+        steps: Number of steps, which need not be whole. Commands that are held for a step are
+            averaged over the new steps.
     """
 
     channel: str | None
-    steps: int
+    steps: float
 
     def __call__(self, rollouts: Rollouts) -> Rollouts:
         """Returns rollouts that are shifted."""
         if self.channel is None:
             return self._of_commands(rollouts)
         column = rollouts.channel_names.index(self.channel)
-        # At one end the last value is repeated, which was not measured there.
-        end = slice(-self.steps, None) if self.steps > 0 else slice(0, -self.steps)
         readings, samplings = [], []
-        for index, values in enumerate(rollouts.readings):
-            known = rollouts.sampling(index)
-            is_read = self._moved(known.is_read, column)
-            is_read[end, column] = False
-            lateness = np.where(is_read, self._moved(known.lateness, column), 0.0)
-            readings.append(self._moved(values, column))
-            samplings.append(Sampling(self._moved(known.values, column), lateness, is_read))
+        for index, time in enumerate(rollouts.time):
+            known, filled = rollouts.sampling(index), np.array(rollouts.readings[index])
+            values, lateness = np.array(known.values), np.array(known.lateness)
+            is_read, taken = np.array(known.is_read), known.is_read[:, column]
+            if taken.any():
+                rows = np.arange(len(time), dtype=np.float64)
+                at = rows[taken] + lateness[taken, column] - self.steps
+                measured = values[taken, column]
+                found, lateness[:, column], is_read[:, column] = placed(at, measured, rows)
+                filled[:, column] = np.interp(rows, at, measured)
+                values[:, column] = np.where(is_read[:, column], found, filled[:, column])
+            readings.append(filled)
+            samplings.append(Sampling(values, lateness, is_read))
         return _with_measurements(rollouts, column, readings, samplings)
 
     def _of_commands(self, rollouts: Rollouts) -> Rollouts:
         """Returns rollouts with shifted commands; where these are not known, it is not usable."""
-        first, cut = max(0, -self.steps), max(0, self.steps)
+        whole = math.floor(self.steps)
+        part = self.steps - whole
+        first, cut = max(0, -whole), max(0, math.ceil(self.steps))
         known = [((first, length - cut),) for length in rollouts.lengths]
         return replace(
             rollouts,
-            actions=tuple(_shifted(actions, self.steps) for actions in rollouts.actions),
+            actions=tuple(
+                (1.0 - part) * _shifted(actions, whole) + part * _shifted(actions, whole + 1)
+                for actions in rollouts.actions
+            ),
             stretches=tuple(map(common, rollouts.spans, known)),
         )
-
-    def _moved(self, table: NDArray[Any], column: int) -> NDArray[Any]:
-        result = table.copy()
-        result[:, column] = _shifted(table[:, column], self.steps)
-        return result
 
     @property
     def remedy(self) -> Remedy:
@@ -168,9 +174,9 @@ class Shift:
         if self.channel is None:
             name = "The time stamps of the commands look"
         when = "late" if self.steps > 0 else "early"
-        return Remedy(f"{name} about {abs(self.steps)} steps too {when}; shifted.", self)
+        return Remedy(f"{name} about {abs(self.steps):.4g} steps too {when}; shifted.", self)
 
-    def by(self, steps: int) -> Remedy:
+    def by(self, steps: float) -> Remedy:
         """Returns the remedy that moves some steps more."""
         return Shift(self.channel, self.steps + steps).remedy
 
@@ -256,6 +262,8 @@ def _changed(rollouts: Rollouts, change: Callable[[Array], Array]) -> Rollouts:
 def _shifted(values: NDArray[Any], steps: int) -> NDArray[Any]:
     """Returns values some rows earlier, or later if negative; the ends are repeated."""
     size = abs(steps)
+    if size == 0:
+        return values
     if steps > 0:
         return np.concatenate((values[size:], np.repeat(values[-1:], size, 0)))
     return np.concatenate((np.repeat(values[:1], size, 0), values[:-size]))

@@ -28,9 +28,10 @@ class FaultSettings:
         least_steps: Least number of steps of a stretch that is checked.
         most_lost: If more than this share of the steps are jumps, they are taken for the device's
             motion.
-        frozen_share: Least change, as a share of the channel's range, that a frozen channel should
-            have made.
-        frozen_change: The same in medians of its changes that are not zero; both are exceeded.
+        frozen_change: Least change that a frozen channel should have made, in medians of its
+            changes that are not zero.
+        frozen_share: Least root-mean-square rate of a frozen position, as a share of its fastest;
+            less may be the bias of the rate's sensor.
         least_freeze: Least number of equal measurements of a frozen channel.
     """
 
@@ -43,8 +44,8 @@ class FaultSettings:
     rest_change: float = 0.01
     least_steps: int = 20
     most_lost: float = 0.02
-    frozen_share: float = 0.1
     frozen_change: float = 4.0
+    frozen_share: float = 0.1
     least_freeze: int = 10
 
     def __post_init__(self) -> None:

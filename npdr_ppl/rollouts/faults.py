@@ -144,8 +144,9 @@ class _Faults:
                 continue
             for column in columns:
                 self._leave_out_spikes(first, end, column)
-            for column in columns:
-                self._leave_out_freezes(first, end, column, columns)
+            # Rates first: a position is not frozen because a frozen rate says that it moves.
+            for column in sorted(columns, key=lambda column: column in self._rate_of):
+                self._leave_out_freezes(first, end, column)
             lost += self._lost_samples(first, end, columns)
         self.sampling, self.spans = sampling, rollouts.spans[index]
         if self.notes:
@@ -185,9 +186,7 @@ class _Faults:
             f"{self._time(int(rows[0]))}."
         )
 
-    def _leave_out_freezes(
-        self, first: int, end: int, column: int, columns: Sequence[int]
-    ) -> None:
+    def _leave_out_freezes(self, first: int, end: int, column: int) -> None:
         rows = slice(first, end + 1)
         if column in self._rate_of:
             found = self._frozen_positions(rows, column, self._rate_of[column])
@@ -224,9 +223,10 @@ class _Faults:
 
     def _frozen_positions(self, rows: slice, column: int, rate: int) -> list[tuple[int, int]]:
         """Returns stretches in which a position stays, but its rate says that it moves."""
-        values, rates = self._values[rows, column], self._values[rows, rate]
+        values = self._values[rows, column]
+        rates = np.where(self._is_read[rows, rate], self._values[rows, rate], 0.0)
         moved = self._step * np.cumsum(rates)
-        least, fastest = _noticeable(values), float(np.abs(rates).max())
+        least, fastest = FAULTS.frozen_change * _usual_change(values), float(np.abs(rates).max())
         return [
             (begin, stop)
             for begin, stop in _constant(values)
@@ -238,13 +238,18 @@ class _Faults:
     def _frozen_rates(self, rows: slice, column: int, position: int) -> list[tuple[int, int]]:
         """Returns stretches in which a rate stays, but its position says that it changes."""
         values, positions = self._values[rows, column], self._values[rows, position]
-        least = _noticeable(positions)
+        noise = np.sqrt(np.square(np.diff(positions, n=2)).mean() / 6.0)
+        least = FAULTS.frozen_change * _usual_change(values)
 
-        def departure(begin: int, stop: int) -> float:
-            moved = values[begin] * self._step * np.arange(stop - begin)
-            return float(np.abs(positions[begin:stop] - positions[begin] - moved).max())
+        def is_frozen(begin: int, stop: int) -> bool:
+            half = (stop - begin) // 2
+            time = self._step * (np.arange(half) - (half - 1) / 2.0)
+            parts = positions[begin : begin + half], positions[stop - half : stop]
+            first, second = (float(time @ part / (time @ time)) for part in parts)
+            error = noise * np.sqrt(2.0 / (time @ time))
+            return abs(second - first) > max(least, FAULTS.joint_departure * error)
 
-        return [span for span in _constant(values) if departure(*span) > least]
+        return [span for span in _constant(values) if is_frozen(*span)]
 
     def _pairs_in(self, columns: Sequence[int]) -> list[tuple[int, int]]:
         """Returns places of positions and of their rates among columns."""
@@ -329,8 +334,7 @@ def _constant(values: Array) -> list[tuple[int, int]]:
     return [span for span in spans if span[1] - span[0] >= FAULTS.least_freeze]
 
 
-def _noticeable(positions: Array) -> float:
-    """Returns the displacement from which on a position has moved."""
-    changes = np.abs(np.diff(positions))
-    usual = float(np.median(changes[changes > 0])) if changes.any() else np.inf
-    return max(FAULTS.frozen_share * float(np.ptp(positions)), FAULTS.frozen_change * usual)
+def _usual_change(values: Array) -> float:
+    """Returns the usual change of a channel from one measurement to the next, if it changes."""
+    changes = np.abs(np.diff(values))
+    return float(np.median(changes[changes > 0])) if changes.any() else np.inf

@@ -53,6 +53,21 @@ def test_where_shifted_commands_are_not_known_the_recording_is_not_usable(steps)
     assert np.array_equal(inner, torque[slice(*span)] + steps)
 
 
+@pytest.mark.parametrize("steps", [2.3, -2.3])
+def test_shifts_need_not_be_whole_steps(steps):
+    wave = recording(SWING, torque=np.arange(399.0))
+    moved = Shift("angle", steps)(wave)
+    time = STEP * (np.arange(400) + moved.samplings[0].lateness[:, 0] + steps)
+    inner = slice(5, -5)
+    assert moved.samplings[0].is_read[inner, 0].all()
+    assert moved.samplings[0].values[inner, 0] == pytest.approx(np.sin(3.0 * time)[inner])
+    shifted = Shift(None, steps)(wave)
+    (((first, end),),) = shifted.spans
+    assert (first, end) == ((0, 396) if steps > 0 else (3, 399))
+    expected = np.arange(399.0)[first:end] + steps
+    assert shifted.actions[0][first:end, 0] == pytest.approx(expected)
+
+
 def test_limits_are_left_out_and_what_was_left_out_before_stays_so():
     rollouts = recording(np.clip(SWING, -0.8, 0.8), 3.0 * np.cos(3.0 * STEP * np.arange(400)))
     rollouts = dataclasses.replace(rollouts, stretches=(((0, 20), (21, 399)),))

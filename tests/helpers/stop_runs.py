@@ -74,7 +74,7 @@ def start(folder, executor):
     """Starts a fit on two workers."""
     environment = os.environ | {
         "PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1", "RAY_USAGE_STATS_ENABLED": "0",
-        "OMP_NUM_THREADS": "1", "LOKY_MAX_CPU_COUNT": "2",
+        "OMP_NUM_THREADS": "1", "LOKY_MAX_CPU_COUNT": "2", "PYTHONFAULTHANDLER": "1",
     }  # fmt: skip
     workers = () if executor == "serial" else ("--workers", "2")
     with (folder / "errors").open("w") as errors:
@@ -135,8 +135,13 @@ def stop(folder, executor, number, seconds, limit):
     seconds_left = time.monotonic() - sent
     if workers_seconds is None:
         workers_seconds = seconds_left
+    if run.pid in left:
+        run.send_signal(signal.SIGABRT)  # writes where it hangs to its errors
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            run.wait(2.0)
     for process in left:
-        os.kill(process, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
     run.wait()
     with contextlib.suppress(ChildProcessError):  # those adopted from the run
         while os.waitpid(-1, 0):
