@@ -8,7 +8,13 @@ from typing import Any
 import typer
 
 from npdr_ppl.cli import compare, demo, discover, fit, listings, logs, report, reproduce, train
-from npdr_ppl.cli.manners import INTERRUPTIONS, Stopped, stop_on_signals
+from npdr_ppl.cli.manners import (
+    INTERRUPTIONS,
+    Commands,
+    Interrupted,
+    exit_code,
+    stop_on_signals,
+)
 from npdr_ppl.errors import NpdrError
 
 __all__ = ["app", "main", "run"]
@@ -21,6 +27,7 @@ _UsageError: Any = typer.BadParameter.__bases__[0]
 
 app = typer.Typer(
     name="npdr",
+    cls=Commands,
     help="Probabilistic programming for robot simulators.",
     no_args_is_help=True,
     add_completion=True,
@@ -52,9 +59,9 @@ def main() -> None:
     try:
         with stop_on_signals():
             sys.exit(_run() or 0)
-    except Stopped as stop:
+    except (Interrupted, KeyboardInterrupt):
         typer.echo("npdr: interrupted.", err=True)
-        sys.exit(stop.exit_code)
+        sys.exit(exit_code())
     except _UsageError as error:
         where = error.ctx.command_path if error.ctx else "npdr"
         _refuse(f"{_sentence(error.format_message())} See {where} --help.")

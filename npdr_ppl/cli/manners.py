@@ -10,14 +10,18 @@ from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 __all__ = [
     "INTERRUPTED",
     "INTERRUPTIONS",
     "AsJson",
+    "Commands",
+    "Interrupted",
     "Quiet",
     "Stopped",
     "Verbose",
+    "exit_code",
     "resumable",
     "stop_on_signals",
 ]
@@ -35,18 +39,37 @@ AGAIN_SECONDS = 0.05
 """Seconds until a dropped signal is sent again. The finaliser should have returned by then."""
 
 
-class Stopped(BaseException):
+_received: list[int] = []
+"""Numbers of the signals that came. Ray replaces :class:`Stopped` by a bare exception."""
+
+
+class Stopped(KeyboardInterrupt):
     """SIGTERM, or SIGHUP from a closed terminal, came; it is handled like Ctrl-C.
+
+    It is a ``KeyboardInterrupt`` because Ray's compiled code waits on after any other exception.
 
     Attributes:
         number: Number of the signal.
-        exit_code: Exit code, the same as in shells: 128 plus the signal's number.
     """
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
         self.number = number
-        self.exit_code = 128 + number
+
+
+class Interrupted(BaseException):
+    """A command was interrupted. typer would make an exit code of a ``KeyboardInterrupt``."""
+
+
+class Commands(TyperGroup):
+    """Commands that pass on interruptions as :class:`Interrupted`."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs the command."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise Interrupted from error
 
 
 @contextmanager
@@ -56,6 +79,7 @@ def stop_on_signals() -> Iterator[None]:
     Python drops exceptions in finalisers and around a fork. If it drops :class:`Stopped`, the
     signal is sent again, until the exception reaches the command.
     """
+    _received.clear()
     replaced = {}
     before = sys.unraisablehook
     timers: list[threading.Timer] = []
@@ -88,7 +112,13 @@ def stop_on_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def exit_code() -> int:
+    """Returns the exit code after an interruption, the same as in shells."""
+    return 128 + _received[-1] if _received else INTERRUPTED
+
+
 def _stop(number: int, frame: Any) -> None:
+    _received.append(number)
     signal.signal(number, signal.SIG_DFL)  # a second signal ends the process at once
     raise Stopped(number)
 
@@ -122,20 +152,18 @@ def resumable(how: str) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        cause = _interruption(error)
-        if cause is None:
+        if not _is_interruption(error):
             raise
         typer.echo(f"npdr: interrupted; {how}", err=True)
-        code = cause.exit_code if isinstance(cause, Stopped) else INTERRUPTED
-        raise typer.Exit(code) from None
+        raise typer.Exit(exit_code()) from None
 
 
-def _interruption(error: BaseException | None) -> KeyboardInterrupt | Stopped | None:
-    """Returns the interruption that an error is, or that compiled code disguised; else ``None``.
+def _is_interruption(error: BaseException | None) -> bool:
+    """Returns whether an error is an interruption, or one that compiled code disguised.
 
     Compiled code, such as Ray's, may turn an interruption into a ``SystemError``. Other errors
     that follow an interruption, such as a device that cannot be switched off, remain errors.
     """
     while isinstance(error, SystemError):
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
-    return error if isinstance(error, KeyboardInterrupt | Stopped) else None
+    return isinstance(error, KeyboardInterrupt)

@@ -13,7 +13,7 @@ import pytest
 import typer
 
 from npdr_ppl.cli.main import main, run
-from npdr_ppl.cli.manners import Stopped, resumable, stop_on_signals
+from npdr_ppl.cli.manners import Commands, Stopped, resumable, stop_on_signals
 from npdr_ppl.engines.workers import Pool, WorkerOptions
 from tests.helpers.pool_tasks import StartsPrograms
 
@@ -122,18 +122,6 @@ def test_a_signal_that_python_drops_comes_again(capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_an_interruption_that_compiled_code_disguised_is_one(capsys):
-    with pytest.raises(typer.Exit) as stop, resumable("do it again."):
-        try:
-            raise Stopped(signal.SIGTERM)
-        except Stopped as error:
-            raise SystemError("returned a result with an exception set") from error
-    assert stop.value.exit_code == 143
-    assert capsys.readouterr().err == "npdr: interrupted; do it again.\n"
-    with pytest.raises(SystemError, match="another"), resumable("do it again."):
-        raise SystemError("another")
-
-
 def test_an_error_that_follows_an_interruption_is_not_hidden_by_it():
     with pytest.raises(OSError, match="cannot be switched off"), resumable("do it again."):
         try:
@@ -151,15 +139,57 @@ def test_ignored_signals_stay_ignored():
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_signal_where_nothing_was_begun_gets_a_sentence(capsys, monkeypatch):
-    def stopped(**options):
-        raise Stopped(signal.SIGTERM)
+def ended(monkeypatch, command):
+    """Runs the program with one command, which a signal ends; returns its exit code."""
+    app = typer.Typer(cls=Commands, add_completion=False)
+    app.callback()(lambda: None)
+    app.command("wait")(command)
+    monkeypatch.setattr("npdr_ppl.cli.main.app", app)
+    monkeypatch.setattr("sys.argv", ["npdr", "wait"])
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        with pytest.raises(SystemExit) as stop:
+            main()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    return stop.value.code
 
-    monkeypatch.setattr("npdr_ppl.cli.main.app", stopped)
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 143
+
+def test_a_signal_where_nothing_was_begun_gets_a_sentence(capsys, monkeypatch):
+    def wait():
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(10.0)
+
+    assert ended(monkeypatch, wait) == 143
     assert capsys.readouterr().err == "npdr: interrupted.\n"
+
+
+def test_an_interruption_that_ray_replaces_keeps_its_exit_code(capsys, monkeypatch):
+    def wait():
+        with resumable("do it again."):
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(10.0)
+            except KeyboardInterrupt:  # Ray lets nothing else end a call, and raises a new one
+                raise KeyboardInterrupt from None
+
+    assert ended(monkeypatch, wait) == 143
+    assert capsys.readouterr().err == "npdr: interrupted; do it again.\n"
+
+
+def test_an_interruption_that_compiled_code_disguised_is_one(capsys, monkeypatch):
+    def wait():
+        with resumable("do it again."):
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(10.0)
+            except Stopped as error:
+                raise SystemError("returned a result with an exception set") from error
+
+    assert ended(monkeypatch, wait) == 143
+    assert capsys.readouterr().err == "npdr: interrupted; do it again.\n"
+    with pytest.raises(SystemError, match="another"), resumable("do it again."):
+        raise SystemError("another")
 
 
 def test_an_interrupted_program_ends_at_once(monkeypatch):

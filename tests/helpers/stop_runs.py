@@ -151,7 +151,7 @@ def stop(folder, executor, number, seconds, limit):
         "was_alive": was_alive, "running": running, "exit_code": run.returncode,
         "workers_seconds": round(workers_seconds, 2), "seconds": round(seconds_left, 2),
         "left": sorted(left.values()),
-        "errors": (folder / "errors").read_text()[-3000:],
+        "errors": (folder / "errors").read_text()[:20_000],
     }  # fmt: skip
 
 
