@@ -44,22 +44,28 @@ def without_faults(rollouts: Rollouts, channels: Sequence[Channel]) -> Rollouts:
         columns[rate.name]: columns[rate.rate_of] for rate in channels if rate.rate_of in columns
     }
     limits = {column: _limits(rollouts, column) for column in columns.values()}
-    samplings, spans, notes = [], [], []
-    for index in range(len(rollouts)):
-        found = _Faults(rollouts, index, [*columns.values()], partners, limits)
-        samplings.append(found.sampling)
-        spans.append(found.spans)
-        notes += found.notes
+
+    def search(clipped: frozenset[int]) -> list[_Faults]:
+        every = range(len(rollouts))
+        return [
+            _Faults(rollouts, k, [*columns.values()], partners, limits, clipped) for k in every
+        ]
+
+    found = search(frozenset())
+    # Where one plateau is certainly wrong, the others at the same limit are, too.
+    if clipped := frozenset[int]().union(*(part.clipped for part in found)):
+        found = search(clipped)
+    notes = [note for part in found for note in part.notes]
     if not notes:
         return rollouts
     return replace(
         rollouts,
         readings=tuple(
-            np.where(sampling.is_read, readings, sampling.values)
-            for sampling, readings in zip(samplings, rollouts.readings, strict=True)
+            np.where(part.sampling.is_read, readings, part.sampling.values)
+            for part, readings in zip(found, rollouts.readings, strict=True)
         ),
-        samplings=tuple(samplings),
-        stretches=tuple(spans),
+        samplings=tuple(part.sampling for part in found),
+        stretches=tuple(part.spans for part in found),
         notes=(*rollouts.notes, *notes),
     )
 
@@ -118,6 +124,7 @@ class _Faults:
         sampling: The measurements without those that are wrong.
         spans: The usable stretches.
         notes: What was left out, a sentence each.
+        clipped: Columns of channels that are clipped.
     """
 
     def __init__(
@@ -127,8 +134,10 @@ class _Faults:
         columns: Sequence[int],
         position_of: Mapping[int, int],
         limits: Mapping[int, tuple[float, float]],
+        clipped: frozenset[int],
     ) -> None:
         self.notes: list[str] = []
+        self.clipped = set(clipped)
         self._position_of = position_of
         self._limits = limits
         self._rate_of = {position: rate for rate, position in position_of.items()}
@@ -212,8 +221,9 @@ class _Faults:
         """
         values, limits = self._values[rows, column], self._limits[column]
         others = [span for span in found if values[span[0]] not in limits]
-        if len(others) < len(found):
-            at_limit = np.isin(values, limits)
+        at_limit = np.isin(values, limits)
+        if len(others) < len(found) or (column in self.clipped and at_limit.any()):
+            self.clipped.add(column)
             self._is_read[rows, column] &= ~at_limit
             self.notes.append(
                 f"{self._where}: {self._names[column]} looks clipped; {int(at_limit.sum())} "
@@ -244,10 +254,11 @@ class _Faults:
         def is_frozen(begin: int, stop: int) -> bool:
             half = (stop - begin) // 2
             time = self._step * (np.arange(half) - (half - 1) / 2.0)
-            parts = positions[begin : begin + half], positions[stop - half : stop]
-            first, second = (float(time @ part / (time @ time)) for part in parts)
+            # A rate that rises and falls shows in the middle.
+            firsts = begin, (begin + stop - half) // 2, stop - half
+            slopes = [time @ positions[first : first + half] / (time @ time) for first in firsts]
             error = noise * np.sqrt(2.0 / (time @ time))
-            return abs(second - first) > max(least, FAULTS.joint_departure * error)
+            return bool(np.ptp(slopes) > max(least, FAULTS.joint_departure * error))
 
         return [span for span in _constant(values) if is_frozen(*span)]
 

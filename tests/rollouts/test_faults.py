@@ -130,6 +130,34 @@ def test_a_dead_rate_is_not_used():
     assert found.notes == ("velocity never changes, although angle does; it is not used.",)
 
 
+@pytest.mark.parametrize("begin", [130, 150, 170, 220, 240])
+def test_a_rate_is_frozen_if_its_position_bends(begin):
+    angle, velocity = swing()
+    velocity[begin : begin + 30] = velocity[begin]
+    (note,) = without_faults(recording(angle, velocity), CHANNELS).notes
+    first, last = STEP * begin, STEP * (begin + 30)
+    assert note == f"Rollout 0: velocity is frozen from {first:.4g} s to {last:.4g} s; left out."
+
+
+def test_what_a_frozen_rate_says_does_not_freeze_its_position():
+    angle, velocity = swing()
+    angle = np.round(angle / 0.02) * 0.02  # stands for twenty rows where it turns
+    velocity[235:285] = velocity[235]
+    (note,) = without_faults(recording(angle, velocity), CHANNELS).notes
+    assert "velocity is frozen" in note
+
+
+def test_a_limit_that_is_wrong_in_one_rollout_is_left_out_of_all():
+    angle, velocity = swing()
+    clipped = np.clip(velocity, -2.0, 2.0)
+    part = slice(22, 82)  # six rows at the limit
+    both = recording(angle, clipped).concatenate(recording(angle[part], clipped[part]))
+    found = without_faults(both, CHANNELS)
+    for sampling in found.samplings:
+        assert sampling.is_read[:, 0].all()
+        assert np.abs(sampling.values[sampling.is_read[:, 1], 1]).max() < 2.0
+
+
 def test_a_clipped_channel_can_freeze_as_well():
     angle, velocity = swing()
     angle[100:200] = angle[100]
