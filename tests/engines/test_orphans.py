@@ -15,6 +15,7 @@ import typer
 from npdr_ppl.cli.main import main, run
 from npdr_ppl.cli.manners import Commands, Stopped, resumable, stop_on_signals
 from npdr_ppl.engines.workers import Pool, WorkerOptions
+from npdr_ppl.engines.workers.guard import guarded_cluster
 from tests.helpers.pool_tasks import StartsPrograms
 
 ROOT = Path(__file__).parents[2]
@@ -204,3 +205,39 @@ def test_an_interrupted_program_ends_at_once(monkeypatch):
     monkeypatch.setattr("npdr_ppl.cli.main.logging.shutdown", lambda: None)
     with pytest.raises(TimeoutError, match="143"):
         run()
+
+
+def orphan(*words):
+    """Starts a program that sleeps and whose parent has ended; returns its process number."""
+    code = (
+        "import subprocess, sys;"
+        "print(subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL).pid, flush=True)"
+    )
+    sleep = [sys.executable, "-c", "import time; time.sleep(60)", *words]
+    started = subprocess.run(
+        [sys.executable, "-c", code, *sleep], stdout=subprocess.PIPE, check=True, text=True
+    )
+    return int(started.stdout)
+
+
+def has_ended(process):
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return True
+    return state == "Z"
+
+
+@on_linux
+def test_ray_workers_end_with_their_cluster_although_nothing_links_them_to_it():
+    session = "/tmp/ray/session_2026-01-02_03-04-05_678901_23"
+    sleep = [sys.executable, "-c", "import time; time.sleep(60)"]
+    late, other = orphan("/ray/_private/worker.py", session), orphan("/ray/_private/worker.py")
+    with subprocess.Popen([*sleep, "/ray/core/raylet", session]) as cluster:
+        with guarded_cluster():
+            time.sleep(2.0)
+        assert cluster.wait(5.0) == -signal.SIGKILL
+    try:
+        assert has_ended(late) and not has_ended(other)
+    finally:
+        os.kill(other, signal.SIGKILL)

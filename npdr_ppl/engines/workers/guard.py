@@ -11,6 +11,7 @@ worker above them, and end the programs that simulations have started.
 
 import contextlib
 import os
+import re
 import select
 import signal
 import subprocess
@@ -29,6 +30,12 @@ MOST_ROUNDS = 50
 
 RAY = b"/ray/"
 """Part of the command line of a cluster's own processes: the folder of the package."""
+
+WORKER = b"/ray/_private/"
+"""Part of the command line of a cluster's processes that are written in Python."""
+
+SESSION = re.compile(rb"session_[0-9][0-9_-]+")
+"""Name of a cluster's session in the command lines of its processes."""
 
 TEMPLATE = b"npdr_ppl.engines.workers.template"
 """Part of the command line of a template."""
@@ -67,6 +74,12 @@ def _command_line(process: int) -> bytes:
     return b""
 
 
+def _is_worker(process: int, session: bytes) -> bool:
+    """Returns whether a process runs a program of Ray for a session."""
+    words = _command_line(process)
+    return session in words and WORKER in words
+
+
 def _below(roots: set[int], processes: dict[int, tuple[int, str]]) -> set[int]:
     """Returns processes with their descendants, without templates and what is below them."""
     found = new = set(roots)
@@ -84,15 +97,20 @@ def main() -> None:
     """Runs the guard; its argument is the number of the process that starts the cluster."""
     parent = int(sys.argv[1])
     known: dict[int, str] = {}
+    session = b""
     while True:
         processes = _processes()
         roots = {p for p, (above, _) in processes.items() if above == parent}
         roots = {p for p in roots if RAY in _command_line(p) and p != os.getpid()}
         known |= {p: processes[p][1] for p in _below(roots, processes)}
+        if not session and (named := SESSION.search(b" ".join(map(_command_line, roots)))):
+            session = named.group()
         if select.select([0], [], [], INTERVAL)[0] and not os.read(0, 1):
             break
     for _ in range(MOST_ROUNDS):
         processes = _processes()
+        if session:  # the parent of workers that started since the last list may have ended
+            known |= {p: start for p, (_, start) in processes.items() if _is_worker(p, session)}
         alive = {p for p, start in known.items() if processes.get(p, (0, ""))[1] == start}
         if not alive:
             break
