@@ -53,6 +53,9 @@ def main():
     import pyarrow.parquet  # noqa: F401
     import pybullet  # noqa: F401
     import xarray  # noqa: F401
+    from rosbags.typesys import Stores, get_typestore
+
+    get_typestore(Stores.ROS2_HUMBLE)
 
     import npdr_ppl
     import npdr_ppl.cli.main

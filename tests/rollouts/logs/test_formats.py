@@ -319,7 +319,7 @@ def test_a_clock_of_its_own_is_noticed(tmp_path):
 
 def test_all_types_of_numbers_are_decoded():
     """The decoder agrees with the library's encoder for every type, byte order and nesting."""
-    from npdr_ppl.rollouts.logs.formats.ros_messages import decode, definitions
+    from npdr_ppl.rollouts.logs.formats.ros_messages import decode, definitions, layout
 
     types = store()
     text = """# a comment
@@ -366,6 +366,43 @@ MSG: pkg/Empty
     for is_little in (True, False):
         data = bytes(types.serialize_cdr(message, "pkg/msg/Outer", little_endian=is_little))
         assert decode(data, "pkg/Outer", known)[0] == expected
+        alike = layout(data, "pkg/Outer", known)
+        assert alike.numbers(data) == (
+            True, -5, 1, 2, 65535, 7, 0.25, 2**62, -1, 0.0, 0.5, 1.0, -3, 5, 0, 2**64 - 1
+        )  # fmt: skip
+        assert alike.places["inner"][1] == {"x": 10, "names": ["a"]}
+        other = data.replace(b"hi", b"ho")
+        assert other != data and alike.numbers(other) is None
+
+
+def test_messages_of_one_layout_read_as_each_by_itself(monkeypatch, tmp_path):
+    """Arrays that grow and names that change begin a new layout."""
+    from mcap_ros2.writer import Writer
+
+    from npdr_ppl.rollouts.logs.formats import bag_logs
+
+    kind = "sensor_msgs/msg/JointState"
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        schema = writer.register_msgdef(kind, store().generate_msgdef(kind, ros_version=2)[0])
+        for index in range(60):
+            num = 1 + index // 10 % 3
+            message = {
+                "header": {"stamp": {"sec": index, "nanosec": 7 * index}, "frame_id": ""},
+                "name": [f"{'ab'[index // 30]}{k}" for k in range(num)],
+                "position": [index + 0.1 * k for k in range(num)],
+                "velocity": [0.5 * index] * (200 if index == 45 else num), "effort": [],
+            }  # fmt: skip
+            writer.write_message("/joints", schema, message, log_time=10**9 * index)
+        writer.finish()
+    quick = read_log(tmp_path / "log.mcap")
+    monkeypatch.setattr(bag_logs, "MAX_LAYOUTS", 0)
+    each = read_log(tmp_path / "log.mcap")
+    assert quick.notes == each.notes and len(quick.signals) == len(each.signals) == 12
+    for one, other in zip(quick.signals, each.signals, strict=True):
+        assert one.name == other.name
+        np.testing.assert_array_equal(one.time, other.time)
+        np.testing.assert_array_equal(one.values, other.values)
 
 
 # -- Folders ---------------------------------------------------------------------------------

@@ -21,9 +21,12 @@ from npdr_ppl.rollouts.logs.formats.folders import files_in
 from npdr_ppl.rollouts.logs.formats.messages import Messages
 from npdr_ppl.rollouts.logs.formats.ros_messages import (
     MAX_VALUES,
+    Definitions,
+    Layout,
     TooManyValuesError,
     decode,
     definitions,
+    layout,
     short_name,
 )
 from npdr_ppl.rollouts.logs.log import Log
@@ -33,6 +36,10 @@ __all__ = ["read_bag_folder", "read_db3_log", "read_mcap_log"]
 
 Decoder = Callable[[bytes], tuple[Any, int]]
 """Returns the fields of a message, and how many values were read."""
+
+MAX_LAYOUTS = 8
+"""Layouts that are made for a topic. The messages of a robot's state have the same one all along;
+those with text that changes have a new one each, which is of no use."""
 
 INSTALL = "install the readers of ROS bags with pip install npdr-ppl[logs]."
 
@@ -105,11 +112,29 @@ class _Topic:
         name: Its name.
         kind: Name of the type of its messages.
         decoder: Reads a message; ``None`` if its messages are not read.
+        layout: The layout of the latest message, if it has one.
+        num_layouts: How many layouts were made.
     """
 
     name: str
     kind: str
     decoder: Decoder | None
+    layout: Layout | None = None
+    num_layouts: int = 0
+
+
+@dataclass(frozen=True)
+class _CdrDecoder:
+    """Reads messages in CDR of one type."""
+
+    name: str
+    types: Definitions
+
+    def __call__(self, data: bytes) -> tuple[Any, int]:
+        return decode(data, self.name, self.types)
+
+    def layout(self, data: bytes) -> Layout:
+        return layout(data, self.name, self.types)
 
 
 class _Topics:
@@ -155,8 +180,7 @@ class _Topics:
         written = text.decode(errors="replace") if text.strip() else _standard(kind)
         if written is None:
             return None
-        types, name = definitions(kind, written), short_name(kind)
-        return lambda data: decode(data, name, types)
+        return _CdrDecoder(short_name(kind), definitions(kind, written))
 
 
 def _standard(kind: str) -> str | None:
@@ -176,6 +200,10 @@ def _add(messages: Messages, topic: _Topic, nanoseconds: int, data: bytes) -> No
     if topic.decoder is None:
         messages.charge(1)
         return
+    if topic.layout is not None and (numbers := topic.layout.numbers(data)) is not None:
+        messages.charge(1 + topic.layout.count)
+        messages.add_alike(topic.name, nanoseconds, topic.layout, numbers)
+        return
     try:
         message, count = topic.decoder(data)
     except TooManyValuesError:
@@ -191,6 +219,9 @@ def _add(messages: Messages, topic: _Topic, nanoseconds: int, data: bytes) -> No
         ) from None
     messages.charge(1 + count)
     messages.add(topic.name, topic.kind, nanoseconds, message)
+    if isinstance(topic.decoder, _CdrDecoder) and topic.num_layouts < MAX_LAYOUTS:
+        topic.layout = topic.decoder.layout(data)
+        topic.num_layouts += 1
 
 
 # -- MCAP ------------------------------------------------------------------------------------

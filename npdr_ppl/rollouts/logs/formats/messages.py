@@ -1,7 +1,7 @@
 """Collects the numbers of messages as signals, one signal for each number of a topic."""
 
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.logs.formats.ros_messages import MAX_ARRAY, MAX_NESTING
+from npdr_ppl.rollouts.logs.formats.ros_messages import MAX_ARRAY, MAX_NESTING, Layout
 from npdr_ppl.rollouts.logs.formats.time_stamps import MAX_CLOCK_DIFFERENCE, in_seconds
 from npdr_ppl.rollouts.logs.log import Log, Signal
 
@@ -51,6 +51,9 @@ class _Topic:
         series: Values by name, each with the positions of their messages.
         units: Unit by name of the field.
         has_long: Whether an array was too long.
+        layout: The layout of the latest messages, if they have one.
+        places: Each series with the place of its numbers in a message of this layout.
+        stamp_places: The same for the parts of the messages' own stamp in s and ns.
     """
 
     received: array = field(default_factory=lambda: array("q"))
@@ -58,6 +61,9 @@ class _Topic:
     series: dict[str, _Series] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     has_long: bool = False
+    layout: Layout | None = None
+    places: list[tuple[_Series, int]] = field(default_factory=list)
+    stamp_places: tuple[int, int] | None = None
 
 
 class Messages:
@@ -97,11 +103,7 @@ class Messages:
                 raise DataError(f"it has more than {LIMITS.columns} topics.")
             is_joints = kind.replace("/msg/", "/") == "sensor_msgs/JointState"
             entry = self._topics[topic] = _Topic(units=_UNITS if is_joints else {})
-        row = len(entry.received)
-        if not -(2**63) <= nanoseconds < 2**63:
-            raise DataError("a time stamp is out of range.")
-        entry.received.append(nanoseconds)
-        entry.stamped.append(_stamp(message))
+        row = self._add_times(entry, nanoseconds, _stamp(_stamp_parts(message)))
         numbers: _Numbers = []
         _numbers(message, _element_names(message), 0, "", numbers)
         for name, value in numbers:
@@ -116,6 +118,37 @@ class Messages:
                 series = entry.series[name] = _Series()
             series.at.append(row)
             series.values.append(value)
+
+    def add_alike(self, topic: str, nanoseconds: int, layout: Layout, read: Sequence[Any]) -> None:
+        """Adds a message with the same layout as one that was added before.
+
+        Args:
+            topic: Its topic.
+            nanoseconds: Time stamp of the recorder in ns.
+            layout: The layout.
+            read: The numbers of the message.
+        """
+        entry = self._topics[topic]
+        if entry.layout is not layout:
+            numbers: _Numbers = []
+            _numbers(layout.places, _element_names(layout.places), 0, "", numbers)
+            entry.places = [(entry.series[n], int(p)) for n, p in numbers if p is not None]
+            entry.stamp_places = _stamp_parts(layout.places)
+            entry.layout = layout
+        stamp = entry.stamp_places
+        parts = None if stamp is None else (read[stamp[0]], read[stamp[1]])
+        row = self._add_times(entry, nanoseconds, _stamp(parts))
+        for series, place in entry.places:
+            series.at.append(row)
+            series.values.append(read[place])
+
+    def _add_times(self, entry: _Topic, nanoseconds: int, stamped: int) -> int:
+        """Adds the time stamps of a message; returns its position in the topic."""
+        if not -(2**63) <= nanoseconds < 2**63:
+            raise DataError("a time stamp is out of range.")
+        entry.received.append(nanoseconds)
+        entry.stamped.append(stamped)
+        return len(entry.received) - 1
 
     def charge(self, count: int) -> None:
         """Counts numbers that were read.
@@ -175,20 +208,26 @@ class Messages:
         return stamped
 
 
-def _stamp(message: Any) -> int:
-    """Returns the time stamp in ns that a message carries, 0 if none."""
+def _stamp_parts(message: Any) -> tuple[Any, Any] | None:
+    """Returns the seconds and the nanoseconds of the stamp that a message carries, if it does."""
     if not isinstance(message, dict):
-        return 0
+        return None
     header = message.get("header")
     inner = header if isinstance(header, dict) else message
     stamp = inner.get("stamp", inner.get("timestamp"))
     if not isinstance(stamp, dict):
+        return None
+    return stamp.get("sec"), stamp.get("nanosec", stamp.get("nsec"))
+
+
+def _stamp(parts: tuple[Any, Any] | None) -> int:
+    """Returns a time stamp in ns, 0 if there is none."""
+    if parts is None:
         return 0
-    seconds = stamp.get("sec")
-    parts = stamp.get("nanosec", stamp.get("nsec"))
-    if type(seconds) is not int or type(parts) is not int or not -(2**31) <= seconds < 2**33:
+    seconds, rest = parts
+    if type(seconds) is not int or type(rest) is not int or not -(2**31) <= seconds < 2**33:
         return 0
-    return seconds * 10**9 + parts if 0 <= parts < 10**9 else 0
+    return seconds * 10**9 + rest if 0 <= rest < 10**9 else 0
 
 
 def _element_names(message: Any) -> list[str] | None:

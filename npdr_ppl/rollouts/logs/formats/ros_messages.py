@@ -20,9 +20,11 @@ __all__ = [
     "MAX_ARRAY",
     "MAX_NESTING",
     "Definitions",
+    "Layout",
     "TooManyValuesError",
     "decode",
     "definitions",
+    "layout",
     "short_name",
 ]
 
@@ -49,6 +51,9 @@ _PRIMITIVES = {
 
 _SIZES = {code: struct.calcsize(f"={code}") for code in _PRIMITIVES.values()}
 """Bytes of a number by its code."""
+
+CDR_HEADER = 4
+"""Bytes before the fields of a message."""
 
 _TEXTS = ("string", "wstring")
 
@@ -171,9 +176,7 @@ def decode(data: bytes, name: str, types: Definitions) -> tuple[dict[str, Any], 
         DataError: The bytes do not hold such a message.
         TooManyValuesError: It has more than ``MAX_VALUES`` values.
     """
-    if len(data) < 4 or data[0] != 0 or data[1] not in (0, 1, 6, 7):
-        raise DataError("a message is not encoded in plain CDR.")
-    reader = _Reader(memoryview(data)[4:], "<" if data[1] & 1 else ">", 8 if data[1] < 2 else 4)
+    reader = _Reader(data)
     try:
         message = reader.message(name, types, 0)
         return message, reader.count
@@ -181,24 +184,72 @@ def decode(data: bytes, name: str, types: Definitions) -> tuple[dict[str, Any], 
         raise DataError("a message ends too early.") from None
 
 
+@dataclass(frozen=True)
+class Layout:
+    """Where the numbers of a message are, to read further messages that differ in them only.
+
+    Attributes:
+        places: The message with each of its numbers replaced by its place among all numbers.
+        count: How many values the message has.
+        size: Its length in bytes.
+        same: Positions and bytes of the parts that are no numbers: lengths of arrays, and text.
+        reader: Reads all numbers.
+    """
+
+    places: dict[str, Any]
+    count: int
+    size: int
+    same: tuple[tuple[int, bytes], ...]
+    reader: struct.Struct
+
+    def numbers(self, data: bytes) -> tuple[Any, ...] | None:
+        """Returns the numbers of a message, ``None`` if it differs in more than them."""
+        if len(data) != self.size or not all(data.startswith(p, at) for at, p in self.same):
+            return None
+        return self.reader.unpack_from(data)
+
+
+def layout(data: bytes, name: str, types: Definitions) -> Layout:
+    """Returns the layout of a message that :func:`decode` has read; its arguments are the same."""
+    reader = _Reader(data, gives_places=True)
+    places = reader.message(name, types, 0)
+    pattern, at = [reader.order], 0
+    for start, end, code in reader.numbers:
+        pattern.append(f"{start - at}x{(end - start) // _SIZES[code]}{code}")
+        at = end
+    same = tuple((start, data[start:end]) for start, end in [(0, CDR_HEADER), *reader.same])
+    return Layout(places, reader.count, len(data), same, struct.Struct("".join(pattern)))
+
+
 class _Reader:
     """Reads values one after another.
 
     Args:
-        data: The message without its header.
-        order: Byte order, as in :mod:`struct`.
-        widest: Largest alignment in bytes.
+        data: The message with its header of four bytes.
+        gives_places: Whether to return the place of each number among all of them in its stead.
 
     Attributes:
+        order: Byte order, as in :mod:`struct`.
         count: Number of values read.
+        numbers: Where each number or array of numbers begins and ends, and its code.
+        same: Where each length and each text begins and ends.
+
+    Raises:
+        DataError: The header is another one.
     """
 
-    def __init__(self, data: memoryview, order: str, widest: int) -> None:
-        self._data = data
-        self._order = order
-        self._widest = widest
-        self._position = 0
+    def __init__(self, data: bytes, *, gives_places: bool = False) -> None:
+        if len(data) < CDR_HEADER or data[0] != 0 or data[1] not in (0, 1, 6, 7):
+            raise DataError("a message is not encoded in plain CDR.")
+        self._data = memoryview(data)
+        self._widest = 8 if data[1] < 2 else 4
+        self._position = CDR_HEADER
+        self._gives_places = gives_places
+        self._num_places = 0
+        self.order = "<" if data[1] & 1 else ">"
         self.count = 0
+        self.numbers: list[tuple[int, int, str]] = []
+        self.same: list[tuple[int, int]] = []
 
     def message(self, name: str, types: Definitions, depth: int) -> dict[str, Any]:
         """Reads the fields of a message."""
@@ -214,7 +265,7 @@ class _Reader:
         if count is None:
             return self._value(field.type, types, depth)
         if count == 0:
-            (count,) = self._numbers("I", 1)
+            count = self._length()
         code = _PRIMITIVES.get(field.type)
         if code is not None:
             return self._array(code, count)
@@ -228,11 +279,11 @@ class _Reader:
         if code is not None:
             return self._numbers(code, 1)[0]
         if kind in _TEXTS:
-            (length,) = self._numbers("I", 1)
-            size = length * (1 if kind == "string" else 2)
+            size = self._length() * (1 if kind == "string" else 2)
             start, self._position = self._position, self._position + size
             if self._position > len(self._data):
                 raise DataError("a message ends too early.")
+            self.same.append((start, self._position))
             raw = bytes(self._data[start : self._position])
             return raw.rstrip(b"\0").decode(errors="replace") if kind == "string" else ""
         return self.message(kind, types, depth + 1)
@@ -249,14 +300,29 @@ class _Reader:
         return None
 
     def _numbers(self, code: str, count: int) -> tuple[Any, ...]:
+        start, numbers = self._unpacked(code, count)
+        if self._gives_places:
+            self.numbers.append((start, self._position, code))
+            numbers = tuple(range(self._num_places, self._num_places + count))
+            self._num_places += count
+        return numbers
+
+    def _length(self) -> int:
+        start, (length,) = self._unpacked("I", 1)
+        self.same.append((start, self._position))
+        return length
+
+    def _unpacked(self, code: str, count: int) -> tuple[int, tuple[Any, ...]]:
+        """Returns where the next numbers begin, and the numbers."""
         self.count += count
         if self.count > MAX_VALUES:
             raise TooManyValuesError
         self._align(code)
-        numbers = struct.unpack_from(f"{self._order}{count}{code}", self._data, self._position)
+        start = self._position
+        numbers = struct.unpack_from(f"{self.order}{count}{code}", self._data, start)
         self._position += count * _SIZES[code]
-        return numbers
+        return start, numbers
 
     def _align(self, code: str) -> None:
         size = min(_SIZES[code], self._widest)
-        self._position += -self._position % size
+        self._position += -(self._position - CDR_HEADER) % size
