@@ -2,12 +2,19 @@
 
     python benchmarks/memory.py --out memory.json
     python benchmarks/memory.py --seconds 25 --commands fit,compare
+    python benchmarks/memory.py --model arm
+    python benchmarks/memory.py --model arm-positions --commands discover
 
 The recording is that of four pendulums, each driven by a torque of its own; the last one's
 velocity is not measured. It is made here by a Runge-Kutta method, with noise. Each command runs in
 a process of its own on one thread, whose peak resident memory, that of the imported libraries
 included, is read at its end. The exit code is 1 if a command needs more than ``--limit`` GiB or
 fails.
+
+With ``--model arm``, the model is a ``MujocoSimulator`` of a MJCF file with seven hinges and seven
+motors, and the recording, of 14 channels, is made by PyBullet; see ``seven_joint_arm.py``. With
+``arm-positions``, the positions alone are recorded. ``npdr fit`` and ``npdr discover`` run with
+all defaults on one thread, and the memory of all their processes together is sampled.
 """
 
 import argparse
@@ -19,6 +26,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -48,6 +56,8 @@ TRUE = 1.1, 0.9, 1.2, 1.0
 
 SEGMENT_LENGTH = 200
 """Steps between two re-synchronisations."""
+
+MODELS = "pendulums", "arm", "arm-positions"
 
 COMMANDS = {
     "none": [],
@@ -192,6 +202,40 @@ def measured(name: str, recording: Path, out: Path) -> dict[str, Any]:
     return {"seconds": round(seconds, 1), "peak_gib": peak, "error": error}
 
 
+def measured_arm(
+    verbs: list[str], seconds: float, *, has_velocities: bool, time_limit: float
+) -> dict[str, dict[str, Any]]:
+    """Runs commands with a MJCF file on a recording of an arm; see the module's docstring.
+
+    Args:
+        verbs: The commands.
+        seconds: Duration of the recording.
+        has_velocities: Whether the velocities are recorded.
+        time_limit: Seconds after which a command is ended.
+    """
+    # Not at the top: npdr reads this file as a model, wherever its workers run.
+    from clean_fits_runs import npdr_command, run
+    from seven_joint_arm import write_arm
+    from seven_joint_arm import write_recording as write_recording_of_arm
+
+    rows = {}
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        model, recording = write_arm(folder), folder / "recording.npz"
+        write_recording_of_arm(recording, seconds, has_velocities=has_velocities)
+        for verb in verbs:
+            out = folder / verb
+            done = run(npdr_command(verb, model, recording, out, 1), time_limit=time_limit)
+            rows[verb] = {
+                "seconds": round(done.seconds, 1),
+                "cpu_seconds": round(done.cpu_seconds, 1),
+                "peak_gib": round(done.peak_bytes / 2**30, 3),
+                "error": done.message or None,
+            }
+            print(verb, rows[verb], flush=True)
+    return rows
+
+
 def run_child(name: str, recording: Path, out: Path) -> int:
     """Runs a command in this process and prints its peak memory in GiB; returns its exit code."""
     from npdr_ppl.cli.main import main
@@ -219,7 +263,9 @@ def main() -> int:
     """Runs the commands; see the module's docstring."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--commands", default=",".join(COMMANDS))
+    parser.add_argument("--model", choices=MODELS, default=MODELS[0])
+    parser.add_argument("--commands", help="default: all that the model has")
+    parser.add_argument("--time-limit", type=float, default=7200.0, help="s, for the arm")
     parser.add_argument("--limit", type=float, default=2.0, help="GiB")
     parser.add_argument("--out", type=Path, default=Path("memory.json"))
     parser.add_argument("--child", help=argparse.SUPPRESS)
@@ -228,16 +274,23 @@ def main() -> int:
     if chosen.child:
         torch.set_num_threads(1)
         return run_child(chosen.child, chosen.data, chosen.out)
-    from tempfile import TemporaryDirectory
-
-    rows = {}
-    with TemporaryDirectory() as folder:
-        recording = Path(folder) / "recording.npz"
-        write_recording(recording, chosen.seconds)
-        for name in chosen.commands.split(","):
-            rows[name] = measured(name, recording, Path(folder) / name)
-            print(name, rows[name], flush=True)
-    chosen.out.write_text(json.dumps({"seconds": chosen.seconds, "commands": rows}, indent=2))
+    if chosen.model == MODELS[0]:
+        rows = {}
+        with TemporaryDirectory() as folder:
+            recording = Path(folder) / "recording.npz"
+            write_recording(recording, chosen.seconds)
+            for name in chosen.commands.split(",") if chosen.commands else COMMANDS:
+                rows[name] = measured(name, recording, Path(folder) / name)
+                print(name, rows[name], flush=True)
+    else:
+        rows = measured_arm(
+            (chosen.commands or "fit,discover").split(","),
+            chosen.seconds,
+            has_velocities=chosen.model == "arm",
+            time_limit=chosen.time_limit,
+        )
+    found = {"model": chosen.model, "seconds": chosen.seconds, "commands": rows}
+    chosen.out.write_text(json.dumps(found, indent=2))
     peaks = [row["peak_gib"] for row in rows.values()]
     failed = any(row["error"] for row in rows.values())
     return int(failed or any(peak is None or peak > chosen.limit for peak in peaks))

@@ -1,25 +1,108 @@
-"""Progress bars for long operations; nothing is shown without a terminal."""
+"""The progress of long operations, on one line of a terminal; elsewhere nothing is shown."""
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
+    from rich.console import Console
 
-__all__ = ["Reporter", "Step", "reporter"]
+__all__ = ["Reporter", "Step", "TimeLeft", "reporter", "words_for"]
 
-Step = Callable[[float, str], None]
-"""Callback that takes the fraction done and a short status."""
+Step = Callable[[float | None, str], None]
+"""Callback that takes the fraction done, ``None`` if the total is not known, and a short status.
+
+A stage reports 0 when it begins, if that is before its first part is done: the time that its parts
+take is counted from the first report."""
+
+BAR_WIDTH = 10
+"""Width of the bar in characters. On a terminal of 80, it leaves room for label, status and time,
+e.g. ``effect 1``, ``2 of 6 candidates fitted`` and ``at most 3.5 min left in this step``."""
+
+
+class TimeLeft:
+    """Estimates how long a piece of work still takes, from the fractions done so far.
+
+    If a fraction f₀ was done at the first report and f at the latest, t − t₀ seconds later, the
+    rest takes
+
+        (1 − f) (t − t₀) / (f − f₀)
+
+    seconds from then on at the mean speed. Between reports the estimate counts down, but by no
+    more than the mean time between two reports: after that, the next one is overdue, and the
+    work is slower than it was.
+
+    Args:
+        clock: Returns the time in s.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._first: tuple[float, float] | None = None  # fraction and time
+        # One tuple, because the thread that draws the line reads it: fraction, time and number of
+        # reports after the first.
+        self._latest: tuple[float, float, int] | None = None
+
+    def report(self, fraction: float | None) -> None:
+        """Takes the fraction done; the count begins anew if it is ``None`` or has decreased."""
+        now, latest = self._clock(), self._latest
+        if fraction is None:
+            self._latest = None
+        elif latest is None or fraction < latest[0]:
+            self._first, self._latest = (fraction, now), (fraction, now, 0)
+        elif fraction > latest[0]:
+            self._latest = fraction, now, latest[2] + 1
+
+    @property
+    def seconds(self) -> float | None:
+        """The estimate in s; ``None`` if it cannot be computed, or if it has run out."""
+        first, latest = self._first, self._latest
+        if first is None or latest is None or not latest[2]:
+            return None
+        fraction, at, number = latest
+        spent = at - first[1]
+        left = (1.0 - fraction) * spent / (fraction - first[0])
+        left -= min(self._clock() - at, spent / number)
+        return left if left > 0.0 else None
+
+
+def words_for(seconds: float) -> str:
+    """Returns a duration in s, min or h with two digits, e.g. ``"85 s"`` or ``"2.5 min"``.
+
+    More digits would claim an accuracy that an estimate does not have. The least is 1 s.
+    """
+    if seconds < 100.0:
+        return f"{max(seconds, 1.0):.0f} s"
+    number, unit = (seconds / 60.0, "min") if seconds < 6000.0 else (seconds / 3600.0, "h")
+    return f"{number:.1f} {unit}" if number < 10.0 else f"{number:.0f} {unit}"
 
 
 class Reporter:
     """Provides one callback per stage of a workflow; this base class reports nothing."""
 
-    def stage(self, label: str) -> Step:
-        """Returns a callback for a stage: fraction done and a short status."""
+    def stage(self, label: str, *, may_end_early: bool = False) -> Step:
+        """Returns a callback for a stage: fraction done and a short status.
+
+        Args:
+            label: Name of the stage.
+            may_end_early: Whether the stage may end before its fraction is 1, as training does.
+                The time left is then an upper limit.
+        """
         return lambda fraction, status: None
+
+    @contextmanager
+    def overall(self, label: str) -> Iterator[Step]:
+        """Yields a callback for the work inside the block: equal parts that each have stages.
+
+        As soon as one part is done, the time left for all of them is shown, instead of that of
+        the present stage. If blocks are nested, it is that of the outermost.
+
+        Args:
+            label: Name of all parts together, e.g. ``"all rounds"``.
+        """
+        yield lambda fraction, status: None
 
     def under(self, label: str) -> "Reporter":
         """Returns a reporter that puts a label before the names of its stages."""
@@ -31,43 +114,93 @@ class _Labelled(Reporter):
         self.parent = parent
         self.label = label
 
-    def stage(self, label: str) -> Step:
-        return self.parent.stage(f"{self.label}: {label}")
+    def stage(self, label: str, *, may_end_early: bool = False) -> Step:
+        return self.parent.stage(f"{self.label}: {label}", may_end_early=may_end_early)
+
+    @contextmanager
+    def overall(self, label: str) -> Iterator[Step]:
+        with self.parent.overall(f"{label} of {self.label}") as step:
+            yield step
 
 
-class _RichReporter(Reporter):
-    def __init__(self) -> None:
+class _LineReporter(Reporter):
+    """Shows the present stage on one line: label, bar, status and time."""
+
+    def __init__(
+        self, console: "Console | None" = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, Progress, ProgressColumn
+        from rich.table import Column
+        from rich.text import Text
 
+        class Words(ProgressColumn):
+            """Text that is made at every refresh; where there is no room, its end is left out."""
+
+            def __init__(self, words: Callable[[Any], str], is_kept: bool = False) -> None:
+                super().__init__(Column(no_wrap=is_kept, overflow="ellipsis"))
+                self.words = words
+
+            def render(self, task: Any) -> Text:
+                return Text(self.words(task), no_wrap=True, overflow="ellipsis")
+
+        self._clock = clock
+        self._began = clock()
+        # The time left, and the words before and after it, of the stage that the line shows and of
+        # the outermost work of equal parts.
+        self._shown: tuple[TimeLeft, str, str] | None = None
+        self._overall: tuple[TimeLeft, str, str] | None = None
         self.bars = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[status]}"),
-            console=Console(stderr=True),
+            Words(lambda task: task.description),
+            BarColumn(BAR_WIDTH),
+            Words(lambda task: task.fields["status"]),
+            Words(lambda task: self.time_words(), is_kept=True),
+            console=console or Console(stderr=True),
+            transient=True,
         )
 
-    def stage(self, label: str) -> Step:
-        # The bar appears with the first step, because a stage may have nothing to do.
-        task: TaskID | None = None
+    def stage(self, label: str, *, may_end_early: bool = False) -> Step:
+        left = TimeLeft(self._clock)
+        times = left, "at most" if may_end_early else "about", "in this step"
 
-        def step(fraction: float, status: str) -> None:
-            nonlocal task
-            if task is None:
-                task = self.bars.add_task(label, total=1.0, status="")
-            self.bars.update(task, completed=fraction, status=status)
+        def step(fraction: float | None, status: str) -> None:
+            left.report(fraction)
+            self._shown = times
+            # The line appears with the first step, because a stage may have nothing to do.
+            if not self.bars.tasks:
+                self.bars.add_task(label, total=1.0, status="")
+            (task,) = self.bars.tasks
+            task.total = None if fraction is None else 1.0
+            done = fraction or 0.0
+            self.bars.update(task.id, description=label, completed=done, status=status)
 
         return step
+
+    @contextmanager
+    def overall(self, label: str) -> Iterator[Step]:
+        left, outer = TimeLeft(self._clock), self._overall
+        self._overall = outer or (left, "about", f"for {label}")
+        try:
+            yield lambda fraction, status: left.report(fraction)
+        finally:
+            self._overall = outer
+
+    def time_words(self) -> str:
+        """Returns the time left where it is known, and otherwise the time that has passed."""
+        for times in (self._overall, self._shown):
+            seconds = None if times is None else times[0].seconds
+            if times is not None and seconds is not None:
+                return f"{times[1]} {words_for(seconds)} left {times[2]}"
+        return f"{words_for(self._clock() - self._began)} so far"
 
 
 @contextmanager
 def reporter(show: bool | Reporter | None = None) -> Iterator[Reporter]:
-    """Shows progress bars inside the block.
+    """Shows a line with the progress inside the block.
 
     Args:
-        show: Whether to show them; ``None`` shows them if standard error is a terminal. The
-            reporter of a larger workflow is used unchanged.
+        show: Whether to show it; ``None`` shows it if standard error is a terminal. The reporter
+            of a larger workflow is used unchanged.
     """
     if isinstance(show, Reporter):
         yield show
@@ -75,6 +208,6 @@ def reporter(show: bool | Reporter | None = None) -> Iterator[Reporter]:
     if not (sys.stderr.isatty() if show is None else show):
         yield Reporter()
         return
-    rich = _RichReporter()
-    with rich.bars:
-        yield rich
+    line = _LineReporter()
+    with line.bars:
+        yield line

@@ -48,7 +48,7 @@ def demo(
     ):
         told = run_demo(out, seed=seed, progress=report)
         step = report.stage("draw figures, write the report")
-        step(0.0, "returns, rollouts, parameters")
+        step(None, "returns, rollouts, parameters")
         write_training_figures(told.training, told.target, told.task, out)
         page = write_report(out)
         step(1.0, "")

@@ -213,7 +213,7 @@ def train(
                 progress=report,
             )
             step = report.stage("draw figures")
-            step(0.0, "returns, rollouts, parameters")
+            step(None, "returns, rollouts, parameters")
             write_training_figures(training, device, chosen_task, out)
             step(1.0, "")
     if animate:

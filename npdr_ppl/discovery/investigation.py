@@ -66,7 +66,7 @@ class Investigation:
         recorded: The recording as it was given.
         settings: The settings of the search.
         seconds: Time spent, by stage.
-        progress: The progress bar.
+        progress: The line with the progress.
 
     Raises:
         DataError: The recording is too short, discovery cannot use an option, or ``holdout`` is
@@ -96,7 +96,7 @@ class Investigation:
         self.settings = search or DiscoveryOptions()
         self.seed = seed
         self.seconds: dict[str, float] = {}
-        self.progress = SearchProgress(self.settings, progress)
+        self.progress = SearchProgress(progress)
         self._data_options = segment_options(rollouts, options)
         self._drawn: list[tuple[Hypothesis, Draws]] = []
 
@@ -111,6 +111,7 @@ class Investigation:
     @cached_property
     def _repair(self) -> Repair:
         with self._stage("check data"):
+            self.progress.say("checking the recording")
             found = repair(self.model, self.recorded, self._data_options)
         simulator = found.simulator
         for effect in self.settings.effects or ():
@@ -149,6 +150,7 @@ class Investigation:
             self.progress.say,
             data_options=self._data_options,
             seed=self.seed,
+            progress=self.progress,
         )
 
     @cached_property
@@ -156,7 +158,7 @@ class Investigation:
         """The original model, fitted to the recording."""
         searcher = self._searcher
         with self._stage("fit"):
-            fitted = searcher.fit_base()
+            fitted = searcher.fit_base(progress=self.progress.stage("fit the original model"))
         return fitted
 
     @cached_property
@@ -169,8 +171,10 @@ class Investigation:
         """The fit that the search begins with, and the model's original priors."""
         given = self.given
         with self._stage("choose steps"):
+            self.progress.say("comparing with finer integration steps")
             found = self._searcher.with_finer_steps(given)
             priors = found.segments.prior.distributions
+            self.progress.say("checking the priors")
             return self._searcher.with_wider_priors(found), priors
 
     @cached_property
@@ -210,7 +214,8 @@ class Investigation:
             for added in search.added:
                 names = list(final.at_edge(added.effect))
                 if added.share > VERDICT.minor_share * explains:
-                    names += limits(final, added.effect, self._searcher.trials)
+                    step = self.progress.stage(f"vary the shape of {added.effect.name}")
+                    names += limits(final, added.effect, self._searcher.trials, step)
                 result.append(tuple(dict.fromkeys(names)))
         return result
 
@@ -220,6 +225,7 @@ class Investigation:
             if known is hypothesis:
                 return draws
         with self._stage(f"posterior {len(self._drawn) + 1}"):
+            self.progress.say("drawing parameters")
             draws = posterior_draws(hypothesis, seed=self.seed)
         self._drawn.append((hypothesis, draws))
         return draws
@@ -232,6 +238,7 @@ class Investigation:
         given, final = self.given, self.search.final
         draws_before, draws_after = self._draws(given), self._draws(final)
         with self._stage("prove"):
+            self.progress.say("predicting the held-out recording")
             data_options = _like(self._data_options, self.rollouts, self.holdout)
             return prove(
                 given,

@@ -101,16 +101,17 @@ def fit(
                     progress=report,
                 )
                 step = report.stage("sample and judge")
+                step(None, "")
                 data = posterior.to_arviz(seed=seed)
                 diagnosis = diagnose(data, rounds_left=max(left, 1))
                 if diagnosis.decision is not Decision.MORE_ROUNDS or left == 0:
                     break
                 rounds, left = rounds + 1, left - 1
-            step(0.5, "most likely draw")
+            step(None, "most likely draw")
             most_likely = posterior.most_likely(seed=seed)
             spent = sum(posterior.provenance.seconds.values())
             sampled = time.perf_counter() - started - spent
-            step(0.8, "scores")
+            step(None, "scores")
             evaluated = prepared.rollouts
             if test is not None:
                 evaluated = prepared.repair.applied_to(test)

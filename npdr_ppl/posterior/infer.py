@@ -134,27 +134,30 @@ def infer(
                     states.append(method.restore(problem, saved.tensors, saved.values))
                     seconds = {stage: saved.seconds[stage] for stage in seconds}
                 infos = saved.infos
-        for index in range(len(infos), rounds):
-            label = f"round {index + 1}/{rounds}"
-            state, info, spent = run_round(
-                bound, method, problem, states[-1], index,
-                num_simulations=num_simulations, seed=seed, report=report, label=label,
-                start=start if index == 0 else None, store=store,
-            )  # fmt: skip
-            states.append(state)
-            seconds = {stage: seconds[stage] + spent[stage] for stage in seconds}
-            infos.append(info)
-            _LOGGER.info(
-                "%s: %d simulations, %d failed; simulate %.1f s, train %.1f s",
-                label, info.num_simulations, info.num_failed, spent["simulate"], spent["train"],
-            )  # fmt: skip
-            if store is not None:
-                store.save_round(index, *method.tensors(state), infos, seconds)
+        with report.overall("all rounds") as done:
+            for index in range(len(infos), rounds):
+                done(index / rounds, "")
+                label = f"round {index + 1}/{rounds}"
+                state, info, spent = run_round(
+                    bound, method, problem, states[-1], index,
+                    num_simulations=num_simulations, seed=seed, report=report, label=label,
+                    start=start if index == 0 else None, store=store,
+                )  # fmt: skip
+                states.append(state)
+                seconds = {stage: seconds[stage] + spent[stage] for stage in seconds}
+                infos.append(info)
+                _LOGGER.info(
+                    "%s: %d simulations, %d failed; simulate %.1f s, train %.1f s",
+                    label, info.num_simulations, info.num_failed,
+                    spent["simulate"], spent["train"],
+                )  # fmt: skip
+                if store is not None:
+                    store.save_round(index, *method.tensors(state), infos, seconds)
         provenance = Provenance(seed, num_simulations, tuple(infos), seconds)
         learnt = Posterior(bound, method, problem, states[1:], provenance, preparation=preparation)
         if bound.likelihood is None:
             return learnt
-        report.stage("compare with the simulator")(0.0, "")
+        report.stage("compare with the simulator")(None, "")
         estimator, correction = check_estimator(
             learnt.densities, bound.likelihood, seed=seed, corrects=corrects
         )
@@ -213,7 +216,8 @@ def run_round(
             store.save_simulations(index, z, x)
     simulated = time.perf_counter()
     with seeded(seed, "train", index):
-        state, info = method.tell(problem, state, z, x, report.stage(f"{label}: train"))
+        train = report.stage(f"{label}: train", may_end_early=True)
+        state, info = method.tell(problem, state, z, x, train)
     info = replace(info, faults=collected.counts())
     spent = {"simulate": simulated - started, "train": time.perf_counter() - simulated}
     return state, info, spent
@@ -248,18 +252,22 @@ def simulate_features(
     per_simulation = sum(o.value.numel() for o in bound.observations.values())
     chunk = max(1, min(len(z), MAX_READINGS_PER_CHUNK // max(1, per_simulation)))
     step = report.stage(f"{label}: simulate")
+
+    def simulated(number: float) -> None:
+        step(min(1.0, number / len(z)), f"{number:.0f} of {len(z)} simulations")
+
+    simulated(0)
     features = []
     for start in range(0, len(z), chunk):
         part = z[start : start + chunk]
+
+        def within(fraction: float, status: str, start: int = start, num: int = len(part)) -> None:
+            simulated(start + fraction * num)
+
         # A stream for each chunk, so that a resumed run simulates the same.
-        share = len(part) / len(z)
-
-        def within(fraction: float, status: str, start: int = start, share: float = share) -> None:
-            step(min(1.0, start / len(z) + fraction * share), status)
-
         with seeded(seed, "simulate", purpose, start), report_progress(within):
             features.append(bound.features(bound.prior.execute(part)).float().cpu())
-        step(min(1.0, (start + chunk) / len(z)), f"{start + len(part)} simulations")
+        simulated(start + len(part))
         if (start // chunk) % CHUNKS_BETWEEN_RELEASES == CHUNKS_BETWEEN_RELEASES - 1:
             release_freed_memory()
     result = torch.cat(features)

@@ -212,11 +212,14 @@ def prepare(
         options: How the data are prepared.
         near: Parameters near which the closest fit is known to be.
         seed: Seed of the search.
-        progress: Called with the fraction done and a short status.
+        progress: Called with the fraction done, ``None`` where it is not known, and a short
+            status.
 
     Raises:
         DataError: No parameters can be simulated along the recording, or the data do not fit.
     """
+    step = progress or (lambda fraction, status: None)
+    step(None, "check the recording")
     repaired = repair(model, rollouts, options)
     rollouts = repaired.rollouts
     prior = Prior(model, (options.with_certain_start().inputs(rollouts),))
@@ -234,12 +237,16 @@ def prepare(
         data_options=data_options,
         seed=seed,
     )
-    closest = searcher.with_finer_steps(searcher.fit_base(near=near, progress=progress))
+    closest = searcher.fit_base(near=near, progress=progress)
+    step(None, "compare with finer integration steps")
+    closest = searcher.with_finer_steps(closest)
     base = BaseFit(searcher.base, closest, searcher.are_steps_coarse)
+    step(None, "check the priors")
     wider = searcher.with_wider_priors(closest)
     ends = ()
     if searcher.are_priors_widened:
         ends = beyond(base.hypothesis.segments.prior.distributions, wider)
+    step(None, "estimate the noise")
     likelihood = _likelihood(base, is_declared)
     estimated = every = None
     if options.noise == "auto" and not is_declared:

@@ -100,6 +100,8 @@ def search_prior(
     centre = torch.zeros(num_parameters, dtype=torch.float64)
     spread = torch.ones_like(centre)
     least, z, elite = math.inf, centre, centre[None]
+    if progress is not None:
+        progress(0.0, "")
     for iteration in range(iterations):
         with seeded(seed, "residual noise", iteration):
             if iteration == 0:

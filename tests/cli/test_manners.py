@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import typer
 
-from npdr_ppl import progress
 from npdr_ppl.cli.main import app
 from npdr_ppl.cli.manners import INTERRUPTED, resumable
 from npdr_ppl.rollouts import Rollouts
@@ -151,14 +150,3 @@ def test_ctrl_c_leaves_a_run_that_continues(recording, tmp_path):
     assert process.returncode == INTERRUPTED, err
     assert f"npdr: interrupted; the same command again continues the run in {out}." in err
     assert not (out / "fit.json").exists()
-
-
-def test_bars_show_the_time_left_and_only_once_there_is_something():
-    from rich.progress import TimeRemainingColumn
-
-    bars = progress._RichReporter()
-    step = bars.stage("train")
-    assert not bars.bars.tasks
-    step(0.5, "half")
-    assert bars.bars.tasks[0].completed == 0.5
-    assert any(isinstance(column, TimeRemainingColumn) for column in bars.bars.columns)

@@ -161,7 +161,7 @@ class Noting(Reporter):
     def __init__(self):
         self.told = defaultdict(list)
 
-    def stage(self, label):
+    def stage(self, label, *, may_end_early=False):
         return lambda fraction, status: self.told[label].append(fraction)
 
 
@@ -170,8 +170,9 @@ def test_a_search_reports_its_progress_to_a_larger_workflow():
     rollouts = pendulum_recording(num_rollouts=1)
     search = npdr.DiscoveryOptions(max_effects=0)
     Investigation(pendulum, rollouts, search=search, progress=told).first  # noqa: B018
-    (fractions,) = told.told.values()
-    assert fractions == sorted(fractions) and 0.0 < fractions[0] <= 1.0
+    fractions = [f for f in told.told["screen candidates"] if f is not None]
+    assert fractions == sorted(fractions) and fractions[0] == 0.0 < fractions[-1] < 1.0
+    assert told.told["fit the original model"][0] == 0.0
 
 
 def test_what_a_model_or_a_training_needs_is_exported():

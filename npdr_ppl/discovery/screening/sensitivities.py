@@ -22,6 +22,7 @@ from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
+from npdr_ppl.preparation.segment_model import SegmentModel
 
 __all__ = ["Variant", "sensitivities"]
 
@@ -89,14 +90,16 @@ def sensitivities(
         )
     largest = float(segments.whitened(base, fit.scale).abs().max())
     rounding = SENSITIVITY.rounding_errors * torch.finfo(base.dtype).eps * largest
-    for group in _groups(probes, box.simulator, segments.inputs.num_segments):
+    for group in _groups(probes, box.simulator, segments):
         changed = box.simulator.with_effects(*(probe.effect for probe in group))
-        starts = fit.offsets[None].expand(sum(len(probe.runs) for probe in group), -1, -1)
-        moved = segments.run(changed, {**box.parameters, **_side_by_side(group)}, starts)
-        differences = segments.whitened(moved - base, fit.scale)
-        for probe, rows in zip(
-            group, differences.split([len(probe.runs) for probe in group]), strict=True
-        ):
+        parameters, sizes = _side_by_side(group), [len(probe.runs) for probe in group]
+        differences = []
+        for part in torch.arange(sum(sizes)).split(segments.draws_per_chunk):
+            own = {name: value[part] for name, value in parameters.items()}
+            starts = fit.offsets[None].expand(len(part), -1, -1)
+            moved = segments.run(changed, {**box.parameters, **own}, starts)
+            differences.append(segments.whitened(moved - base, fit.scale))
+        for probe, rows in zip(group, torch.cat(differences).split(sizes), strict=True):
             yield from _variants(probe, rows, rounding)
 
 
@@ -152,14 +155,17 @@ def _probe(
 
 
 def _groups(
-    probes: list[_Probe], simulator: Simulator, num_segments: int
+    probes: list[_Probe], simulator: Simulator, segments: SegmentModel
 ) -> Iterator[list[_Probe]]:
     """Yields groups of effects of one kind that are simulated together, each in its own rows.
 
     An effect at zero strength changes nothing, and a step of many simulations costs little more
     than one of a few. If each simulation is a call of an engine, every effect is its own group.
     """
-    together = 1 if isinstance(simulator, PooledSimulator) else SENSITIVITY.segments_per_part
+    num_segments = segments.inputs.num_segments
+    # A few segments of a recording at a high rate have as many measurements as a chunk should.
+    most = min(SENSITIVITY.segments_per_part, segments.draws_per_chunk * num_segments)
+    together = 1 if isinstance(simulator, PooledSimulator) else most
     kinds: dict[object, list[_Probe]] = {}
     for probe in probes:
         effect = probe.effect

@@ -60,15 +60,19 @@ def fit_base(
         segments: The model along the recording.
         near: Parameters near which the fit is known to be; by default they are searched for.
         seed: Seed of the search.
-        progress: Called with the fraction of the search done and a short status.
+        progress: Called with a short status, and during the search with the fraction of it done.
 
     Raises:
         DataError: No parameters can be simulated along the recording, or simulations fail close
             to the fit.
     """
+    step = progress or (lambda fraction, status: None)
     begun: list[Hypothesis] = []
     failure: DataError | None = None
-    for start in _starts(segments, near, seed, progress):
+    starts = _starts(segments, near, seed, progress)
+    for number, start in enumerate(starts, 1):
+        # How many steps a fit takes is not known.
+        step(None, f"rough fit {number} of {len(starts)}")
         try:
             begun.append(fit_segment_model(segments, start=start, is_rough=True))
         except DataError as error:
@@ -77,8 +81,11 @@ def fit_base(
         assert failure is not None
         raise failure
     best = closest(begun)
+    step(None, "fit to convergence")
     fitted = fit_segment_model(segments, start=best.parameters, offsets=best.fit.offsets)
-    found = Trials(segments).with_own_starts(off_the_ends(fitted))
+    fitted = off_the_ends(fitted)
+    step(None, "fit with better initial states")
+    found = Trials(segments).with_own_starts(fitted)
     _ = found.linearisation  # computed now, because all later steps need it
     return found
 

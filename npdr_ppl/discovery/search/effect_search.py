@@ -13,6 +13,7 @@ from npdr_ppl.discovery.screening.alarm import Alarm, sound_alarm
 from npdr_ppl.discovery.screening.latent_force import Responses, responses
 from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.screening.screening import Screened
+from npdr_ppl.discovery.screening.sensitivities import Variant
 from npdr_ppl.discovery.screening.separation import separation_matrix
 from npdr_ppl.discovery.screening.variants import candidates_at, variants_of
 from npdr_ppl.discovery.search.alternatives import (
@@ -35,7 +36,7 @@ from npdr_ppl.language.model import Model
 from npdr_ppl.memory import release_freed_memory
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
-from npdr_ppl.progress import Step
+from npdr_ppl.progress import Reporter, Step
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Round", "Search", "Searcher", "explained"]
@@ -94,6 +95,7 @@ class Searcher:
         report: Called with a sentence at each step.
         data_options: How the recording is cut into segments; discovery's defaults if ``None``.
         seed: Seed of all random numbers.
+        progress: Where to show how many candidates are done.
 
     Attributes:
         rollouts: The recording.
@@ -113,6 +115,7 @@ class Searcher:
         *,
         data_options: DataOptions | None = None,
         seed: int = 0,
+        progress: Reporter | None = None,
     ) -> None:
         self._model = model
         self.rollouts = rollouts
@@ -123,6 +126,7 @@ class Searcher:
         self.are_priors_widened = False
         self._last: Round | None = None
         self._report = report
+        self._progress = progress or Reporter()
 
     @cached_property
     def base(self) -> SegmentModel:
@@ -228,9 +232,12 @@ class Searcher:
         release_freed_memory()
         averaged = hypothesis.averaged()
         projection = Projection(averaged)
+        step = self._progress.stage("screen candidates")
+        step(None, "responses to pulses of force")
         found = responses(averaged)
         candidates = candidates_at(hypothesis, self.options)
         variants = variants_of(candidates, projection, found, number=number)
+        variants = _counted(variants, len(candidates), step)
         sensors = hypothesis.simulator.sensors
         looks = len(hypothesis.effects)
         alarm, ranking = sound_alarm(
@@ -267,10 +274,13 @@ class Searcher:
         strong evidence against the model without it. Otherwise ``None`` is returned in its place.
         """
         ranking = now.ranking
-        trials = self.trials.extended(current, ranking, self._report)
+        label = f"effect {len(current.effects) + 1}"
+        # Candidates that are far behind the best one are skipped.
+        step = self._progress.stage(label, may_end_early=True)
+        trials = self.trials.extended(current, ranking, self._report, step)
         if not trials:
             return None, {}, {}
-        trials = self.trials.converged(trials)
+        trials = self.trials.converged(trials, progress=self._progress.stage(label))
         each = math.log(SEARCH.prior_of_any / max(1, len(ranking)))
         hypotheses = [current, *trials.values()]
         prior = [
@@ -322,8 +332,12 @@ class Searcher:
         added: list[Added] = []
         trials: dict[tuple[str, str], Hypothesis] = {}
         waiting = current.effects
+        num = len(waiting)
+        step = self._progress.stage("compare with alternatives")
         while waiting:
             asked = current
+            compared = num - len(waiting)
+            step(compared / num, f"{compared} of {num} effects compared")
             for effect, alternatives in zip(
                 waiting, self._alternatives(asked, waiting, rounds), strict=True
             ):
@@ -338,6 +352,8 @@ class Searcher:
                     {} if alternatives is None else alternatives.others
                 )
                 trials |= {(effect.name, name): trial for name, trial in tried.items()}
+                compared = num - len(waiting)
+                step(compared / num, f"{compared} of {num} effects compared")
                 if current is not asked:
                     current = self.trials.with_own_starts(current)
                     break  # the other effects are compared together with the new one
@@ -356,6 +372,19 @@ class Searcher:
         found = side_by_side(function, new, number if len(new) >= number else 1)
         for effect in effects:
             yield known[effect.name] or next(found)
+
+
+def _counted(variants: Iterator[Variant], num: int, step: Step) -> Iterator[Variant]:
+    """Yields the variants, and reports of how many of ``num`` candidates they are."""
+    seen: set[str] = set()
+    step(0.0, f"0 of {num} candidates")
+    for variant in variants:
+        if variant.effect.name not in seen:
+            # The variants of a candidate follow each other: those before it are done.
+            step(len(seen) / num, f"{len(seen)} of {num} candidates")
+            seen.add(variant.effect.name)
+        yield variant
+    step(None, "laws that are not in the catalogue")
 
 
 def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:

@@ -15,6 +15,7 @@ from npdr_ppl.discovery.search.settings import EVIDENCE
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.preparation.settings import LINEARISATION
+from npdr_ppl.progress import Step
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["limits"]
@@ -23,7 +24,12 @@ DISTINCT = 5.0
 """Loss of evidence at the other end above which the recording determines the parameter."""
 
 
-def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ...]:
+def limits(
+    current: Hypothesis,
+    effect: Effect,
+    trials: Trials,
+    progress: Step = lambda fraction, status: None,
+) -> tuple[str, ...]:
     """Returns the names of shape parameters that fit equally well at one end of their priors.
 
     All other parameters are refitted at each end (a profile likelihood).
@@ -39,6 +45,7 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
         current: The model with the effect, fitted.
         effect: The effect.
         trials: Fits the model.
+        progress: Called with the fraction of the fits that is done.
     """
     if not effect.strength:
         return ()
@@ -61,7 +68,7 @@ def limits(current: Hypothesis, effect: Effect, trials: Trials) -> tuple[str, ..
         math.inf
         if held is None
         else current.share * float(held.losses(current.fit.scale).sum() - best)
-        for held in trials.holding(current, ends)
+        for held in trials.holding(current, ends, progress)
     ]
     result = []
     for name, low, high in zip(shapes.values(), lost[::2], lost[1::2], strict=True):

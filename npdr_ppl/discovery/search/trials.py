@@ -18,6 +18,7 @@ from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.preparation.segment_fit import SegmentFit
 from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.progress import Step
 
 __all__ = ["Trials"]
 
@@ -58,6 +59,7 @@ class Trials:
         current: Hypothesis,
         ranking: Sequence[Screened],
         report: Callable[[str], None] = lambda _: None,
+        progress: Step = lambda fraction, status: None,
     ) -> dict[str, Hypothesis]:
         """Fits the hypothesis with each candidate of the shortlist, from its linear estimate.
 
@@ -68,10 +70,17 @@ class Trials:
             current: The hypothesis.
             ranking: The candidates, the best first.
             report: Called with a sentence about each candidate.
+            progress: Called with the fraction of the shortlist that is fitted.
         """
         trials: dict[str, Hypothesis] = {}
         waiting = list(ranking[: TRIALS.shortlist])
+        done, planned = 0, len(waiting)
+
+        def fitted(number: int) -> None:
+            progress(number / planned, f"{number} of {planned} candidates fitted")
+
         while waiting:
+            fitted(done)
             tried, waiting = (
                 waiting[: TRIALS.candidates_per_decision],
                 waiting[TRIALS.candidates_per_decision :],
@@ -81,6 +90,8 @@ class Trials:
                 if found is not None:
                     trials[candidate.name] = found
                     report(f"tried {candidate.name}: {_shown(found)}")
+                done += 1
+                fitted(done)
             if trials:
                 far = _far_behind(current, closest(list(trials.values())))
                 waiting = [
@@ -89,13 +100,18 @@ class Trials:
         return trials
 
     def converged(
-        self, trials: dict[str, Hypothesis], *, done: str | None = None
+        self,
+        trials: dict[str, Hypothesis],
+        *,
+        done: str | None = None,
+        progress: Step = lambda fraction, status: None,
     ) -> dict[str, Hypothesis]:
         """Fits the best trials until convergence; the others are too far behind.
 
         Args:
             trials: The model with each of several effects.
             done: Name of the effect whose fit has converged already.
+            progress: Called with the fraction of these trials that has converged.
         """
         scale = closest(list(trials.values())).fit.scale
         losses = {name: float(trial.losses(scale).sum()) for name, trial in trials.items()}
@@ -113,8 +129,11 @@ class Trials:
         ]
         result = dict(trials)
         fits = self._fits(asked, next(iter(trials.values())).simulator)
-        for name, longer in zip(contenders, fits, strict=True):
+        num = len(contenders)
+        progress(0.0, f"0 of {num} best fits converged")
+        for number, (name, longer) in enumerate(zip(contenders, fits, strict=True), 1):
             result[name] = longer or trials[name]
+            progress(number / num, f"{number} of {num} best fits converged")
         return result
 
     def refitted(
@@ -172,20 +191,29 @@ class Trials:
         return current if found is None or not found.can_be_linearised else found
 
     def holding(
-        self, current: Hypothesis, held: Sequence[Mapping[str, float]]
+        self,
+        current: Hypothesis,
+        held: Sequence[Mapping[str, float]],
+        progress: Step = lambda fraction, status: None,
     ) -> list[Hypothesis | None]:
         """Refits a hypothesis with some of its parameters held fixed.
 
         Args:
             current: The hypothesis.
             held: For each wanted hypothesis, reference coordinates by site.
+            progress: Called with the fraction of these fits that is done.
 
         Returns:
             ``None`` in place of those that cannot be simulated.
         """
         effects, start, offsets = current.effects, current.parameters, current.fit.offsets
         asked = [_Fit(current.segments, effects, start, offsets, held=places) for places in held]
-        return list(self._fits(asked, current.simulator))
+        found: list[Hypothesis | None] = []
+        progress(0.0, f"0 of {len(asked)} fits")
+        for number, refitted in enumerate(self._fits(asked, current.simulator), 1):
+            found.append(refitted)
+            progress(number / len(asked), f"{number} of {len(asked)} fits")
+        return found
 
     def apart_from_waves_in_step(self, tried: Mapping[str, Hypothesis]) -> dict[str, Hypothesis]:
         """Removes models whose last effect is a wave that is synchronous with the motion."""

@@ -55,7 +55,7 @@ def write_comparison_figures(
         progress: Called with the fraction done and a short status.
     """
     step = progress or (lambda fraction, status: None)
-    step(0.0, "marginals")
+    step(None, "marginals")
     posteriors = {label: comparison.posteriors[label] for label in comparison.ranking}
     some = next(iter(posteriors.values()))
     draws = {label: q.sample(NUM_DRAWS, seed=seed) for label, q in posteriors.items()}
@@ -65,7 +65,7 @@ def write_comparison_figures(
     units = parameter_units(some.prior)
     figure = plot_overlaid_marginals(samples, prior, units=units)
     paths = [save_figure(figure, out / "marginals.png")]
-    step(0.25, "pairs")
+    step(None, "pairs")
     if len(prior) > 1:
         x, y = most_informative(samples, prior)
         rows = _wrapped(samples)
@@ -76,7 +76,7 @@ def write_comparison_figures(
             smoothing=SMOOTHING,
         )  # fmt: skip
         paths.append(save_figure(figure, out / "pairs.png"))
-    step(0.5, "predictions")
+    step(None, "predictions")
     options = some.bound.options
     shown = rollouts[[0]]
     # The posteriors are simulated for one figure, so they share the memory budget.
@@ -98,7 +98,7 @@ def write_comparison_figures(
         resets=replayed.inputs.start.double().numpy() * shown.time_step,
     )
     paths.append(save_figure(figure, out / "bands.png"))
-    step(0.9, "seconds")
+    step(None, "seconds")
     seconds = {label: comparison.rows[label].seconds for label in comparison.ranking}
     paths.append(save_figure(plot_seconds(seconds), out / "seconds.png"))
     step(1.0, "")

@@ -47,7 +47,7 @@ def write_fit_figures(
         progress: Called with the fraction done and a short status.
     """
     step = progress or (lambda fraction, status: None)
-    step(0.0, "marginals")
+    step(None, "marginals")
     draws = posterior.sample(NUM_DRAWS, seed=seed)
     prior = posterior.prior
     samples = scalar_columns(draws)
@@ -63,11 +63,11 @@ def write_fit_figures(
             out / "marginals.png",
         )
     ]
-    step(0.25, "pairs")
+    step(None, "pairs")
     if 1 < len(samples) <= MAX_PAIRS:
         figure = plot_pair(samples, prior_samples, marks=marks)
         paths.append(save_figure(figure, out / "pairs.png"))
-    step(0.7, "predictions")
+    step(None, "predictions")
     options = posterior.bound.options
     shown = rollouts[[0]]
     num = affordable_draws(

@@ -276,7 +276,7 @@ class _Run:
             from npdr_ppl.arviz_module import to_netcdf
 
             to_netcdf(data, self.folder / "posterior.nc")
-        step(0.3, "sampled")
+        step(None, "sampled")
         figures = judge.figures(posterior, most_likely)
         step(1.0, "")
         infos = posterior.provenance.rounds
