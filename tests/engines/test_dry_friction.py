@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from npdr_ppl.engines.common.dry_friction import solve_dry_friction
 from npdr_ppl.engines.common.integrators import INTEGRATORS
-from npdr_ppl.engines.ode.dry_friction import solve_dry_friction
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import (
     AsymmetricCoulombFriction,

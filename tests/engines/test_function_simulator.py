@@ -11,7 +11,16 @@ import torch
 import npdr_ppl as npdr
 from npdr_ppl.errors import DataError, ModelError, SimulationError
 from npdr_ppl.language.handlers import add_effect
-from npdr_ppl.models.effects import InputDelay
+from npdr_ppl.models.effects import (
+    Backlash,
+    Bias,
+    CoulombFriction,
+    HardeningSpring,
+    InputDelay,
+    JointElasticity,
+    StribeckFriction,
+    ViscousFriction,
+)
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.posterior.prepare import prepare
 
@@ -89,6 +98,88 @@ def test_parameters_and_a_hidden_delay_are_found():
     assert delay == pytest.approx(STEP, abs=1e-3)
 
 
+HINGE = npdr.Port("hinge", "force", "N m", rated=4.5, rated_speed=5.0)
+
+
+def pushed_rod(parameters, initial_state, actions, time_step, forces):
+    """The rod with forces of effects, in three steps of the midpoint method per time step."""
+    angle, velocity = initial_state.unbind(-1)
+    mass, length, step = parameters["mass"], parameters["length"], time_step / 3
+    states = []
+    for torque in (actions + forces)[..., 0].unbind(-1):
+        for _ in range(3):
+            middle = angle + 0.5 * step * velocity
+            weight = 0.5 * mass * length * 9.81 * torch.sin(middle)
+            acceleration = (torque - weight) / (mass * length**2 / 3.0)
+            angle = angle + step * (velocity + 0.5 * step * acceleration)
+            velocity = velocity + step * acceleration
+        states.append(torch.stack([angle, velocity], dim=-1))
+    return torch.stack(states, dim=-2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "effect",
+    [
+        Bias("hinge"),
+        ViscousFriction("hinge"),
+        CoulombFriction("hinge"),
+        HardeningSpring("hinge"),
+        StribeckFriction("hinge"),
+        JointElasticity("hinge"),
+        Backlash("hinge"),
+    ],
+    ids=lambda effect: effect.id,
+)
+def test_forces_of_effects_move_a_function_as_they_move_an_engine(effect):
+    """The truth is the pendulum of the zoo in fine steps; its error in long steps is the scale.
+
+    Elasticity and play change much within a step of 20 ms, the other effects do not.
+    """
+    engine = Pendulum(integrator="rk4", substeps=16).with_effects(effect)
+    coarse = Pendulum(integrator="rk4").with_effects(effect)
+    plain = simulator(pushed_rod, forces={"angle": HINGE})
+    inputs = recording().inputs(100)
+    values = {
+        f"hinge.{effect.id}.{name}": prior.icdf(torch.tensor([0.3, 0.7]))
+        for name, prior in effect.default_priors(HINGE).items()
+    }
+    without = plain.simulate({}, inputs)
+    true = engine.simulate(values, inputs)
+    found = plain.with_effects(effect).simulate(values, inputs)
+    change, scale = (true - without).norm(), (coarse.simulate(values, inputs) - true).norm()
+    assert change > 0.0 and (found - true).norm() < 3.0 * scale + 1e-2 * change
+    if effect.strength:
+        none = {f"hinge.{effect.id}.{name}": torch.zeros(2) for name in effect.strength}
+        still = plain.with_effects(effect).simulate({**values, **none}, inputs)
+        torch.testing.assert_close(still, without.expand_as(still), rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_dry_friction_that_an_own_function_lacks_is_found():
+    engine = Pendulum(integrator="rk4", substeps=16).with_effects(CoulombFriction("hinge"))
+    given = recording()
+    values = {"mass": 1.1, "length": 0.9, "hinge.coulomb_friction.magnitude": 0.3}
+    values = {name: torch.tensor([value]) for name, value in values.items()}
+    true = engine.simulate(values, given.inputs(None, "recorded"))[0, 0].double().numpy()
+    readings = np.concatenate((given.readings[0][:1], true))
+    readings[1:] += np.random.default_rng(2).normal(0.0, [1e-3, 1e-2], true.shape)
+    rollouts = npdr.Rollouts.from_arrays(
+        [readings], [given.actions[0]], channel_names=("angle", "velocity"),
+        action_names=("torque",), time_step=STEP,
+    )  # fmt: skip
+
+    def pushed(inputs):
+        mass = pyro.sample("mass", dist.Uniform(0.5, 2.0))
+        length = pyro.sample("length", dist.Uniform(0.5, 1.5))
+        own = simulator(pushed_rod, forces={"angle": HINGE})
+        return npdr.simulate("swing", own, {"mass": mass, "length": length}, inputs)
+
+    search = npdr.DiscoveryOptions(max_effects=1)
+    found = npdr.discover(pushed, rollouts, search=search, progress=False)
+    assert [finding.effect.name for finding in found.effects] == ["hinge.coulomb_friction"]
+
+
 def test_commands_are_clamped_and_free_motion_needs_none():
     inputs = recording().inputs(100)
     strong = simulator(actions=[npdr.Channel("torque", "N m", -0.1, 0.1)])
@@ -136,6 +227,12 @@ def test_mistakes_get_one_sentence():
         simulator(states=[npdr.Channel("mass", "kg")])
     with pytest.raises(ModelError, match="has no states"):
         simulator(states=[])
+    with pytest.raises(ModelError, match="position among the states"):
+        simulator(pushed_rod, forces={"velocity": HINGE})
+    with pytest.raises(ModelError, match="of kind sensor"):
+        simulator(pushed_rod, forces={"angle": npdr.Port("hinge", "sensor", "N m")})
+    with pytest.raises(ModelError, match="No state is the rate of angle"):
+        simulator(pushed_rod, states=[npdr.Channel("angle", "rad")], forces={"angle": HINGE})
     wrong = simulator(lambda *_: torch.zeros(3))
     with pytest.raises(SimulationError, match=r"a tensor of shape \(4, 100, 2\); got \(3,\)"):
         wrong.simulate({}, recording().inputs(100))

@@ -1,31 +1,36 @@
 """A plain function of batched parameters, initial states and actions as a simulator."""
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
+from npdr_ppl.engines.common.batching import flatten
 from npdr_ppl.engines.common.signals import Signals, domain_by_segment, needs_accelerations
+from npdr_ppl.engines.functions.forced_motion import ForcedMotion
 from npdr_ppl.errors import ModelError, SimulationError
 from npdr_ppl.language.channels import Channel, Parameter, Port
-from npdr_ppl.language.effects import Effect, SensorEffect
+from npdr_ppl.language.effects import Effect, ForceEffect, SensorEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["BatchedFunction", "FunctionSimulator"]
 
-BatchedFunction = Callable[[dict[str, Tensor], Tensor, Tensor, float], Tensor]
+BatchedFunction = Callable[..., Tensor]
 """``f(parameters, initial_state, actions, time_step)``: parameters by name, ``(N,)`` each; initial
 states ``(N, states)``; actions ``(N, steps, actions)``, each held for a step; seconds per step.
-Returns the states after each step, ``(N, steps, states)``."""
+Returns the states after each step, ``(N, steps, states)``. A function with force ports has a fifth
+argument, generalised forces ``(N, steps, ports)``, each held for a step."""
 
 
 class FunctionSimulator(Simulator):
     """A function that simulates many draws at once, as a simulator.
 
-    Effects on commands, measurements, the clock and parameters attach to it. Forces would have to
-    act inside the function; derive from ``ODESimulator`` for those.
+    Effects on commands, measurements, the clock and parameters attach to every function. Effects
+    on forces attach if the function takes forces: it is then called for one step at a time, from
+    the state after the one before, so it must not depend on earlier steps otherwise.
 
     Args:
         function: The function, see :data:`BatchedFunction`. It gets float64 tensors.
@@ -33,10 +38,13 @@ class FunctionSimulator(Simulator):
         parameters: Domain parameters with nominal values.
         actions: The action channels; none for free motion. Commands are clamped to their bounds.
         time_step: Seconds per step that the function is meant for.
+        forces: Force ports by the state, a position, that they act on, in the order of the
+            function's last argument; none if it takes no forces.
         is_differentiable: Whether gradients flow from trajectories to parameters.
 
     Raises:
-        ModelError: Names are repeated, or there is no state.
+        ModelError: Names are repeated, there is no state, or a port does not act on a position
+            whose rate is a state.
 
     Example:
         >>> import torch, npdr_ppl as npdr
@@ -69,6 +77,7 @@ class FunctionSimulator(Simulator):
         parameters: Sequence[Parameter],
         actions: Sequence[Channel] = (),
         time_step: float,
+        forces: Mapping[str, Port] | None = None,
         is_differentiable: bool = False,
     ) -> None:
         self.function = function
@@ -77,14 +86,20 @@ class FunctionSimulator(Simulator):
         self.parameters = tuple(parameters)
         self.time_step = time_step
         self.is_differentiable = is_differentiable
-        names = [part.name for part in (*states, *actions, *parameters)]
+        self.forces = dict(forces or {})
+        names = [part.name for part in (*states, *actions, *parameters, *self.forces.values())]
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ModelError(f"{self.name}: {', '.join(repeated)} has two meanings.")
         if not states:
             raise ModelError(f"{self.name} has no states.")
+        self._joints = {
+            _column(self, state, port): port.name for state, port in self.forces.items()
+        }
+        self._rates = tuple(_rate_column(self, state) for state in self.forces)
         self.ports = tuple(
             [Port(a.name, "action", a.unit, rated=_rated(a)) for a in actions]
+            + [*self.forces.values()]
             + [Port(s.name, "sensor", s.unit, rated=_rated(s)) for s in states]
         )
 
@@ -121,17 +136,37 @@ class FunctionSimulator(Simulator):
         signals = Signals(self, domain, inputs, shape)
         initial_states = signals.initial_states()
         own = {p.name: domain[p.name].expand(shape).reshape(-1) for p in self.parameters}
-        values = self._run(own, initial_states, signals.actions(), inputs.time_step)
+        step, actions = inputs.time_step, signals.actions()
+        laws = tuple(effect for effect in self.effects if isinstance(effect, ForceEffect))
+        if laws:
+            forced = copy.copy(self)
+            forced.effects = laws
+
+            def advance(states: Tensor, action: Tensor, forces: Tensor) -> Tensor:
+                return self._run(own, states, action[:, None], step, forces[:, None])[:, 0]
+
+            motion = ForcedMotion(forced, self._joints, self._rates, advance, step)
+            tables = flatten(tuple(law.own_parameters(domain) for law in laws), shape, expand=True)
+            values = motion.run(tables, initial_states, actions, signals.start_times)
+        else:
+            none = actions.new_zeros(*actions.shape[:2], len(self.forces))
+            values = self._run(own, initial_states, actions, step, none)
         readings = signals.readings(values, initial_states)
         readings = readings.reshape(*shape, *readings.shape[1:])
         readings = torch.where(inputs.mask[..., None], readings, torch.zeros_like(readings))
         return readings.to(dtype)
 
     def _run(
-        self, parameters: dict[str, Tensor], initial_states: Tensor, actions: Tensor, step: float
+        self,
+        parameters: dict[str, Tensor],
+        initial_states: Tensor,
+        actions: Tensor,
+        step: float,
+        forces: Tensor,
     ) -> Tensor:
         """Returns the states after each step, ``(N, steps, states)``."""
-        result: Any = self.function(parameters, initial_states, actions, step)
+        given = (parameters, initial_states, actions, step)
+        result: Any = self.function(*given, forces) if self.forces else self.function(*given)
         expected = (len(initial_states), actions.shape[1], len(self.states))
         if not isinstance(result, Tensor) or tuple(result.shape) != expected:
             found = tuple(result.shape) if isinstance(result, Tensor) else type(result).__name__
@@ -142,6 +177,27 @@ class FunctionSimulator(Simulator):
         if result.is_complex():
             raise SimulationError(f"{self.name} returned complex numbers.")
         return result.to(torch.float64)
+
+
+def _column(simulator: FunctionSimulator, state: str, port: Port) -> int:
+    """Returns the column of the position that a force port acts on."""
+    positions = {s.name: i for i, s in enumerate(simulator.states) if s.rate_of is None}
+    if port.kind != "force":
+        raise ModelError(f"{port.name} is of kind {port.kind}; a port of forces is of kind force.")
+    if state not in positions:
+        raise ModelError(
+            f"{port.name} should act on a position among the states "
+            f"({', '.join(positions) or 'none'}), not on {state!r}."
+        )
+    return positions[state]
+
+
+def _rate_column(simulator: FunctionSimulator, state: str) -> int:
+    """Returns the column of the rate of a position."""
+    for column, other in enumerate(simulator.states):
+        if other.rate_of == state:
+            return column
+    raise ModelError(f"No state is the rate of {state}; a force acts on a state that has one.")
 
 
 def _rated(channel: Channel) -> float:

@@ -5,13 +5,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.common.effect_chain import EffectChain, Moments, State, Tables
-from npdr_ppl.engines.common.integrators import Components
-from npdr_ppl.engines.ode.dry_friction import (
+from npdr_ppl.engines.common.dry_friction import (
     DryFriction,
     dry_friction_over_step,
     stopping_friction,
 )
+from npdr_ppl.engines.common.effect_chain import EffectChain, Moments, State, Tables
+from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.ode.mechanical_system import MechanicalSystem
 from npdr_ppl.language.effect_context import Joint
 
