@@ -3,8 +3,8 @@
     python cost_server.py
 
 Each line of the input is a JSON list: the kind of file, and its path. The answer is a JSON object:
-``outcome`` ("read", "refused" or what else happened), ``message``, ``seconds`` of processor time on
-a core of the usual speed, and ``megabytes`` above the start.
+``outcome`` ("read", "refused" or what else happened), ``message``, ``seconds`` of processor time,
+converted to a core of the usual speed, and ``megabytes`` above the start.
 """
 
 import json
