@@ -217,19 +217,31 @@ def _fit(
     left = np.maximum(steps - half_width, 0)
     right = np.minimum(steps + half_width, last)
     fit = np.empty((2, len(steps), readings.shape[1]))
-    error = np.empty_like(fit)
-    extents = np.stack([steps - left, right - steps], axis=1)
-    for before, after in np.unique(extents, axis=0):
-        rows = np.flatnonzero((extents == (before, after)).all(axis=1))
-        weights = _weights(int(before), int(after))
-        windows = readings[steps[rows, None] + np.arange(-before, after + 1)]
-        fit[:, rows] = np.einsum("kn,pnc->kpc", weights, windows)
-        # Equal consecutive encoder values repeat the same error. A window therefore holds only
-        # one independent error per run of equal values.
-        size = before + after + 1
-        independent = 1 + num_changes[right[rows]] - num_changes[left[rows]]
-        norms = np.linalg.norm(weights, axis=1)
-        error[:, rows] = norms[:, None, None] * np.sqrt(size / independent)
+    norms = np.empty((2, len(steps)))
+    at_start, at_end = left > steps - half_width, right < steps + half_width
+    whole = np.flatnonzero(~at_start & ~at_end)
+    if len(whole):
+        weights = _weights(half_width, half_width)
+        windows = readings[steps[whole, None] + np.arange(-half_width, half_width + 1)]
+        fit[:, whole] = (weights @ windows).transpose(1, 0, 2)
+        norms[:, whole] = np.linalg.norm(weights, axis=1)[:, None]
+    # One-sided windows at the same end overlap, so one product serves all of them.
+    for is_here in (at_start & ~at_end, at_end & ~at_start, at_start & at_end):
+        rows = np.flatnonzero(is_here)
+        if not len(rows):
+            continue
+        first, stop = left[rows].min(), right[rows].max() + 1
+        several = np.zeros((2, len(rows), stop - first))
+        extents = np.stack((left, right + 1, steps))[:, rows].T.tolist()
+        for index, (start, end, step) in enumerate(extents):
+            own = _weights(step - start, end - 1 - step)
+            several[:, index, start - first : end - first] = own
+        fit[:, rows] = several @ readings[first:stop]
+        norms[:, rows] = np.linalg.norm(several, axis=2)
+    # Equal consecutive encoder values repeat the same error. A window therefore holds only
+    # one independent error per run of equal values.
+    independent = 1 + num_changes[right] - num_changes[left]
+    error = norms[:, :, None] * np.sqrt((right - left + 1)[:, None] / independent)
     return fit, error
 
 
