@@ -9,7 +9,7 @@ from npdr_ppl.embeddings import Embedding
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.segments import InitialState, layout_of
+from npdr_ppl.rollouts.segments import InitialState, layout_of, motion
 
 __all__ = [
     "MAX_READINGS_PER_CHUNK",
@@ -38,10 +38,11 @@ FEWEST_SEGMENTS = 8
 """Least number of segments of a recording that is long enough. With fewer, a test cannot
 distinguish an effect from chance."""
 
-MOST_READINGS = 300_000
-"""Greatest number of measurements that a fit uses, in at least ``FEWEST_SEGMENTS`` segments; 43 s
+MOST_READINGS = 100_000
+"""Greatest number of measurements that a fit uses, in at least ``FEWEST_SEGMENTS`` segments; 14 s
 of 7 channels at 1 kHz. The derivatives of all measurements are in memory together; with so
-many, a fit of ``benchmarks/memory.py`` stays below 2 GB."""
+many, an arm of seven joints in ``benchmarks/memory.py``, whose states have 14 derivatives, stays
+below 2 GB."""
 
 PLAIN_FEATURES = "bayessim"
 """Features if there is no closest fit, at which the score features are computed."""
@@ -109,13 +110,19 @@ class DataOptions:
 
     def used_segments(self, rollouts: Rollouts) -> torch.Tensor:
         """Returns the indices of the segments that are used, among all of them."""
-        return one_of_each_part(*self.num_segments(rollouts), seed=0)
+        used, every = self.num_segments(rollouts)
+        if used == every:
+            return torch.arange(every)
+        return one_of_each_part(
+            used, every, seed=0, weights=motion(rollouts, self.steps(rollouts))
+        )
 
     def num_segments(self, rollouts: Rollouts) -> tuple[int, int]:
         """Returns how many segments of rollouts are used, and how many there are.
 
         Of a very long recording, one segment of each of equal parts is used, if initial states
-        are uncertain; see ``MOST_READINGS``. Otherwise all are used.
+        are uncertain; see ``MOST_READINGS``. The more a segment moves, the more likely it is the
+        one, because standstill tells little. Otherwise all are used.
         """
         length = self.steps(rollouts) or max(rollouts.lengths)
         every = len(layout_of(rollouts, self.steps(rollouts)))
@@ -137,7 +144,9 @@ class DataOptions:
         return replace(self, initial_state="estimated")
 
 
-def one_of_each_part(num_parts: int, num: int, *, seed: int) -> torch.Tensor:
+def one_of_each_part(
+    num_parts: int, num: int, *, seed: int, weights: torch.Tensor | None = None
+) -> torch.Tensor:
     """Returns a random index of each of equal parts of a range, ``(num_parts,)``, in order.
 
     Indices at equal distances could always meet the same phase of a periodic excitation.
@@ -146,11 +155,20 @@ def one_of_each_part(num_parts: int, num: int, *, seed: int) -> torch.Tensor:
         num_parts: Number of parts, at most ``num``.
         num: Length of the range.
         seed: Seed of the choice.
+        weights: What the probability of an index within its part is proportional to, ``(num,)``;
+            equal by default, and in parts without any weight.
     """
     ends = torch.arange(num_parts + 1) * num // num_parts
     generator = torch.Generator().manual_seed(seed)
     share = torch.rand(num_parts, generator=generator, dtype=torch.float64)
-    return ends[:-1] + (share * ends.diff()).long()
+    if weights is None:
+        return ends[:-1] + (share * ends.diff()).long()
+    chosen = []
+    for first, end, level in zip(ends[:-1].tolist(), ends[1:].tolist(), share, strict=True):
+        own = weights[first:end] if weights[first:end].any() else torch.ones(end - first)
+        below = own.double().cumsum(0)
+        chosen.append(first + int((below <= level * below[-1]).sum()))
+    return torch.tensor(chosen)
 
 
 def checked_options(

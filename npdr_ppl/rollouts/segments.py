@@ -1,5 +1,6 @@
 """Segments: pieces of rollouts, each simulated from an initial state taken from the data."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any, Literal, get_args
@@ -21,6 +22,7 @@ __all__ = [
     "cut",
     "inputs",
     "layout_of",
+    "motion",
     "observation",
     "stitch",
 ]
@@ -224,6 +226,24 @@ def layout_of(rollouts: Recording, segment_length: int | None) -> list[tuple[int
         for first, end in spans
         for start in range(first, end, segment_length or end - first)
     ]
+
+
+def motion(rollouts: Recording, segment_length: int | None) -> torch.Tensor:
+    """Returns how much each segment moves, ``(S,)``; see :func:`layout_of`.
+
+    It is the distance between the quartiles of a channel in the segment, which single wrong
+    readings do not change, relative to the channel's standard deviation, summed over the channels.
+    """
+    found = []
+    with warnings.catch_warnings():
+        # A channel may have no readings in a segment; it then counts as still.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        spread = np.nanstd(np.concatenate(rollouts.readings), axis=0)
+        for rollout, start, end in layout_of(rollouts, segment_length):
+            readings = rollouts.readings[rollout][start : end + 1]
+            low, high = np.nanquantile(readings, [0.25, 0.75], axis=0)
+            found.append(np.nansum((high - low) / np.where(spread > 0.0, spread, np.inf)))
+    return torch.tensor(found, dtype=torch.float64)
 
 
 def _estimated(rollouts: Recording, layout: Sequence[tuple[int, int, int]]) -> StateEstimate:

@@ -1,7 +1,9 @@
 """Of a very long recording, a fit uses segments that are spread over all of it."""
 
+import numpy as np
 import pytest
 
+import npdr_ppl as npdr
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.preparation import data_options
 from npdr_ppl.preparation.data_options import DataOptions
@@ -40,6 +42,19 @@ def test_a_long_recording_is_used_in_part(rollouts, few):
     assert [row // 4 for row in rows] == list(range(10))  # one of each tenth of the recording
     assert len({row % 4 for row in rows}) > 1  # not at equal distances
     assert (part.observed == whole.observed[rows]).all()
+
+
+def test_of_a_recording_that_mostly_rests_the_motion_is_used(few):
+    time = 0.02 * np.arange(801)
+    phase = np.maximum(0.0, time % 1.6 - 1.2)  # rests for three quarters of each tenth
+    angle = np.sin(2.0 * np.pi * phase / 0.4) + np.random.default_rng(0).normal(0.0, 1e-4, 801)
+    angle[30] = 5.0  # a wrong reading is no motion
+    resting = npdr.Rollouts.from_arrays(
+        [np.stack([angle, np.gradient(angle, 0.02)], 1)], [np.zeros((800, 1))],
+        channel_names=("angle", "velocity"), action_names=("torque",), time_step=0.02,
+    )  # fmt: skip
+    index = DataOptions(segment_length=20).used_segments(resting)
+    assert index.tolist() == [4 * part + 3 for part in range(10)]
 
 
 def test_all_segments_are_used_where_initial_states_are_taken_as_true(rollouts, few):
