@@ -22,7 +22,7 @@ with warnings.catch_warnings():
 
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.errors import DataError
-from npdr_ppl.hdf5_checks import check_self_contained
+from npdr_ppl.hdf5_checks import check_self_contained, named_netcdf
 
 __all__ = [
     "Data",
@@ -222,17 +222,10 @@ def from_netcdf(path: str | PathLike[str]) -> Data:
     Raises:
         DataError: The file is damaged, or takes data from another file.
     """
-    try:
+    with named_netcdf(path):
         check_self_contained(path)
         with _any_group(), az.rc_context({"data.load": "eager"}):
             return az.from_netcdf(fspath(path), engine="h5netcdf")
-    except DataError as error:
-        raise DataError(f"{fspath(path)}: {error}") from None
-    # Decoders raise nearly any error for corrupt bytes.
-    except Exception as error:
-        raise DataError(
-            f"{fspath(path)} is not a readable NetCDF file ({type(error).__name__})."
-        ) from error
 
 
 @contextmanager

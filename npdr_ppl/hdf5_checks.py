@@ -16,7 +16,8 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from os import PathLike
+from contextlib import contextmanager
+from os import PathLike, fspath
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ import numpy as np
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS, check_expansion
 
-__all__ = ["check_self_contained", "holds_lists"]
+__all__ = ["check_self_contained", "holds_lists", "named_netcdf"]
 
 MAX_SHARED_TEXTS = 64
 """Largest number of texts in one attribute; each can be as long as the file."""
@@ -41,6 +42,20 @@ _HEAP = struct.Struct("<4sB3xQ")
 
 _HEAP_OBJECT = struct.Struct("<HHIQ")
 """Head of an object in it: index, number of references, nothing, and size."""
+
+
+@contextmanager
+def named_netcdf(path: str | PathLike[str]) -> Iterator[None]:
+    """Turns every error in the block into a DataError that names the file."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(f"{fspath(path)}: {error}") from None
+    # Decoders raise nearly any error for corrupt bytes.
+    except Exception as error:
+        raise DataError(
+            f"{fspath(path)} is not a readable NetCDF file ({type(error).__name__})."
+        ) from error
 
 
 def check_self_contained(path: str | PathLike[str], *, may_hold_lists: bool = False) -> None:

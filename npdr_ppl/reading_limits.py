@@ -27,6 +27,8 @@ class ReadingLimits:
         rollouts: Largest count of rollouts; each costs about 0.1 ms to check.
         line_length: Longest row of a CSV file in characters; ``columns`` numbers of 25
             characters take a tenth of it.
+        blank_lines: Largest count of blank lines of a CSV file beyond one for each row. Some
+            programs on Windows write one after each row.
         text_bytes: Longest text beside the data, such as attributes, names and footers, in bytes;
             ours have less than a tenth of it.
         json_bytes: Largest JSON file or text of a run in bytes; policies with many parameters take
@@ -36,6 +38,8 @@ class ReadingLimits:
             have hundreds of data sets.
         robot_parts: Largest count of elements of a robot's description, with all repetitions;
             large robots have a thousand.
+        robot_attributes: Largest count of attributes of a robot's description; ten for each of
+            ``robot_parts`` are less than half of it.
         depth: Deepest nesting of parts; our files are nested three times, robots' bodies thirty.
         instructions: Largest count of instructions of a pickle; a rollout has a thousand.
     """
@@ -47,11 +51,13 @@ class ReadingLimits:
     columns: int = 1_000
     rollouts: int = 10_000
     line_length: int = 2**18
+    blank_lines: int = 100_000
     text_bytes: int = 2**20
     json_bytes: int = 2**23
     json_values: int = 200_000
     parts: int = 10_000
     robot_parts: int = 4_000
+    robot_attributes: int = 100_000
     depth: int = 200
     instructions: int = 1_000_000
 
@@ -65,8 +71,10 @@ class ReadingLimits:
             "numbers",
             "columns",
             "rollouts",
+            "blank_lines",
             "parts",
             "robot_parts",
+            "robot_attributes",
             "instructions",
         )
         check_range(self, 1, 1_000, "expansion", "depth")

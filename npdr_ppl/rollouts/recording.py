@@ -204,6 +204,8 @@ def _check_stretches(recording: "Recording") -> None:
     shapes = [readings.shape for readings in recording.readings]
     if recording.samplings and [s.values.shape for s in recording.samplings] != shapes:
         raise DataError("samplings and readings have different shapes.")
+    if not recording.stretches:
+        return  # all of every rollout is usable
     if len(recording.spans) != len(recording.readings):
         raise DataError(
             f"there are {len(recording.readings)} rollouts, but usable stretches of "
@@ -280,12 +282,12 @@ def _check_arrays(recording: "Recording") -> None:
                 raise DataError(
                     f"{name} of {where} should have shape {shape}, got {values.shape}."
                 )
-        rollout_checks.check_finite(readings, recording.channel_names, where)
-        rollout_checks.check_finite(actions, recording.action_names, where)
-        rollout_checks.check_finite(time[:, None], ("time",), where)
-        if recording.rewards is not None:
-            rollout_checks.check_finite(recording.rewards[index][:, None], ("reward",), where)
-        rollout_checks.check_time(time, where)
+    rollout_checks.check_values(recording.readings, recording.channel_names)
+    rollout_checks.check_values(recording.actions, recording.action_names)
+    rollout_checks.check_values([time[:, None] for time in recording.time], ("time",))
+    if recording.rewards is not None:
+        rollout_checks.check_values([r[:, None] for r in recording.rewards], ("reward",))
+    rollout_checks.check_times(recording.time)
     found = rollout_checks.canonical_time_step(recording.time)
     if abs(found - recording.time_step) > rollout_checks.MAX_RATE_DIFFERENCE * recording.time_step:
         raise DataError(

@@ -21,6 +21,8 @@ __all__ = [
     "check_finite",
     "check_names",
     "check_time",
+    "check_times",
+    "check_values",
     "check_unit_texts",
     "named",
     "refusing",
@@ -41,6 +43,10 @@ fraction of the median step. Time stamps rounded to milliseconds at 30 Hz deviat
 MAX_RATE_DIFFERENCE = 0.01
 """Largest relative difference between the time steps of two rollouts that is attributed to the
 clock."""
+
+_VALUES_TOGETHER = 100_000
+"""Number of values of short rollouts that are checked together. A call of NumPy costs as much as a
+thousand values; more of them together would take much memory."""
 
 _FORBIDDEN_IN_NAMES = re.compile(r"[,;\"'/\\]")
 _MAX_NAME_LENGTH = 100
@@ -178,10 +184,60 @@ def check_unit_texts(units: Sequence[str], names: Sequence[str]) -> None:
             )
 
 
+def check_values(rollouts: Sequence[NDArray[np.float64]], names: Sequence[str]) -> None:
+    """Raises a DataError if values of a rollout, ``(T, len(names))`` each, are not plausible."""
+    for batch in _batches(rollouts):
+        if batch.stop - batch.start > 1 and not _is_bad(np.concatenate(rollouts[batch])).any():
+            continue
+        for index in range(batch.start, batch.stop):
+            check_finite(rollouts[index], names, f"rollout {index}")
+
+
+def check_times(times: Sequence[NDArray[np.float64]]) -> None:
+    """Raises a DataError unless each rollout's time stamps increase in equal steps.
+
+    Args:
+        times: Time stamps of each rollout, ``(T + 1,)`` with T of at least 1, in s.
+    """
+    for batch in _batches(times):
+        if batch.stop - batch.start > 1 and _are_even(times[batch]):
+            continue
+        for index in range(batch.start, batch.stop):
+            check_time(times[index], f"rollout {index}")
+
+
+def _batches(arrays: Sequence[NDArray[np.float64]]) -> Iterator[slice]:
+    """Yields groups of rollouts that are checked together; a long rollout is alone."""
+    first, total = 0, 0
+    for index, values in enumerate(arrays):
+        total += values.size
+        if total > _VALUES_TOGETHER and index > first:
+            yield slice(first, index)
+            first, total = index, values.size
+    yield slice(first, len(arrays))
+
+
+def _are_even(times: Sequence[NDArray[np.float64]]) -> bool:
+    """Returns whether the steps of each rollout surely differ too little for an error.
+
+    The usual step lies between the smallest and the largest one. If these two differ by less than
+    the tolerance, no step differs by more from the usual one.
+    """
+    counts = np.array([len(time) for time in times])
+    steps = np.delete(np.diff(np.concatenate(times)), np.cumsum(counts[:-1]) - 1)
+    firsts = np.cumsum(counts - 1) - (counts - 1)
+    least, most = (f.reduceat(steps, firsts) for f in (np.minimum, np.maximum))
+    return bool(((least > 0) & (most - least <= MAX_STEP_JITTER * least)).all())
+
+
+def _is_bad(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        return ~(np.abs(values) <= MAX_MAGNITUDE)
+
+
 def check_finite(values: NDArray[np.float64], names: Sequence[str], where: str) -> None:
     """Raises a DataError if values ``(T, len(names))`` are not finite or above MAX_MAGNITUDE."""
-    with np.errstate(invalid="ignore"):
-        is_bad = ~(np.abs(values) <= MAX_MAGNITUDE)
+    is_bad = _is_bad(values)
     if is_bad.any():
         step, column = np.argwhere(is_bad)[0]
         raise DataError(

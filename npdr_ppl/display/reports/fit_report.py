@@ -1,6 +1,7 @@
 """The report on a fit."""
 
 from collections.abc import Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,14 @@ from npdr_ppl.display.reports.meanings import decision_verdict, findings
 from npdr_ppl.display.reports.posterior_parts import posterior_charts, predictive_charts
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
 from npdr_ppl.drawing.numbers import number
+from npdr_ppl.hdf5_checks import check_self_contained, named_netcdf
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import FitRecord
 
 __all__ = ["fit_report", "parameters_table"]
+
+MAX_ROWS = 1_000
+"""Largest number of parameters in a table or chart, so that a page can be read and opens fast."""
 
 
 def fit_report(folder: Path) -> Report:
@@ -33,14 +38,15 @@ def fit_report(folder: Path) -> Report:
     result = read_json(folder / "fit.json", FitRecord)
     description = run_description(folder)
     diagnosis = result.get("diagnosis") or {}
+    data = _posterior(folder)
     return Report(
         "fit",
         f"Fit of {len(result['parameters'])} parameters by {result['backend']}",
         decision_verdict(diagnosis),
         _key_figures(result, diagnosis),
         [
-            Section("Parameters", _parameters(result, diagnosis, folder)),
-            *_recording(folder),
+            Section("Parameters", _parameters(result, diagnosis, data)),
+            *_recording(folder, data),
             Section("Diagnostics", [FindingsPart(findings(diagnosis))]),
             *source_section(description),
             provenance_section(description, folder),
@@ -55,23 +61,28 @@ def parameters_table(
     most_likely: Mapping[str, Any],
     contraction: Mapping[str, Any],
 ) -> TablePart:
-    """Returns mean, spread and interval of every parameter as a table."""
-    rows = []
-    for name, row in parameters.items():
-        for label, mean, sd, (low, high), likely in _elements(name, row, most_likely.get(name)):
-            unit = units.get(name, "")
-            rows.append(
-                [
-                    f"{label} [{unit}]" if unit and unit != "1" else label,
-                    number(mean, ".4g"),
-                    number(sd, ".2g"),
-                    f"{number(low, '.4g')} … {number(high, '.4g')}",
-                    number(likely, ".4g"),
-                    number(contraction.get(label), ".0%"),
-                ]
-            )
+    """Returns mean, spread and interval of the first parameters as a table."""
+    elements = (
+        (units.get(name, ""), element)
+        for name, row in parameters.items()
+        for element in _elements(name, row, most_likely.get(name))
+    )
+    rows = [
+        [
+            f"{label} [{unit}]" if unit and unit != "1" else label,
+            number(mean, ".4g"),
+            number(sd, ".2g"),
+            f"{number(low, '.4g')} … {number(high, '.4g')}",
+            number(likely, ".4g"),
+            number(contraction.get(label), ".0%"),
+        ]
+        for unit, (label, mean, sd, (low, high), likely) in islice(elements, MAX_ROWS)
+    ]
     columns = ("parameter", "mean", "sd", "94 % interval", "most likely", "contraction")
-    return TablePart(columns, rows, "The interval contains 94 % of the posterior.")
+    caption = "The interval contains 94 % of the posterior."
+    if next(elements, None) is not None:
+        caption += f" Only the first {MAX_ROWS} parameters are shown."
+    return TablePart(columns, rows, caption)
 
 
 def _elements(
@@ -111,9 +122,7 @@ def _key_figures(result: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> lis
     return figures
 
 
-def _parameters(
-    result: Mapping[str, Any], diagnosis: Mapping[str, Any], folder: Path
-) -> list[Part]:
+def _parameters(result: Mapping[str, Any], diagnosis: Mapping[str, Any], data: Any) -> list[Part]:
     contraction = diagnosis.get("contraction") or {}
     parts: list[Part] = [
         parameters_table(
@@ -123,7 +132,7 @@ def _parameters(
             contraction=contraction,
         )
     ]
-    if data := _posterior(folder):
+    if data:
         return parts + posterior_charts(data, result.get("units") or {})
     # Without draws, only the intervals are drawn, relative to the means.
     scalars = {
@@ -133,7 +142,7 @@ def _parameters(
     }
     rows = {
         name: (row["hdi_94"][0] / row["mean"], 1.0, row["hdi_94"][1] / row["mean"])
-        for name, row in scalars.items()
+        for name, row in islice(scalars.items(), MAX_ROWS)
     }
     caption = "94 % intervals relative to the mean; the draws (posterior.nc) are missing."
     if not rows:
@@ -141,15 +150,21 @@ def _parameters(
     return [*parts, intervals_chart("intervals", rows, title="relative to mean", caption=caption)]
 
 
-def _recording(folder: Path) -> list[Section]:
-    if not (data := _posterior(folder)):
+def _recording(folder: Path, data: Any) -> list[Section]:
+    if not data:
         return []
     charts = predictive_charts(data, folder / "run")
     return [Section("Predictions and the recording", charts)] if charts else []
 
 
 def _posterior(folder: Path) -> Any:
+    """Returns the ArviZ object with the draws, or ``None`` if there is none."""
+    file = folder / "posterior.nc"
+    if not file.exists():
+        return None
+    # ArviZ takes a second to import, so it is imported only if there are draws that can be read.
+    with named_netcdf(file):
+        check_self_contained(file)
     from npdr_ppl.arviz_module import from_netcdf
 
-    file = folder / "posterior.nc"
-    return from_netcdf(file) if file.exists() else None
+    return from_netcdf(file)

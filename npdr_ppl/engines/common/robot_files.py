@@ -116,6 +116,9 @@ def _parsed(text: str, name: str) -> ElementTree.Element:
         ModelError: It is not well-formed, or has more parts or deeper ones than a robot. Engines
             accept some texts that are not well-formed, but may see other elements in them.
     """
+    # A parser keeps all attributes of an element in memory, so they are counted before it begins.
+    if text.count("=") > LIMITS.robot_attributes:
+        raise ModelError(f"{name} has more than {LIMITS.robot_attributes} attributes.")
     if "<!DOCTYPE" in text:
         raise ModelError(f"{name} has a DOCTYPE, which engines do not understand; remove it.")
     parser = ElementTree.XMLPullParser(("start", "end"))

@@ -77,18 +77,21 @@ def _parse(data: bytes) -> tuple[dict[str, NDArray[np.float64]], "array[int]"]:
     rows: list[list[str]] = []
     lines = array("q")
     blocks: list[list[NDArray[np.float64]]] = []
+    rollouts = _RolloutCount()
 
     def convert() -> None:
         numbers = lines[len(lines) - len(rows) :]
         cells = [[row[index] for row in rows] for index in range(len(header))]
         columns = zip(header, cells, strict=True)
         blocks.append([_numbers(name, column, numbers) for name, column in columns])
+        rollouts.add(blocks[-1][header.index("rollout")])
         rows.clear()
 
     try:
         for row in reader:
             source.row_length = 0
             if not row or (len(row) == 1 and not row[0].strip()):
+                source.add_blank(len(lines))
                 continue
             if not header:
                 header = _checked_header(row)
@@ -116,18 +119,44 @@ def _parse(data: bytes) -> tuple[dict[str, NDArray[np.float64]], "array[int]"]:
     }, lines
 
 
+class _RolloutCount:
+    """Counts rollouts block by block, so that a file with too many is not read to its end."""
+
+    def __init__(self) -> None:
+        self._number = 1
+        self._last = np.empty(0)
+
+    def add(self, values: NDArray[np.float64]) -> None:
+        """Takes the next values of the column rollout; raises a DataError if they are too many.
+
+        A change to or from an empty cell does not count; it gets a message of its own later.
+        """
+        self._number += int((np.abs(np.diff(values, prepend=self._last)) > 0).sum())
+        self._last = values[-1:]
+        if self._number > LIMITS.rollouts:
+            raise DataError(f"it has more than {LIMITS.rollouts} rollouts.")
+
+
 class BoundedLines:
     """The lines of a text, decoded block by block; no row may be longer than a limit.
 
     Attributes:
         number: Number of the present line, from 1.
         row_length: Characters since the last row ended; a quoted cell may hold several lines.
+        num_blank: Number of blank lines so far.
     """
 
     def __init__(self, data: bytes) -> None:
         self._file = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig", newline="")
         self.number = 0
         self.row_length = 0
+        self.num_blank = 0
+
+    def add_blank(self, num_rows: int) -> None:
+        """Counts a blank line; raises a DataError if there are many more of them than rows."""
+        self.num_blank += 1
+        if self.num_blank > num_rows + LIMITS.blank_lines:
+            raise DataError(f"it has {LIMITS.blank_lines} more blank lines than rows.")
 
     def __iter__(self) -> "BoundedLines":
         return self

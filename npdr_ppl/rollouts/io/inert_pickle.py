@@ -15,9 +15,9 @@ import math
 import pickletools
 import struct
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,10 @@ _DTYPES = frozenset(("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2",
 _LABEL_DTYPES = frozenset(("O", "O8"))  # accepted for arrays of text only
 _MAX_DIMENSIONS = 8
 _MAX_LABEL_LENGTH = 200
+
+_CONTAINER_WORK = 4
+"""Work of making a list, dictionary or record, in instructions. The garbage collector visits each
+of them several times."""
 
 
 @dataclass
@@ -91,8 +95,8 @@ class _PickledDtype:
     byte_order: str = "="
 
 
-class _Mark:
-    """A marker on the stack; the entries above it belong together."""
+_MARK = object()
+"""A marker on the stack; the entries above it belong together."""
 
 
 def read_pickle(data: bytes, records: Collection[str]) -> Any:
@@ -138,7 +142,7 @@ class _Costs:
         size: Bytes of the file.
 
     Attributes:
-        work: Instructions, and entries that they visited again.
+        work: Instructions, containers that they made, and entries that they visited again.
         copied: Bytes of text that were copied.
     """
 
@@ -190,41 +194,15 @@ class _Machine:
         self.costs = costs or _Costs(size)
 
     def run(self) -> Any:
-        constants = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-        containers: dict[str, Callable[[], Any]] = {
-            "EMPTY_DICT": dict,
-            "EMPTY_LIST": list,
-            "EMPTY_TUPLE": tuple,
-            "MARK": _Mark,
-        }
-        # genops decodes one instruction at a time and leaves the file position right after it.
-        # joblib writes the raw bytes of an array there.
-        for opcode, operand, _ in pickletools.genops(self.file):
-            argument: Any = operand
+        # The operand is read before the step, so that the file position is right after the
+        # instruction. joblib writes the raw bytes of an array there.
+        while code := self.file.read(1):
             self.costs.spend(1)
-            name = opcode.name
-            if name in ("PROTO", "FRAME"):
-                continue
-            if name == "STOP":
+            read_operand, step = _INSTRUCTIONS[code]
+            operand = read_operand(self.file) if read_operand else None
+            if step is None:
                 return _plain(self.stack.pop())
-            if name in constants:
-                self.stack.append(constants[name])
-            elif name in containers:
-                self.stack.append(containers[name]())
-            elif name in _LITERALS:
-                self.stack.append(argument)
-            elif name in ("BINPUT", "LONG_BINPUT"):
-                self.memo[argument] = self.stack[-1]
-            elif name == "MEMOIZE":
-                self.memo[len(self.memo)] = self.stack[-1]
-            elif name in ("BINGET", "LONG_BINGET"):
-                self.stack.append(self.memo[argument])
-            elif name in _STEPS:
-                _STEPS[name](self)
-            elif name == "GLOBAL":
-                self.stack.append(self.named(argument))
-            else:
-                raise DataError(f"the pickle uses the instruction {name}, which data do not need.")
+            step(self, operand)
         raise EOFError
 
     def named(self, name: str) -> _Global:
@@ -236,10 +214,15 @@ class _Machine:
             "known record; nothing of it was run."
         )
 
+    def add(self, container: Any) -> None:
+        """Puts a new container or record on the stack."""
+        self.costs.spend(_CONTAINER_WORK)
+        self.stack.append(container)
+
     def pop_mark(self) -> list[Any]:
         """Removes and returns the entries above the topmost marker."""
         entries: list[Any] = []
-        while not isinstance(entry := self.stack.pop(), _Mark):
+        while (entry := self.stack.pop()) is not _MARK:
             entries.append(entry)
         return entries[::-1]
 
@@ -250,7 +233,7 @@ class _Machine:
             entries = [self.stack.pop() for _ in range(count)][::-1]
         self.stack.append(tuple(_plain(entry) for entry in entries))
 
-    def append(self, entries: list[Any]) -> None:
+    def append(self, entries: Sequence[Any]) -> None:
         if not isinstance(self.stack[-1], list):
             raise TypeError
         self.stack[-1].extend(_plain(entry) for entry in entries)
@@ -280,7 +263,7 @@ class _Machine:
         if cls.name == _JOBLIB_ARRAY:
             self.stack.append(_PickledArray(is_joblib=True))
         else:
-            self.stack.append(Record(cls.name, arguments))
+            self.add(Record(cls.name, arguments))
 
     def reduce(self) -> None:
         arguments, function = self.stack.pop(), self.stack.pop()
@@ -376,7 +359,7 @@ _LITERALS = frozenset(
 )
 
 _STEPS: dict[str, Callable[[_Machine], None]] = {
-    "APPEND": lambda machine: machine.append([machine.stack.pop()]),
+    "APPEND": lambda machine: machine.append((machine.stack.pop(),)),
     "APPENDS": lambda machine: machine.append(machine.pop_mark()),
     "BUILD": _Machine.build,
     "NEWOBJ": _Machine.new_object,
@@ -390,10 +373,56 @@ _STEPS: dict[str, Callable[[_Machine], None]] = {
     "TUPLE3": lambda machine: machine.tuple_of(3),
 }
 
+_Step = Callable[[_Machine, Any], None]
+
+
+def _step(name: str) -> _Step | None:
+    """Returns what the machine does for an instruction, given its operand; ``None`` to stop."""
+    constants: dict[str, Any] = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
+    constants |= {"EMPTY_TUPLE": (), "MARK": _MARK}
+    containers: dict[str, type] = {"EMPTY_DICT": dict, "EMPTY_LIST": list}
+    if name == "STOP":
+        return None
+    if name in ("PROTO", "FRAME"):
+        return lambda machine, operand: None
+    if name in constants:
+        constant = constants[name]
+        return lambda machine, operand: machine.stack.append(constant)
+    if name in containers:
+        container = containers[name]
+        return lambda machine, operand: machine.add(container())
+    if name in _LITERALS:
+        return lambda machine, operand: machine.stack.append(operand)
+    if name in ("BINPUT", "LONG_BINPUT"):
+        return lambda machine, operand: machine.memo.__setitem__(operand, machine.stack[-1])
+    if name == "MEMOIZE":
+        return lambda machine, operand: machine.memo.__setitem__(
+            len(machine.memo), machine.stack[-1]
+        )
+    if name in ("BINGET", "LONG_BINGET"):
+        return lambda machine, operand: machine.stack.append(machine.memo[operand])
+    if name == "GLOBAL":
+        return lambda machine, operand: machine.stack.append(machine.named(operand))
+    if name in _STEPS:
+        step = _STEPS[name]
+        return lambda machine, operand: step(machine)
+
+    def refuse(machine: _Machine, operand: Any) -> None:
+        raise DataError(f"the pickle uses the instruction {name}, which data do not need.")
+
+    return refuse
+
+
+_INSTRUCTIONS: dict[bytes, tuple[Callable[[IO[bytes]], Any] | None, _Step | None]] = {
+    opcode.code.encode("latin-1"): (opcode.arg and opcode.arg.reader, _step(opcode.name))
+    for opcode in pickletools.opcodes
+}
+"""Of each instruction, a function that reads its operand if it has one, and its step."""
+
 
 def _plain(value: Any) -> Any:
     """Returns the array of a finished placeholder, and any other value unchanged."""
-    if isinstance(value, _Mark) or (isinstance(value, _PickledArray) and value.values is None):
+    if value is _MARK or (isinstance(value, _PickledArray) and value.values is None):
         raise TypeError
     return value.values if isinstance(value, _PickledArray) else value
 

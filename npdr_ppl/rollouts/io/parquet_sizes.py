@@ -11,6 +11,7 @@ References:
 """
 
 import os
+from contextlib import suppress
 from typing import IO, Any
 
 from npdr_ppl.errors import DataError
@@ -31,7 +32,10 @@ _PAGE_DECOMPRESSED, _PAGE_COMPRESSED = 2, 3
 """Fields of a page's header."""
 
 HEADER_BYTES = 2**16
-"""Longest page header that is read, in bytes; statistics of numbers take less than a hundred."""
+"""Longest page header that is read, in bytes."""
+
+USUAL_HEADER_BYTES = 2**9
+"""Bytes of a page header that are read at first; with statistics of numbers it has about 100."""
 
 
 def check_footer(file: IO[bytes]) -> None:
@@ -88,15 +92,26 @@ def _page_bytes(file: IO[bytes], column: dict[int, Any]) -> float:
     end = position + column[_COMPRESSED]
     total = 0.0
     while position < end:
-        file.seek(position)
-        header = _Compact(file.read(HEADER_BYTES))
-        fields = header.structure()
+        header, fields = _page_header(file, position)
         decompressed, compressed = fields[_PAGE_DECOMPRESSED], fields[_PAGE_COMPRESSED]
         if decompressed < 0 or compressed < 0:
             raise DataError("a page has a negative size.")
         total += decompressed
         position += header.position + compressed
     return total
+
+
+def _page_header(file: IO[bytes], position: int) -> tuple["_Compact", dict[int, Any]]:
+    """Returns the header of a page, and its fields."""
+    for length in (USUAL_HEADER_BYTES, HEADER_BYTES):
+        file.seek(position)
+        header = _Compact(file.read(length))
+        # Text that is skipped may end behind the bytes, so the position is compared, too.
+        with suppress(IndexError):
+            fields = header.structure()
+            if header.position <= len(header.data):
+                return header, fields
+    raise DataError("a page has no header, or one that is too long.")
 
 
 class _Compact:
@@ -116,9 +131,12 @@ class _Compact:
             raise ValueError("nested too deeply")
         found: dict[int, Any] = {}
         identifier = 0
-        while kind := self._byte():
+        data = self.data
+        while kind := data[self.position]:
+            self.position += 1
             identifier = identifier + (kind >> 4) if kind >> 4 else self._number()
             found[identifier] = self._value(kind & 15, depth)
+        self.position += 1
         return found
 
     def _byte(self) -> int:
@@ -126,10 +144,16 @@ class _Compact:
         return self.data[self.position - 1]
 
     def _length(self) -> int:
+        # A footer has many thousands of lengths, so their bytes are read in one loop.
+        data, position = self.data, self.position
         result = shift = 0
-        while (byte := self._byte()) & 128:
+        while (byte := data[position]) & 128:
+            position += 1
             result |= (byte & 127) << shift
             shift += 7
+            if shift > 63:  # adding up a longer one takes time that grows with its square
+                raise ValueError("a number has more than 64 bits")
+        self.position = position + 1
         return result | byte << shift
 
     def _number(self) -> int:
@@ -137,8 +161,14 @@ class _Compact:
         return (value >> 1) ^ -(value & 1)
 
     def _value(self, kind: int, depth: int) -> Any:
-        if kind in (4, 5, 6):
-            return self._number()
+        if 4 <= kind <= 6:
+            value = self._length()
+            return (value >> 1) ^ -(value & 1)
+        # Text, truth values, bytes and floating-point numbers are not needed.
+        if kind == 8:
+            length = self._length()
+            self.position += length
+            return None
         if kind in (9, 10):
             head = self._byte()
             length = head >> 4 if head >> 4 < 15 else self._length()
@@ -146,9 +176,7 @@ class _Compact:
             return [self._value(entry, depth + 1) for _ in range(length)]
         if kind == 12:
             return self.structure(depth + 1)
-        if kind not in (1, 2, 3, 7, 8):
+        if kind not in (1, 2, 3, 7):
             raise ValueError("not a structure of a Parquet file")
-        # Truth values, bytes, floating-point numbers and text are not needed.
-        length = self._length() if kind == 8 else {3: 1, 7: 8}.get(kind, 0)
-        self.position += length
+        self.position += {3: 1, 7: 8}.get(kind, 0)
         return None

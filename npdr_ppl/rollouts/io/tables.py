@@ -69,8 +69,8 @@ def from_table(
         return _uneven(columns, channel_names, action_names, spans, units, bool(rewards))
     stepwise_spans = [slice(span.start, span.stop - 1) for span in spans]
     return Recording(
-        readings=tuple(_matrix(columns, channel_names, span) for span in spans),
-        actions=tuple(_matrix(columns, action_names, span) for span in stepwise_spans),
+        readings=_matrices(columns, channel_names, spans),
+        actions=_matrices(columns, action_names, stepwise_spans),
         channel_names=tuple(channel_names),
         action_names=tuple(action_names),
         time_step=rollout_checks.canonical_time_step(times),
@@ -119,8 +119,7 @@ def _is_uneven(
         if is_empty.any():
             return True
     try:
-        for index, time in enumerate(times):
-            rollout_checks.check_time(time, f"rollout {index}")
+        rollout_checks.check_times(times)
         rollout_checks.canonical_time_step(times)
     except DataError:
         return True
@@ -237,6 +236,12 @@ def _stepwise_columns(
     return always or stepwise
 
 
-def _matrix(columns: Mapping[str, Array], names: Sequence[str], span: slice) -> Array:
-    parts = [columns[name][span] for name in names]
-    return np.stack(parts, axis=1) if parts else np.zeros((span.stop - span.start, 0))
+def _matrices(
+    columns: Mapping[str, Array], names: Sequence[str], spans: Sequence[slice]
+) -> tuple[Array, ...]:
+    """Returns some columns of each rollout, ``(rows, len(names))``."""
+    # One matrix of all rollouts, because a call of NumPy costs more than a short rollout's values.
+    rows = np.zeros((len(columns["rollout"]), len(names)))
+    for index, name in enumerate(names):
+        rows[:, index] = columns[name]
+    return tuple(rows[span] for span in spans)

@@ -33,6 +33,12 @@ MAX_TEXT_BYTES = 2**26
 """Largest total of the cells that stay text, in bytes. As text, a cell takes ten times the memory
 of a number; vectors of six joints at 50 Hz reach this size after half an hour."""
 
+MAX_WORDS = MAX_TEXT_BYTES // 10
+"""Largest number of words or numbers in the cells that stay text. Recorded numbers have about ten
+characters, so that their vectors reach ``MAX_TEXT_BYTES`` first."""
+
+_BETWEEN_WORDS = (",", ";", " ")
+
 
 def read_csv_log(path: Path, settings: LogSettings) -> Log:
     """Reads a CSV file with any columns.
@@ -65,6 +71,7 @@ def read_csv_columns(path: Path, has_header: bool | None) -> dict[str, Array | T
         for row in reader:
             lines.row_length = 0
             if not row or (len(row) == 1 and not row[0].strip()):
+                lines.add_blank(table.num_rows)
                 continue
             if not table.names:
                 if has_header is None:
@@ -100,6 +107,7 @@ class _Table:
 
     Attributes:
         names: Names of the columns, empty until :meth:`begin`.
+        num_rows: Number of rows so far.
     """
 
     def __init__(self, *, decimal_comma: bool) -> None:
@@ -107,8 +115,9 @@ class _Table:
         self._comma = decimal_comma
         self._rows: list[list[str]] = []
         self._blocks: list[list[Array | Texts]] = []
-        self._count = 0
+        self.num_rows = 0
         self._text_bytes = 0
+        self._num_words = 0
 
     def begin(self, header: list[str]) -> None:
         """Takes the names of the columns."""
@@ -131,8 +140,8 @@ class _Table:
         if len(row) > width and any(cell.strip() for cell in row[width:]):
             raise DataError(f"line {line} has {len(row)} cells, but the first line has {width}.")
         self._rows.append((row + [""] * (width - len(row)))[:width])
-        self._count += 1
-        if self._count * width > LIMITS.numbers:
+        self.num_rows += 1
+        if self.num_rows * width > LIMITS.numbers:
             raise DataError(f"it has more than {LIMITS.numbers:.0e} numbers.")
         if len(self._rows) * width >= CELLS_PER_BLOCK:
             self._convert()
@@ -158,9 +167,13 @@ class _Table:
             numbers = numbers_of(cells, comma=self._comma)
             if numbers is None:
                 self._text_bytes += sum(map(len, cells))
+                text = "\n".join(cells)
+                self._num_words += len(cells) + max(map(text.count, _BETWEEN_WORDS))
             block.append(cells if numbers is None else numbers)
         if self._text_bytes > MAX_TEXT_BYTES:
             raise DataError(f"its text takes more than {MAX_TEXT_BYTES} bytes.")
+        if self._num_words > MAX_WORDS:
+            raise DataError(f"its text has more than {MAX_WORDS} words or numbers.")
         self._blocks.append(block)
         self._rows.clear()
 

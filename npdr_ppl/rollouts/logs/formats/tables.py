@@ -150,16 +150,19 @@ def log_of_columns(
             for name, difference in different.items()
         ]
     signals = []
+    is_timed = np.isfinite(time)
     for name, values in numbers.items():
         if name in stamps:
             continue
         own = next((s for s in stamps if name.startswith(s[: -len("header/stamp")])), None)
         is_known = np.isfinite(values)
         at = time if own is None else np.where(np.isfinite(stamps[own]), stamps[own], np.nan)
-        keep = is_known & np.isfinite(at)
+        keep = is_known & (is_timed if own is None else np.isfinite(at))
         unit = (units or {}).get(name, "")
         signals.append(
-            Signal(f"{prefix}{name}", at if keep.all() else at[keep], values[keep], unit)
+            Signal(f"{prefix}{name}", at, values.copy(), unit)
+            if keep.all()
+            else Signal(f"{prefix}{name}", at[keep], values[keep], unit)
         )
     notes += [f"the signals beside {rollout_checks.shown(s)} have its time." for s in stamps]
     return Log(
@@ -276,10 +279,12 @@ def _components(
 
 def _vectors(cells: Texts) -> Array | None:
     """Returns the vectors in cells such as ``[0.1, 0.2]``, ``(N, K)``, or ``None`` for text."""
-    rows: list[list[float] | None] = []
-    for cell in cells:
+    # Rows go into an array at once, because a list takes four times the memory. Its width doubles
+    # when a row is longer, so that it is seldom copied.
+    longest = 0
+    result = np.empty((len(cells), 0))
+    for index, cell in enumerate(cells):
         if not cell.strip():
-            rows.append(None)
             continue
         try:
             values = _DECODER.decode(cell)
@@ -287,15 +292,15 @@ def _vectors(cells: Texts) -> Array | None:
             values = _unusual_vector(cell)
         if values is None:
             return None
-        rows.append(values)
-    longest = max((len(row) for row in rows if row is not None), default=0)
-    if longest == 0 or longest > LIMITS.columns or longest * len(rows) > LIMITS.numbers:
-        return None
-    result = np.full((len(rows), longest), np.nan)
-    for index, row in enumerate(rows):
-        if row is not None:
-            result[index, : len(row)] = row
-    return result
+        longest = max(longest, len(values))
+        if longest > LIMITS.columns or longest * len(cells) > LIMITS.numbers:
+            return None
+        if longest > (width := result.shape[1]):
+            wider = np.full((len(cells), max(longest, 2 * width)), np.nan)
+            wider[:index, :width] = result[:index]
+            result = wider
+        result[index, : len(values)] = values
+    return result[:, :longest] if longest else None
 
 
 _DECODER = msgspec.json.Decoder(list[float])
