@@ -10,7 +10,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
 
 NUMBERS = {"csv": 1500, "parquet": 150, "npz": 150, "nc": 150, "pickle": 300, "mjcf": 150,
-           "urdf": 100, "run": 150, "resume": 150,
+           "urdf": 100, "run": 40, "resume": 150,
            **dict.fromkeys(file_outcomes.LOGS, 100)}  # fmt: skip
 """Files by format."""
 

@@ -236,7 +236,7 @@ def test_a_law_that_may_as_well_be_its_limit_is_not_named(hidden, strength, inst
     ("rig", "port", "shorter"),
     [
         # Every candidate is simulated step after step, and the arm takes five times as many.
-        ("furuta", "arm", {"num_steps": 1250, "segment_length": 50}),
+        ("furuta", "arm", {"num_steps": 625, "segment_length": 25}),
         ("cart_pole", "rail", {}),
     ],
 )

@@ -121,10 +121,12 @@ def test_workers_import_nothing_from_the_current_folder(hostile, tmp_path, name)
 @pytest.mark.parametrize(
     "command",
     [
-        ("fit", "own.py:model", "--simulations", "60", "--workers", "2", "--out", "fit"),
+        ("fit", "own.py:model", "--backend", "abc", "--initial-state", "recorded",
+         "--simulations", "60", "--workers", "2", "--out", "fit"),
         ("compare", "pendulum", "--backends", "abc,bayesian-linear-regression", "--simulations",
          "60", "--workers", "2", "--out", "compare"),
-        ("discover", "pendulum", "--workers", "2", "--out", "found"),
+        ("discover", "pendulum", "--candidates", "hinge.coulomb_friction,hinge.spring",
+         "--workers", "2", "--out", "found"),
     ],
     ids=lambda words: words[0],
 )  # fmt: skip

@@ -34,6 +34,7 @@ from tests.helpers.small_loop import (
     small_options,
     small_task,
     swinging_task,
+    without_remedies,
 )
 
 
@@ -54,15 +55,18 @@ def fork(folder, seed, mode, modules=None):
     try:
         folder.mkdir(parents=True, exist_ok=True)
         model, target, task, options = pendulum, HandmadePendulum, small_task(), small_options()
+        context = contextlib.nullcontext()
         if mode == "discover":
+            context = without_remedies()
             model, target = accurate_pendulum, DryPendulum
             task, options = swinging_task(), discovering_options()
         if mode == "check":
             # No policy succeeds, so the loop does all that a check can ask for.
             task = replace(small_task(), success=1e9)
             options = small_options(iterations=1, extra_rollouts=1, least_success=0.5)
-        train(model, target(folder / "episodes.log"), task, options=SMALL_DATA, loop=options,
-              out=folder / "run", seed=seed, progress=False)  # fmt: skip
+        with context:
+            train(model, target(folder / "episodes.log"), task, options=SMALL_DATA, loop=options,
+                  out=folder / "run", seed=seed, progress=False)  # fmt: skip
         if modules is not None:
             modules.write_text("\n".join(sys.modules))
         os._exit(0)

@@ -4,9 +4,11 @@ The target is not made by the package: it integrates the pendulum's equation its
 parameters, and writes a line for every episode after it has finished.
 """
 
+import contextlib
 import math
 import os
 import time
+from dataclasses import replace
 
 import numpy as np
 import pyro
@@ -14,7 +16,7 @@ import pyro.distributions as dist
 import torch
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery import DiscoveryOptions
+from npdr_ppl.discovery import DiscoveryOptions, recording_repair
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.loop.control_task import ControlTask
 from npdr_ppl.loop.loop_options import LoopOptions
@@ -177,3 +179,14 @@ def discovering_options(when="before inference", **changed):
     discovery = DiscoveryOptions(effects=few, max_effects=1)
     settings = {"iterations": 1, "discovers": when, "discovery": discovery}
     return small_options(**{**settings, **changed})
+
+
+@contextlib.contextmanager
+def without_remedies():
+    """Tries no remedies of faults, which takes most of the time of a small run that discovers."""
+    settings = recording_repair.REPAIR
+    recording_repair.REPAIR = replace(settings, large_residual=1.0)
+    try:
+        yield
+    finally:
+        recording_repair.REPAIR = settings

@@ -11,7 +11,7 @@ from npdr_ppl.loop.npdr_loop import train
 from npdr_ppl.models.pendulum import pendulum
 from tests.helpers.small_loop import SMALL_DATA, HandmadePendulum, small_options, small_task
 
-EDITS = 6
+EDITS = 3
 """Edits of each file."""
 
 

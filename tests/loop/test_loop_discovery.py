@@ -24,7 +24,13 @@ from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.policies.playback import Sinusoid
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
-from tests.helpers.small_loop import SMALL_DATA, DryPendulum, discovering_options, swinging_task
+from tests.helpers.small_loop import (
+    SMALL_DATA,
+    DryPendulum,
+    discovering_options,
+    swinging_task,
+    without_remedies,
+)
 
 
 def run(folder, options, **kwargs):
@@ -45,7 +51,8 @@ def finished(tmp_path_factory):
     """A run of two iterations on a pendulum with dry friction."""
     folder = tmp_path_factory.mktemp("loop") / "run"
     options = discovering_options(iterations=2)
-    return folder, options, run(folder, options)
+    with without_remedies():
+        return folder, options, run(folder, options)
 
 
 @pytest.mark.slow
@@ -96,7 +103,8 @@ def test_a_resumed_run_reads_what_was_found(finished, monkeypatch):
 
 @pytest.mark.slow
 def test_after_a_diagnosis_the_model_as_it_was_has_a_posterior_too(tmp_path):
-    result = run(tmp_path / "run", discovering_options("after diagnosis", extra_rounds=0))
+    with without_remedies():
+        result = run(tmp_path / "run", discovering_options("after diagnosis", extra_rounds=0))
     decisions = result.iterations[0]["decisions"]
     assert [d["action"] for d in decisions][0] == Action.REVISED
     assert decisions[0]["decision"] == "revise the model"
