@@ -229,5 +229,12 @@ def _drift(channel: Track, commands: Track) -> tuple[float, float] | None:
     before = channel.time[after - 1]
     nearest = np.where(changed - before < channel.time[after] - changed, after - 1, after)
     lateness = np.unwrap(changed - channel.time[nearest], period=step)
-    (slope, _), covariance = np.polyfit(changed, lateness, 1, cov=True)
-    return float(slope), float(covariance[0, 0]) ** 0.5
+    passed, late = changed - changed.mean(), lateness - lateness.mean()
+    # Of stamps that hardly differ or are near the largest number, the squares are 0 or infinite.
+    with np.errstate(over="ignore", invalid="ignore"):
+        square = float(passed @ passed)
+        if not 0.0 < square < np.inf:
+            return None
+        slope = float(passed @ late) / square
+        rest = late - slope * passed
+        return slope, float(rest @ rest / (len(rest) - 2) / square) ** 0.5

@@ -156,6 +156,11 @@ def test_clocks_that_drift_apart_are_said_where_a_table_repeats_commands(drift):
     assert not said or "differ by 0.01 %" in said[0]
 
 
+def test_clocks_of_large_numbers_are_compared_too():
+    time = 1e13 + STEP * np.arange(1000)  # rounded to 2 ms
+    assert made([track(time)], [Track(time, np.sin(np.arange(1000.0)))]).notes == ()
+
+
 def test_commands_at_another_rate_are_not_taken_for_a_drift():
     time = STEP * np.arange(2000)
     slow = np.arange(0.0, time[-1], 20.83 * STEP)
