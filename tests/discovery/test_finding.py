@@ -142,7 +142,8 @@ def test_a_pair_of_effects():
 
 @pytest.mark.slow
 def test_an_inseparable_pair_is_reported_as_a_class():
-    case, found = discover("pendulum", "inseparable", (("gravity", "tilt"),), strength=0.3)
+    place = ("gravity", "tilt")
+    case, found = discover("pendulum", "inseparable", (place,), strength=0.3, num_rollouts=2)
     (finding,) = found.effects
     kinds = {finding.effect.id, *finding.equivalent_to}
     assert {"tilt", "encoder_bias", "unbalance"} <= kinds
@@ -181,7 +182,9 @@ def test_nothing_is_found_where_nothing_is_missing():
 @pytest.mark.slow
 def test_an_effect_outside_the_catalogue_is_unknown():
     place = ("hinge", "cross_term")
-    _, found = discover("pendulum", "outside", (place,), strength=0.15, max_effects=2)
+    _, found = discover(
+        "pendulum", "outside", (place,), strength=0.15, max_effects=2, num_rollouts=2
+    )
     assert found.verdict == "unknown", found.effects
     assert found.remainder.fired
 
@@ -223,7 +226,13 @@ def test_a_resonance_without_its_entry_is_unknown():
 def test_a_law_that_may_as_well_be_its_limit_is_not_named(hidden, strength, instead, shape):
     others, place = (instead, CoulombFriction("hinge")), ("hinge", hidden)
     _, found = discover(
-        "pendulum", "one", (place,), strength=strength, effects=others, max_effects=1
+        "pendulum",
+        "one",
+        (place,),
+        strength=strength,
+        effects=others,
+        max_effects=1,
+        num_rollouts=2,
     )
     (finding,) = found.effects
     assert finding.effect.id == instead.id and finding.at_edge == (shape,)
@@ -314,11 +323,11 @@ def test_coarse_steps_are_no_discovery_and_hide_none():
     # One Euler step per sample is off by half a sample: a delay of 10 ms, if one believed it.
     few = (InputDelay("torque"), CoulombFriction("hinge"), ViscousFriction("hinge"))
     search = npdr.DiscoveryOptions(effects=few)
-    still = npdr.discover(pendulum, swing(0.0, num_rollouts=3, seed=SEED), search=search)
+    still = npdr.discover(pendulum, swing(0.0, num_rollouts=2, seed=SEED), search=search)
     assert (still.verdict, still.effects) == ("none", []), still.reason
     assert "the revised model takes finer ones" in still.reason
-    recording = swing(0.3, num_rollouts=4, seed=SEED)
-    found = npdr.discover(pendulum, recording[[0, 1, 2]], holdout=recording[[3]], search=search)
+    recording = swing(0.3, num_rollouts=3, seed=SEED)
+    found = npdr.discover(pendulum, recording[[0, 1]], holdout=recording[[2]], search=search)
     assert [f.effect.name for f in found.effects] == ["hinge.coulomb_friction"], found.reason
     assert found.verdict == "named"
     assert found.effects[0].parameters["magnitude"].mean == pytest.approx(0.3, rel=0.03)
@@ -340,7 +349,7 @@ def test_coarse_steps_of_an_engine_are_no_discovery():
         return npdr.simulate("trajectory", simulator, {"mass": mass}, inputs)
 
     few = (InputDelay("torque"), CoulombFriction("hinge"))
-    recording = swing(0.0, num_rollouts=2, seed=SEED)
+    recording = swing(0.0, num_rollouts=1, seed=SEED)
     found = npdr.discover(rod, recording, search=npdr.DiscoveryOptions(effects=few))
     assert (found.verdict, found.effects) == ("none", []), found.reason
     assert "the revised model takes finer ones" in found.reason
@@ -373,7 +382,8 @@ def test_a_recording_made_in_coarse_steps_is_left_to_them():
 def test_wrong_data_are_repaired_and_not_taken_for_physics(kind, said):
     # Each fault has an effect beside it that explains a part of it.
     tempting = (InputDelay("torque"), Spring("hinge"), CoulombFriction("hinge"))
-    _, found = discover("pendulum", "bad_data", (("data", kind),), effects=tempting)
+    place = ("data", kind)
+    _, found = discover("pendulum", "bad_data", (place,), effects=tempting, num_rollouts=1)
     (note,) = found.problems
     assert said in note
     assert not found.effects
