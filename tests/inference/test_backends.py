@@ -43,7 +43,14 @@ def method(request):
 def brief(method):
     """The same for tests of manners, for which a few draws of a slow sampler will do."""
     if method.name == "nuts":
-        return dataclasses.replace(method, num_samples=50, warmup=30)
+        return dataclasses.replace(method, num_samples=20, warmup=20)
+    return method
+
+
+def little_trained(method):
+    """The same after a few epochs, for tests that compare what one training made."""
+    if hasattr(method, "epochs"):
+        return dataclasses.replace(method, epochs=5)
     return method
 
 
@@ -163,6 +170,7 @@ def test_log_prob_is_differentiable(brief):
 
 @pytest.mark.slow
 def test_same_seed_same_result_also_after_resumption(brief, tmp_path):
+    brief = little_trained(brief)
     problem = make_problem()
     state, _ = run_round(brief, problem, brief.init(problem), 0, n=200)
     again, _ = run_round(brief, problem, brief.init(problem), 0, n=200)
@@ -191,7 +199,7 @@ def test_initial_state_survives_writing(brief):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in sorted(backends()) if backend_class(n).amortises])
 def test_amortised_states_hold_at_every_observation(name):
-    method = backend(name)
+    method = little_trained(backend(name))
     problem = make_problem()
     state, _ = run_round(method, problem, method.init(problem), 0, n=300)
     observations = torch.stack((OBSERVATION, -OBSERVATION, torch.zeros(3)))
