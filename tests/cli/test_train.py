@@ -67,6 +67,7 @@ def recording(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_draws")
 def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
     out = tmp_path / "run"
     words = [

@@ -24,6 +24,9 @@ from npdr_ppl.run_files import load_tensors
 from npdr_ppl.targets import RecordedTarget
 from tests.helpers.small_loop import SMALL_DATA, HandmadePendulum, small_options, small_task
 
+# No test is of the check of a posterior, which takes most of the time of a run this small.
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 
 def scripted(monkeypatch, *decisions):
     """Makes diagnoses return these decisions, one after the other."""
