@@ -383,7 +383,7 @@ def test_wrong_data_are_repaired_and_not_taken_for_physics(kind, said):
     # Each fault has an effect beside it that explains a part of it.
     tempting = (InputDelay("torque"), Spring("hinge"), CoulombFriction("hinge"))
     place = ("data", kind)
-    _, found = discover("pendulum", "bad_data", (place,), effects=tempting, num_rollouts=1)
+    _, found = discover("pendulum", "bad_data", (place,), effects=tempting, num_rollouts=2)
     (note,) = found.problems
     assert said in note
     assert not found.effects

@@ -4,14 +4,13 @@
 
 Each line of the input is a JSON list: the kind of file, and its path. The answer is a JSON object:
 ``outcome`` ("read", "refused" or what else happened), ``message``, ``seconds`` of processor time,
-converted to a core of the usual speed, and ``megabytes`` above the start.
+and ``megabytes`` above the start.
 """
 
 import json
 import os
 import signal
 import sys
-import time
 from pathlib import Path
 
 from file_outcomes import outcome
@@ -20,24 +19,9 @@ PAGE = os.sysconf("SC_PAGE_SIZE")
 TIME_LIMIT = 20
 """Processor time in seconds after which a child is ended."""
 
-TURNS = 1_000_000
-"""Turns of the loop that measures the speed of a core."""
-
-SECONDS_PER_TURN = 50e-9
-"""What a turn takes on a core of the usual speed; one that is shared may take twice as long."""
-
-
-def slowness():
-    """Returns how many times slower this core is than a usual one at present, at least 1."""
-    began, total = time.process_time(), 0
-    for turn in range(TURNS):
-        total += turn
-    return max(1.0, (time.process_time() - began) / (TURNS * SECONDS_PER_TURN))
-
 
 def measured(kind, path):
     """Reads a file in a child of this process; returns the answer."""
-    slow = slowness()
     reading, writing = os.pipe()
     child = os.fork()
     if not child:
@@ -54,7 +38,7 @@ def measured(kind, path):
     with os.fdopen(reading, "rb") as pipe:
         text = pipe.read()
     _, status, usage = os.wait4(child, 0)
-    answer = {"seconds": (usage.ru_utime + usage.ru_stime) / max(slow, slowness())}
+    answer = {"seconds": usage.ru_utime + usage.ru_stime}
     if not text:
         return answer | {"outcome": f"died ({status})", "message": "", "megabytes": 0.0}
     before, found, message = json.loads(text)
