@@ -40,9 +40,8 @@ distinguish an effect from chance."""
 
 MOST_READINGS = 100_000
 """Greatest number of measurements that a fit uses, in at least ``FEWEST_SEGMENTS`` segments; 14 s
-of 7 channels at 1 kHz. The derivatives of all measurements are in memory together; with so
-many, an arm of seven joints in ``benchmarks/memory.py``, whose states have 14 derivatives, stays
-below 2 GB."""
+of 7 channels at 1 kHz. The derivatives of all measurements are in memory together; a fit of an arm
+of seven joints in ``benchmarks/memory.py`` needed more than 2 GB with three times as many."""
 
 PLAIN_FEATURES = "bayessim"
 """Features if there is no closest fit, at which the score features are computed."""
