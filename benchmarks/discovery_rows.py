@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
 from hidden_rigs import RIGS
 
 __all__ = [
+    "Judged",
     "REMOVED",
     "Row",
     "effect_id",
@@ -162,13 +164,23 @@ def sparse_name(row: Row) -> str | None:
     return row["sparse"]["first"]
 
 
-def estimates(row: Row) -> Iterator[tuple[bool, float]]:
-    """Yields for each parameter of an effect that is truly there how well it was estimated.
+@dataclass(frozen=True)
+class Judged:
+    """How well a parameter of an effect that is truly there was estimated.
 
-    Yields:
-        Whether its 90 % interval holds the truth, and its relative error, NaN where the truth is
-        zero.
+    Attributes:
+        is_inside: Whether its 90 % interval holds the truth.
+        error: Its relative error, NaN if the truth is zero.
+        deviation: Its posterior standard deviation relative to the truth, NaN likewise.
     """
+
+    is_inside: bool
+    error: float
+    deviation: float
+
+
+def estimates(row: Row) -> Iterator[Judged]:
+    """Yields each parameter of the effects that are truly there."""
     for effect in row["effects"]:
         for short, estimate in effect["parameters"].items():
             site = f"{effect['port']}.{effect['effect']}.{short}"
@@ -178,6 +190,11 @@ def estimates(row: Row) -> Iterator[tuple[bool, float]]:
             low, high = (math.nan if end is None else end for end in estimate["hdi_94"])
             middle, half = 0.5 * (low + high), 0.5 * (high - low)
             half *= 1.645 / 1.881  # from 94 % to 90 % of a normal distribution
-            mean = math.nan if estimate["mean"] is None else estimate["mean"]
-            error = abs(mean / true - 1.0) if true else math.nan
-            yield abs(true - middle) <= half, error
+            mean, deviation = (
+                math.nan if estimate[name] is None else estimate[name] for name in ("mean", "sd")
+            )
+            yield Judged(
+                abs(true - middle) <= half,
+                abs(mean / true - 1.0) if true else math.nan,
+                abs(deviation / true) if true else math.nan,
+            )

@@ -29,8 +29,10 @@ from discovery_rows import (
     sparse_name,
 )
 from discovery_table import Baselines, Line, Rate, bootstrap
+from scipy.optimize import brentq
+from scipy.special import erf
 
-__all__ = ["STRONG", "by_effect", "gap_closed", "summary_lines"]
+__all__ = ["STRONG", "by_effect", "expected_error", "gap_closed", "summary_lines"]
 
 FALSE_ALARM_RATE = 0.01
 """The rate of false alarms that was asked for."""
@@ -245,12 +247,21 @@ def _ratio(row: Row, one: str, other: str) -> float:
 
 
 def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
-    found = [pair for row in rows for pair in estimates(row)]
-    inside = Rate(sum(is_inside for is_inside, _ in found), len(found))
-    errors = [error for _, error in found if math.isfinite(error)]
+    rigs = sorted({row["rig"] for row in rows})
+    lines = _parameter_lines_of(rows, "parameters, d ≥ 10")
+    for rig in rigs if len(rigs) > 1 else ():
+        lines += _parameter_lines_of([row for row in rows if row["rig"] == rig], f"… {rig}")
+    return lines
+
+
+def _parameter_lines_of(rows: Sequence[Row], label: str) -> list[Line]:
+    found = [judged for row in rows for judged in estimates(row)]
+    inside = Rate(sum(judged.is_inside for judged in found), len(found))
+    measured = [judged for judged in found if math.isfinite(judged.error)]
+    errors = [judged.error for judged in measured]
     return [
         Line(
-            "parameters, d ≥ 10: 90 % intervals cover",
+            f"{label}: 90 % intervals cover",
             inside.total,
             inside.value,
             inside.interval if inside.total else None,
@@ -258,13 +269,37 @@ def _parameter_lines(rows: Sequence[Row]) -> list[Line]:
             upper=0.95,
         ),
         Line(
-            "parameters, d ≥ 10: median relative error",
+            f"{label}: median relative error",
             len(errors),
             float(np.median(errors)) if errors else math.nan,
             bootstrap(errors, 50.0),
-            upper=0.10,
+            upper=0.08,
+        ),
+        Line(
+            f"{label}: … that the posteriors themselves expect",
+            len(errors),
+            expected_error([judged.deviation for judged in measured]),
         ),
     ]
+
+
+def expected_error(deviations: Sequence[float]) -> float:
+    """Returns the median error of estimates with these standard deviations, if they are right.
+
+    No estimator has a smaller one where the posteriors are exact: what is larger than the target
+    is then uncertainty that recording and prior leave.
+
+    Args:
+        deviations: Relative standard deviations of normal posteriors; NaN is left out.
+    """
+    known = np.array([d for d in deviations if math.isfinite(d) and d > 0.0])
+    if not len(known):
+        return math.nan
+
+    def excess(error: float) -> float:
+        return float(erf(error / known / math.sqrt(2.0)).mean()) - 0.5
+
+    return float(brentq(excess, 0.0, 10.0 * float(known.max())))
 
 
 def _calibration_lines(rows: Sequence[Row]) -> list[Line]:

@@ -3,6 +3,7 @@
 import json
 import math
 
+import numpy as np
 import pytest
 from discovery_figures import (
     Bin,
@@ -12,7 +13,7 @@ from discovery_figures import (
     reliability,
 )
 from discovery_report import print_summary
-from discovery_summary import gap_closed, summary_lines
+from discovery_summary import expected_error, gap_closed, summary_lines
 from discovery_table import Line, Rate
 from scipy.stats import binom
 
@@ -26,7 +27,7 @@ def finding(name, probability=0.99, estimate=1.0, half=0.1, equivalent=()):
         "probability": probability,
         "alternatives": {name: probability},
         "equivalent_to": list(equivalent),
-        "parameters": {"size": {"mean": estimate, "hdi_94": interval}},
+        "parameters": {"size": {"mean": estimate, "sd": half / 1.881, "hdi_94": interval}},
     }
 
 
@@ -254,3 +255,22 @@ def test_everything_is_printed_and_drawn(tmp_path, capsys):
 
 def test_no_rows_make_a_table_without_figures():
     assert all(line.verdict == "–" for line in summary_lines([]))
+
+
+def test_an_error_that_posteriors_expect_is_that_of_their_own_draws():
+    generator = np.random.default_rng(0)
+    deviations = [0.02, 0.1, 0.5, math.nan]
+    errors = np.abs(generator.standard_normal((100_000, 3)) * deviations[:3])
+    # The standard error of a median of 3e5 values is far below the tolerance.
+    assert expected_error(deviations) == pytest.approx(float(np.median(errors)), rel=0.02)
+
+
+def test_errors_of_several_rigs_have_a_line_each():
+    rows = [
+        row(found=[finding("hinge.bias", estimate=1.0)]),
+        row(found=[finding("hinge.bias", estimate=1.5, half=0.1)], rig="furuta"),
+    ]
+    found = lines(rows)
+    assert found["… pendulum: median relative error"].value == pytest.approx(0.0)
+    assert found["… furuta: median relative error"].value == pytest.approx(0.5)
+    assert found["… furuta: 90 % intervals cover"].value == 0.0
