@@ -154,15 +154,17 @@ def pickle_of_nested_lists(path):
 
 
 def _rollouts(count, kind, length):
-    """Returns a list of the same rollout, all of whose fields are the same array."""
+    """Returns a list of the same rollout, whose fields are views of the same bytes."""
     dtype = b"cnumpy\ndtype\n" + _text(kind) + b"K\x00K\x01\x87R"
-    size = length * int(kind[1:])
-    content = b"B" + struct.pack("<I", size) + (bytes(range(256)) * (size // 256 + 1))[:size]
-    shape = b"J" + struct.pack("<i", length) + b"\x85"
-    values = ARRAY + _array_state(shape, content, dtype) + b"q\x00"
-    fields = _text(b"time") + values
-    for name in (b"observations", b"actions", b"rewards"):
-        fields += _text(name) + b"h\x00"
+
+    def values(rows):
+        size = rows * int(kind[1:])
+        content = b"B" + struct.pack("<I", size) + (bytes(range(256)) * (size // 256 + 1))[:size]
+        return ARRAY + _array_state(b"J" + struct.pack("<i", rows) + b"\x85", content, dtype)
+
+    # A rollout has one more measurement than actions.
+    fields = _text(b"time") + values(length) + b"q\x00" + _text(b"observations") + b"h\x00"
+    fields += _text(b"actions") + values(length - 1) + b"q\x02" + _text(b"rewards") + b"h\x02"
     rollout = ROLLOUT + b")\x81}(" + fields + b"ubq\x01"
     return b"\x80\x03](" + rollout + b"h\x01" * (count - 1) + b"e."
 

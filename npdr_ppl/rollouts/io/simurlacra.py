@@ -1,6 +1,8 @@
 """Imports rollouts recorded with SimuRLacra, without running code from their pickles."""
 
+import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from os import PathLike
 from typing import Any, TypeGuard
 
@@ -39,15 +41,36 @@ def read_simurlacra(
             raise DataError(f"it has {len(episodes)} rollouts, more than {LIMITS.rollouts}.")
         # The same array may occur many times, and numbers of fewer bytes become float64.
         check_expansion(8.0 * sum(_numbers(episode.fields) for episode in episodes), len(data))
-        parts = [_rollout(episode.fields, names or {}) for episode in episodes]
-        return joined(parts)
+        episodes = [_episode(episode.fields, names or {}) for episode in episodes]
+        # Rollouts with the same columns are checked together, which takes a third of the time.
+        alike = itertools.groupby(episodes, key=lambda e: (e.columns, e.rewards is None))
+        return joined([_recording(list(group)) for _, group in alike])
+
+
+@dataclass(frozen=True)
+class _Episode:
+    """One rollout, as it is in the pickle.
+
+    Attributes:
+        columns: Names of the channels and of the actions.
+        readings: Measurements, ``(T + 1, channels)``.
+        actions: Actions, ``(T, actions)``.
+        rewards: Rewards, ``(T,)``, or ``None``.
+        time: Time stamps in s, ``(T + 1,)``.
+    """
+
+    columns: tuple[tuple[str, ...], tuple[str, ...]]
+    readings: NDArray[np.float64]
+    actions: NDArray[np.float64]
+    rewards: NDArray[np.float64] | None
+    time: NDArray[np.float64]
 
 
 def _numbers(fields: Mapping[str, Any]) -> int:
     return sum(values.size for values in fields.values() if isinstance(values, np.ndarray))
 
 
-def _rollout(fields: Mapping[str, Any], names: Mapping[str, str]) -> Recording:
+def _episode(fields: Mapping[str, Any], names: Mapping[str, str]) -> _Episode:
     bounds = fields.get("_rollout_bounds")
     if isinstance(bounds, np.ndarray) and bounds.size > 2:
         raise DataError("the rollouts are joined end to end; save them as a list instead.")
@@ -55,17 +78,31 @@ def _rollout(fields: Mapping[str, Any], names: Mapping[str, str]) -> Recording:
     kind = "states" if "states" in fields else "observations"
     readings = _matrix(fields, kind)
     actions = _matrix(fields, "actions_applied" if "actions_applied" in fields else "actions")
-    rewards = _matrix(fields, "rewards")[:, 0] if "rewards" in fields else None
-    time = _matrix(fields, "time")[:, 0]
     channels = _labels(spaces.get(kind), readings.shape[1], kind.removesuffix("s"))
     commands = _labels(spaces.get("actions"), actions.shape[1], "action")
+    return _Episode(
+        (
+            tuple(names.get(name, name) for name in channels),
+            tuple(names.get(name, name) for name in commands),
+        ),
+        readings,
+        actions,
+        _matrix(fields, "rewards")[:, 0] if "rewards" in fields else None,
+        _matrix(fields, "time")[:, 0],
+    )
+
+
+def _recording(episodes: Sequence[_Episode]) -> Recording:
+    """Returns rollouts with the same columns as one recording."""
+    channels, actions = episodes[0].columns
+    rewards = [e.rewards for e in episodes if e.rewards is not None]
     return Recording.from_arrays(
-        [readings],
-        [actions],
-        channel_names=[names.get(name, name) for name in channels],
-        action_names=[names.get(name, name) for name in commands],
-        rewards=None if rewards is None else [rewards],
-        time=[time],
+        [e.readings for e in episodes],
+        [e.actions for e in episodes],
+        channel_names=channels,
+        action_names=actions,
+        rewards=rewards or None,
+        time=[e.time for e in episodes],
     )
 
 
