@@ -193,7 +193,9 @@ def _glitch_at_end(tables: list[Table], generator: np.random.Generator, channel:
 
 def _unit(tables: list[Table], generator: np.random.Generator, channel: str) -> None:
     for table in tables:
-        factor = 1000.0 if "position" in channel and "cart" in channel else 180.0 / np.pi
+        # The carts and the carriage move along a line, everything else turns.
+        is_linear = channel.startswith("cart") or "position" in table.channels
+        factor = 1000.0 if is_linear else 180.0 / np.pi
         table.channels[channel] = table.channels[channel] * factor
 
 

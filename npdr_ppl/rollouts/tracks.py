@@ -29,6 +29,10 @@ CLOCK_DIFFERENCES = 2e-5, 1e-2
 """Relative differences between two rates that are taken for those of two clocks: quartz errs by
 1e-5 to 1e-4. Larger ones are other rates."""
 
+UNKNOWN_LATENESS = 0.25
+"""Standard deviation of a lateness, in steps, from which it is not known: one that is spread evenly
+over a step has 0.29, and its whole steps cannot be counted."""
+
 FEWEST_STEPS = 10
 """Fewest steps of a stream that can be called regular."""
 
@@ -217,7 +221,8 @@ def _drift(channel: Track, commands: Track) -> tuple[float, float] | None:
 
     Only commands that differ from the ones before are compared, as a table repeats a command at
     each measurement that it was not written with. ``None`` if they do not change at the rate of
-    the measurements: their lateness is known but for whole steps.
+    the measurements, or if jitter spreads their lateness over a step: it is known but for whole
+    steps.
     """
     changed = commands.time[np.diff(commands.values, prepend=np.nan) != 0.0]
     if min(len(changed), len(channel)) <= STEPS_TOGETHER:
@@ -237,4 +242,6 @@ def _drift(channel: Track, commands: Track) -> tuple[float, float] | None:
             return None
         slope = float(passed @ late) / square
         rest = late - slope * passed
+        if rest.std() > UNKNOWN_LATENESS * step:
+            return None
         return slope, float(rest @ rest / (len(rest) - 2) / square) ** 0.5

@@ -156,6 +156,14 @@ def test_clocks_that_drift_apart_are_said_where_a_table_repeats_commands(drift):
     assert not said or "differ by 0.01 %" in said[0]
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_jitter_of_nearly_a_step_is_not_taken_for_a_drift(seed):
+    generator = np.random.default_rng(seed)
+    time = STEP * np.arange(500)
+    stamps = np.sort(time + generator.uniform(-0.45, 0.45, 500) * STEP)
+    assert "clock" not in " ".join(made([track(stamps)], [Track(time, np.sin(time))]).notes)
+
+
 def test_clocks_of_large_numbers_are_compared_too():
     time = 1e13 + STEP * np.arange(1000)  # rounded to 2 ms
     assert made([track(time)], [Track(time, np.sin(np.arange(1000.0)))]).notes == ()
