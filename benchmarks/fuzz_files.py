@@ -1,7 +1,8 @@
 """Reads a hundred thousand damaged files: each is read or refused with one sentence.
 
 Valid recordings, robots and run folders are damaged byte by byte, and in the ways that files of
-their format get damaged. Anything but success or one sentence, warnings included, is a failure.
+their format get damaged. Anything but success or one sentence, warnings included, is a failure, as
+is more memory than 1 GiB.
 
     python benchmarks/fuzz_files.py --files 100000 --seed 0
 """
@@ -12,6 +13,7 @@ import json
 import os
 import random
 import re
+import resource
 import shutil
 import signal
 import sys
@@ -33,6 +35,9 @@ from npdr_ppl.rollouts import Rollouts
 
 SECONDS = 20
 """Seconds after which reading one file counts as hanging."""
+
+LARGEST_MEMORY = 1.0
+"""GiB that a process may use, the libraries included."""
 
 ROBOT = """<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 -0.2"/>
 <mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
@@ -345,6 +350,11 @@ def main() -> int:
                 print(failure, file=sys.stderr, flush=True)
             figures[kind] = {"outcomes": dict(outcomes), "sentences": dict(sentences)}
             is_right &= not failures
+    # Of the children that read the files, the libraries included.
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+    print(f"largest memory of a process: {peak:.2f} GiB")
+    figures["peak_gib"] = peak
+    is_right &= peak <= LARGEST_MEMORY
     if options.json is not None:
         options.json.write_text(json.dumps(figures, indent=2))
     return int(not is_right)
