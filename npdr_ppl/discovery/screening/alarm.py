@@ -18,6 +18,7 @@ from npdr_ppl.discovery.screening.latent_force import Responses
 from npdr_ppl.discovery.screening.moments import forces_at_moments
 from npdr_ppl.discovery.screening.permutation_tests import LargestStatistic
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.pulse_changes import ForceChange, PulseChanges
 from npdr_ppl.discovery.screening.screening import Screened, Screening
 from npdr_ppl.discovery.screening.sensitivities import Variant
 from npdr_ppl.discovery.screening.settings import ALARM
@@ -75,9 +76,11 @@ def sound_alarm(
         The alarm, and the candidates that explain a part of the misfit, the best first.
     """
     chance = LargestStatistic(projection, seed=seed)
-    generic = generic_laws(found, sensors) + reading_laws(projection)
-    waves = wave_laws(found)
-    listed = [wave for port in waves.values() for wave in port] + ripple_laws(found, sensors)
+    ports = {name: PulseChanges(projection, change) for name, change in found.by_port.items()}
+    generic = generic_laws(found, ports, sensors) + reading_laws(projection)
+    waves = wave_laws(found, ports)
+    listed = [wave for port in waves.values() for wave in port]
+    listed += ripple_laws(found, ports, sensors)
     # Each kind is tested separately, so that many implausible laws do not hide an effect of the
     # catalogue.
     values: dict[str, float] = {}
@@ -138,11 +141,14 @@ def _screened(
 
 def _unexplained(
     laws: Iterable[GenericLaw], projection: Projection, gains: dict[str, float], names: list[str]
-) -> Iterator[Tensor]:
+) -> Iterator[Tensor | ForceChange]:
     """Yields the changes of laws that refitted parameters cannot imitate; adds gains and names."""
     for law in laws:
         change = law.change
-        scores = projection.scores(change)
+        if isinstance(change, ForceChange):
+            scores = change.pulses.scores(change.values)
+        else:
+            scores = projection.scores(change)
         # A change that is absorbed up to rounding errors cannot be tested.
         if float(scores.absorbed.min()) < 1.0 - 1e-6:
             gains[law.name] = scores.gain(slice(None))

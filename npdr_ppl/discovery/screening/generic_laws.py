@@ -2,13 +2,14 @@
 
 * Forces at a joint: polynomials, signs and products of all recorded channels, waves in time, and
   ripples. A ripple is a wave in a position, alone or times a command or the direction of motion.
-  The change from such a force is a weighted sum of the responses to pulses.
+  The change from such a force is a weighted sum of the responses to pulses
+  (:mod:`~npdr_ppl.discovery.screening.pulse_changes`).
 * Errors of a sensor, as functions of its own value.
 * Ringing after every change of speed, as of a part that is carried on a spring or stands on one.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,7 +19,8 @@ from torch import Tensor
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.latent_force import Responses
 from npdr_ppl.discovery.screening.projection import Projection
-from npdr_ppl.discovery.screening.settings import GENERIC_LAWS, PERMUTATION_TEST
+from npdr_ppl.discovery.screening.pulse_changes import ForceChange, PulseChanges
+from npdr_ppl.discovery.screening.settings import GENERIC_LAWS
 from npdr_ppl.language.channels import Channel
 
 __all__ = [
@@ -43,52 +45,62 @@ class GenericLaw:
     """
 
     name: str
-    make: Callable[[], Tensor]
+    make: Callable[[], Tensor | ForceChange]
 
     @property
-    def change(self) -> Tensor:
-        """Its change of the whitened measurements, ``(S, N, k)``; computed at each access."""
+    def change(self) -> Tensor | ForceChange:
+        """Its change of the whitened measurements; computed at each access.
+
+        It is ``(S, N, k)``, or the values of a law of force at the pulses.
+        """
         return self.make()
 
 
-def generic_laws(found: Responses, sensors: Sequence[Channel] = ()) -> list[GenericLaw]:
+def generic_laws(
+    found: Responses, ports: Mapping[str, PulseChanges], sensors: Sequence[Channel] = ()
+) -> list[GenericLaw]:
     """Returns a dictionary of laws, as forces at every joint.
 
     Args:
         found: The responses to pulses.
+        ports: The changes that forces can cause, by port.
         sensors: The simulator's sensors; of angles, sines and cosines are tried too.
     """
     values = _dictionary(found, {sensor.name for sensor in sensors if sensor.unit == "rad"})
     return [
-        GenericLaw(f"{port}: {name}", partial(torch.matmul, change, value[..., None]))
-        for port, change in found.by_port.items()
+        GenericLaw(f"{port}: {name}", partial(ForceChange, pulses, value[..., None]))
+        for port, pulses in ports.items()
         for name, value in values.items()
     ]
 
 
-def wave_laws(found: Responses) -> dict[str, list[GenericLaw]]:
+def wave_laws(found: Responses, ports: Mapping[str, PulseChanges]) -> dict[str, list[GenericLaw]]:
     """Returns waves in time of many frequencies, as forces, by port.
 
     Args:
         found: The responses to pulses.
+        ports: The changes that forces can cause, by port.
     """
     return {
         port: [
             GenericLaw(
                 f"{port}: wave of {frequency:.3g} Hz",
-                partial(_waved, change, found, frequency),
+                partial(_waved, pulses, found, frequency),
             )
             for frequency in _frequencies(found).tolist()
         ]
-        for port, change in found.by_port.items()
+        for port, pulses in ports.items()
     }
 
 
-def ripple_laws(found: Responses, sensors: Sequence[Channel]) -> list[GenericLaw]:
+def ripple_laws(
+    found: Responses, ports: Mapping[str, PulseChanges], sensors: Sequence[Channel]
+) -> list[GenericLaw]:
     """Returns ripples over every position, as forces at every port.
 
     Args:
         found: The responses to pulses.
+        ports: The changes that forces can cause, by port.
         sensors: The simulator's sensors, which tell positions from velocities.
     """
     recorded = [sensor for sensor in sensors if sensor.name in found.channels]
@@ -111,22 +123,23 @@ def ripple_laws(found: Responses, sensors: Sequence[Channel]) -> list[GenericLaw
             laws += [
                 GenericLaw(
                     f"{port}: {text}{name}",
-                    partial(_rippled, change, factor, x, number),
+                    partial(_rippled, pulses, factor, x, number),
                 )
-                for port, change in found.by_port.items()
+                for port, pulses in ports.items()
                 for text, factor in factors.items()
             ]
     return laws
 
 
-def _waved(change: Tensor, found: Responses, frequency: float) -> Tensor:
-    return change @ _wave(found, frequency)
+def _waved(pulses: PulseChanges, found: Responses, frequency: float) -> ForceChange:
+    return ForceChange(pulses, _wave(found, frequency))
 
 
-def _rippled(change: Tensor, factor: Tensor, x: Tensor, number: float) -> Tensor:
+def _rippled(pulses: PulseChanges, factor: Tensor, x: Tensor, number: float) -> ForceChange:
     """Returns the change from a factor times a ripple over x, both ``(S, pulses)``."""
     phase = number * (x - x.mean())
-    return change @ (factor[..., None] * torch.stack((phase.sin(), phase.cos()), dim=-1))
+    ripple = torch.stack((phase.sin(), phase.cos()), dim=-1)
+    return ForceChange(pulses, factor[..., None] * ripple)
 
 
 def reading_laws(projection: Projection) -> list[GenericLaw]:
@@ -244,14 +257,9 @@ def strongest_frequency(projection: Projection, found: Responses, port: str) -> 
         port: The port.
     """
     frequencies = _frequencies(found)
-    change = found.by_port[port]
-    gains: list[float] = []
-    for chunk in frequencies.split(
-        max(1, PERMUTATION_TEST.numbers_per_part // (2 * change[..., 0].numel()))
-    ):
-        waves = torch.cat([_wave(found, frequency) for frequency in chunk.tolist()], dim=-1)
-        scores = projection.scores(change @ waves)
-        gains += [scores.gain(slice(2 * k, 2 * k + 2)) for k in range(len(chunk))]
+    waves = torch.cat([_wave(found, frequency) for frequency in frequencies.tolist()], dim=-1)
+    scores = PulseChanges(projection, found.by_port[port]).scores(waves)
+    gains = [scores.gain(slice(2 * k, 2 * k + 2)) for k in range(len(frequencies))]
     return float(frequencies[max(range(len(gains)), key=gains.__getitem__)])
 
 

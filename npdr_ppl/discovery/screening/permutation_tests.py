@@ -18,6 +18,7 @@ after the candidate is fitted to the permutation.
 
 import math
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from scipy import special
 from torch import Tensor
 
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.pulse_changes import ForceChange, PulseChanges
 from npdr_ppl.discovery.screening.settings import PERMUTATION_TEST
 
 __all__ = ["LargestStatistic", "block_sums"]
@@ -63,6 +65,7 @@ class LargestStatistic:
         spread = (0.5 * (square + square.mean())).sqrt().clamp_min(1e-30)
         self._spread = spread[:, None, None]
         self._standard = self._joined(used[..., None] / self._spread)[..., 0]
+        self._bases: dict[PulseChanges, _Along] = {}
         generator = torch.Generator().manual_seed(seed)
         order = _derangements(draws, self._blocks, generator)
         signs = torch.randint(0, 2, order.shape, generator=generator).double() * 2.0 - 1.0
@@ -77,37 +80,103 @@ class LargestStatistic:
             check_invariants=True,
         ).coalesce()
 
-    def p_values(self, groups: Iterable[Tensor]) -> list[float]:
+    def p_values(self, groups: Iterable[Tensor | ForceChange]) -> list[float]:
         """Returns each candidate's p-value among all of them.
 
         Args:
-            groups: Changes of each candidate, ``(S, N, k)``; only a few are in memory at a time.
+            groups: Changes of each candidate, ``(S, N, k)``, or laws of force; only a few are in
+                memory at a time.
         """
-        observed: dict[int, float] = {}
-        largest = torch.zeros(len(self._deals), dtype=torch.float64)
-        for places, alike in _in_batches(groups):
-            tails = self._tails(torch.stack(alike, dim=-2))
-            largest = largest.maximum(tails.amax(0))
-            observed |= dict(zip(places, tails[:, 0].tolist(), strict=True))
-        own = torch.tensor(
-            [observed[place] for place in range(len(observed))], dtype=torch.float64
-        )
-        return (largest >= own[:, None] - 1e-12).double().mean(1).tolist()
+        places_by_size: dict[int, list[int]] = {}
+        observed: dict[int, list[Tensor]] = {}
+        largest: dict[int, Tensor] = {}
+        for places, changes, standard in self._in_batches(groups):
+            size = changes.shape[-1]
+            statistics = self._statistics(changes, standard)
+            # The tail falls with the statistic, so only the largest one's is needed.
+            most = statistics.amax(0)
+            largest[size] = most.maximum(largest.get(size, most))
+            observed.setdefault(size, []).append(statistics[:, 0])
+            places_by_size.setdefault(size, []).extend(places)
+        tails = torch.zeros(len(self._deals), dtype=torch.float64)
+        for size, statistics in largest.items():
+            tails = tails.maximum(self._log_tail(statistics, size))
+        tails = tails.sort().values
+        values: dict[int, float] = {}
+        for size, places in places_by_size.items():
+            own = self._log_tail(torch.cat(observed[size]), size)
+            num = len(tails) - torch.searchsorted(tails, own - 1e-12)
+            values |= dict(zip(places, (num.double() / len(tails)).tolist(), strict=True))
+        return [values[place] for place in range(len(values))]
 
-    def _tails(self, columns: Tensor) -> Tensor:
-        """Returns minus the log tail of each candidate's statistic by permutation, ``(P, draws)``.
+    def _in_batches(
+        self, groups: Iterable[Tensor | ForceChange]
+    ) -> Iterator[tuple[list[int], Tensor, Tensor]]:
+        """Yields candidates that are tested together: those with equal numbers of strengths.
+
+        Yields:
+            Their places, their projected changes in the segments that are used, ``(S, N, P, k)``,
+            and the standardised residuals of each block in the same coordinates.
+        """
+        waiting: dict[tuple[PulseChanges | None, int], tuple[list[int], list[Tensor]]] = {}
+        for place, group in enumerate(groups):
+            pulses, given = (
+                (group.pulses, group.values) if isinstance(group, ForceChange) else (None, group)
+            )
+            size = given.shape[-1]
+            places, alike = waiting.setdefault((pulses, size), ([], []))
+            places.append(place)
+            alike.append(given)
+            coordinates = given[..., 0].numel() if pulses is None else self._along(pulses).size
+            if (len(alike) + 1) * coordinates * size > PERMUTATION_TEST.numbers_per_part:
+                del waiting[pulses, size]
+                yield places, *self._projected(pulses, alike)
+        for (pulses, _), (places, alike) in waiting.items():
+            yield places, *self._projected(pulses, alike)
+
+    def _projected(
+        self, pulses: PulseChanges | None, alike: list[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Returns projected changes, ``(S, N, P, k)``, and residuals in the same coordinates."""
+        given = torch.stack(alike, dim=-2)
+        columns, shape = given.flatten(-2), given.shape[-2:]
+        if pulses is None:
+            changes = self._projection.projected(columns)[: self._num_used]
+            return changes.unflatten(-1, shape), self._standard
+        along = self._along(pulses)
+        changes = along.columns @ pulses.weights(columns)[: self._num_used]
+        return changes.unflatten(-1, shape), along.standard
+
+    def _along(self, pulses: PulseChanges) -> "_Along":
+        """Returns a port's columns in a basis with few elements; computed once."""
+        if pulses not in self._bases:
+            columns = pulses.columns[: self._num_used].unflatten(0, (self._blocks, -1))
+            standard = self._standard.unflatten(-1, columns.shape[1:3])
+            parts = [_in_span(columns[:, j], standard[:, j]) for j in range(columns.shape[1])]
+            turned, residuals = (torch.stack(part, dim=1) for part in zip(*parts, strict=True))
+            self._bases[pulses] = _Along(turned.flatten(0, 1), residuals.flatten(1))
+        return self._bases[pulses]
+
+    def _log_tail(self, statistics: Tensor, size: int) -> Tensor:
+        return _log_tail(statistics, size, self._blocks - size)
+
+    def _statistics(self, changes: Tensor, standard: Tensor) -> Tensor:
+        """Returns Hotelling's statistic of each candidate by permutation, ``(P, draws)``.
 
         Args:
-            columns: Changes of P candidates with k strengths each, ``(S, N, P, k)``.
+            changes: Projected changes of P candidates with k strengths, ``(S, N, P, k)``.
+            standard: Standardised residuals of each block in the same coordinates.
         """
-        _, _, num, size = columns.shape
-        changes = self._projection.projected(columns.flatten(-2))[: self._num_used]
+        size = changes.shape[-1]
         weights, signals = (
-            self._joined(by_segment).unflatten(-1, (num, size))
-            for by_segment in (changes * self._spread, changes / self._spread)
+            self._joined(by_segment)
+            for by_segment in (
+                changes * self._spread[..., None],
+                changes / self._spread[..., None],
+            )
         )
         # Score of block b with the residuals of block c, (P, b, c, k), standardised.
-        scores = torch.einsum("bnpk,cn->pbck", weights, self._standard)
+        scores = torch.einsum("bnpk,cn->pbck", weights, standard)
         scale = (scores.square().sum((1, 2)) / self._blocks).clamp_min(1e-300).sqrt()
         scores, weights = scores / scale[:, None, None], weights / scale
         # Score of block b with the change of each strength in block c, (P, b, c, k, strength).
@@ -128,7 +197,7 @@ class LargestStatistic:
         gram = expected.flatten(-2).flatten(1, 2)
         taken = ((both @ (gram.mT @ gram)) * both).sum(-1) / self._blocks
         left = (1.0 - taken / statistic.clamp_min(1e-300)).clamp_min(1e-6)
-        return _log_tail(statistic / left, size, self._blocks - size)
+        return statistic / left
 
     def _permuted(self, table: Tensor) -> Tensor:
         """Returns a table's sums in every permutation, ``(P, b, c, Q)`` to ``(P, draws, Q)``."""
@@ -140,17 +209,42 @@ class LargestStatistic:
         return by_segment.unflatten(0, (self._blocks, -1)).flatten(1, 2)
 
 
-def _in_batches(groups: Iterable[Tensor]) -> Iterator[tuple[list[int], list[Tensor]]]:
-    """Yields places and changes of candidates with equal numbers of strengths, in batches."""
-    waiting: dict[int, tuple[list[int], list[Tensor]]] = {}
-    for place, group in enumerate(groups):
-        size = group.shape[-1]
-        places, alike = waiting.setdefault(size, ([], []))
-        places.append(place)
-        alike.append(group)
-        if (len(alike) + 1) * group.numel() > PERMUTATION_TEST.numbers_per_part:
-            yield waiting.pop(size)
-    yield from waiting.values()
+@dataclass(frozen=True)
+class _Along:
+    """The changes that forces at a port can cause, in an orthonormal basis of their span.
+
+    Attributes:
+        columns: The columns of :class:`PulseChanges` in the segments that are used, ``(S, n, c)``.
+        standard: Standardised residuals of each block, as far as they lie in the span.
+    """
+
+    columns: Tensor
+    standard: Tensor
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates of all segments."""
+        return self.columns[..., 0].numel()
+
+
+def _in_span(columns: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns vectors in an orthonormal basis of the span of all columns.
+
+    Products among columns, and of columns with residuals, do not change. There is no basis with
+    fewer elements than measurements if there are as many columns.
+
+    Args:
+        columns: Columns of each block, ``(blocks, N, c)``.
+        residuals: Residuals of each block, ``(blocks, N)``.
+
+    Returns:
+        The columns, ``(blocks, n, c)``, and the residuals, ``(blocks, n)``.
+    """
+    num, measurements, width = columns.shape
+    if num * width >= measurements:
+        return columns, residuals
+    basis, turned = torch.linalg.qr(columns.transpose(0, 1).flatten(1))
+    return turned.unflatten(1, (num, width)).transpose(0, 1), residuals @ basis
 
 
 def _derangements(draws: int, size: int, generator: torch.Generator) -> Tensor:

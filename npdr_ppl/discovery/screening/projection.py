@@ -92,8 +92,7 @@ class Projection:
         Args:
             columns: The columns x, ``(S, N, P)``.
         """
-        refit = torch.linalg.solve(self._information, self._explained(columns))
-        return self.whitened(columns - self._by_z @ refit)
+        return self.whitened(columns - self._by_z @ self.refit(self._explained(columns)))
 
     def whitened(self, columns: Tensor) -> Tensor:
         """Returns C^-½ x. If x is a residual, its components are independent, of unit variance.
@@ -112,7 +111,24 @@ class Projection:
 
     def _explained(self, columns: Tensor) -> Tensor:
         """Returns the parameters' scores with columns in place of residuals, ``(d, P)``."""
-        return (self._weights.mT @ columns).sum(0)
+        return self.explained_by_segment(columns).sum(0)
+
+    def explained_by_segment(self, columns: Tensor) -> Tensor:
+        """Returns Jᵀ C⁻¹ x, ``(S, d, P)``, for columns x, ``(S, N, P)``."""
+        return self._weights.mT @ columns
+
+    def refit(self, explained: Tensor) -> Tensor:
+        """Returns (Jᵀ C⁻¹ J + 1)⁻¹ y, the refitted parameters for the sum y of Jᵀ C⁻¹ x.
+
+        Args:
+            explained: The sums y, ``(d, P)``.
+        """
+        return torch.linalg.solve(self._information, explained)
+
+    @cached_property
+    def whitened_parameters(self) -> Tensor:
+        """C^-½ J, ``(S, N, d)``."""
+        return self.whitened(self._by_z)
 
     @property
     def parameter_scores(self) -> Tensor:
@@ -143,7 +159,7 @@ class Projection:
         """Returns the scores of columns, ``(S, N, P)``."""
         weighted = self.solve(columns)
         cross = self._explained(columns)
-        refit = torch.linalg.solve(self._information, cross)
+        refit = self.refit(cross)
         own = (columns.mT @ weighted).sum(0)
         by_segment = (columns.mT @ self._weighted[..., None])[..., 0] - self._score @ refit
         return Scores(by_segment, own - cross.mT @ refit, own.diagonal())
