@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from npdr_ppl.errors import DataError
+from npdr_ppl.errors import DataError, NpdrError
 from npdr_ppl.language.handlers import with_noise
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.model import Model
@@ -255,6 +255,7 @@ class SegmentModel:
         self.starts = starts
         self.inputs = self._smoothed if starts is None else starts.put_into(self._smoothed)
         self._offsets = uncertain_components(self.inputs)
+        self._idle: Tensor | None = None  # until it is asked for
 
     @cached_property
     def least_scale(self) -> Tensor:
@@ -407,29 +408,92 @@ class SegmentModel:
             scale: Standard deviation of each channel's residuals, ``(C,)``.
             is_rough: Whether one-sided differences will do, at half the price.
         """
-        d, m = len(z), self.num_offsets
+        step, idle = LINEARISATION.initial_state_step, self._without_influence
+        eye = torch.eye(self.num_offsets, dtype=torch.float64)
+        moves = step * eye[~idle]
+        # One simulation confirms of all the others together that they have no influence.
+        check = step * idle.double()[None] if bool(idle.any()) else moves[:0]
+        by_z, by_start, (here, *checked) = self._moved_residuals(
+            z, offsets, scale, moves, check, is_rough=is_rough
+        )
+        starts = here.new_zeros(*here.shape, len(eye))
+        starts[..., ~idle] = by_start
+        if checked and not torch.equal(checked[0], here):
+            _, starts[..., idle], _ = self._moved_residuals(
+                z, offsets, scale, step * eye[idle], moves[:0], is_rough=is_rough
+            )
+        return Linearisation(here, by_z, starts)
+
+    def _moved_residuals(
+        self,
+        z: Tensor,
+        offsets: Tensor,
+        scale: Tensor,
+        moves: Tensor,
+        check: Tensor,
+        *,
+        is_rough: bool,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns derivatives by parameters and by offsets, and residuals.
+
+        Args:
+            z: Parameters, ``(d,)``.
+            offsets: Offsets of the initial states, ``(S, m)``.
+            scale: Standard deviation of each channel's residuals, ``(C,)``.
+            moves: Differences of the offsets, ``(k, m)``.
+            check: Further differences, ``(c, m)``, with which residuals are returned.
+            is_rough: Whether one-sided differences will do.
+
+        Returns:
+            Derivatives by parameters, ``(S, N, d)``, and along the moves, ``(S, N, k)``, per
+            length of a move; and residuals, ``(1 + c, S, N)``, the first without any difference.
+        """
+        d, k, c = len(z), len(moves), len(check)
         shifts = LINEARISATION.parameter_step * torch.eye(d, dtype=torch.float64)
-        moves = LINEARISATION.initial_state_step * torch.eye(m, dtype=torch.float64)[:, None]
         signs = (1.0,) if is_rough else (1.0, -1.0)
         num = len(signs)
         points = torch.cat([sign * shifts for sign in signs])
-        starts = torch.cat([sign * moves for sign in signs]).reshape(num * m, 1, m)
+        starts = torch.cat([sign * moves for sign in signs] + [check])[:, None]
+        unmoved = torch.zeros(num * k + c + 1, d, dtype=torch.float64)
+        no_start = torch.zeros(1, 1, self.num_offsets, dtype=torch.float64)
         residual = self.residuals(
-            z + torch.cat((points, torch.zeros(num * m + 1, d, dtype=torch.float64))),
-            offsets + torch.cat((torch.zeros(num * d, 1, m), starts, torch.zeros(1, 1, m))),
+            z + torch.cat((points, unmoved)),
+            offsets + torch.cat((no_start.expand(num * d, -1, -1), starts, no_start)),
             scale,
         )
-        by_z, by_start, here = residual.split((num * d, num * m, 1))
+        by_z, by_start, checked, here = residual.split((num * d, num * k, c, 1))
         if is_rough:
             down, right = here.expand_as(by_z), here.expand_as(by_start)
             up, left = by_z, by_start
         else:
-            up, down, left, right = by_z[:d], by_z[d:], by_start[:m], by_start[m:]
-        return Linearisation(
-            here[0],
+            up, down, left, right = by_z[:d], by_z[d:], by_start[:k], by_start[k:]
+        return (
             ((down - up) / (num * LINEARISATION.parameter_step)).permute(1, 2, 0),
             ((right - left) / (num * LINEARISATION.initial_state_step)).permute(1, 2, 0),
+            torch.cat((here, checked)),
         )
+
+    @property
+    def _without_influence(self) -> Tensor:
+        """Mask ``(m,)`` of the offsets that move no initial state of the simulator.
+
+        Such are those of measured velocities, where velocities are estimated from positions.
+        """
+        if self._idle is None:
+            eye = torch.eye(self.num_offsets, dtype=torch.float64)[:, None]
+            self._idle = torch.zeros(self.num_offsets, dtype=torch.bool)
+            try:
+                moved, unmoved = (
+                    self.simulator.initial_states(self._shifted(offsets))
+                    for offsets in (eye.expand(-1, self.inputs.num_segments, -1), self.no_offsets)
+                )
+            except NpdrError:  # the simulator finds its initial states in another way
+                return self._idle
+            shape = self.num_offsets, self.inputs.num_segments
+            self._idle = ~torch.stack(
+                [(a != b).expand(shape).any(1) for a, b in zip(moved, unmoved, strict=True)]
+            ).any(0)
+        return self._idle
 
     def _shifted(self, offsets: Tensor) -> Inputs:
         """Returns the inputs with their initial states shifted, a batch of n."""

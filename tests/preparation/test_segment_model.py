@@ -1,4 +1,4 @@
-"""Averaged measurements of long recordings."""
+"""Averaged measurements of long recordings, and derivatives by initial states."""
 
 import pytest
 import torch
@@ -6,6 +6,7 @@ import torch
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.preparation.settings import LINEARISATION
 from tests.helpers.pendulum_recordings import swinging
 
 
@@ -22,3 +23,41 @@ def test_averages_of_neighbours_keep_noise_white_and_slow_changes_distinct():
     distance = averaged.whitened(slow, scale).norm() / segments.whitened(slow, scale).norm()
     assert 0.97 < float(distance) <= 1.0
     assert segments.averaged(segments.observed.numel(), 1) is segments
+
+
+@pytest.fixture
+def segments():
+    return SegmentModel(pendulum, swinging(steps=240), DataOptions(None, 30))
+
+
+def differences(segments, z, offsets, scale, *, is_rough):
+    """Returns the simulation's derivatives by every offset, one simulation after another."""
+    step = LINEARISATION.initial_state_step
+    columns = []
+    for move in step * torch.eye(segments.num_offsets, dtype=torch.float64):
+        right = segments.residuals(z[None], offsets[None] + move, scale)[0]
+        back = torch.zeros_like(move) if is_rough else -move
+        left = segments.residuals(z[None], offsets[None] + back, scale)[0]
+        columns.append((left - right) / (step if is_rough else 2.0 * step))
+    return torch.stack(columns, dim=-1)
+
+
+@pytest.mark.parametrize("is_rough", [False, True])
+@pytest.mark.parametrize("is_mistaken", [False, True])
+def test_offsets_that_move_no_initial_state_are_not_simulated(
+    segments, monkeypatch, is_rough, is_mistaken
+):
+    idle = segments._without_influence
+    # A velocity is estimated from positions: its own measurement and its rate have no influence.
+    assert 0 < int(idle.sum()) < segments.num_offsets
+    if is_mistaken:  # as where a simulator of one's own uses them in another way
+        monkeypatch.setattr(
+            SegmentModel, "_without_influence", property(lambda _: torch.ones_like(idle))
+        )
+    generator = torch.Generator().manual_seed(0)
+    offsets = torch.randn(segments.no_offsets.shape, generator=generator).double()
+    z = torch.full((segments.prior.num_parameters,), 0.1, dtype=torch.float64)
+    scale = torch.full((segments.observed.shape[-1],), 1e-2, dtype=torch.float64)
+    found = segments.linearise(z, offsets, scale, is_rough=is_rough).by_starts
+    wanted = differences(segments, z, offsets, scale, is_rough=is_rough)
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9 * float(wanted.abs().max()))
