@@ -416,13 +416,13 @@ class SegmentModel:
         by_z, by_start, (here, *checked) = self._moved_residuals(
             z, offsets, scale, moves, check, is_rough=is_rough
         )
-        starts = here.new_zeros(*here.shape, len(eye))
-        starts[..., ~idle] = by_start
+        starts = here.new_zeros(len(eye), *here.shape)
+        starts[~idle] = by_start
         if checked and not torch.equal(checked[0], here):
-            _, starts[..., idle], _ = self._moved_residuals(
+            _, starts[idle], _ = self._moved_residuals(
                 z, offsets, scale, step * eye[idle], moves[:0], is_rough=is_rough
             )
-        return Linearisation(here, by_z, starts)
+        return Linearisation(here, by_z.permute(1, 2, 0), starts.permute(1, 2, 0))
 
     def _moved_residuals(
         self,
@@ -445,7 +445,7 @@ class SegmentModel:
             is_rough: Whether one-sided differences will do.
 
         Returns:
-            Derivatives by parameters, ``(S, N, d)``, and along the moves, ``(S, N, k)``, per
+            Derivatives by parameters, ``(d, S, N)``, and along the moves, ``(k, S, N)``, per
             length of a move; and residuals, ``(1 + c, S, N)``, the first without any difference.
         """
         d, k, c = len(z), len(moves), len(check)
@@ -468,8 +468,8 @@ class SegmentModel:
         else:
             up, down, left, right = by_z[:d], by_z[d:], by_start[:k], by_start[k:]
         return (
-            ((down - up) / (num * LINEARISATION.parameter_step)).permute(1, 2, 0),
-            ((right - left) / (num * LINEARISATION.initial_state_step)).permute(1, 2, 0),
+            (down - up) / (num * LINEARISATION.parameter_step),
+            (right - left) / (num * LINEARISATION.initial_state_step),
             torch.cat((here, checked)),
         )
 
