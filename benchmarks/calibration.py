@@ -37,7 +37,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "members-8": {"members": 8},
     "decay": {"weight_decay": 0.1},
     "narrow": {"hidden": (64, 64)},
-    "one-transform": {"transforms": 1},
+    "one-spline": {"transforms": 2},
     "affine": {"flow": "maf", "transforms": 4},
     "slow": {"learning_rate": 3e-3},
     "short": {"epochs": 15},
