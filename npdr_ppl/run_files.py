@@ -136,7 +136,9 @@ def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
     inputs = {file, file.parent / LOCK, *file.parent.glob("data_*")}
     if not any(entry not in inputs for entry in file.parent.iterdir()):
         return False
-    words = ", ".join(dict.fromkeys(IN_WORDS.get(key, key) for key in differing))
+    # An edited file can have keys of any text.
+    names = (key if key.isidentifier() else ascii(key)[:40] for key in differing)
+    words = ", ".join(dict.fromkeys(IN_WORDS.get(name, name) for name in names))
     raise DataError(
         f"{file.parent} holds a run that differs in {words}; choose another folder, or remove it."
     )

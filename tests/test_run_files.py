@@ -15,7 +15,14 @@ from npdr_ppl.arviz_module import from_dict, from_netcdf, to_netcdf
 from npdr_ppl.atomic_files import remove_unfinished, replacing
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.run_files import claimed, load_tensors, read_json, save_tensors, write_json
+from npdr_ppl.run_files import (
+    claimed,
+    holds_this_run,
+    load_tensors,
+    read_json,
+    save_tensors,
+    write_json,
+)
 from npdr_ppl.run_records import FitRecord
 
 HOLD = """
@@ -176,3 +183,12 @@ def test_a_full_disk_leaves_the_old_file_and_says_which_it_is(tmp_path, name):
         assert path.read_bytes() == before
         assert os.listdir(tmp_path) == [name]
     read(path)
+
+
+def test_names_in_an_edited_description_are_printable(tmp_path):
+    description = {"options": {"length": 1}}
+    write_json(tmp_path / "run.json", {"options": {"length": 1, "\u2028other": 2}})
+    (tmp_path / "result.json").touch()
+    with pytest.raises(DataError, match=r"differs in '\\u2028other';") as raised:
+        holds_this_run(tmp_path / "run.json", description)
+    assert str(raised.value).isprintable()

@@ -3,6 +3,8 @@
 import io
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from npdr_ppl.errors import DataError, ModelError
@@ -80,6 +82,23 @@ def test_a_parquet_footer_of_one_endless_number_is_refused():
     data = content + len(content).to_bytes(4, "little") + b"PAR1"
     with pytest.raises(ValueError, match="64 bits"):
         check_footer(io.BytesIO(data))
+
+
+def test_a_parquet_footer_with_statistics_of_another_type_is_refused(tmp_path):
+    # pyarrow ends the whole process when it meets one.
+    path = tmp_path / "data.parquet"
+    table = pa.table({"time": np.arange(30.0), "x": np.sin(np.arange(30.0))})
+    pq.write_table(table, path)
+    data = path.read_bytes()
+    check_footer(io.BytesIO(data))
+    assert read_log(path)
+    # The column's repetition, "optional", before the length of its name and the name.
+    optional = b"\x25\x02\x18\x01x"
+    assert data.count(optional) == 1
+    path.write_bytes(data.replace(optional, b"\x25\x00\x18\x01x"))
+    for read in (Rollouts.load, read_log):
+        with pytest.raises(DataError, match="statistics of a column contradict its type"):
+            read(path)
 
 
 def test_robots_of_too_many_attributes_are_refused(tmp_path):

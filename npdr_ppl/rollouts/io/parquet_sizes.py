@@ -11,7 +11,9 @@ References:
 """
 
 import os
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import IO, Any
 
 from npdr_ppl.errors import DataError
@@ -25,8 +27,20 @@ _MARK = b"PAR1"
 _GROUPS, _COLUMNS, _METADATA = 4, 1, 3
 """Fields of the footer, of a row group and of a column."""
 
-_COMPRESSED, _DATA_OFFSET, _DICTIONARY_OFFSET = 7, 9, 11
+_ENCRYPTED = (8, 9)
+"""Fields of a column that only an encrypted one has."""
+
+_COMPRESSED, _DATA_OFFSET, _DICTIONARY_OFFSET, _SIZES = 7, 9, 11, 16
 """Fields of a column's metadata."""
+
+_TEXT_BYTES, _REPETITION_LEVELS, _DEFINITION_LEVELS = 1, 2, 3
+"""Fields of a column's size statistics: bytes of its texts, and a count of each level."""
+
+_SCHEMA, _TYPE, _REPETITION, _NUM_CHILDREN = 2, 1, 3, 5
+"""Fields of the footer and of an element of its schema."""
+
+_OPTIONAL, _REPEATED, _TEXT = 1, 2, 6
+"""Repetitions of an element of the schema, and the type of texts."""
 
 _PAGE_DECOMPRESSED, _PAGE_COMPRESSED = 2, 3
 """Fields of a page's header."""
@@ -42,8 +56,8 @@ def check_footer(file: IO[bytes]) -> None:
     """Checks the footer and the pages before the library opens the file.
 
     Raises:
-        DataError: The footer is longer than that of any recording, or the pages decompress to too
-            many bytes.
+        DataError: The footer is longer than that of any recording or contradicts itself, the file
+            is encrypted, or the pages decompress to too many bytes.
     """
     size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - 8))
@@ -54,9 +68,13 @@ def check_footer(file: IO[bytes]) -> None:
         raise DataError(f"its description takes {length} bytes, more than {LIMITS.text_bytes}.")
     file.seek(size - 8 - length)
     footer = _Compact(file.read(length)).structure()
+    leaves = _leaves(footer[_SCHEMA])
     total = 0.0
     for group in footer[_GROUPS]:
-        for column in group[_COLUMNS]:
+        for column, leaf in zip(group[_COLUMNS], leaves, strict=True):
+            if any(field in column for field in _ENCRYPTED):
+                raise DataError("it is encrypted.")
+            leaf.check(column[_METADATA].get(_SIZES, {}))
             total += _page_bytes(file, column[_METADATA])
             check_expansion(total, size)
     file.seek(0)
@@ -84,6 +102,54 @@ def check_parquet(parquet: Any, size: int) -> None:
                 f"{field.name} is of type {shown(str(field.type))}, but numbers are needed."
             )
     check_expansion(8.0 * metadata.num_rows * metadata.num_columns, size)
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    """A column as the schema describes it.
+
+    Attributes:
+        is_text: Whether it holds texts.
+        repetition: Largest repetition level.
+        definition: Largest definition level.
+    """
+
+    is_text: bool
+    repetition: int
+    definition: int
+
+    def check(self, sizes: dict[int, Any]) -> None:
+        """Checks size statistics, which the library takes for those of this column.
+
+        Raises:
+            DataError: They are those of another kind of column.
+        """
+        levels = (_REPETITION_LEVELS, self.repetition), (_DEFINITION_LEVELS, self.definition)
+        fits = all(len(sizes.get(field) or ()) in (0, most + 1) for field, most in levels)
+        if not fits or (_TEXT_BYTES in sizes and not self.is_text):
+            raise DataError("the statistics of a column contradict its type.")
+
+
+def _leaves(schema: Sequence[dict[int, Any]]) -> list[_Leaf]:
+    """Returns the columns of a schema, whose elements are listed depth first, the root first."""
+    leaves: list[_Leaf] = []
+    # Children that are still to come, and the levels of their parent, from the root down.
+    waiting = [[schema[0].get(_NUM_CHILDREN, 0), 0, 0]]
+    for element in schema[1:]:
+        while waiting and not waiting[-1][0]:
+            waiting.pop()
+        if not waiting:
+            raise DataError("its schema contradicts itself.")
+        waiting[-1][0] -= 1
+        _, repetition, definition = waiting[-1]
+        kind = element.get(_REPETITION)
+        repetition += kind == _REPEATED
+        definition += kind in (_OPTIONAL, _REPEATED)
+        if element.get(_NUM_CHILDREN):
+            waiting.append([element[_NUM_CHILDREN], repetition, definition])
+        else:
+            leaves.append(_Leaf(element.get(_TYPE) == _TEXT, repetition, definition))
+    return leaves
 
 
 def _page_bytes(file: IO[bytes], column: dict[int, Any]) -> float:
