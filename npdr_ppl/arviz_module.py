@@ -49,6 +49,11 @@ EQUAL_LOG_WEIGHTS = 1e-6
 """Greatest difference between log weights that count as equal: rounding of a double-precision
 simulation. A Pareto distribution cannot be fitted to their tail."""
 
+LARGEST_GAP = 350.0
+"""Difference between the largest log weight and the median one from which the shape of the tail
+counts as infinite. It is half of what double precision represents; ArviZ's fit of the tail
+overflows at twice this and may then call it reliable."""
+
 az: Any = arviz  # its annotations do not tell a dataset from an array
 
 Data = arviz.InferenceData
@@ -160,12 +165,17 @@ def loo(data: Data, *, var_name: str | None = None) -> Loo:
         data: An ArviZ object with a ``log_likelihood``.
         var_name: Variable of that group; needed if it has several.
     """
+    judged = _judged_draws(data)
     with _quiet_loo():
-        found = az.loo(_judged_draws(data), pointwise=True, var_name=var_name)
+        found = az.loo(judged, pointwise=True, var_name=var_name)
     elpd_i = np.asarray(found.loo_i)
     # ArviZ divides by n instead of n - 1; the difference matters with few segments.
     se = float(np.sqrt(elpd_i.size * elpd_i.var(ddof=1))) if elpd_i.size > 1 else float("nan")
-    return Loo(float(found.elpd_loo), se, float(found.p_loo), np.asarray(found.pareto_k), elpd_i)
+    likelihoods = judged["log_likelihood"]
+    weights = -likelihoods[var_name or next(iter(likelihoods.data_vars))]
+    gap = weights.max(("chain", "draw")) - weights.median(("chain", "draw"))
+    k = np.where(gap > LARGEST_GAP, np.inf, np.asarray(found.pareto_k))
+    return Loo(float(found.elpd_loo), se, float(found.p_loo), k, elpd_i)
 
 
 def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.DataFrame:
@@ -239,7 +249,8 @@ def _any_group() -> Iterator[None]:
 @contextmanager
 def _quiet_loo() -> Iterator[None]:
     """Silences warnings about large Pareto k, which the caller gets as numbers or a flag."""
-    with warnings.catch_warnings():
+    # Of weights hundreds of orders of magnitude apart, quotients overflow; see LARGEST_GAP.
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
         # With a single observation, its value equals the sum, about which ArviZ warns.
         warnings.filterwarnings("ignore", message="The point-wise LOO is the same with the sum")
         warnings.filterwarnings("ignore", message=".*shape parameter of Pareto distribution")

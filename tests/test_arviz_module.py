@@ -236,3 +236,13 @@ def test_no_other_module_imports_arviz():
             if any(name.split(".")[0].startswith("arviz") for name in names):
                 offenders.add(path.name)
     assert offenders == {"arviz_module.py"}
+
+
+def test_leave_one_out_of_weights_hundreds_of_orders_apart_is_unreliable():
+    # The tail begins 6e-309 above the smallest normal number; ArviZ alone returns 1/3.
+    log_weights = np.r_[-np.linspace(760, 720, 20), -708.16, -698.0, -307.0, -256.0, 0.0]
+    likelihood = np.stack((-log_weights, np.linspace(-1.0, 1.0, 25)), axis=-1)[None]
+    draws = {"a": np.linspace(-1.0, 1.0, 25)[None]}
+    data = from_dict({"posterior": draws, "log_likelihood": {"x": likelihood}})
+    k = loo(data).pareto_k
+    assert k[0] == np.inf and k[1] < 1.0
