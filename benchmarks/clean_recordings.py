@@ -27,6 +27,9 @@ from npdr_ppl.rollouts import Rollouts
 STEP = 0.01
 FIRST_SEED = 5000
 
+RESTING_SPEED = 1e-3
+"""Speed after a bounce, in m/s, from which the ball rests until the next row."""
+
 
 def rig(name: str) -> Callable[[int], tuple[Callable, Rollouts]]:
     """Returns a maker of recordings of a rig."""
@@ -108,6 +111,9 @@ def bouncing(seed: int) -> tuple[Callable, Rollouts]:
             if hit > left:
                 break
             height, speed, left = 0.0, restitution * (gravity * hit - speed), left - hit
+            if speed < RESTING_SPEED:  # infinitely many bounces follow in a finite time
+                speed, left = 0.0, 0.0
+                break
         height += speed * left - 0.5 * gravity * left**2
         speed -= gravity * left
     readings = np.array(rows) + rng.normal(0.0, [1e-3, 1e-2], (601, 2))
