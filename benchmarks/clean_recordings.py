@@ -28,7 +28,7 @@ STEP = 0.01
 FIRST_SEED = 5000
 
 RESTING_SPEED = 1e-3
-"""Speed after a bounce, in m/s, from which the ball rests until the next row."""
+"""Speed after a bounce, in m/s, below which the ball rests until the next row."""
 
 
 def rig(name: str) -> Callable[[int], tuple[Callable, Rollouts]]:

@@ -276,7 +276,7 @@ def _parameter_lines_of(rows: Sequence[Row], label: str) -> list[Line]:
             upper=0.08,
         ),
         Line(
-            f"{label}: … that the posteriors themselves expect",
+            f"{label}: median relative error expected from the posteriors",
             len(errors),
             expected_error([judged.deviation for judged in measured]),
         ),
@@ -286,8 +286,8 @@ def _parameter_lines_of(rows: Sequence[Row], label: str) -> list[Line]:
 def expected_error(deviations: Sequence[float]) -> float:
     """Returns the median error of estimates with these standard deviations, if they are right.
 
-    No estimator has a smaller one where the posteriors are exact: what is larger than the target
-    is then uncertainty that recording and prior leave.
+    If the posteriors are exact, no estimator has a smaller median error. Recording and prior then
+    leave more uncertainty than the target allows, if this is larger than the target.
 
     Args:
         deviations: Relative standard deviations of normal posteriors; NaN is left out.

@@ -32,8 +32,8 @@ Their common base density is fitted to these afterwards
 By default a flow begins with an affine map, because the width of the posterior may depend strongly
 on the features. With a uniform prior, z is Phi^-1 of the parameter's position in its range, and a
 given width of the position is 15 times wider in z at 99 % of the range than at its centre.
-Preconditioning has one width for all features. A spline is the identity outside [-5, 5] of these
-widths, so that splines alone cannot represent the posterior near the end of a range.
+Preconditioning scales by one width for all features. Splines act only within five of these widths,
+so that they alone cannot represent the posterior near the end of a range.
 """
 
 from collections.abc import Iterator, Mapping

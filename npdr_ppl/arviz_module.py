@@ -3,6 +3,7 @@
 ArviZ 1 has other containers, arguments and column names. Results here are named as in ArviZ 1.
 """
 
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -50,9 +51,9 @@ EQUAL_LOG_WEIGHTS = 1e-6
 simulation. A Pareto distribution cannot be fitted to their tail."""
 
 LARGEST_GAP = 350.0
-"""Difference between the largest log weight and the median one from which the shape of the tail
-counts as infinite. It is half of what double precision represents; ArviZ's fit of the tail
-overflows at twice this and may then call it reliable."""
+"""Range of the log weights in a tail above which its shape counts as infinite. It is half of what
+double precision represents; ArviZ's fit overflows at twice this and may then call the tail
+reliable."""
 
 az: Any = arviz  # its annotations do not tell a dataset from an array
 
@@ -173,8 +174,9 @@ def loo(data: Data, *, var_name: str | None = None) -> Loo:
     se = float(np.sqrt(elpd_i.size * elpd_i.var(ddof=1))) if elpd_i.size > 1 else float("nan")
     likelihoods = judged["log_likelihood"]
     weights = -likelihoods[var_name or next(iter(likelihoods.data_vars))]
-    gap = weights.max(("chain", "draw")) - weights.median(("chain", "draw"))
-    k = np.where(gap > LARGEST_GAP, np.inf, np.asarray(found.pareto_k))
+    weights = weights.stack(every=("chain", "draw")).transpose("every", ...)
+    is_representable = _tail_gap(weights.to_numpy()) <= LARGEST_GAP
+    k = np.where(is_representable, np.asarray(found.pareto_k), np.inf)
     return Loo(float(found.elpd_loo), se, float(found.p_loo), k, elpd_i)
 
 
@@ -196,7 +198,10 @@ def compare(models: Mapping[str, Data], *, var_name: str | None = None) -> pd.Da
         table = az.compare(judged, ic="loo", scale="log", method="stacking", var_name=var_name)
     table = table.rename(columns={"elpd_loo": "elpd", "p_loo": "p"})
     table["elpd_diff"] = 0.0 - table["elpd_diff"]
-    n = loo(next(iter(models.values())), var_name=var_name).elpd_i.size
+    judgements = {name: loo(data, var_name=var_name) for name, data in models.items()}
+    unreliable = [bool(np.isinf(judgements[name].pareto_k).any()) for name in table.index]
+    table["warning"] = table["warning"] | np.array(unreliable)
+    n = next(iter(judgements.values())).elpd_i.size
     for column in ("se", "dse"):  # as in loo
         table[column] *= np.sqrt(n / (n - 1)) if n > 1 else np.nan
     columns = ("rank", "elpd", "p", "elpd_diff", "weight", "se", "dse", "warning")
@@ -284,4 +289,16 @@ def pareto_smoothed(log_weights: ArrayLike) -> tuple[NDArray[np.float64], float]
         warnings.simplefilter("ignore")  # k is returned, and the caller judges it
         smoothed, k = az.psislw(values[is_used])
     result[is_used] = np.asarray(smoothed, dtype=float)
-    return result, float(np.asarray(k))
+    is_representable = _tail_gap(values[is_used]) <= LARGEST_GAP
+    return result, float(np.asarray(k)) if is_representable else math.inf
+
+
+def _tail_gap(log_weights: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Returns the range of the log weights in the tail that is fitted, along the first axis.
+
+    The tail has the largest min(n / 5, 3 √n) of n weights (Vehtari et al. 2024).
+    """
+    num = len(log_weights)
+    first = num - math.ceil(min(0.2 * num, 3.0 * math.sqrt(num)))
+    ordered = np.sort(log_weights, axis=0)
+    return ordered[-1] - ordered[first]

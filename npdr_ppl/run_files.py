@@ -137,8 +137,8 @@ def holds_this_run(file: Path, description: Mapping[str, Any]) -> bool:
     if not any(entry not in inputs for entry in file.parent.iterdir()):
         return False
     # An edited file can have keys of any text.
-    names = (key if key.isidentifier() else ascii(key)[:40] for key in differing)
-    words = ", ".join(dict.fromkeys(IN_WORDS.get(name, name) for name in names))
+    names = (IN_WORDS.get(key, shown_sentence(key, 40)) for key in differing)
+    words = ", ".join(dict.fromkeys(names))
     raise DataError(
         f"{file.parent} holds a run that differs in {words}; choose another folder, or remove it."
     )

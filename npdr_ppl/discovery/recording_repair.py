@@ -244,15 +244,25 @@ def _searched(segments: SegmentModel) -> Hypothesis | None:
 
 
 def _misfits(hypothesis: Hypothesis) -> dict[str, float]:
-    """Returns the residual relative to the measurements' change in windows, by channel."""
-    segments = hypothesis.segments
+    """Returns the residual relative to the measurements' change in windows, by channel.
+
+    A share of the motion, in the windows with the largest residuals, does not count. A window that
+    begins at an impact has a wrong initial state in any recording. A wrong unit, sign or time
+    stamp shows in all windows in which the device moves.
+    """
+    segments, fit = hypothesis.segments, hypothesis.fit
     names = segments.inputs.channel_names
     columns = [names.index(name) for name in segments.channel_names]
+    residual = segments.observed - segments.simulate(fit.z[None], fit.offsets[None])[0]
     change = segments.observed - segments.inputs.initial_values[:, None, columns]
-    count = segments.num_measured.sum(0).clamp_min(1)
-    square = (change * segments.is_measured).square().sum((0, 1))
-    spread = (square / count).sqrt().double()
-    ratio = (hypothesis.fit.scale / spread.clamp_min(1e-12)).clamp_max(10.0)
+    residuals, changes = (
+        (values * segments.is_measured).double().square().sum(1) for values in (residual, change)
+    )  # (S, C)
+    order = residuals.argsort(0, descending=True)
+    residuals, changes = residuals.gather(0, order), changes.gather(0, order)
+    is_counted = changes.cumsum(0) > REPAIR.disregarded_share * changes.sum(0)
+    left, moved = ((values * is_counted).sum(0) for values in (residuals, changes))
+    ratio = (left / moved.clamp_min(1e-24)).sqrt().clamp_max(10.0).nan_to_num(10.0)
     return dict(zip(segments.channel_names, ratio.tolist(), strict=True))
 
 

@@ -58,13 +58,16 @@ def remedies(sensors: Sequence[Channel], rollouts: Rollouts) -> Iterator[Remedy]
             names = " and ".join(group)
             text = f"{names} {looks} recorded in {other}, not in SI units; converted."
             yield Remedy(text, _Scaled(group, 1.0 / factor))
-    for name in rollouts.action_names:
-        text = f"The sign of {name} looks inverted; changed."
-        yield Remedy(text, _ScaledAction(name, -1.0))
+    for k, name in enumerate(rollouts.action_names):
+        if any(actions[:, k].any() for actions in rollouts.actions):
+            text = f"The sign of {name} looks inverted; changed."
+            yield Remedy(text, _ScaledAction(name, -1.0))
     shifts = [steps for steps in REPAIR.shifts if 4 * steps < min(rollouts.lengths)]
     long = [steps for steps in shifts if steps * rollouts.time_step > REPAIR.longest_delay]
-    for steps in (*shifts, *(-steps for steps in long)):
-        yield Shift(None, steps).remedy
+    # Shifted commands that never change would only leave out the ends of the recording.
+    if any(np.ptp(actions, axis=0).any() for actions in rollouts.actions if len(actions)):
+        for steps in (*shifts, *(-steps for steps in long)):
+            yield Shift(None, steps).remedy
     for sensor in sensors:
         column = rollouts.channel_names.index(sensor.name)
         values = np.concatenate(rollouts.measurements(column))

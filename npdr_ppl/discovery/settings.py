@@ -22,6 +22,9 @@ class RepairSettings:
     Attributes:
         large_residual: Residual, relative to the change of a window's measurements, above which
             remedies are tried.
+        disregarded_share: Share of the squared change of the measurements that does not count, in
+            the windows with the largest residuals. Of a bouncing ball's windows, up to a sixth
+            begin at an impact and have a wrong initial state.
         remedy_factor: A remedy is applied if it reduces the residual to less than this fraction.
         most_remedies: Greatest number of remedies of one recording.
         shifts: Shifts of the commands, and of one channel, that are tried first, in steps.
@@ -31,6 +34,7 @@ class RepairSettings:
     """
 
     large_residual: float = 0.1
+    disregarded_share: float = 0.2
     remedy_factor: float = 0.5
     most_remedies: int = 3
     shifts: tuple[int, ...] = (1, 2, 4, 7, 10, 13, 16, 19)
@@ -39,7 +43,15 @@ class RepairSettings:
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
-        check_range(self, 0.0, 1.0, "large_residual", "remedy_factor", "longest_delay")
+        check_range(
+            self,
+            0.0,
+            1.0,
+            "large_residual",
+            "disregarded_share",
+            "remedy_factor",
+            "longest_delay",
+        )
         check_range(self, 1, 1000, "most_remedies", "shifts", "fewest_clipped")
 
 

@@ -255,7 +255,7 @@ class SegmentModel:
         self.starts = starts
         self.inputs = self._smoothed if starts is None else starts.put_into(self._smoothed)
         self._offsets = uncertain_components(self.inputs)
-        self._idle: Tensor | None = None  # until it is asked for
+        self.__dict__.pop("_without_influence", None)
 
     @cached_property
     def least_scale(self) -> Tensor:
@@ -411,17 +411,17 @@ class SegmentModel:
         step, idle = LINEARISATION.initial_state_step, self._without_influence
         eye = torch.eye(self.num_offsets, dtype=torch.float64)
         moves = step * eye[~idle]
-        # One simulation confirms of all the others together that they have no influence.
+        # One simulation shifts all the others at once, to confirm that they have no influence.
         check = step * idle.double()[None] if bool(idle.any()) else moves[:0]
         by_z, by_start, (here, *checked) = self._moved_residuals(
             z, offsets, scale, moves, check, is_rough=is_rough
         )
+        if checked and not torch.equal(checked[0].nan_to_num(), here.nan_to_num()):
+            # The simulator uses them in another way, so that all are simulated from now on.
+            self.__dict__["_without_influence"] = torch.zeros_like(idle)
+            return self.linearise(z, offsets, scale, is_rough=is_rough)
         starts = here.new_zeros(len(eye), *here.shape)
         starts[~idle] = by_start
-        if checked and not torch.equal(checked[0], here):
-            _, starts[idle], _ = self._moved_residuals(
-                z, offsets, scale, step * eye[idle], moves[:0], is_rough=is_rough
-            )
         return Linearisation(here, by_z.permute(1, 2, 0), starts.permute(1, 2, 0))
 
     def _moved_residuals(
@@ -473,27 +473,24 @@ class SegmentModel:
             torch.cat((here, checked)),
         )
 
-    @property
+    @cached_property
     def _without_influence(self) -> Tensor:
         """Mask ``(m,)`` of the offsets that move no initial state of the simulator.
 
-        Such are those of measured velocities, where velocities are estimated from positions.
+        Such are those of velocities that are estimated from positions in all segments.
         """
-        if self._idle is None:
-            eye = torch.eye(self.num_offsets, dtype=torch.float64)[:, None]
-            self._idle = torch.zeros(self.num_offsets, dtype=torch.bool)
-            try:
-                moved, unmoved = (
-                    self.simulator.initial_states(self._shifted(offsets))
-                    for offsets in (eye.expand(-1, self.inputs.num_segments, -1), self.no_offsets)
-                )
-            except NpdrError:  # the simulator finds its initial states in another way
-                return self._idle
-            shape = self.num_offsets, self.inputs.num_segments
-            self._idle = ~torch.stack(
-                [(a != b).expand(shape).any(1) for a, b in zip(moved, unmoved, strict=True)]
-            ).any(0)
-        return self._idle
+        eye = torch.eye(self.num_offsets, dtype=torch.float64)[:, None]
+        try:
+            moved, unmoved = (
+                self.simulator.initial_states(self._shifted(offsets))
+                for offsets in (eye.expand(-1, self.inputs.num_segments, -1), self.no_offsets)
+            )
+        except NpdrError:  # the simulator finds its initial states in another way
+            return torch.zeros(self.num_offsets, dtype=torch.bool)
+        shape = self.num_offsets, self.inputs.num_segments
+        return ~torch.stack(
+            [(a != b).expand(shape).any(1) for a, b in zip(moved, unmoved, strict=True)]
+        ).any(0)
 
     def _shifted(self, offsets: Tensor) -> Inputs:
         """Returns the inputs with their initial states shifted, a batch of n."""

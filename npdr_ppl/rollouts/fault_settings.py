@@ -19,6 +19,9 @@ class FaultSettings:
             the channel's departures nearby: of spikes, jumps and the last row.
         spike_change: Least size of a spike, in medians of the channel's changes that are not zero.
         mended_share: Share of a departure that may be left after a fault is mended.
+        contradicted_share: Share of a spike of a position that its rate must leave unexplained, in
+            the steps before and after it. A driver that differentiates the position gives a rate
+            that explains half of it; at an impact, the rate explains one of the steps.
         largest_loss: Most samples whose loss is recognised by the jump in time that explains all
             channels. Longer gaps are jumps of most channels.
         left_over: Share of a channel's jump that may be left if its cause is the right one.
@@ -38,6 +41,7 @@ class FaultSettings:
     jump_size: float = 12.0
     spike_change: float = 4.0
     mended_share: float = 0.1
+    contradicted_share: float = 0.25
     largest_loss: int = 10
     left_over: float = 0.3
     joint_departure: float = 5.0
@@ -51,7 +55,15 @@ class FaultSettings:
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(
-            self, 0.0, 1.0, "rest_change", "most_lost", "frozen_share", "mended_share", "left_over"
+            self,
+            0.0,
+            1.0,
+            "rest_change",
+            "most_lost",
+            "frozen_share",
+            "mended_share",
+            "contradicted_share",
+            "left_over",
         )
         check_range(
             self,

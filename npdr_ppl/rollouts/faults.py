@@ -181,6 +181,8 @@ class _Faults:
     def _leave_out_spikes(self, first: int, end: int, column: int) -> None:
         values = self._values[first : end + 1, column]
         rows = _spikes(values) + first
+        if column in self._rate_of:
+            rows = rows[self._contradict_rate(rows, column)]
         if not len(rows):
             return
         self._is_read[rows, column] = False
@@ -194,6 +196,22 @@ class _Faults:
             f"{self._where}: {many} of {self._names[column]} left out as spikes, the first at "
             f"{self._time(int(rows[0]))}."
         )
+
+    def _contradict_rate(self, rows: NDArray[np.int64], column: int) -> NDArray[np.bool_]:
+        """Returns of which rows a position contradicts its rate, in both steps beside the row.
+
+        At an impact a position has a kink, which can look like a spike, but its rate agrees in the
+        step before or after it.
+        """
+        position, rate = self._values[:, column], self._values[:, self._rate_of[column]]
+        size = position[rows] - 0.5 * (position[rows - 1] + position[rows + 1])
+
+        def unexplained(row: NDArray[np.int64]) -> Array:
+            moved = 0.5 * self._step * (rate[row] + rate[row + 1])
+            return (position[row + 1] - position[row] - moved) / size
+
+        both = np.minimum(unexplained(rows - 1), -unexplained(rows))
+        return both > FAULTS.contradicted_share
 
     def _leave_out_freezes(self, first: int, end: int, column: int) -> None:
         rows = slice(first, end + 1)

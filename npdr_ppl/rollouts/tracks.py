@@ -30,8 +30,8 @@ CLOCK_DIFFERENCES = 2e-5, 1e-2
 1e-5 to 1e-4. Larger ones are other rates."""
 
 UNKNOWN_LATENESS = 0.25
-"""Standard deviation of a lateness, in steps, from which it is not known: one that is spread
-evenly over a step has 0.29, and its whole steps cannot be counted."""
+"""Standard deviation of a lateness, in steps, above which a drift is not estimated. A lateness
+that is spread evenly over a step has 0.29; its whole steps cannot be counted."""
 
 FEWEST_STEPS = 10
 """Fewest steps of a stream that can be called regular."""

@@ -78,6 +78,14 @@ def test_limits_are_left_out_and_what_was_left_out_before_stays_so():
     assert np.abs(found.readings[0][~is_read, 0]).max() < 0.8
 
 
+def test_commands_that_never_change_are_neither_shifted_nor_turned_round():
+    sentences = " ".join(r.sentence for r in remedies(Pendulum.sensors, recording(SWING)))
+    assert "commands" not in sentences and "torque" not in sentences
+    moving = recording(SWING, torque=SWING[1:])
+    sentences = " ".join(r.sentence for r in remedies(Pendulum.sensors, moving))
+    assert "commands" in sentences and "sign of torque" in sentences
+
+
 @pytest.mark.parametrize("name", ["angle", "velocity"])
 def test_signs_are_restored_from_the_other_channel(name):
     true = recording(SWING, 3.0 * np.cos(3.0 * STEP * np.arange(400)))

@@ -50,14 +50,24 @@ def test_offsets_that_move_no_initial_state_are_not_simulated(
     idle = segments._without_influence
     # A velocity is estimated from positions: its own measurement and its rate have no influence.
     assert 0 < int(idle.sum()) < segments.num_offsets
+    num_moved = int((~idle).sum())
     if is_mistaken:  # as where a simulator of one's own uses them in another way
-        monkeypatch.setattr(
-            SegmentModel, "_without_influence", property(lambda _: torch.ones_like(idle))
-        )
+        segments.__dict__["_without_influence"] = torch.ones_like(idle)
     generator = torch.Generator().manual_seed(0)
     offsets = torch.randn(segments.no_offsets.shape, generator=generator).double()
     z = torch.full((segments.prior.num_parameters,), 0.1, dtype=torch.float64)
     scale = torch.full((segments.observed.shape[-1],), 1e-2, dtype=torch.float64)
+    rows = []
+    residuals = SegmentModel.residuals
+
+    def counted(self, z, *others):
+        rows.append(len(z))
+        return residuals(self, z, *others)
+
+    monkeypatch.setattr(SegmentModel, "residuals", counted)
     found = segments.linearise(z, offsets, scale, is_rough=is_rough).by_starts
+    if not is_mistaken:  # the point itself, the confirmation, and a difference to each side
+        assert rows == [2 + (1 if is_rough else 2) * (len(z) + num_moved)]
+    monkeypatch.undo()
     wanted = differences(segments, z, offsets, scale, is_rough=is_rough)
     torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9 * float(wanted.abs().max()))

@@ -117,6 +117,28 @@ def test_impacts_are_neither_spikes_nor_gaps():
     assert not found.notes
 
 
+@pytest.mark.parametrize("part", np.linspace(0.0, 1.0, 11).tolist())
+def test_an_impact_at_any_part_of_a_step_is_no_spike(part):
+    # A ball that falls and rises at 4.9 m/s and 3.7 m/s, and hits the floor in row 300 or later.
+    time = STEP * (np.arange(600) - 300 - part)
+    height = np.where(time < 0.0, -4.9 * time, 3.7 * time) - 4.905 * time**2
+    speed = np.where(time < 0.0, -4.9, 3.7) - 9.81 * time
+    generator = np.random.default_rng(0)
+    height += generator.normal(0.0, 1e-3, 600)
+    near = slice(200, 400)
+    found = without_faults(recording(height[near], speed[near]), CHANNELS)
+    assert not any("spike" in note for note in found.notes)
+
+
+def test_a_spike_of_a_position_is_left_out_although_its_rate_follows_in_part():
+    angle, velocity = swing()
+    angle[250] += 0.5
+    assert "of angle" in without_faults(recording(angle, velocity), CHANNELS).notes[0]
+    derived = np.gradient(angle, STEP)  # a driver that differentiates the position
+    notes = without_faults(recording(angle, derived), CHANNELS).notes
+    assert any("of angle left out as spikes" in note for note in notes)
+
+
 def test_an_exactly_constant_speed_is_no_dead_channel():
     time = STEP * np.arange(600)
     steady = recording(2.0 * time, np.full(600, 2.0))

@@ -93,7 +93,7 @@ class LargestStatistic:
         for places, changes, standard in self._in_batches(groups):
             size = changes.shape[-1]
             statistics = self._statistics(changes, standard)
-            # The tail falls with the statistic, so only the largest one's is needed.
+            # The tail probability decreases with the statistic, so only the largest is needed.
             most = statistics.amax(0)
             largest[size] = most.maximum(largest.get(size, most))
             observed.setdefault(size, []).append(statistics[:, 0])
@@ -230,8 +230,8 @@ class _Along:
 def _in_span(columns: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
     """Returns vectors in an orthonormal basis of the span of all columns.
 
-    Products among columns, and of columns with residuals, do not change. There is no basis with
-    fewer elements than measurements if there are as many columns.
+    Products among columns, and of columns with residuals, do not change. With at least as many
+    columns as measurements, a basis saves nothing, and both are returned unchanged.
 
     Args:
         columns: Columns of each block, ``(blocks, N, c)``.

@@ -8,8 +8,8 @@ are refitted is
     W R v − W J u,     u = (Jᵀ C⁻¹ J + 1)⁻¹ Jᵀ C⁻¹ R v
 
 In every segment, this is a combination of the P + d columns of (W R, W J), whatever the law is.
-So the products with measurements are computed once per port, and tens of thousands of laws then
-cost products of P + d numbers per segment.
+So the products with measurements are computed once per port. The score of a law then costs
+products of P + d numbers per segment, instead of products of all measurements.
 """
 
 from dataclasses import dataclass

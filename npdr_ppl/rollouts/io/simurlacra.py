@@ -42,7 +42,7 @@ def read_simurlacra(
         # The same array may occur many times, and numbers of fewer bytes become float64.
         check_expansion(8.0 * sum(_numbers(episode.fields) for episode in episodes), len(data))
         episodes = [_episode(episode.fields, names or {}) for episode in episodes]
-        # Rollouts with the same columns are checked together, which takes a third of the time.
+        # Consecutive rollouts with the same columns are checked together: three times as fast.
         alike = itertools.groupby(episodes, key=lambda e: (e.columns, e.rewards is None))
         return joined([_recording(list(group)) for _, group in alike])
 
