@@ -57,7 +57,7 @@ def short_kernels(monkeypatch):
 @pytest.fixture
 def quick():
     """A backend that trains in a second."""
-    return backend("snpe-c", transforms=1, hidden=(32,), epochs=15, members=2)
+    return backend("snpe-c", transforms=2, hidden=(32,), epochs=15, members=2)
 
 
 @pytest.fixture
