@@ -260,7 +260,8 @@ def _misfits(hypothesis: Hypothesis) -> dict[str, float]:
     )  # (S, C)
     order = residuals.argsort(0, descending=True)
     residuals, changes = residuals.gather(0, order), changes.gather(0, order)
-    is_counted = changes.cumsum(0) > REPAIR.disregarded_share * changes.sum(0)
+    # All windows count if nothing was measured to move.
+    is_counted = changes.cumsum(0) >= REPAIR.disregarded_share * changes.sum(0)
     left, moved = ((values * is_counted).sum(0) for values in (residuals, changes))
     ratio = (left / moved.clamp_min(1e-24)).sqrt().clamp_max(10.0).nan_to_num(10.0)
     return dict(zip(segments.channel_names, ratio.tolist(), strict=True))

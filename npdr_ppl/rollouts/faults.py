@@ -208,10 +208,10 @@ class _Faults:
 
         def unexplained(row: NDArray[np.int64]) -> Array:
             moved = 0.5 * self._step * (rate[row] + rate[row + 1])
-            return (position[row + 1] - position[row] - moved) / size
+            return np.sign(size) * (position[row + 1] - position[row] - moved)
 
         both = np.minimum(unexplained(rows - 1), -unexplained(rows))
-        return both > FAULTS.contradicted_share
+        return both > FAULTS.contradicted_share * np.abs(size)
 
     def _leave_out_freezes(self, first: int, end: int, column: int) -> None:
         rows = slice(first, end + 1)

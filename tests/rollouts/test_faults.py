@@ -5,7 +5,7 @@ import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.models.pendulum import Pendulum
-from npdr_ppl.rollouts.faults import without_faults
+from npdr_ppl.rollouts.faults import _Faults, without_faults
 
 STEP = 0.01
 CHANNELS = Pendulum().sensors
@@ -128,6 +128,16 @@ def test_an_impact_at_any_part_of_a_step_is_no_spike(part):
     near = slice(200, 400)
     found = without_faults(recording(height[near], speed[near]), CHANNELS)
     assert not any("spike" in note for note in found.notes)
+
+
+def test_a_position_midway_between_its_neighbours_raises_no_warning():
+    # It departs from the cubic through two neighbours on each side, not from the straight line.
+    _, velocity = swing()
+    angle = np.linspace(0.0, 0.6, 600)
+    angle[250] = 0.5 * (angle[249] + angle[251])
+    found = recording(angle, velocity)
+    faults = _Faults(found, 0, (0, 1), {1: 0}, {0: (0.0, 0.6), 1: (-9.0, 9.0)}, frozenset())
+    assert not faults._contradict_rate(np.array([250]), 0).any()
 
 
 def test_a_spike_of_a_position_is_left_out_although_its_rate_follows_in_part():
