@@ -29,6 +29,6 @@ def test_a_channel_that_never_moves_is_not_explained_by_a_simulation_that_does()
 def test_one_window_with_a_wrong_initial_state_does_not_count():
     rollouts = swinging(steps=240)
     torn = [values.copy() for values in rollouts.readings]
-    # The window from row 30 on gets a wrong initial state. With all windows, 0.17 and 0.26 are left.
+    # The window from row 30 on gets a wrong initial state; with it, 0.17 and 0.26 are left.
     torn[0][29:33] += np.array([1.0, 0.0])
     assert max(misfits(dataclasses.replace(rollouts, readings=tuple(torn))).values()) < 0.1
