@@ -187,6 +187,7 @@ class DiscoveryRecord(TypedDict, total=False):
     parameters: dict[str, EffectInterval]
     counts: dict[str, dict[str, Number]]
     finer_steps: int
+    wider_priors: list[list[str]]
     seed: int
     versions: dict[str, str] | None
     model: str | dict[str, Any] | None

@@ -23,6 +23,7 @@ from npdr_ppl.discovery.search.effect_search import Search
 from npdr_ppl.discovery.search.prior_ends import PriorEnd
 from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.language.model import Model
+from npdr_ppl.language.wider_priors import wider_sites
 from npdr_ppl.run_files import write_json
 
 __all__ = ["Discovery", "Verdict", "describe_candidate"]
@@ -104,6 +105,7 @@ class Discovery:
             },
             "where": [spot.to_dict() for spot in self.where],
             "finer_steps": num_finer_steps(self.revised),
+            "wider_priors": wider_sites(self.revised),
             "effects": [finding.to_dict() for finding in self.effects],
             "ranking": [describe_candidate(s, self.alarm.p_values[s.name]) for s in self.ranking],
             "separation": {

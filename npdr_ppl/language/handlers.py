@@ -35,6 +35,7 @@ class EffectMessenger(Messenger):
     Inside the handler the effect's parameters become sample sites
     ``"<port>.<effect>.<parameter>"``, drawn just before the black-box site they act on. Several
     black-box sites whose simulators have the port represent one device and share the parameters.
+    Default priors of delays and lags reach at least three steps of the inputs.
 
     Args:
         effect: The effect.
@@ -68,7 +69,8 @@ class EffectMessenger(Messenger):
         if self.site is not None and msg["name"] != self.site:
             return
         if self._drawn is None:
-            priors = self.effect.priors(box.simulator.port(self.effect.port))
+            port = box.simulator.port(self.effect.port)
+            priors = self.effect.at_rate(port, box.inputs.time_step).priors(port)
             self._drawn = {}
             for name, prior in priors.items():
                 site = f"{self.effect.name}.{name}"

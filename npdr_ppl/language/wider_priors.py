@@ -11,7 +11,13 @@ from torch import Tensor
 
 from npdr_ppl.language.model import Model
 
-__all__ = ["ModelWithWiderPriors", "described_prior", "widened", "with_wider_priors"]
+__all__ = [
+    "ModelWithWiderPriors",
+    "described_prior",
+    "wider_sites",
+    "widened",
+    "with_wider_priors",
+]
 
 TIMES = 3.0
 """Factor by which scales of distributions and widths of ranges are multiplied."""
@@ -68,6 +74,22 @@ def with_wider_priors(model: Model, names: Sequence[str]) -> Model:
         names: Latent sites to widen; sites with other kinds of priors keep them.
     """
     return ModelWithWiderPriors(model, names)
+
+
+def wider_sites(model: Any) -> list[list[str]]:
+    """Returns the sites whose priors were widened, one list for each time, the first one first.
+
+    Applied in this order, :func:`with_wider_priors` makes the same priors again.
+
+    Args:
+        model: A Pyro model, possibly inside handlers of this package.
+    """
+    found: list[list[str]] = []
+    while (base := getattr(model, "base", None)) is not None:
+        if isinstance(model, ModelWithWiderPriors):
+            found.insert(0, list(model.names))
+        model = base
+    return found
 
 
 def widened(prior: Any) -> Any | None:

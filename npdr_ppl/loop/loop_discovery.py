@@ -15,9 +15,11 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery import DiscoveryOptions, discover
+from npdr_ppl.discovery.search.settings import PRIOR_ENDS
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect, with_finer_steps
 from npdr_ppl.language.model import Model
+from npdr_ppl.language.wider_priors import with_wider_priors
 from npdr_ppl.models.effects.registry import effect_class
 from npdr_ppl.posterior.run_folder import MAX_FINER_STEPS
 from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS, DataOptions
@@ -106,11 +108,13 @@ class LoopDiscovery:
         return replace(self.options, segment_length="auto")
 
     def _read(self, result: Mapping[str, Any]) -> Revision:
-        """Returns the revision that a saved discovery describes."""
+        """Returns the revision that a saved discovery describes, with the priors of the search."""
         own = {effect.name: effect for effect in self.search.effects or ()}
         model = self.model
         for _ in range(min(result.get("finer_steps", 0), MAX_FINER_STEPS)):
             model = with_finer_steps(model)
+        for names in result.get("wider_priors", ())[: PRIOR_ENDS.most_widenings]:
+            model = with_wider_priors(model, names)
         for row in result["effects"]:
             name = f"{row['port']}.{row['effect']}"
             model = add_effect(model, own.get(name) or effect_class(row["effect"])(row["port"]))

@@ -14,6 +14,8 @@ from npdr_ppl.discovery import DiscoveryOptions
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import ModelWithEffects, add_effect, num_finer_steps
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.wider_priors import wider_sites
 from npdr_ppl.loop import loop_discovery
 from npdr_ppl.loop.loop_discovery import LoopDiscovery, effect_names
 from npdr_ppl.loop.loop_inference import _sites
@@ -192,7 +194,7 @@ def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
             }
         )
     )
-    revision = look.look(None, tmp_path)  # type: ignore[arg-type]
+    revision = look.look(at_rest(0.02), tmp_path)
     assert isinstance(revision.model, ModelWithEffects)
     assert effect_names(revision.model) == ["hinge.coulomb_friction", "torque.input_delay"]
     assert num_finer_steps(revision.model) == 1
@@ -202,6 +204,38 @@ def test_a_revision_begins_at_the_model_that_the_loop_was_given(tmp_path):
     assert {k: float(v) for k, v in revision.parameters.items()} == {
         "torque.input_delay.delay": pytest.approx(0.01)
     }
+
+
+def test_a_revision_has_the_priors_with_which_it_was_found(tmp_path):
+    """Devices with slow sampling have longer delays, and a prior may have been too narrow."""
+    (tmp_path / "discovery.json").write_text(
+        json.dumps(
+            {
+                "reason": "Missing: torque.input_delay.",
+                "alarm": {"p_value": 0.001},
+                "wider_priors": [["length"], ["length", "mass"]],
+                "effects": [{"effect": "input_delay", "port": "torque"}],
+                "parameters": {"torque.input_delay.delay": {"mean": 0.09}},
+            }
+        )
+    )
+    rollouts = at_rest(0.05)
+    look = LoopDiscovery(pendulum, SMALL_DATA, DiscoveryOptions(), seed=0)
+    revision = look.look(rollouts, tmp_path)
+    assert revision.model is not None
+    priors = Prior(revision.model, (rollouts.inputs(None, "recorded"),)).distributions
+    assert float(priors["torque.input_delay.delay"].high) == pytest.approx(0.15)
+    # Each time, a range of 1.4 grows by its own width at both ends.
+    assert float(priors["mass"].high) == pytest.approx(1.7 + 1.4)
+    assert float(priors["length"].high) > 1.7 + 1.4 + 2.0
+    assert wider_sites(revision.model) == [["length"], ["length", "mass"]]
+
+
+def at_rest(time_step):
+    return Rollouts.from_arrays(
+        readings=np.zeros((1, 41, 2)), actions=np.zeros((1, 40, 1)),
+        channel_names=("angle", "velocity"), action_names=("torque",), time_step=time_step,
+    )  # fmt: skip
 
 
 @pytest.mark.slow
