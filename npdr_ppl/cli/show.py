@@ -64,7 +64,7 @@ def show_fit(result: Mapping[str, Any], out: Path) -> None:
         f"rollouts (most likely draw); simulate {seconds['simulate']:.1f} s, "
         f"train {seconds['train']:.1f} s, sample {seconds['sample']:.1f} s"
     )
-    console.print(result["preparation"]["sentence"], highlight=False)
+    _print_preparation(console, result)
     console.print(
         f"[bold]{result['diagnosis']['decision']}[/bold]: {result['diagnosis']['reason']}"
     )
@@ -107,6 +107,7 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
     for label, row in rows.items():
         if row["error"] is not None:
             _print_reason(console, f"{label} failed", row["error"])
+    _print_preparation(console, result)
     console.print(f"Results and figures are in {out}/")
 
 
@@ -158,6 +159,7 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             values = [number(gap[k], ".4g") for k in ("before", "after", "noise_floor")]
             table.add_row(metric, *values, number(gap["closed"], ".0%"))
         console.print(table)
+    _print_preparation(console, found)
     _print_reason(console, found["verdict"], found["reason"])
     if found["remainder"]["fired"] and found["verdict"] != "unknown":
         share = found["remainder"]["unexplained"]
@@ -242,10 +244,17 @@ def show_training(result: Mapping[str, Any], out: Path) -> None:
         )
     console.print(table)
     last = result["iterations"][-1]
+    _print_preparation(console, last)
     _print_reason(console, last["decision"], last["reason"])
     for check in last.get("checks", [])[-1:]:
         _print_reason(console, check["decision"], check["reason"])
     console.print(f"Results and figures are in {out}/")
+
+
+def _print_preparation(console: Console, result: Mapping[str, Any]) -> None:
+    """Prints how the recording was prepared, if inference got one."""
+    if result.get("preparation") is not None:
+        console.print(result["preparation"]["sentence"], highlight=False)
 
 
 def show_missing_effect(found: Mapping[str, Any], result: Mapping[str, Any], out: Path) -> None:

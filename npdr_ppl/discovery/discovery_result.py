@@ -24,6 +24,7 @@ from npdr_ppl.discovery.search.prior_ends import PriorEnd
 from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import wider_sites
+from npdr_ppl.preparation.preparation_summary import PreparationSummary
 from npdr_ppl.run_files import write_json
 
 __all__ = ["Discovery", "Verdict", "describe_candidate"]
@@ -40,6 +41,7 @@ class Discovery:
     Attributes:
         verdict: One word; see :data:`Verdict`.
         reason: The reason for the verdict, in a sentence.
+        preparation: How the recording was prepared.
         problems: What was changed in the recording, or left out of it, a sentence each.
         narrow_priors: Priors that do not contain the revised model's parameters; the search used
             wider ones.
@@ -68,6 +70,7 @@ class Discovery:
 
     verdict: Verdict
     reason: str
+    preparation: PreparationSummary
     problems: tuple[str, ...]
     narrow_priors: tuple[PriorEnd, ...]
     alarm: Alarm
@@ -95,6 +98,7 @@ class Discovery:
         return {
             "verdict": self.verdict,
             "reason": self.reason,
+            "preparation": self.preparation.to_dict(),
             "data_problems": list(self.problems),
             "priors_too_narrow": [str(end) for end in self.narrow_priors],
             "alarm": {"p_value": self.alarm.p_value, "fired": self.alarm.fired},

@@ -1,5 +1,6 @@
 """Discovery: finds which effect a model lacks, adds it and measures whether that helps."""
 
+import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -35,6 +36,7 @@ from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.preparation_summary import PreparationSummary
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
 
@@ -267,6 +269,21 @@ class Investigation:
         classes = [g for g in added.effect.equivalence if len(ids & set(g.members)) > 1]
         return next_experiment(alternatives, self.rollouts, self._data_options, classes)
 
+    @property
+    def preparation(self) -> PreparationSummary:
+        """What was done to the recording, and with it to the model, before the search."""
+        likelihood = self.start.likelihood
+        scale = likelihood.fit.scale * math.sqrt(likelihood.variance)
+        names = self.start.segments.channel_names
+        return PreparationSummary(
+            self.rollouts,
+            self._data_options,
+            dict(zip(names, scale.tolist(), strict=True)),
+            self._searcher.are_steps_coarse,
+            likelihood.share,
+            tuple(map(str, self.narrow_priors)),
+        )
+
     def conclude(self) -> Discovery:
         """Runs all stages and returns the result."""
         search = self.search
@@ -291,6 +308,7 @@ class Investigation:
         return Discovery(
             verdict=verdict,
             reason=reason,
+            preparation=self.preparation,
             problems=self.problems,
             narrow_priors=self.narrow_priors,
             alarm=self.first.alarm,

@@ -279,6 +279,8 @@ class _Loop:
             asked = Decision.NEW_ROLLOUT, reason, Action.ANOTHER_ROLLOUT
             decisions.append(decision_record(*asked, is_from_check=True))
         self.posterior = settled.posterior
+        prepared = settled.posterior.preparation
+        assert prepared is not None  # of rollouts there always is one
         record: dict[str, Any] = {
             "decision": decisions[-1]["decision"],
             "reason": decisions[-1]["reason"],
@@ -287,6 +289,7 @@ class _Loop:
             "effects": effect_names(self.model.model),
             "internal_model": self.domain,
             "parameters": describe(settled.data)["parameters"],
+            "preparation": prepared.summary.to_dict(),
             "checks": checks,
             **(trained or {}),
         }

@@ -133,7 +133,7 @@ def fit(
             "evaluated_on": "fitted" if test is None else "held-out",
         },
         "noise": prepared.noise,
-        "preparation": prepared.to_dict() | {"sentence": prepared.sentence()},
+        "preparation": prepared.summary.to_dict(),
         "checks": posterior.checks(),
         "seconds": {**posterior.provenance.seconds, "sample": sampled},
         "diagnosis": diagnosis.to_dict(),

@@ -30,6 +30,7 @@ from npdr_ppl.preparation.binding import BoundModel, bind
 from npdr_ppl.preparation.closest_fit import ClosestFit, closest_fit
 from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS, PLAIN_FEATURES, DataOptions
 from npdr_ppl.preparation.initial_states import InitialStates
+from npdr_ppl.preparation.preparation_summary import PreparationSummary
 from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.segment_model import SegmentModel, has_closest_fit
@@ -156,43 +157,17 @@ class Preparation:
         one = torch.ones(1, dtype=torch.float64)
         return GaussianMixture.from_moments(one, self.likelihood.fit.z[None], covariance[None])
 
-    def to_dict(self) -> dict[str, Any]:
-        """Returns JSON-serialisable values."""
-        length = self.options.steps(self.rollouts)
-        embedding = self.options.embedding
-        used, every = self.options.num_segments(self.rollouts)
-        return {
-            "recording": list(self.rollouts.notes),
-            "segment_length": length,
-            "segments": {"used": used, "recorded": every},
-            "segment_seconds": None if length is None else length * self.rollouts.time_step,
-            "initial_states": self.options.initial_state,
-            "embedding": embedding if isinstance(embedding, str) else repr(embedding),
-            "noise": self.noise,
-            "steps": "refined" if self.are_steps_coarse else "as the model has them",
-            "independent_share": None if self.likelihood is None else self.likelihood.share,
-            "priors_too_narrow": [str(end) for end in self.ends],
-        }
-
-    def sentence(self) -> str:
-        """Returns a line that says how the recording was prepared."""
-        length = self.options.steps(self.rollouts)
-        cut = (
-            "whole rollouts"
-            if length is None
-            else f"segments of {length} steps ({length * self.rollouts.time_step:.3g} s)"
+    @property
+    def summary(self) -> PreparationSummary:
+        """What was done, for a run's JSON."""
+        return PreparationSummary(
+            self.rollouts,
+            self.options,
+            self.noise,
+            self.are_steps_coarse,
+            None if self.likelihood is None else self.likelihood.share,
+            tuple(map(str, self.ends)),
         )
-        used, every = self.options.num_segments(self.rollouts)
-        if used < every:
-            cut = f"{used} of {every} {cut}, spread evenly over the recording"
-        starts = {
-            "uncertain": "estimated, uncertain initial states",
-            "estimated": "estimated initial states taken as true",
-            "recorded": "recorded initial states taken as true",
-        }[self.options.initial_state]
-        noise = "the model's own noise" if self.noise is None else "estimated noise"
-        steps = ", integration steps refined" if self.are_steps_coarse else ""
-        return f"Prepared: {cut}, {starts}, {noise}{steps}."
 
 
 def prepare(

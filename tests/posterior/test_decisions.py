@@ -59,7 +59,7 @@ def test_a_complete_model_is_accepted_at_the_true_parameters(accepted):
         assert found.sample(500)[name].mean() == pytest.approx(value, rel=0.01)
     assert diagnosis["decision"] == Decision.ACCEPT, diagnosis["reason"]
     assert found.preparation.are_steps_coarse
-    assert "uncertain initial states" in found.preparation.sentence()
+    assert "uncertain initial states" in found.preparation.summary.sentence()
 
 
 @pytest.mark.slow
@@ -69,6 +69,24 @@ def test_discovery_agrees_that_nothing_is_missing(clean, found):
     checks = found.checks()
     assert checks["model"]["p_value"] == discovery.alarm.p_value
     assert checks["priors"] == []
+    assert prepared_as(discovery.to_dict()) == prepared_as({"preparation": summary(found)})
+
+
+@pytest.mark.slow
+def test_a_comparison_prepares_the_recording_like_a_fit(clean, found, quick):
+    comparison = npdr.compare(
+        pendulum, clean, backends={"quick": quick}, rounds=1, num_simulations=100, progress=False
+    )
+    assert comparison.to_dict()["preparation"] == summary(found)
+
+
+def summary(posterior):
+    return posterior.preparation.summary.to_dict()
+
+
+def prepared_as(result):
+    """Returns the preparation without the features, which discovery does not need."""
+    return {name: value for name, value in result["preparation"].items() if name != "embedding"}
 
 
 @pytest.mark.slow

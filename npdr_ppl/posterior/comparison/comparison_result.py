@@ -92,11 +92,13 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the content of ``comparison.json``; what is not finite is NaN or None."""
+        prepared = self.error_model.prepared
         return {
             "backends": {label: self._row(label) for label in self.rows},
             "ranking": self.ranking,
             "weights": self.weights,
             "ensemble": None if self.mixture is None else self.mixture.to_dict(),
+            "preparation": None if prepared is None else prepared.summary.to_dict(),
             "error_model": self.error_model.to_dict(),
             "settings": dict(self.settings),
         }

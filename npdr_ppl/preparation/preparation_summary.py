@@ -1,0 +1,74 @@
+"""What was done to a recording before inference, in one line and for a run's JSON."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.rollouts import Rollouts
+
+__all__ = ["PreparationSummary"]
+
+
+@dataclass(frozen=True)
+class PreparationSummary:
+    """What ``fit``, ``compare``, ``train`` and ``discover`` did to a recording.
+
+    Attributes:
+        rollouts: The recording that is fitted; its ``notes`` say what was repaired.
+        options: How it is cut into segments.
+        noise: Estimated standard deviation by channel, in its unit; ``None`` if the model keeps
+            its own.
+        are_steps_coarse: Whether the model's own integration steps were refined.
+        independent_share: Effective number of independent measurements, as a share of all;
+            ``None`` if it was not estimated.
+        narrow_priors: The priors that end too early, a sentence each.
+    """
+
+    rollouts: Rollouts
+    options: DataOptions
+    noise: Mapping[str, float] | None
+    are_steps_coarse: bool
+    independent_share: float | None
+    narrow_priors: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns JSON-serialisable values, the sentence included."""
+        length = self.options.steps(self.rollouts)
+        embedding = self.options.embedding
+        used, every = self.options.num_segments(self.rollouts)
+        return {
+            "sentence": self.sentence(),
+            "recording": list(self.rollouts.notes),
+            "segment_length": length,
+            "segments": {"used": used, "recorded": every},
+            "segment_seconds": None if length is None else length * self.rollouts.time_step,
+            "initial_states": self.options.initial_state,
+            "embedding": (
+                embedding if embedding is None or isinstance(embedding, str) else repr(embedding)
+            ),
+            "noise": None if self.noise is None else dict(self.noise),
+            "steps": "refined" if self.are_steps_coarse else "as the model has them",
+            "independent_share": self.independent_share,
+            "priors_too_narrow": list(self.narrow_priors),
+        }
+
+    def sentence(self) -> str:
+        """Returns a line that says how the recording was prepared."""
+        length = self.options.steps(self.rollouts)
+        cut = (
+            "whole rollouts"
+            if length is None
+            else f"segments of {length} steps ({length * self.rollouts.time_step:.3g} s)"
+        )
+        used, every = self.options.num_segments(self.rollouts)
+        if used < every:
+            cut = f"{used} of {every} {cut}, spread evenly over the recording"
+        starts = {
+            "uncertain": "estimated, uncertain initial states",
+            "estimated": "estimated initial states taken as true",
+            "recorded": "recorded initial states taken as true",
+        }[self.options.initial_state]
+        noise = "the model's own noise" if self.noise is None else "estimated noise"
+        steps = ", integration steps refined" if self.are_steps_coarse else ""
+        return f"Prepared: {cut}, {starts}, {noise}{steps}."
