@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from npdr_ppl.rollouts import Rollouts
-from tests.helpers.command_line import run
+from tests.helpers.command_line import assert_prints_sentence, run
 
 RECORDING = Path(__file__).parents[3] / "shared/data/quanser_qube/swing_up_500hz_5s.csv"
 
@@ -56,6 +56,8 @@ def test_fit_writes_what_the_documentation_promises(monkeypatch, capsys, tmp_pat
     assert code == 0
     assert "most likely" in text
     fit = json.loads((out / "fit.json").read_text())
+    assert fit["preparation"]["segment_length"] == 25
+    assert_prints_sentence(text, fit["preparation"])
     assert fit["backend"] == "snpe-c"
     assert set(fit["parameters"]["mass"]) == {"mean", "sd", "hdi_94"}
     assert 0.3 <= fit["most_likely"]["length"] <= 1.7
@@ -121,6 +123,7 @@ def test_compare_writes_what_the_documentation_promises(monkeypatch, capsys, tmp
     assert "60 simulations each" in text
     assert max(map(len, text.splitlines())) <= 100
     comparison = json.loads((out / "comparison.json").read_text())
+    assert_prints_sentence(text, comparison["preparation"])
     assert set(comparison["backends"]) == set(comparison["ranking"]) == set(comparison["weights"])
     assert set(comparison["ranking"]) == {"snpe-c(epochs=2)", "maf"}
     for row in comparison["backends"].values():

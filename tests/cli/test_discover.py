@@ -16,7 +16,7 @@ from npdr_ppl.cli import discover, show
 from npdr_ppl.cli.resolve import resolve_holdout, resolve_model
 from npdr_ppl.discovery import DiscoveryOptions, Investigation, kept_fits
 from npdr_ppl.run_files import save_tensors
-from tests.helpers.command_line import run_for_module
+from tests.helpers.command_line import assert_prints_sentence, run_for_module
 from tests.helpers.discovery_recording import CANDIDATES, FRICTION, MISSING, pendulum_recording
 
 NAMES = {
@@ -79,6 +79,7 @@ def test_it_names_what_is_missing(finished):
     found = json.loads((folder / "discovery.json").read_text())
     assert NAMES <= set(found)
     assert found["verdict"] == "named"
+    assert_prints_sentence(text, found["preparation"])
     (effect,) = found["effects"]
     assert f"{effect['port']}.{effect['effect']}" == MISSING
     assert {"probability", "equivalent_to", "parameters"} <= set(effect)

@@ -15,7 +15,7 @@ from npdr_ppl.cli.resolve import (
 from npdr_ppl.errors import ModelError, NpdrError
 from npdr_ppl.models.furuta import furuta
 from npdr_ppl.rollouts import Rollouts
-from tests.helpers.command_line import run
+from tests.helpers.command_line import assert_prints_sentence, run
 
 RIG = """
 import dataclasses
@@ -80,6 +80,7 @@ def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
     assert "deploy: The policy succeeds in" in text
     assert max(map(len, text.splitlines())) <= 100
     first = json.loads((out / "train.json").read_text())
+    assert_prints_sentence(text, first["iterations"][-1]["preparation"])
     assert {"decision", "reason", "real_return", "sim_return"} <= set(first["iterations"][0])
     assert len(first["iterations"][0]["real_returns"]) == 2
     for name in ("learning_curve.png", "rollouts.png", "parameters.png", "rollout.gif"):

@@ -30,3 +30,16 @@ def run_for_module(*words):
         patch.setattr(sys, "argv", ["npdr", *map(str, words)])
         cli.main()
     return stop.value.code or 0, out.getvalue(), err.getvalue()
+
+
+def assert_prints_sentence(text, preparation):
+    """Fails unless a command's output has the line about its recording's preparation.
+
+    Args:
+        text: The output.
+        preparation: The same preparation in the command's JSON.
+    """
+    sentence = preparation["sentence"]
+    assert sentence.startswith("Prepared: segments of")
+    # Terminals break the line.
+    assert sentence in " ".join(text.split())
