@@ -148,9 +148,10 @@ class Shift:
                 rows = np.arange(len(time), dtype=np.float64)
                 at = rows[taken] + lateness[taken, column] - self.steps
                 measured = values[taken, column]
-                found, lateness[:, column], is_read[:, column] = placed(at, measured, rows)
+                found = placed(at, measured, len(rows))
+                lateness[:, column], is_read[:, column] = found.lateness, found.is_read
                 filled[:, column] = np.interp(rows, at, measured)
-                values[:, column] = np.where(is_read[:, column], found, filled[:, column])
+                values[:, column] = np.where(found.is_read, found.values, filled[:, column])
             readings.append(filled)
             samplings.append(Sampling(values, lateness, is_read))
         return _with_measurements(rollouts, column, readings, samplings)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from scipy.interpolate import Akima1DInterpolator
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
+from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.recording import Recording
 from npdr_ppl.rollouts.sampling import (
@@ -22,7 +24,7 @@ from npdr_ppl.rollouts.sampling import (
 )
 from npdr_ppl.rollouts.tracks import Track, clock_notes
 
-__all__ = ["Gridded", "at_one_rate", "grid_of", "recording_of", "tracks_of"]
+__all__ = ["Gridded", "at_one_rate", "grid_of", "on_given_grids", "recording_of", "tracks_of"]
 
 FEWEST_SMOOTHED = 5
 """Fewest measurements that are interpolated by cubic polynomials; Akima's method needs as many."""
@@ -43,14 +45,49 @@ class Gridded:
         readings: Interpolated measurements, ``(T + 1, C)``.
         actions: Mean commands of the steps, ``(T, A)``.
         sampling: The measurements as they were taken.
-        spans: The stretches without long gaps.
+        num_unused: Number of measurements of each channel that share a row with another one and
+            are not used, ``(C,)``.
     """
 
     time: Array
     readings: Array
     actions: Array
     sampling: Sampling
-    spans: Spans
+    num_unused: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, channels: Sequence[Track], time: Array, actions: Array, step: float) -> "Gridded":
+        """Puts measurements on a grid that is known.
+
+        The readings follow from the measurements on the grid alone. A file that keeps these gives
+        the same rollout again.
+
+        Args:
+            channels: What was measured.
+            time: Times of the rows in s on the clock of the channels, ``(T + 1,)``.
+            actions: Mean commands of the steps, ``(T, A)``.
+            step: Seconds between the rows.
+        """
+        shape = (len(time), len(channels))
+        readings, lateness = np.zeros(shape), np.zeros(shape)
+        is_read, num_unused = np.zeros(shape, dtype=bool), np.zeros(len(channels), dtype=np.int64)
+        values = np.zeros(shape)
+        for k, track in enumerate(channels):
+            found = placed((track.time - time[0]) / step, track.values, len(time))
+            rows = np.flatnonzero(found.is_read)
+            at = rows + found.lateness[rows]
+            readings[:, k] = _interpolated(at, found.values[rows], len(time))
+            exact = rows[found.lateness[rows] == 0.0]
+            readings[exact, k] = found.values[exact]
+            values[:, k] = np.where(found.is_read, found.values, readings[:, k])
+            lateness[:, k], is_read[:, k] = found.lateness, found.is_read
+            num_unused[k] = found.num_unused
+        return cls(time, readings, actions, Sampling(values, lateness, is_read), num_unused)
+
+    @cached_property
+    def spans(self) -> Spans:
+        """The stretches without long gaps."""
+        return spans_without_gaps(self.sampling.is_read)
 
 
 def grid_of(channels: Sequence[Track], actions: Sequence[Track], step: float) -> Gridded | None:
@@ -79,32 +116,30 @@ def grid_of(channels: Sequence[Track], actions: Sequence[Track], step: float) ->
         return None
     if count * len(tracks) > LIMITS.numbers:
         raise DataError(f"{count} steps of {step:.6g} s are more than are read.")
-    grid: Array = begin + step * np.arange(count + 1, dtype=np.float64)
-    shape = (count + 1, len(channels))
-    readings, values, lateness = np.empty(shape), np.empty(shape), np.empty(shape)
-    is_read = np.empty(shape, dtype=bool)
-    for k, track in enumerate(channels):
-        found, late, taken = placed(track.time, track.values, grid)
-        exact = taken & (late == 0.0)
-        readings[:, k] = np.where(exact, found, _interpolated(track, grid))
-        values[:, k] = np.where(taken, found, readings[:, k])
-        lateness[:, k], is_read[:, k] = late, taken
-    commands = [_mean_held(_bridged(track), grid) for track in actions]
-    return Gridded(
-        grid - begin,
-        readings,
+    rows = step * np.arange(count + 1, dtype=np.float64)
+    commands = [_mean_held(_bridged(track), begin + rows) for track in actions]
+    return Gridded.of(
+        [Track(track.time - begin, track.values) for track in channels],
+        rows,
         np.stack(commands, axis=1) if commands else np.zeros((count, 0)),
-        Sampling(values, lateness, is_read),
-        spans_without_gaps(is_read),
+        step,
     )
 
 
-def _interpolated(track: Track, grid: Array) -> Array:
-    """Returns values at the times of a grid; beyond the ends, those of the ends."""
-    inside = np.clip(grid, track.time[0], track.time[-1])
-    if len(track) < FEWEST_SMOOTHED:
-        return np.interp(inside, track.time, track.values)
-    return np.asarray(Akima1DInterpolator(track.time, track.values)(inside), dtype=np.float64)
+def _interpolated(at: Array, values: Array, num_rows: int) -> Array:
+    """Returns values at each row; beyond the ends, those of the ends.
+
+    Args:
+        at: Increasing times of the values, in steps after the first row, ``(N,)``.
+        values: The values, ``(N,)``; zero is returned if there are none.
+        num_rows: Number of rows.
+    """
+    if not len(at):
+        return np.zeros(num_rows)
+    inside = np.clip(np.arange(num_rows, dtype=np.float64), at[0], at[-1])
+    if len(at) < FEWEST_SMOOTHED:
+        return np.interp(inside, at, values)
+    return np.asarray(Akima1DInterpolator(at, values)(inside), dtype=np.float64)
 
 
 def _bridged(track: Track) -> Track:
@@ -169,26 +204,61 @@ def recording_of(
     if len(rollouts) > LIMITS.rollouts:
         raise DataError(f"it has {len(rollouts)} rollouts, more than {LIMITS.rollouts}.")
     step = float(f"{min(steps):.9g}") if time_step is None else time_step
-    if not 1e-9 <= step <= 1e9:
-        raise DataError(f"the time step is {step:.6g} s, which is implausible.")
-    made = [grid_of(*tracks, step) for tracks in rollouts]
+    rollout_checks.check_time_step(step)
     notes = (*notes, *clock_notes(rollouts))
+    return _recording_at(rollouts, channels, actions, step, notes)
+
+
+def _recording_at(
+    rollouts: Sequence[tuple[Sequence[Track], Sequence[Track]]],
+    channels: Sequence[tuple[str, str]],
+    actions: Sequence[tuple[str, str]],
+    step: float,
+    notes: Sequence[str],
+) -> Recording:
+    """Returns the recording of rollouts with a time step; arguments as for recording_of."""
+    made = [grid_of(*tracks, step) for tracks in rollouts]
     parts = [part for part in made if part is not None]
     if not parts:
         raise DataError("the channels and actions have no time in common.")
+    if len(made) > len(parts):
+        notes = (
+            *notes,
+            f"Rollouts shorter than a step: {len(made) - len(parts)}; left out.",
+        )
+    return on_given_grids(parts, channels, actions, time_step=step, notes=notes)
+
+
+def on_given_grids(
+    parts: Sequence[Gridded],
+    channels: Sequence[tuple[str, str]],
+    actions: Sequence[tuple[str, str]],
+    *,
+    time_step: float,
+    notes: Sequence[str] = (),
+) -> Recording:
+    """Returns the recording of rollouts that are on grids with the same time step.
+
+    Args:
+        parts: The rollouts, at least one.
+        channels: Name and unit of each channel.
+        actions: Name and unit of each action.
+        time_step: Seconds between the rows.
+        notes: What was left out or changed before, a sentence each.
+    """
     samplings = tuple(part.sampling for part in parts)
     return Recording(
         readings=tuple(part.readings for part in parts),
         actions=tuple(part.actions for part in parts),
         channel_names=tuple(name for name, _ in channels),
         action_names=tuple(name for name, _ in actions),
-        time_step=step,
+        time_step=time_step,
         time=tuple(part.time for part in parts),
         channel_units=tuple(unit for _, unit in channels),
         action_units=tuple(unit for _, unit in actions),
         samplings=() if all(part.is_regular for part in samplings) else samplings,
         stretches=tuple(part.spans for part in parts),
-        notes=(*notes, *_notes(parts, [name for name, _ in channels], len(made))),
+        notes=(*notes, *_notes(parts, [name for name, _ in channels])),
     )
 
 
@@ -209,12 +279,13 @@ def _at_step(recording: Recording, step: float) -> Recording:
     notes = recording.notes
     if recording.rewards is not None:
         notes = (*notes, "Rates differ; rewards are left out.")
-    made = recording_of(
+    # The commands are on the grid, whose clock is not theirs: clocks were compared before.
+    made = _recording_at(
         [tracks_of(recording, index) for index in range(len(recording))],
         list(zip(recording.channel_names, recording.channel_units, strict=True)),
         list(zip(recording.action_names, recording.action_units, strict=True)),
-        time_step=step,
-        notes=notes,
+        step,
+        notes,
     )
     ratio = recording.time_step / step
     usable = [
@@ -241,22 +312,29 @@ def tracks_of(recording: Recording, index: int) -> tuple[list[Track], list[Track
     return channels, [Track.of(time[:-1], values) for values in recording.actions[index].T]
 
 
-def _notes(parts: Sequence[Gridded], channels: Sequence[str], num_rollouts: int) -> list[str]:
+def _notes(parts: Sequence[Gridded], channels: Sequence[str]) -> list[str]:
     """Returns what was found about the times of the measurements, a sentence each."""
     notes = []
-    if num_rollouts > len(parts):
-        notes.append(f"Rollouts shorter than a step: {num_rollouts - len(parts)}; left out.")
     late = np.concatenate([np.abs(part.sampling.lateness).max(1) for part in parts])
     if (late > JITTER).any():
         notes.append(
             "Time stamps are uneven: simulations are compared with measurements at the times at "
             "which they were taken."
         )
-    taken = np.concatenate([part.sampling.is_read for part in parts]).mean(0)
+    used = sum(part.sampling.is_read.sum(0) for part in parts)
+    num_unused = sum(part.num_unused for part in parts)
+    shared = [
+        f"{unused} of {unused + taken} measurements of {name}"
+        for name, taken, unused in zip(channels, used, num_unused, strict=True)
+        if unused
+    ]
+    if shared:
+        notes.append(f"{', '.join(shared)} share a time step with another and are not used.")
+    num_rows = sum(len(part.time) for part in parts)
     slow = [
-        f"{name} ({share:.0%})"
-        for name, share in zip(channels, taken, strict=True)
-        if share < MOST_LOST
+        f"{name} ({taken / num_rows:.0%})"
+        for name, taken, unused in zip(channels, used, num_unused, strict=True)
+        if taken + unused < MOST_LOST * num_rows
     ]
     if slow:
         notes.append(f"Not measured at every step: {', '.join(slow)}.")

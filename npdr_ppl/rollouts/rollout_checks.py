@@ -21,6 +21,7 @@ __all__ = [
     "check_finite",
     "check_names",
     "check_time",
+    "check_time_step",
     "check_times",
     "check_values",
     "check_unit_texts",
@@ -264,6 +265,12 @@ def check_time(time: NDArray[np.float64], where: str) -> None:
         )
 
 
+def check_time_step(time_step: float) -> None:
+    """Raises a DataError unless a time step, in s, is from a nanosecond to thirty years."""
+    if not 1e-9 <= time_step <= 1e9:
+        raise DataError(f"the time step is {time_step:.6g} s, which is implausible.")
+
+
 def canonical_time_step(times: Sequence[NDArray[np.float64]]) -> float:
     """Returns the common time step, in s, of the time stamps of all rollouts.
 
@@ -285,8 +292,7 @@ def canonical_time_step(times: Sequence[NDArray[np.float64]]) -> float:
         time_step = first
     else:
         time_step = float(f"{(longest[-1] - longest[0]) / num_steps:.12g}")
-    if not 1e-9 <= time_step <= 1e9:
-        raise DataError(f"the time step is {time_step:.6g} s, which is implausible.")
+    check_time_step(time_step)
     for index, time in enumerate(times):
         own = float(time[-1] - time[0]) / (len(time) - 1)
         allowed = max(MAX_RATE_DIFFERENCE, MAX_STEP_JITTER / (len(time) - 1)) * time_step

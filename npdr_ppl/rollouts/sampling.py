@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,18 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts.arrays import Array
 
-__all__ = ["Sampling", "Spans", "common", "placed", "spans_without_gaps", "split"]
+__all__ = [
+    "MOST_BRIDGED",
+    "MOST_LATENESS",
+    "NEAREST",
+    "Placed",
+    "Sampling",
+    "Spans",
+    "common",
+    "placed",
+    "spans_without_gaps",
+    "split",
+]
 
 Spans = tuple[tuple[int, int], ...]
 """First step and end of each usable stretch of a rollout."""
@@ -17,6 +29,23 @@ Spans = tuple[tuple[int, int], ...]
 MOST_BRIDGED = 3.0
 """Longest gap between two measurements that is bridged, in usual intervals of the channel: three,
 or two lost messages. In longer gaps the commands are usually missing, too."""
+
+NEAREST = 0.5
+"""Largest distance in time steps between a measurement and the row that is nearest to it."""
+
+MOST_LATENESS = 1.0
+"""Largest distance in time steps between a measurement and its row. Simulations are compared with
+it by a parabola through the row and its two neighbours, which lie one step away. The error of a
+parabola is proportional to x³ − x, and on −1 ≤ x ≤ 1 it is at most 3 % larger than at 0.5."""
+
+LATENESS_PARTS = 2.0**24
+"""Lateness is a multiple of a time step divided by this. The time stamp that a file keeps then
+gives the same lateness again, in spite of rounding errors, up to 10⁸ rows. At 50 Hz the unit is
+1.2 ns, and time stamps are rarely finer than 1 ns."""
+
+MOST_PASSES = 4
+"""Largest number of passes in which measurements move to empty rows. With time stamps that depart
+by up to half a step, no measurement moves after the second pass."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +55,9 @@ class Sampling:
     Attributes:
         values: Measurements at their own times; where none was taken, the recording's reading,
             which is interpolated there.
-        lateness: Time of each measurement minus the time of its row, in time steps, from −0.5 to
-            0.5; zero where none was taken.
+        lateness: Time of each measurement minus the time of its row, in time steps, from −1 to 1;
+            zero where none was taken. It is beyond ±0.5 only where the nearest row has another
+            measurement.
         is_read: Whether a measurement was taken.
     """
 
@@ -40,8 +70,8 @@ class Sampling:
         shape = self.values.shape
         if self.lateness.shape != shape or self.is_read.shape != shape:
             raise DataError("the parts of a sampling have different shapes.")
-        if not (np.abs(self.lateness) <= 0.5 + 1e-9).all():
-            raise DataError("a measurement is more than half a step away from its row.")
+        if not (np.abs(self.lateness) <= MOST_LATENESS + 1e-9).all():
+            raise DataError("a measurement is more than a time step away from its row.")
         for part in (self.values, self.lateness, self.is_read):
             part.flags.writeable = False
 
@@ -69,36 +99,96 @@ class Sampling:
         return Sampling(values[:, chosen], lateness[:, chosen], is_read[:, chosen])
 
 
-def placed(time: Array, values: Array, grid: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Puts one channel's measurements on the nearest rows of a grid.
+class Placed(NamedTuple):
+    """One channel's measurements on T + 1 rows.
 
-    Of several measurements nearest to the same row, the nearest one is kept.
+    Attributes:
+        values: The measurements, zero where there is none, ``(T + 1,)``.
+        lateness: Time of each measurement minus that of its row, in time steps, ``(T + 1,)``.
+        is_read: Whether there is a measurement, ``(T + 1,)``.
+        num_unused: Number of measurements that found no row.
+    """
+
+    values: Array
+    lateness: Array
+    is_read: NDArray[np.bool_]
+    num_unused: int
+
+
+def placed(place: Array, values: Array, num_rows: int) -> Placed:
+    """Puts one channel's measurements on the rows of a grid, at most one on each row.
+
+    A measurement belongs to the nearest row. If several do, one of them moves to an empty row, if
+    no measurement gets further than ``MOST_LATENESS`` from its row; those in between move up.
+    Of measurements that still share a row, the nearest one is kept.
 
     Args:
-        time: Increasing times of the measurements in s, ``(N,)``.
+        place: Increasing times of the measurements, in time steps after the first row, ``(N,)``.
         values: The measurements, ``(N,)``.
-        grid: Times of the rows in s, at equal distances, ``(T + 1,)``.
-
-    Returns:
-        Values, lateness in steps, and whether there is a measurement, ``(T + 1,)`` each; values
-        and lateness are zero where there is none.
+        num_rows: Number of rows, T + 1.
     """
-    step = (grid[-1] - grid[0]) / (len(grid) - 1)
-    place = (time - grid[0]) / step
+    place = np.rint(place * LATENESS_PARTS) / LATENESS_PARTS
     # Halves are rounded up, so that a clock that runs between the rows meets each of them.
-    row = np.floor(place + 0.5 + 1e-9).astype(np.int64)
-    inside = (row >= 0) & (row < len(grid))
-    place, row, values = place[inside], row[inside], values[inside]
+    nearest = np.floor(place + NEAREST)
+    inside = (nearest >= 0) & (nearest < num_rows)
+    num = int(inside.sum())
+    inside &= np.diff(place, prepend=-np.inf) > 0
+    place, values = place[inside], values[inside]
+    row = _spread(place, nearest[inside].astype(np.int64), num_rows)
     late = place - row
     # The nearest is written last.
     order = np.argsort(-np.abs(late), kind="stable")
-    found, lateness = np.zeros(len(grid)), np.zeros(len(grid))
-    is_read = np.zeros(len(grid), dtype=bool)
+    found, lateness = np.zeros(num_rows), np.zeros(num_rows)
+    is_read = np.zeros(num_rows, dtype=bool)
     found[row[order]], lateness[row[order]] = values[order], late[order]
     is_read[row] = True
-    # Stamps are rounded; a billionth of a step is no lateness.
-    lateness[np.abs(lateness) < 1e-9] = 0.0
-    return found, lateness, is_read
+    return Placed(found, lateness, is_read, num - int(is_read.sum()))
+
+
+def _spread(place: Array, row: NDArray[np.int64], num_rows: int) -> NDArray[np.int64]:
+    """Returns the rows of measurements after some of those that share one have moved.
+
+    Args:
+        place: Increasing times of the measurements in time steps, ``(N,)``.
+        row: Nearest row of each, ``(N,)``.
+        num_rows: Number of rows.
+    """
+    for _ in range(MOST_PASSES):
+        before = row
+        row = _moved_up(place, row, num_rows)
+        # Backwards in time, the earlier rows are the later ones.
+        row = (
+            num_rows
+            - 1
+            - _moved_up(num_rows - 1 - place[::-1], num_rows - 1 - row[::-1], num_rows)[::-1]
+        )
+        if np.array_equal(row, before):
+            break
+    return row
+
+
+def _moved_up(place: Array, row: NDArray[np.int64], num_rows: int) -> NDArray[np.int64]:
+    """Returns rows of which empty ones are filled from earlier ones with several measurements.
+
+    The last measurement of each row from the one with several to the one before the empty row
+    moves to the next row, provided that each was taken at its own row or later: it is then at most
+    one step before its new row. Arguments are those of :func:`_spread`.
+    """
+    count = np.bincount(row, minlength=num_rows)
+    empty, several = np.flatnonzero(count == 0), np.flatnonzero(count > 1)
+    if not len(empty) or not len(several):
+        return row
+    last = np.cumsum(count) - 1
+    may_move = (count > 0) & (place[last.clip(0)] >= np.arange(num_rows))
+    nearest = np.searchsorted(several, empty) - 1
+    source, empty = several[nearest.clip(0)], empty[nearest >= 0]
+    source = source[nearest >= 0]
+    num_stuck = np.concatenate(([0], np.cumsum(~may_move)))
+    is_open = num_stuck[empty] == num_stuck[source]
+    change = np.zeros(len(row) + 1, dtype=np.int64)
+    change[last[source[is_open]]] += 1
+    change[last[empty[is_open] - 1] + 1] -= 1
+    return row + np.cumsum(change[:-1])
 
 
 def split(spans: Spans, steps: Iterable[int]) -> Spans:

@@ -13,6 +13,7 @@ from torch import Tensor
 from npdr_ppl.errors import DataError, ShapeError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.rollouts.recording import Recording
+from npdr_ppl.rollouts.sampling import NEAREST
 from npdr_ppl.rollouts.states import StateEstimate, estimate_states
 
 __all__ = [
@@ -108,7 +109,7 @@ def cut(
     sampling = {}
     if rollouts.samplings:
         sampling = {
-            "is_read": torch.tensor(_after_steps(rollouts, layout, num_steps, "is_read")),
+            "is_read": torch.tensor(_compared(rollouts, layout, num_steps)),
             "lateness": torch.tensor(
                 _after_steps(rollouts, layout, num_steps, "lateness"), dtype=dtype
             ),
@@ -165,6 +166,23 @@ def _after_steps(
     result = np.zeros(shape, dtype=source[0].dtype)
     for row, (rollout, start, stop) in enumerate(layout):
         result[row, : stop - start] = source[rollout][start + 1 : stop + 1]
+    return result
+
+
+def _compared(
+    rollouts: Recording, layout: Sequence[tuple[int, int, int]], num_steps: int
+) -> NDArray[np.bool_]:
+    """Returns where segments are compared with a measurement, ``(S, K, C)``.
+
+    At the first and the last step of a segment, measurements that lie more than half a step
+    outside of it are left out. A simulation would have to be extrapolated to them.
+    """
+    result = _after_steps(rollouts, layout, num_steps, "is_read")
+    lateness = _after_steps(rollouts, layout, num_steps, "lateness")
+    segment = np.arange(len(layout))
+    last = np.array([stop - start - 1 for _, start, stop in layout])
+    result[:, 0] &= lateness[:, 0] >= -NEAREST
+    result[segment, last] &= lateness[segment, last] <= NEAREST
     return result
 
 
