@@ -7,10 +7,12 @@ import pytest
 import torch
 
 import npdr_ppl as npdr
+from npdr_ppl.errors import DataError
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.gridding import recording_of
+from npdr_ppl.rollouts.sampling import placed
 from npdr_ppl.rollouts.tracks import Track, usual_step, without_restarts
 
 STEP = 0.02
@@ -186,23 +188,100 @@ def test_a_restarted_clock_goes_on_behind_a_gap():
     assert without_restarts((swapped,)) == ((swapped,), 0)
 
 
+@pytest.mark.parametrize("rate, least", [(100.0, 0.99), (250.0, 0.9)])
+@pytest.mark.parametrize("seed", range(5))
+def test_measurements_that_share_a_row_move_to_empty_ones(rate, least, seed):
+    """Jitter of ± 5 ms: the nearest rows alone hold 83 % and 71 % of the measurements."""
+    noise = np.random.default_rng(seed).uniform(-0.005, 0.005, 2000)
+    time = np.sort(np.arange(2000) / rate + noise)
+    rollouts = made([track(time)])
+    (sampling,) = rollouts.samplings
+    taken = sampling.is_read[:, 0]
+    assert taken.sum() >= least * 2000 and np.abs(sampling.lateness).max() <= 1.0
+    own = time[0] + rollouts.time[0] + rollouts.time_step * sampling.lateness[:, 0]
+    assert np.allclose(sampling.values[taken, 0], np.sin(own[taken]), rtol=0.0, atol=1e-9)
+    unused = 2000 - int(taken.sum())
+    said = f"{unused} of 2000 measurements of channel_0 share a time step with another"
+    assert (said in " ".join(rollouts.notes)) == (unused > 0)
+    assert "Not measured" not in " ".join(rollouts.notes)
+
+
+def test_a_gap_does_not_make_measurements_share_rows():
+    noise = np.random.default_rng(0).uniform(-0.2, 0.2, 500)
+    time = np.delete(STEP * (np.arange(500) + noise), slice(200, 220))
+    assert made([track(time)]).samplings[0].is_read.sum() == 480
+
+
+def test_measurements_move_no_further_than_a_step():
+    place = np.array([0.0, 1.1, 1.2, 2.1, 4.0, 5.6, 5.8, 5.9, 7.0])
+    found = placed(place, place, 9)
+    assert np.flatnonzero(found.is_read).tolist() == [0, 1, 2, 3, 4, 5, 6, 7]
+    at = np.arange(9) + found.lateness
+    assert np.allclose(at[found.is_read], np.delete(place, 6), atol=1e-7)
+    assert found.num_unused == 1
+
+
+def test_a_channel_that_is_faster_than_the_steps_is_compared_at_the_rows():
+    rollouts = made([track(0.001 * np.arange(1001))], time_step=0.01)
+    assert rollouts.samplings == () and "900 of 1001 measurements" in rollouts.notes[0]
+
+
+def test_segments_are_not_compared_with_measurements_outside_of_them():
+    place = np.array([0.0, 0.6, 1.3, 2.3, 4.0, 5.0, 6.0])
+    rollouts = made([track(STEP * place)], time_step=STEP)
+    late = rollouts.samplings[0].lateness[:, 0]
+    inputs = rollouts.inputs(3)
+    assert (late[4], inputs.is_read[..., 0].tolist()) == (0.0, [[True] * 3, [True] * 3])
+    early = made([track(STEP * np.array([0.0, 1.0, 2.0, 2.7, 3.2, 3.4, 6.0]))], time_step=STEP)
+    assert early.samplings[0].lateness[4, 0] == pytest.approx(-0.6, abs=1e-6)
+    assert early.inputs(3).is_read[..., 0].tolist() == [[True] * 3, [False, False, True]]
+
+
 @pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "nc"])
-def test_every_format_keeps_times_and_gaps(tmp_path, suffix):
-    time = np.delete(jittered(), [50, *range(200, 210)])
-    rollouts = made([track(time), track(time[::3], np.cos)], [track(STEP * np.arange(300))])
-    path = tmp_path / f"data.{suffix}"
+@pytest.mark.parametrize("size", [0.25, 0.5])
+@pytest.mark.parametrize("is_free", [False, True], ids=["commands", "free"])
+def test_every_format_keeps_times_and_gaps(tmp_path, suffix, size, is_free):
+    """Jitter is given in steps; the second channel has a third of the rate."""
+    time = np.delete(jittered(size=size * STEP), [50, *range(200, 210)])
+    channels = [track(np.sort(time)), track(np.sort(time[::3]), np.cos)]
+    rollouts = made(channels, [] if is_free else [track(STEP * np.arange(300))])
+    assert read_back(rollouts, tmp_path, suffix) == rollouts
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "nc"])
+@pytest.mark.parametrize("seed", range(10))
+def test_every_format_keeps_free_motion_at_two_rates(tmp_path, suffix, seed):
+    generator = np.random.default_rng(seed)
+    num = int(generator.integers(30, 200))
+    slow = int(generator.integers(2, 6))
+    offset = generator.uniform(0.0, STEP)
+    channels = [track(STEP * np.arange(num)), track(offset + STEP * np.arange(0, num, slow))]
+    rollouts = made(channels)
+    again = read_back(rollouts, tmp_path, suffix)
+    assert again == rollouts and again.channel_names == ("channel_0", "channel_1")
+
+
+def test_a_table_that_does_not_count_its_steps_is_refused(tmp_path):
+    path = tmp_path / "data.csv"
+    made([track(jittered(30))]).to_csv(path)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:10], *lines[12:], ""]))
+    with pytest.raises(DataError, match="step does not count the steps of rollout 0"):
+        Rollouts.load(path)
+
+
+def test_a_slow_channel_that_is_empty_in_the_last_row_is_no_action(tmp_path):
+    rows = [f"0,{STEP * k:.2f},{np.sin(STEP * k):.6f},{'' if k % 2 else k}" for k in range(100)]
+    path = tmp_path / "data.csv"
+    path.write_text("\n".join(["rollout,time,angle,temperature", *rows, ""]))
+    rollouts = Rollouts.load(path)
+    assert rollouts.channel_names == ("angle", "temperature") and rollouts.action_names == ()
+
+
+def read_back(rollouts, folder, suffix):
+    path = folder / f"data.{suffix}"
     getattr(rollouts, {"nc": "to_netcdf"}.get(suffix, f"to_{suffix}"))(path)
-    again = Rollouts.load(path)
-    assert again.action_names == ("action_0",)
-    for one, two in zip(rollouts.samplings, again.samplings, strict=True):
-        for k in range(2):
-            assert np.array_equal(
-                one.values[one.is_read[:, k], k], two.values[two.is_read[:, k], k]
-            )
-    if suffix in ("npz", "nc"):
-        assert again == rollouts
-    else:
-        assert again.time_step == pytest.approx(rollouts.time_step, rel=0.01)
+    return Rollouts.load(path)
 
 
 def test_cells_without_a_number_are_missing_measurements(tmp_path):

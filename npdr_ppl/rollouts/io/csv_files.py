@@ -50,12 +50,17 @@ def write_csv(rollouts: Recording, path: str | PathLike[str]) -> None:
     """Writes rollouts; see :meth:`Rollouts.to_csv`."""
     columns = to_table(rollouts)
     cells = [
-        ["" if value != value else repr(value) for value in column.tolist()]
-        for column in columns.values()
+        ["" if value != value else _cell(name, value) for value in column.tolist()]
+        for name, column in columns.items()
     ]
     rows = map(",".join, zip(*cells, strict=True))
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         file.write("\n".join([",".join(columns), *rows, ""]))
+
+
+def _cell(name: str, value: float) -> str:
+    """Returns a number as text; rollouts and steps are counted."""
+    return f"{value:.0f}" if name in ("rollout", "step") else repr(value)
 
 
 def check_encoding(data: bytes) -> None:

@@ -49,6 +49,7 @@ class _TableMetadata(msgspec.Struct):
 
     units: dict[str, str] = {}
     time_step: float | None = None
+    actions: list[str] | None = None
 
 
 _NPZ_ARRAYS = {  # name of each array and its number of dimensions
@@ -96,7 +97,12 @@ def write_parquet(rollouts: Recording, path: AnyPath) -> None:
     }
     units = dict(zip(rollouts.channel_names, rollouts.channel_units, strict=True))
     units |= dict(zip(rollouts.action_names, rollouts.action_units, strict=True))
-    metadata = {_METADATA_KEY: json.dumps({"units": units, "time_step": rollouts.time_step})}
+    about = {
+        "units": units,
+        "time_step": rollouts.time_step,
+        "actions": rollouts.action_names,
+    }
+    metadata = {_METADATA_KEY: json.dumps(about)}
     with replacing(path) as temporary:
         pq.write_table(pa.table(columns).replace_schema_metadata(metadata), temporary)
 
@@ -121,9 +127,10 @@ def read_parquet(path: AnyPath, actions: Sequence[str] | None) -> Recording:
             }
             metadata = (table.schema.metadata or {}).get(_METADATA_KEY, b"{}")
             about = msgspec.json.decode(metadata, type=_TableMetadata)
-        rollouts = from_table(columns, actions, units=about.units)
-        step = about.time_step
-        return rollouts if step is None else replace(rollouts, time_step=step)
+        if actions is None and about.actions is not None:
+            # Another program may have removed columns.
+            actions = [name for name in about.actions if name in columns]
+        return from_table(columns, actions, units=about.units, time_step=about.time_step)
 
 
 # -- NPZ -------------------------------------------------------------------------------------
