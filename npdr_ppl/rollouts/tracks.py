@@ -6,13 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from npdr_ppl.rollouts.arrays import Array
-from npdr_ppl.rollouts.sampling import MOST_BRIDGED
 
-__all__ = ["Track", "clock_notes", "stamp_notes", "usual_step", "without_restarts"]
+__all__ = ["LARGEST", "REGULAR_SHARE", "Track", "clock_notes", "usual_step"]
 
 STEPS_TOGETHER = 5
 """Steps over which the usual step is measured: jitter of single stamps averages out, and if one
 message in twenty is lost, most blocks are still complete."""
+
+SHORT_STEP = 0.5
+"""Longest step within a burst of time stamps, in usual steps. Jitter of half a step makes an eighth
+of the steps as short; in bursts of two, half of them are."""
 
 REGULAR_SHARE = 0.5
 """Share of the steps of a stream that have to be usual if it is written at a rate."""
@@ -123,66 +126,21 @@ class Track:
 
 
 def usual_step(time: Array) -> float:
-    """Returns the mean step of time stamps ``(N,)`` in s; a gap counts as several steps."""
+    """Returns the mean step of time stamps ``(N,)`` in s; a gap counts as several steps.
+
+    If stamps come in bursts, which is usual where messages are sent together, the step is the mean
+    over whole bursts.
+    """
     time = np.unique(time)
     together = min(STEPS_TOGETHER, len(time) - 1)
     if together < 1:
         return np.inf
+    usual = float(np.median(time[together:] - time[:-together])) / together
+    num_bursts = int((np.diff(time) > SHORT_STEP * usual).sum())
+    together = min(round((len(time) - 1) / max(num_bursts, 1)) * together, len(time) - 1)
     durations = time[together:] - time[:-together]
     count = np.rint(durations / np.median(durations) * together).clip(1)
     return float(durations[::together].sum() / count[::together].sum())
-
-
-def without_restarts(times: Sequence[Array]) -> tuple[tuple[Array, ...], int]:
-    """Returns time stamps of clocks that were restarted together as those of one clock.
-
-    A stamp that lies more than ``MOST_BRIDGED`` usual steps before the last one shows a restart.
-    How long it took is not known, so what follows is placed behind a gap.
-
-    Args:
-        times: Time stamps of each signal in the order in which they were written, in s.
-
-    Returns:
-        The time stamps, and the number of restarts.
-    """
-    parts = [_between_restarts(time) for time in times]
-    num = max(len(part) for part in parts)
-    if num == 1:
-        return tuple(times), 0
-    forward = [np.diff(time)[np.diff(time) > 0] for time in times]
-    gap = (MOST_BRIDGED + 2.0) * max(float(np.median(s)) for s in forward if len(s))
-    moved: list[list[Array]] = [[] for _ in times]
-    end = -np.inf
-    for k in range(num):
-        present = [part[k] for part in parts if k < len(part) and len(part[k])]
-        shift = 0.0 if k == 0 else end + gap - min(float(time.min()) for time in present)
-        for own, part in zip(moved, parts, strict=True):
-            if k < len(part):
-                own.append(part[k] + shift)
-        end = shift + max(float(time.max()) for time in present)
-    return tuple(np.concatenate(own) for own in moved), num - 1
-
-
-def stamp_notes(times: Sequence[Array], num_restarts: int) -> list[str]:
-    """Returns what is wrong about time stamps, and what is done about it, a sentence each.
-
-    Args:
-        times: Time stamps of each signal in the order in which they were written, without
-            restarts, in s.
-        num_restarts: How often the clock was restarted.
-    """
-    notes = []
-    if num_restarts:
-        often = "once" if num_restarts == 1 else f"{num_restarts} times"
-        notes.append(f"The clock was restarted {often}; the data after it are another stretch.")
-    steps = [np.diff(time[np.isfinite(time)]) for time in times]
-    repeated = max((int((step == 0).sum()) for step in steps), default=0)
-    swapped = max((int((step < 0).sum()) for step in steps), default=0)
-    if repeated:
-        notes.append(f"Repeated time stamps: {repeated}; the first sample of each is used.")
-    if swapped:
-        notes.append(f"Samples out of order: {swapped}; sorted by their time stamps.")
-    return notes
 
 
 def clock_notes(rollouts: Sequence[tuple[Sequence[Track], Sequence[Track]]]) -> list[str]:
@@ -203,17 +161,6 @@ def clock_notes(rollouts: Sequence[tuple[Sequence[Track], Sequence[Track]]]) -> 
         f"The clocks of commands and measurements differ by {100 * drift:.2g} %, which looks "
         f"like a delay that changes by {6e4 * drift:.2g} ms per minute."
     ]
-
-
-def _between_restarts(time: Array) -> list[Array]:
-    """Splits time stamps where the clock went back."""
-    steps = np.diff(time)
-    if not (steps < 0).any() or not (steps > 0).any():
-        return [time]
-    usual = float(np.median(steps[steps > 0]))
-    back = np.flatnonzero(steps[:-1] < -MOST_BRIDGED * usual)
-    # After a single late message the clock is where it was before.
-    return np.split(time, back[time[back + 2] <= time[back]] + 1)
 
 
 def _drift(channel: Track, commands: Track) -> tuple[float, float] | None:

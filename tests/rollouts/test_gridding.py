@@ -11,9 +11,11 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.clock_jumps import Jumps, without_jumps
 from npdr_ppl.rollouts.gridding import recording_of
+from npdr_ppl.rollouts.logs import Signal, rollouts_of
 from npdr_ppl.rollouts.sampling import placed
-from npdr_ppl.rollouts.tracks import Track, usual_step, without_restarts
+from npdr_ppl.rollouts.tracks import Track, usual_step
 
 STEP = 0.02
 
@@ -179,13 +181,93 @@ def test_commands_at_another_rate_are_not_taken_for_a_drift():
 
 def test_a_restarted_clock_goes_on_behind_a_gap():
     time = np.concatenate((STEP * np.arange(100), 0.013 + STEP * np.arange(80)))
-    (moved,), number = without_restarts((time,))
-    assert number == 1 and np.diff(moved).min() > 0
+    (moved,), jumps = without_jumps((time,), 1)
+    assert jumps == Jumps(num_restarts=1) and np.diff(moved).min() > 0
     assert np.diff(moved)[99] == pytest.approx(5 * STEP, abs=1e-9)
     late = np.concatenate((STEP * np.arange(51), [0.9], STEP * np.arange(51, 99)))
-    assert without_restarts((late,))[1] == 0, "one message that came late"
+    assert without_jumps((late,), 1)[1] == Jumps(), "one message that came late"
     swapped = STEP * np.array([0, 1, 3, 2, 4])
-    assert without_restarts((swapped,)) == ((swapped,), 0)
+    (kept,), jumps = without_jumps((swapped,), 1)
+    assert np.array_equal(kept, swapped) and jumps == Jumps()
+
+
+@pytest.mark.parametrize("wrong", [1e6, -1e6, 0.0, 1.7e9])
+@pytest.mark.parametrize("row", [0, 100, 299])
+@pytest.mark.parametrize("begin", [1e3, 1.6e9])
+def test_a_single_wrong_stamp_costs_one_sample(wrong, row, begin):
+    true = begin + STEP * np.arange(300)
+    time = true.copy()
+    time[row] = wrong
+    (kept,), jumps = without_jumps((time,), 1)
+    assert jumps == Jumps(num_outlying=1) and np.flatnonzero(np.isnan(kept)).tolist() == [row]
+    assert np.array_equal(np.delete(kept, row), np.delete(true, row))
+
+
+def test_a_stamp_ahead_of_those_that_follow_is_wrong_and_one_behind_a_gap_is_not():
+    time = STEP * np.arange(300)
+    time[100] = 3.0
+    assert without_jumps((time,), 1)[1] == Jumps(num_outlying=1)
+    time = np.delete(STEP * np.arange(300), slice(200, 299))
+    (kept,), jumps = without_jumps((time,), 1)
+    assert jumps == Jumps() and np.array_equal(kept, time)
+
+
+def test_wrong_stamps_of_all_signals_leave_one_stretch():
+    """A table with a command in every tenth row, in which two rows have a wrong stamp."""
+    time = STEP * np.arange(500)
+    time[[200, 390]] = 1e6, 0.0
+    commands = time[::10].copy()
+    (kept, held), jumps = without_jumps((time, commands), 1)
+    assert jumps.num_restarts == 0 and np.nanmax(kept) == time[-1]
+    assert np.isnan(held[20]) and np.nanmax(held) == commands[-1]
+
+
+@pytest.mark.parametrize("jump", [1.7e9, 86_400.0])
+def test_a_pause_or_a_clock_that_is_set_forward_becomes_a_gap(jump):
+    """At 1 kHz; the command is written every 2 s, also in the pause."""
+    time = 0.001 * np.arange(2000)
+    time[700:] += jump
+    commands = np.array([0.0, 0.5, 0.5 * jump, jump + 1.5])
+    rollouts = load(time, commands)
+    assert rollouts.spans == (((0, 699), (704, 2003)),)
+    assert f"1, the longest of {jump:.6g} s" in rollouts.notes[0]
+    values = rollouts.actions[0][:, 0]
+    assert (values[0], values[650], values[710], values[1600]) == (0.0, 1.0, 2.0, 3.0)
+
+
+def load(time, commands):
+    signals = (
+        Signal("q", time, np.sin(time)),
+        Signal("u", commands, np.arange(len(commands)) * 1.0),
+    )
+    return Rollouts.of(rollouts_of([signals[0]], [signals[1]]))
+
+
+def test_a_command_long_before_the_recording_holds():
+    rollouts = load(1e4 + STEP * np.arange(300), np.array([0.0]))
+    assert rollouts.notes == () and rollouts.lengths == (299,)
+    rollouts = load(1e4 + STEP * np.arange(300), np.array([0.0, 1.0]))
+    assert rollouts.notes == () and set(rollouts.actions[0][:, 0]) == {1.0}
+
+
+@pytest.mark.parametrize("jump", ["middle", "end", "set", "day"])
+def test_a_table_with_jumps_of_the_clock_is_read(tmp_path, jump):
+    time = 0.001 * np.arange(1000)
+    time[{"middle": slice(400, 401), "end": slice(999, 1000)}.get(jump, slice(400, 1000))] += {
+        "set": 1.7e9, "day": 86_400.0
+    }.get(jump, 1e6)  # fmt: skip
+    rows = [f"0,{t!r},{k}" for k, t in enumerate(time.tolist())]
+    path = tmp_path / "data.csv"
+    path.write_text("\n".join(["rollout,time,angle", *rows, ""]))
+    rollouts = Rollouts.load(path)
+    assert rollouts.num_usable >= 997 and len(rollouts.notes) >= 1
+
+
+@pytest.mark.parametrize("size", [2, 3, 4])
+def test_bursts_have_the_mean_step(size):
+    number = np.arange(4000)
+    time = 0.002 * size * (number // size) + 0.0001 * (number % size)
+    assert usual_step(time) == pytest.approx(0.002, rel=2e-3)
 
 
 @pytest.mark.parametrize("rate, least", [(100.0, 0.99), (250.0, 0.9)])

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
+from npdr_ppl.rollouts.clock_jumps import stamp_notes, without_jumps
 from npdr_ppl.rollouts.gridding import MOST_LOST, Gridded, on_given_grids, recording_of, tracks_of
 from npdr_ppl.rollouts.recording import Recording
-from npdr_ppl.rollouts.tracks import Track, stamp_notes, without_restarts
+from npdr_ppl.rollouts.tracks import Track
 
 __all__ = ["from_table", "to_table"]
 
@@ -155,10 +156,10 @@ def _uneven(
 ) -> Recording:
     """Returns rollouts with missing values or uneven time stamps."""
     notes = ["The time stamps are uneven; rewards are left out."] if has_rewards else []
-    rollouts, clocks, num_restarts = [], [], 0
+    rollouts, clocks, jumps = [], [], []
     for span in spans:
-        (time,), number = without_restarts((columns["time"][span],))
-        num_restarts += number
+        (time,), found = without_jumps((columns["time"][span],), 1)
+        jumps.append(found)
         clocks.append(time)
         channels, actions = (
             [Track.of(time, columns[name][span]) for name in names]
@@ -170,7 +171,7 @@ def _uneven(
         [(name, units.get(name, "")) for name in channel_names],
         [(name, units.get(name, "")) for name in action_names],
         time_step=time_step,
-        notes=[*notes, *stamp_notes(clocks, num_restarts)],
+        notes=[*notes, *stamp_notes(clocks, jumps)],
     )
 
 

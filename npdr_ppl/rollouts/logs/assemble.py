@@ -5,10 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.rollouts.clock_jumps import stamp_notes, without_jumps
 from npdr_ppl.rollouts.gridding import recording_of
 from npdr_ppl.rollouts.logs.log import Signal
 from npdr_ppl.rollouts.recording import Recording
-from npdr_ppl.rollouts.tracks import Track, stamp_notes, without_restarts
+from npdr_ppl.rollouts.tracks import Track
 
 __all__ = ["rollouts_of"]
 
@@ -36,7 +37,7 @@ def rollouts_of(
         raise DataError("no signal is mapped to a channel.")
     signals = (*channels, *actions)
     clocks = [signal.time for signal in signals] + ([episodes.time] if episodes else [])
-    times, num_restarts = without_restarts(clocks)
+    times, jumps = without_jumps(clocks, len(channels))
     tracks = [Track.of(t, signal.values) for t, signal in zip(times, signals, strict=False)]
     num = len(channels)
     for k, (signal, track) in enumerate(zip(signals, tracks, strict=True)):
@@ -52,7 +53,7 @@ def rollouts_of(
         [(signal.name, signal.unit) for signal in channels],
         [(signal.name, signal.unit) for signal in actions],
         time_step=time_step,
-        notes=stamp_notes(times, num_restarts),
+        notes=stamp_notes(times, [jumps]),
     )
 
 
