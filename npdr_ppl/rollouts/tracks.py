@@ -14,8 +14,8 @@ STEPS_TOGETHER = 5
 message in twenty is lost, most blocks are still complete."""
 
 SHORT_STEP = 0.5
-"""Longest step within a burst of time stamps, in usual steps. Jitter of half a step makes an eighth
-of the steps as short; in bursts of two, half of them are."""
+"""Longest step within a burst of time stamps, in usual steps. Jitter of half a step makes one step
+in eight as short; in bursts of two, half of them are."""
 
 REGULAR_SHARE = 0.5
 """Share of the steps of a stream that have to be usual if it is written at a rate."""

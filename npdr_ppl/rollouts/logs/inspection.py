@@ -6,9 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from npdr_ppl.rollouts.clock_jumps import without_jumps
 from npdr_ppl.rollouts.logs.log import Log, Signal
 from npdr_ppl.rollouts.logs.mapping import toml_text
 from npdr_ppl.rollouts.logs.signal_names import Role, plain_names, role_of
+from npdr_ppl.rollouts.tracks import usual_step
 
 __all__ = ["Description", "SignalSummary", "Timing", "described", "mapping_to_start_from"]
 
@@ -61,11 +63,11 @@ class Timing:
         count: Number of time stamps.
         begin: First time stamp in s after the log's begin.
         end: Last time stamp in s after the log's begin.
-        step: Median step between time stamps in s, NaN if there is none.
-        jitter: ``USUAL_SHARE`` percent of the steps are within this of the median step, in s.
+        step: Usual step between time stamps in s, as in the rollouts; NaN if there is none.
+        jitter: ``USUAL_SHARE`` percent of the steps are within this of the usual step, in s.
         largest: Largest step in s.
         largest_at: Begin of the largest step in s after the log's begin.
-        gaps: Number of steps of at least ``GAP`` median steps.
+        gaps: Number of steps of at least ``GAP`` usual steps.
         backwards: Number of time stamps that repeat the one before or go back.
     """
 
@@ -124,7 +126,8 @@ def _timing(time: Array, signals: list[Signal]) -> Timing:
     forward = steps[steps > 0]
     step = jitter = largest = at = float("nan")
     if len(forward):
-        step = float(np.median(forward))
+        (stamps,), _ = without_jumps((time,), 1)
+        step = usual_step(stamps[np.isfinite(stamps)])
         jitter = float(np.percentile(np.abs(forward - step), USUAL_SHARE))
         largest, at = float(steps.max()), float(time[np.argmax(steps)])
     return Timing(

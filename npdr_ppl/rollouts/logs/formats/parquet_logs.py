@@ -1,6 +1,6 @@
 """Reads Parquet files and data frames with any columns."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,14 @@ _PER_SECOND = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 
 def read_parquet_log(path: Path, settings: LogSettings) -> Log:
     """Reads a Parquet file with any columns: numbers, lists of numbers, times and text."""
-    return log_of_columns(path.name, read_parquet_columns(path), settings)
+    import pyarrow.parquet as pq
+    import pyarrow.types as kinds
+
+    columns = read_parquet_columns(path)
+    with path.open("rb") as file:
+        fields = pq.read_schema(file)
+    dated = [f.name for f in fields if kinds.is_timestamp(f.type) or kinds.is_duration(f.type)]
+    return log_of_columns(path.name, columns, settings, in_seconds=dated)
 
 
 def read_parquet_columns(
@@ -73,28 +80,45 @@ def columns_of_frame(frame: "pd.DataFrame") -> dict[str, Array | Texts]:
 
     if not isinstance(frame, pd.DataFrame):
         raise DataError(f"a pandas data frame is needed, not a {type(frame).__name__}.")
-    index = frame.index
     columns: dict[str, Array | Texts] = {}
-    is_time = isinstance(index, pd.DatetimeIndex | pd.TimedeltaIndex)
-    if is_time or (index.name is not None and str(index.name) not in frame.columns):
-        columns[str(index.name or "time")] = _series(index.to_series())
-    for name, series in frame.items():
-        if str(name) in columns:
-            raise DataError(f"the column {rollout_checks.shown(str(name))} appears twice.")
-        columns[str(name)] = _series(series)
+    for name, series in _all_series(frame):
+        if name in columns:
+            raise DataError(f"the column {rollout_checks.shown(name)} appears twice.")
+        columns[name] = _series(series)
     return columns
 
 
 def read_frame_log(frame: "pd.DataFrame", settings: LogSettings) -> Log:
     """Makes a log of a data frame."""
-    return log_of_columns("data frame", columns_of_frame(frame), settings)
+    columns = columns_of_frame(frame)
+    dated = [name for name, series in _all_series(frame) if _is_dated(series)]
+    return log_of_columns("data frame", columns, settings, in_seconds=dated)
+
+
+def _all_series(frame: "pd.DataFrame") -> Iterator[tuple[str, Any]]:
+    """Yields the index of a data frame, where it is named or holds times, and its columns."""
+    import pandas as pd
+
+    index = frame.index
+    is_time = isinstance(index, pd.DatetimeIndex | pd.TimedeltaIndex)
+    if is_time or (index.name is not None and str(index.name) not in frame.columns):
+        yield str(index.name or "time"), index.to_series()
+    for name, series in frame.items():
+        yield str(name), series
+
+
+def _is_dated(series: Any) -> bool:
+    """Returns whether a column of a data frame holds dates or durations."""
+    import pandas as pd
+
+    return isinstance(series.dtype, pd.DatetimeTZDtype) or series.dtype.kind in "mM"
 
 
 def _series(series: Any) -> Array | Texts:
     """Returns a column of a data frame: numbers, times in s, or text."""
     import pandas as pd
 
-    if isinstance(series.dtype, pd.DatetimeTZDtype) or series.dtype.kind in "mM":
+    if _is_dated(series):
         ticks = series.astype("int64").to_numpy()
         kind: Any = series.dtype
         unit = getattr(kind, "unit", None) or np.datetime_data(kind)[0]

@@ -1,7 +1,7 @@
 """Makes signals of the columns of a table, whichever format the table came from."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 
 import msgspec
@@ -86,6 +86,7 @@ def log_of_columns(
     prefix: str = "",
     components: Mapping[str, Sequence[str]] | Sequence[str] = (),
     units: Mapping[str, str] | None = None,
+    in_seconds: Collection[str] = (),
 ) -> Log:
     """Makes a log of a table.
 
@@ -99,6 +100,7 @@ def log_of_columns(
         components: Names of the components of vectors: by column, or one list for all vectors of
             its length. Other vectors number their components from 0.
         units: Units by column.
+        in_seconds: Names of the columns that hold times in s, because their type states a unit.
 
     Raises:
         DataError: There is no time, or a column that the settings name is missing.
@@ -111,7 +113,7 @@ def log_of_columns(
     if chosen is not None:
         if chosen not in columns:
             raise DataError(missing("column", chosen, columns))
-        time, note = _seconds(chosen, columns[chosen], settings)
+        time, note = _seconds(chosen, columns[chosen], settings, in_seconds)
         notes += [f"{about}{note}."] if note else []
     elif settings.time_step is not None:
         time = np.arange(rows) * np.float64(settings.time_step)
@@ -143,7 +145,7 @@ def log_of_columns(
         time = _continued(time, numbers[episodes])
     stamps: dict[str, Array] = {}
     if not settings.time:
-        stamps, different = _stamps(numbers, time, settings)
+        stamps, different = _stamps(numbers, time, settings, in_seconds)
         notes += [
             f"{rollout_checks.shown(name)} differs from the time of the table by "
             f"{difference:.3g} s and is not used."
@@ -199,7 +201,9 @@ def _unnamed(columns: Columns) -> str | None:
     return first if (steps > 0).all() and not (steps == 1).all() else None
 
 
-def _seconds(name: str, values: Array | Texts, settings: LogSettings) -> tuple[Array, str]:
+def _seconds(
+    name: str, values: Array | Texts, settings: LogSettings, in_seconds: Collection[str]
+) -> tuple[Array, str]:
     """Returns the time stamps of a column in s, and what was guessed."""
     if isinstance(values, list):
         try:
@@ -213,11 +217,14 @@ def _seconds(name: str, values: Array | Texts, settings: LogSettings) -> tuple[A
             ) from None
     if values.ndim != 1:
         raise DataError(f"the time column {rollout_checks.shown(name)} holds vectors.")
-    return seconds_of(name, values, settings)
+    return (values, "") if name in in_seconds else seconds_of(name, values, settings)
 
 
 def _stamps(
-    numbers: Mapping[str, Array], time: Array, settings: LogSettings
+    numbers: Mapping[str, Array],
+    time: Array,
+    settings: LogSettings,
+    in_seconds: Collection[str],
 ) -> tuple[dict[str, Array], dict[str, float]]:
     """Returns the stamps of messages that can be used, and the differences of the others.
 
@@ -225,6 +232,7 @@ def _stamps(
         numbers: Columns by name.
         time: Time stamps of the rows in s, ``(N,)``.
         settings: How the log is read.
+        in_seconds: Names of the columns that hold times in s.
 
     Returns:
         Stamps in s by column, and the median difference in s between the two clocks by column.
@@ -233,7 +241,7 @@ def _stamps(
     for name, values in numbers.items():
         if not is_stamp(name) or not np.isfinite(values).any():
             continue
-        stamps = seconds_of(name, values, settings)[0]
+        stamps = _seconds(name, values, settings, in_seconds)[0]
         is_known = np.isfinite(stamps) & np.isfinite(time)
         difference = float(np.median((time - stamps)[is_known])) if is_known.any() else np.nan
         if abs(difference) <= MAX_CLOCK_DIFFERENCE:

@@ -45,6 +45,14 @@ _EPOCH: tuple[tuple[float, TimeUnit], ...] = ((1e17, "ns"), (1e14, "us"), (1e11,
 _STEPS: tuple[tuple[float, TimeUnit], ...] = ((5e5, "ns"), (500.0, "us"), (0.5, "ms"))
 """Smallest steps of time stamps in these units. Robots are sampled at 2 Hz to 2 kHz."""
 
+SLOWEST_STEP = 1.1
+"""Longest step that may be one in seconds although it may be one in milliseconds, too: of a slow
+log at 1 Hz, with a tolerance of a tenth. A robot that is sampled at 1 kHz has the same numbers."""
+
+LEAST_DURATION = 1.0
+"""Shortest recording in s. Where steps may be seconds or milliseconds, time stamps that would end
+sooner are taken for seconds: t = 0, 1, 2, … 300 is a log of five minutes, not of 0.3 s."""
+
 
 def _split(name: str) -> tuple[str, TimeUnit | None]:
     """Returns a name in lower case without its unit, and the unit if it has one."""
@@ -98,6 +106,9 @@ def guessed_unit(name: str, stamps: Array) -> TimeUnit:
     steps = np.diff(known)
     steps = steps[steps > 0]
     usual = float(np.median(steps)) if len(steps) else 0.0
+    duration = float(known.max() - known.min()) / TIME_UNITS["ms"]
+    if usual <= SLOWEST_STEP and duration < LEAST_DURATION:
+        return "s"
     for least, unit in _STEPS:
         if usual >= least:
             return unit
