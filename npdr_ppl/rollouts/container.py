@@ -56,7 +56,8 @@ class Rollouts(Recording):
 
         Units are SI. A rollout has one more row of measurements than of actions. Actions and the
         column ``reward`` are therefore recognised by an empty cell in the last row of every
-        rollout.
+        rollout. Measurements that were not taken at equal steps have rows of their own; the column
+        ``step`` then counts the rows at which steps begin, and is empty in the others.
 
         Args:
             path: The file, UTF-8 with commas.
@@ -177,7 +178,7 @@ class Rollouts(Recording):
         write_csv(self, path)
 
     def to_parquet(self, path: Path) -> None:
-        """Writes the columns of the CSV layout, with units in the file's metadata."""
+        """Writes the columns of :meth:`from_csv`; metadata hold units, time step and actions."""
         from npdr_ppl.rollouts.io.file_formats import write_parquet
 
         write_parquet(self, path)

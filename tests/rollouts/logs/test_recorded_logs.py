@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.logs import read_log
+from npdr_ppl.rollouts.logs import Mapping, read_log
 from npdr_ppl.rollouts.logs.inspection import described
+from npdr_ppl.rollouts.logs.load_logs import recording_of_logs
 
 DATA = Path(__file__).parents[4] / "shared/data"
 
@@ -58,6 +59,55 @@ def test_so_101_becomes_rollouts():
     # A step later or earlier changes a position by up to 0.3 rad/s · 20 ms.
     assert np.abs(rollouts.readings[0] - wanted).max() < 0.01
     assert rollouts.time_step == pytest.approx(0.02006, rel=1e-3)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_so_101_in_one_file(tmp_path, suffix):
+    """The example of docs/logs.md; both logs have clocks of their own."""
+    mapping = {
+        "channels": {"position": {"signal": "state_motor/positions/Rotation"}},
+        "actions": {"command": {"signal": "control/positions/Rotation"}},
+    }
+    motions = [DATA / "so101/raw" / name for name in ("slow_precision", "random_waypoints")]
+    rollouts = Rollouts.of(recording_of_logs(motions, mapping))
+    path = tmp_path / f"so101.{suffix}"
+    getattr(rollouts, f"to_{suffix}")(path)
+    again = Rollouts.load(path)
+    assert again == rollouts and again.notes == rollouts.notes == ()
+
+
+LOGS = {
+    "furuta_odrive/logs/oscillations.csv": "/joint_states/joint1/position",
+    "furuta_odrive/logs/hardware_pure_joint1_oscillations.csv": "/joint_states/joint1/position",
+    "furuta_odrive/logs/hardware_sin_response_2V_1s.csv": "/joint_states/joint1/position",
+    "dfki_pendulum/logs/identification.csv": "position",
+    "dfki_pendulum/logs/swing_up_ddp.csv": "position",
+    "ur10e/logs/ur-20_01_22-joint_2.csv": "column_2",
+    "ur10e/logs/ur-20_01_22-joint_4.csv": "column_4",
+    "so101/raw/random_waypoints": "state_motor/positions/Rotation",
+}
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_a_position_of_every_log_is_kept_by_every_table(tmp_path, name):
+    mapping = {"channels": {"position": {"signal": LOGS[name]}}}
+    log = read_log(DATA / name)
+    rollouts = Rollouts.of(Mapping.of(mapping).apply(log))
+    for suffix in ("csv", "parquet"):
+        path = tmp_path / f"position.{suffix}"
+        getattr(rollouts, f"to_{suffix}")(path)
+        assert Rollouts.load(path) == rollouts
+    used = sum(len(part) for part in rollouts.measurements(0))
+    assert used > 0.98 * len(log.by_name[LOGS[name]].values)
+    assert _step(log, LOGS[name]) == pytest.approx(rollouts.time_step, rel=1e-6)
+
+
+def _step(log, name):
+    return next(
+        timing.step
+        for timing in described(log).timings
+        if name in [signal.name for signal in timing.signals]
+    )
 
 
 @pytest.mark.parametrize("name", ["hardware_sin_response_1V_1s", "oscillations"])
