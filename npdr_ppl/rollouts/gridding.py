@@ -287,14 +287,17 @@ def _at_step(recording: Recording, step: float) -> Recording:
         step,
         notes,
     )
-    ratio = recording.time_step / step
-    usable = [
-        tuple((math.ceil(first * ratio), math.floor(end * ratio)) for first, end in spans)
-        for spans in recording.spans
-    ]
     if recording.is_whole or len(made) < len(recording):
         return made
-    return replace(made, stretches=tuple(map(common, made.spans, usable)))
+    ratio = recording.time_step / step
+    stretches = []
+    for index, (spans, found) in enumerate(zip(recording.spans, made.spans, strict=True)):
+        if spans == spans_without_gaps(recording.sampling(index).is_read):
+            stretches.append(found)  # nothing but gaps, which were found again
+            continue
+        usable = [(math.ceil(first * ratio), math.floor(end * ratio)) for first, end in spans]
+        stretches.append(common(found, tuple(usable)))
+    return replace(made, stretches=tuple(stretches))
 
 
 def tracks_of(recording: Recording, index: int) -> tuple[list[Track], list[Track]]:

@@ -343,6 +343,19 @@ def test_every_format_keeps_free_motion_at_two_rates(tmp_path, suffix, seed):
     assert again == rollouts and again.channel_names == ("channel_0", "channel_1")
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_tables_keep_the_gaps_of_joined_rates(tmp_path, seed):
+    parts = []
+    for step in (STEP, 1.37 * STEP):
+        generator = np.random.default_rng([seed, int(1e3 * step)])
+        time = np.sort(step * (np.arange(300) + generator.uniform(-0.4, 0.4, 300)))
+        gaps = generator.integers(10, 280, 3)
+        time = np.delete(time, np.unique(np.concatenate([np.arange(g, g + 9) for g in gaps])))
+        parts.append(made([track(time), track(time[::3], np.cos)], [track(time)]))
+    for joined in (parts[0].concatenate(parts[1]), parts[1].concatenate(parts[0])):
+        assert not joined.is_whole and read_back(joined, tmp_path, "csv") == joined
+
+
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_logs_of_two_clocks_in_one_file_have_no_drift(tmp_path, suffix):
     """Two robots whose clocks differ by 0.0035 %; commands change at each step."""
