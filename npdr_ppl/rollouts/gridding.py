@@ -324,8 +324,8 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str]) -> list[str]:
             "Time stamps are uneven: simulations are compared with measurements at the times at "
             "which they were taken."
         )
-    used = sum(part.sampling.is_read.sum(0) for part in parts)
-    num_unused = sum(part.num_unused for part in parts)
+    used = np.sum([part.sampling.is_read.sum(0) for part in parts], axis=0).tolist()
+    num_unused = np.sum([part.num_unused for part in parts], axis=0).tolist()
     shared = [
         f"{unused} of {unused + taken} measurements of {name}"
         for name, taken, unused in zip(channels, used, num_unused, strict=True)

@@ -258,7 +258,7 @@ def _uneven_table(rollouts: Recording) -> dict[str, Array]:
         table = {
             "rollout": np.full(len(time), float(index)),
             "time": time,
-            "step": column(rows, np.arange(len(grid))),
+            "step": column(rows, np.arange(len(grid), dtype=np.float64)),
         }
         for name, track in zip(rollouts.channel_names, channels, strict=True):
             table[name] = column(np.searchsorted(time, track.time), track.values)

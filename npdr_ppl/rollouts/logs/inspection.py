@@ -10,7 +10,7 @@ from npdr_ppl.rollouts.clock_jumps import without_jumps
 from npdr_ppl.rollouts.logs.log import Log, Signal
 from npdr_ppl.rollouts.logs.mapping import toml_text
 from npdr_ppl.rollouts.logs.signal_names import Role, plain_names, role_of
-from npdr_ppl.rollouts.tracks import usual_step
+from npdr_ppl.rollouts.tracks import LARGEST, usual_step
 
 __all__ = ["Description", "SignalSummary", "Timing", "described", "mapping_to_start_from"]
 
@@ -117,7 +117,7 @@ def described(log: Log) -> Description:
 
 
 def _known_time(signal: Signal) -> Array:
-    return signal.time[np.isfinite(signal.values) & np.isfinite(signal.time)]
+    return signal.time[np.isfinite(signal.values) & (np.abs(signal.time) < LARGEST)]
 
 
 def _timing(time: Array, signals: list[Signal]) -> Timing:
@@ -125,9 +125,10 @@ def _timing(time: Array, signals: list[Signal]) -> Timing:
     steps = np.diff(time)
     forward = steps[steps > 0]
     step = jitter = largest = at = float("nan")
-    if len(forward):
-        (stamps,), _ = without_jumps((time,), 1)
-        step = usual_step(stamps[np.isfinite(stamps)])
+    (stamps,), _ = without_jumps((time,), 1)
+    usual = usual_step(stamps[np.isfinite(stamps)])
+    if len(forward) and np.isfinite(usual):
+        step = usual
         jitter = float(np.percentile(np.abs(forward - step), USUAL_SHARE))
         largest, at = float(steps.max()), float(time[np.argmax(steps)])
     return Timing(
@@ -139,7 +140,7 @@ def _timing(time: Array, signals: list[Signal]) -> Timing:
         jitter=jitter,
         largest=largest,
         largest_at=at,
-        gaps=int((steps > GAP * step * (1 - 0.1)).sum()) if len(forward) else 0,
+        gaps=int((steps > GAP * step * (1 - 0.1)).sum()),
         backwards=int((steps <= 0).sum()),
     )
 

@@ -52,3 +52,10 @@ def test_a_log_is_described_with_the_time_step_of_its_rollouts():
     rollouts = Rollouts.from_dataframe(frame, mapping_of("a"))
     assert timing.step == pytest.approx(rollouts.time_step, rel=1e-6)
     assert timing.step == pytest.approx(0.032 / 3, rel=1e-3)
+
+
+@pytest.mark.parametrize("time", [[2.0, 1.0], [1.0], [1.0, 1.0], [0.0, 1e308, -1e308, 5.0]])
+def test_a_log_of_few_or_impossible_stamps_is_described(time):
+    frame = pd.DataFrame({"time": time, "a": np.arange(float(len(time)))})
+    (timing,) = described(read_frame_log(frame, LogSettings())).timings
+    assert timing.gaps == 0
