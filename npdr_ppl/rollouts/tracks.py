@@ -68,9 +68,9 @@ class Track:
         Args:
             time: Time stamps in s, ``(N,)``.
             values: Values, NaN where one is missing, ``(N,)``.
-                Values from ``LARGEST`` on count as missing.
+                Values and time stamps from ``LARGEST`` on count as missing.
         """
-        is_known = (np.abs(values) < LARGEST) & np.isfinite(time)
+        is_known = (np.abs(values) < LARGEST) & (np.abs(time) < LARGEST)
         time, first = np.unique(time[is_known], return_index=True)
         is_new = np.diff(time, prepend=-np.inf) >= RESOLUTION
         return cls(time[is_new], values[is_known][first][is_new])
