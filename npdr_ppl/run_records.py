@@ -193,6 +193,13 @@ class DiscoveryRecord(TypedDict, total=False):
     model: str | dict[str, Any] | None
 
 
+class ExcitationRecord(TypedDict):
+    """The excitation of another rollout, and the information in nats that each would give."""
+
+    name: str
+    information: dict[str, Number]
+
+
 class DecisionRecord(TypedDict):
     """A decision of the loop; those of a check have no action."""
 
@@ -200,6 +207,7 @@ class DecisionRecord(TypedDict):
     reason: str
     action: NotRequired[str]
     diagnosis: NotRequired[DiagnosisRecord | None]
+    excitation: NotRequired[ExcitationRecord | None]
 
 
 class IterationRecord(TypedDict):
