@@ -222,10 +222,7 @@ def _shapes(rollouts: Rollouts, trial: _Trial) -> dict[str, Policy]:
         zip(rollouts.action_names, (EXPERIMENT.safe_share * largest).tolist(), strict=True)
     )
     actions, step = trial.domains.simulator.actions, rollouts.time_step
-    return {
-        name: _playback(name, amplitude, actions, step)
-        for name in excitation_commands(step)
-    }
+    return {name: _playback(name, amplitude, actions, step) for name in excitation_commands(step)}
 
 
 def _playback(
