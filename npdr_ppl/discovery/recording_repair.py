@@ -185,7 +185,9 @@ def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remed
         if as_read is None
         else (as_read.segments.measured)
     )
-    best, least = _best(remedies(sensors, rollouts), ratio)
+    # A channel that the simulation explains has no fault.
+    suspects = {name for name, value in present.items() if value >= REPAIR.large_residual}
+    best, least = _best(remedies(sensors, rollouts, suspects if present else None), ratio)
     if best is not None and isinstance(best.apply, Shift):
         best, least = _refined(best.apply, ratio)
     if least < REPAIR.remedy_factor:
@@ -268,5 +270,9 @@ def _misfits(hypothesis: Hypothesis) -> dict[str, float]:
 
 
 def _mean(misfits: Mapping[str, float]) -> float:
-    """Returns the geometric mean over the channels."""
-    return math.exp(sum(math.log(max(value, 1e-12)) for value in misfits.values()) / len(misfits))
+    """Returns the root of the mean square over the channels.
+
+    A fault is often in one of many channels, and well explained channels must not hide it, as they
+    would in a geometric mean.
+    """
+    return math.sqrt(sum(value**2 for value in misfits.values()) / len(misfits))

@@ -9,7 +9,9 @@ import npdr_ppl as npdr
 from npdr_ppl.discovery.recording_repair import repair
 from npdr_ppl.discovery.remedies import Shift, remedies
 from npdr_ppl.errors import DataError
+from npdr_ppl.models.cart_pole import cart_pole
 from npdr_ppl.models.pendulum import Pendulum, pendulum
+from tests.helpers.rig_recordings import recording_of
 
 STEP = 0.02
 
@@ -112,3 +114,17 @@ def test_strict_refuses_faults_and_nothing_else():
     with pytest.raises(DataError, match="one measurement of velocity left out"):
         repair(pendulum, spoilt, strict)
     assert len(repair(pendulum, spoilt, npdr.DataOptions()).rollouts.notes) == 1
+
+
+@pytest.mark.slow
+def test_a_fault_in_one_of_four_channels_is_not_hidden_by_the_others():
+    rollouts = recording_of("cart_pole").rollouts
+    names = rollouts.channel_names
+    inverted = np.where(np.array(names) == "cart_velocity", -1.0, 1.0)
+    spoilt = dataclasses.replace(rollouts, readings=tuple(r * inverted for r in rollouts.readings))
+    found = repair(cart_pole, spoilt, npdr.DataOptions())
+    assert [r.sentence for r in found.remedies] == [
+        "The sign of cart_velocity looks inverted; changed."
+    ]
+    assert np.allclose(found.rollouts.readings[0], rollouts.readings[0])
+    assert repair(cart_pole, rollouts, npdr.DataOptions()).remedies == ()
