@@ -178,6 +178,7 @@ class DiscoveryRecord(TypedDict, total=False):
     verdict: str
     reason: str
     data_problems: list[str]
+    remarks: list[str]
     alarm: Alarm | None
     remainder: Alarm | None
     effects: list[EffectRecord] | None

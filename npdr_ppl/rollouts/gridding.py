@@ -11,6 +11,7 @@ from scipy.interpolate import Akima1DInterpolator
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts.arrays import Array
+from npdr_ppl.rollouts.notes import Remark
 from npdr_ppl.rollouts.recording import Recording
 from npdr_ppl.rollouts.sampling import (
     MOST_BRIDGED,
@@ -208,7 +209,7 @@ def _at_step(recording: Recording, step: float) -> Recording:
     """Returns a recording with another, smaller time step."""
     notes = recording.notes
     if recording.rewards is not None:
-        notes = (*notes, "Rates differ; rewards are left out.")
+        notes = (*notes, Remark("Rates differ; rewards are left out."))
     made = recording_of(
         [tracks_of(recording, index) for index in range(len(recording))],
         list(zip(recording.channel_names, recording.channel_units, strict=True)),
@@ -249,8 +250,10 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str], num_rollouts: int)
     late = np.concatenate([np.abs(part.sampling.lateness).max(1) for part in parts])
     if (late > JITTER).any():
         notes.append(
-            "Time stamps are uneven: simulations are compared with measurements at the times at "
-            "which they were taken."
+            Remark(
+                "Time stamps are uneven: simulations are compared with measurements at the times "
+                "at which they were taken."
+            )
         )
     taken = np.concatenate([part.sampling.is_read for part in parts]).mean(0)
     slow = [
@@ -259,7 +262,7 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str], num_rollouts: int)
         if share < MOST_LOST
     ]
     if slow:
-        notes.append(f"Not measured at every step: {', '.join(slow)}.")
+        notes.append(Remark(f"Not measured at every step: {', '.join(slow)}."))
     cut = sum(len(part.actions) - sum(b - a for a, b in part.spans) for part in parts)
     if cut:
         total = sum(len(part.actions) for part in parts)

@@ -9,6 +9,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.gridding import recording_of, tracks_of
+from npdr_ppl.rollouts.notes import Remark
 from npdr_ppl.rollouts.recording import Recording
 from npdr_ppl.rollouts.tracks import Track, stamp_notes, without_restarts
 
@@ -135,7 +136,7 @@ def _uneven(
     has_rewards: bool,
 ) -> Recording:
     """Returns rollouts with missing values or uneven time stamps."""
-    notes = ["The time stamps are uneven; rewards are left out."] if has_rewards else []
+    notes = [Remark("The time stamps are uneven; rewards are left out.")] if has_rewards else []
     rollouts, clocks, num_restarts = [], [], 0
     for span in spans:
         (time,), number = without_restarts((columns["time"][span],))
