@@ -3,6 +3,8 @@
 import dataclasses
 
 import numpy as np
+import pyro
+import pyro.distributions as dist
 import pytest
 
 import npdr_ppl as npdr
@@ -180,6 +182,18 @@ def test_strict_refuses_faults_of_the_time_that_were_found_on_reading(change, se
     assert any(note.startswith(sentence) for note in read.notes)
     with pytest.raises(DataError, match=f"^{sentence}"):
         repair(pendulum, read, npdr.DataOptions(strict=True, initial_state="estimated"))
+
+
+def test_strict_refuses_faults_of_the_time_for_a_model_of_two_simulators_too(tmp_path):
+    def two_arms(inputs):
+        mass = pyro.sample("mass", dist.Uniform(0.3, 1.7))
+        for name in ("left", "right"):
+            npdr.simulate(name, Pendulum(), {"mass": mass, "length": mass}, inputs)
+
+    read = swing_read_at(tmp_path, _with_gap)
+    assert repair(two_arms, read, npdr.DataOptions()).rollouts is read
+    with pytest.raises(DataError, match="^Gaps: "):
+        repair(two_arms, read, npdr.DataOptions(strict=True))
 
 
 @pytest.mark.parametrize("change", [lambda time: None, _with_jitter])
