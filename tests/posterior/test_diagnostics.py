@@ -175,6 +175,16 @@ def test_a_decision_is_taken_once_the_reasons_before_it_are_excluded():
     assert decided(right, [], reliable, sd=0.02, **few)[0] is Decision.ACCEPT
 
 
+@pytest.mark.parametrize("influential", [0, 1, 2])
+def test_segments_that_decide_about_the_posterior_alone_are_counted(influential):
+    found = npdr.diagnose(exported(sd=0.02, segments=10, influential=influential))
+    assert found.influential_share == pytest.approx(influential / 10)
+    assert (found.pareto_k > 0.7) == (influential > 0)
+    # One segment of ten may be influential.
+    expected = Decision.NEW_ROLLOUT if influential > 1 else Decision.ACCEPT
+    assert found.decision is expected, found.reason
+
+
 def test_chains_that_agree_but_hardly_move_want_more_rounds():
     data = exported(sd=0.02, persistence=0.98)
     loose = Thresholds(r_hat=10.0)
