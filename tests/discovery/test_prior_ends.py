@@ -31,9 +31,10 @@ def ends(prior, value):
         # One in a thousand is 3.09 standard deviations above or below the mean.
         (dist.Normal(1.0, 0.5), (1.0, -0.5, 2.5), (-0.6,), (2.6,)),
         (dist.LogNormal(0.0, 0.5), (1.0, 0.22, 4.6), (0.2, 0.05), (4.8, 20.0)),
-        # One in a thousand is 3.29 scales from zero.
-        (dist.HalfNormal(2.0), (0.1, 6.5), (), (6.7, 20.0)),
-        (dist.Exponential(1.0), (1.0, 6.8), (), (7.0,)),
+        # One in a thousand is 3.29 scales from zero. No strength is less than zero.
+        (dist.HalfNormal(2.0), (0.0, 1e-4, 0.1, 6.5), (), (6.7, 20.0)),
+        (dist.Uniform(0.0, 1.0), (0.0, 1e-4, 0.9), (), (1.0, 2.0)),
+        (dist.Exponential(1.0), (0.0, 1e-4, 1.0, 6.8), (), (7.0,)),
     ],
 )
 def test_a_value_is_beyond_an_end_if_its_prior_has_hardly_any_mass_there(
