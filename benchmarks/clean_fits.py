@@ -36,7 +36,7 @@ from npdr_ppl.errors import DataError  # noqa: E402
 KEYS = ("subject", "condition", "variant", "seed")
 """What tells rows apart."""
 
-SEEDS = {"tune": range(100), "test": range(1000, 1100)}
+SEEDS = {"tune": range(100), "test": range(1000, 1200)}
 """Seeds of both parts."""
 
 

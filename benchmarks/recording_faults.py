@@ -327,12 +327,13 @@ def run(case: Case, kind: str, channel: str, seed: int) -> dict[str, Any]:
         "effects": [finding.to_dict() for finding in found.effects],
     }
     is_absorbed = kind in ("late", "early") and "torque.input_delay" in case.names
-    text = " ".join(found.problems) + " " + " ".join(effects)
+    # Uneven times and different rates are no faults, but are said, too.
+    text = " ".join((*found.problems, *found.remarks, *effects))
     expected = KINDS[kind][1].split("|") if kind != "none" else []
     return {
         **judged,
         "verdict": found.verdict,
-        "notes": list(found.problems),
+        "notes": [*found.problems, *found.remarks],
         "is_said": any(word in text for word in expected) if expected else not found.problems,
         "is_found": has_all_classes(judged) or (is_absorbed and "commands look" in text),
         "cpu": time.process_time() - begun,

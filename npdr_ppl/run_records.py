@@ -178,6 +178,7 @@ class DiscoveryRecord(TypedDict, total=False):
     verdict: str
     reason: str
     data_problems: list[str]
+    remarks: list[str]
     alarm: Alarm | None
     remainder: Alarm | None
     effects: list[EffectRecord] | None
@@ -193,6 +194,13 @@ class DiscoveryRecord(TypedDict, total=False):
     model: str | dict[str, Any] | None
 
 
+class ExcitationRecord(TypedDict):
+    """The excitation of another rollout, and the information in nats that each would give."""
+
+    name: str
+    information: dict[str, Number]
+
+
 class DecisionRecord(TypedDict):
     """A decision of the loop; those of a check have no action."""
 
@@ -200,6 +208,7 @@ class DecisionRecord(TypedDict):
     reason: str
     action: NotRequired[str]
     diagnosis: NotRequired[DiagnosisRecord | None]
+    excitation: NotRequired[ExcitationRecord | None]
 
 
 class IterationRecord(TypedDict):

@@ -41,12 +41,18 @@ def inspect(
     write: Annotated[
         Path | None, typer.Option(help="Write a mapping to start from to this TOML file.")
     ] = None,
+    time: Annotated[str, typer.Option(help="Name of the column with the time stamps.")] = "",
+    time_step: Annotated[
+        float | None, typer.Option(help="Seconds between the rows of a log without time stamps.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show the signals of a log: rate, largest gap, jitter, range, unit, and what they may be.
 
     Example: npdr inspect bag_folder --write mapping.toml
     """
+    import msgspec
+
     from npdr_ppl.rollouts import Rollouts
     from npdr_ppl.rollouts.logs.inspection import described, mapping_to_start_from
     from npdr_ppl.rollouts.logs.mapping import Mapping
@@ -54,27 +60,34 @@ def inspect(
 
     if write is not None and write.exists():
         raise DataError(f"{write} exists already; choose another name or remove it first.")
-    chosen = None if mapping is None else Mapping.of(mapping)
-    content = read_log(log, None if chosen is None else chosen.log)
+    chosen = Mapping() if mapping is None else Mapping.of(mapping)
+    stated = {"time": time or chosen.log.time, "time_step": time_step or chosen.log.time_step}
+    settings = msgspec.structs.replace(chosen.log, **stated)
+    chosen = Mapping.of(msgspec.to_builtins(msgspec.structs.replace(chosen, log=settings)))
+    content = read_log(log, settings)
     found = described(content)
+    if chosen.channels:  # its remarks on units are those that count
+        found = dataclasses.replace(found, notes=content.notes)
     if as_json:
         told = _without_nan(dataclasses.asdict(found))
         typer.echo(json.dumps(told, indent=2, ensure_ascii=False))
     else:
         for line in _lines(found):
             typer.echo(line)
-    if chosen is not None:
+    if chosen.channels:
         rollouts = Rollouts.of(chosen.apply(content))
         if not as_json:
-            typer.echo(f"\nWith {mapping}:\n{_wrapped(repr(rollouts))}")
+            typer.echo(f"\nWith {mapping}:")
+            _print_rollouts(rollouts, known=content.notes)
+    elif mapping is not None and not as_json:
+        typer.echo(f"\n{mapping} has no channels, so no rollouts are made.")
     if write is not None:
         with replacing(write) as temporary:
-            temporary.write_text(mapping_to_start_from(found), encoding="utf-8")
+            temporary.write_text(mapping_to_start_from(found, settings), encoding="utf-8")
         if not as_json:
-            typer.echo(
-                f"\nWrote {write}. Check its names and units, then:\n"
-                f"    npdr fit MODEL --data {log} --mapping {write} --out fit"
-            )
+            typer.echo(f"\nWrote {write}. Check its names and units, then:")
+            typer.echo(f"    npdr fit MODEL --data {log} --mapping {write} --out fit")
+            _print_lack_of_actions(found)
 
 
 def convert(
@@ -96,8 +109,41 @@ def convert(
         raise DataError(f"--out should end in {', '.join(writers)}; got {out}.")
     rollouts: Rollouts = load_all(logs, mapping)
     getattr(rollouts, writer)(out)
-    typer.echo(_wrapped(repr(rollouts)))
+    _print_rollouts(rollouts)
     typer.echo(f"Wrote {out}.")
+
+
+def _print_rollouts(rollouts: "Rollouts", known: Sequence[str] = ()) -> None:
+    """Prints rollouts in a line, and how they were read.
+
+    Args:
+        rollouts: The rollouts.
+        known: Notes that were printed before.
+    """
+    typer.echo(_wrapped(repr(rollouts)))
+    for note in rollouts.notes:
+        if note not in known:
+            typer.echo(_wrapped(note, "  "))
+    if not rollouts.action_names:
+        typer.echo("No actions: the motion is taken as free.")
+
+
+def _print_lack_of_actions(found: "Description") -> None:
+    """Prints that a written mapping has no actions, and which signals may be some."""
+    from npdr_ppl.rollouts.logs.inspection import possible_actions, proposed_actions
+
+    if proposed_actions(found):
+        return
+    possible = possible_actions(found)
+    hint = (
+        f" If {_listed(possible)} is a command, remove the # before its lines." if possible else ""
+    )
+    typer.echo(_wrapped(f"No actions: the motion is taken as free.{hint}"))
+
+
+def _listed(names: Sequence[str], most: int = 3) -> str:
+    """Returns the first names, separated by "or"."""
+    return " or ".join([*names[:most], *(["another one"] if len(names) > most else [])])
 
 
 def _lines(found: "Description") -> Sequence[str]:

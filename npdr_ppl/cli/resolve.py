@@ -202,11 +202,8 @@ def load_all(paths: Sequence[Path], mapping: Path | None = None) -> "Rollouts":
         DataError: A file is bad, or columns or time steps differ.
     """
     from npdr_ppl.rollouts import Rollouts
-    from npdr_ppl.rollouts.logs.load_logs import recording_of_logs
 
-    if len(paths) == 1:
-        return Rollouts.load(paths[0], mapping)
-    return Rollouts.of(recording_of_logs(paths, mapping))
+    return Rollouts.load(paths, mapping)
 
 
 def resolve_holdout(

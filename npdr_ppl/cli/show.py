@@ -1,6 +1,6 @@
 """Result tables on the terminal."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
@@ -114,8 +114,7 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
 def show_discovery(found: Mapping[str, Any], out: Path) -> None:
     """Prints the content of ``discovery.json``, up to the last finished stage."""
     console = _console()
-    for problem in found["data_problems"]:
-        _print_reason(console, "recording", problem)
+    _print_notes(console, (*found["data_problems"], *found.get("remarks", ())))
     if "verdict" in found:
         _show_findings(console, found)
     elif "alarm" in found:
@@ -159,7 +158,8 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             values = [number(gap[k], ".4g") for k in ("before", "after", "noise_floor")]
             table.add_row(metric, *values, number(gap["closed"], ".0%"))
         console.print(table)
-    _print_preparation(console, found)
+    if found.get("preparation") is not None:
+        console.print(found["preparation"]["sentence"], highlight=False)
     _print_reason(console, found["verdict"], found["reason"])
     if found["remainder"]["fired"] and found["verdict"] != "unknown":
         share = found["remainder"]["unexplained"]
@@ -252,9 +252,16 @@ def show_training(result: Mapping[str, Any], out: Path) -> None:
 
 
 def _print_preparation(console: Console, result: Mapping[str, Any]) -> None:
-    """Prints how the recording was prepared, if inference got one."""
+    """Prints the notes of the recording and how it was prepared, if inference got one."""
     if result.get("preparation") is not None:
+        _print_notes(console, result["preparation"]["recording"])
         console.print(result["preparation"]["sentence"], highlight=False)
+
+
+def _print_notes(console: Console, notes: Iterable[str]) -> None:
+    """Prints what was found in a recording and how it was read, a line each."""
+    for note in notes:
+        _print_reason(console, "recording", note)
 
 
 def show_missing_effect(found: Mapping[str, Any], result: Mapping[str, Any], out: Path) -> None:

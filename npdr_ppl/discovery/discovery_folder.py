@@ -136,7 +136,11 @@ def findings_until(
     if reached >= STAGES.index("name"):
         discovery = investigation.conclude()
         return {"stage": stage, **discovery.to_dict()}, discovery
-    found: dict[str, Any] = {"stage": stage, "data_problems": list(investigation.problems)}
+    found: dict[str, Any] = {
+        "stage": stage,
+        "data_problems": list(investigation.problems),
+        "remarks": list(investigation.remarks),
+    }
     if reached >= STAGES.index("locate"):
         found["where"] = [spot.to_dict() for spot in investigation.where]
     if reached >= STAGES.index("alarm"):

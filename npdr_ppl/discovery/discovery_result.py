@@ -42,7 +42,8 @@ class Discovery:
         verdict: One word; see :data:`Verdict`.
         reason: The reason for the verdict, in a sentence.
         preparation: How the recording was prepared.
-        problems: What was changed in the recording, or left out of it, a sentence each.
+        problems: The faults of the recording and what was done about them, a sentence each.
+        remarks: How the recording was read, a sentence each; these are no faults.
         narrow_priors: Priors that do not contain the revised model's parameters; the search used
             wider ones.
         alarm: Whether the original model and the recording disagree.
@@ -72,6 +73,7 @@ class Discovery:
     reason: str
     preparation: PreparationSummary
     problems: tuple[str, ...]
+    remarks: tuple[str, ...]
     narrow_priors: tuple[PriorEnd, ...]
     alarm: Alarm
     remainder: Alarm
@@ -100,6 +102,7 @@ class Discovery:
             "reason": self.reason,
             "preparation": self.preparation.to_dict(),
             "data_problems": list(self.problems),
+            "remarks": list(self.remarks),
             "priors_too_narrow": [str(end) for end in self.narrow_priors],
             "alarm": {"p_value": self.alarm.p_value, "fired": self.alarm.fired},
             "remainder": {

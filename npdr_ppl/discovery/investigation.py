@@ -39,6 +39,7 @@ from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.preparation_summary import PreparationSummary
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.notes import faults_among, remarks_among
 
 __all__ = ["Investigation", "discover"]
 
@@ -140,8 +141,13 @@ class Investigation:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What was changed in the recording, or left out of it, a sentence each."""
-        return self.rollouts.notes
+        """The faults of the recording and what was done about them, a sentence each."""
+        return faults_among(self.rollouts.notes)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """How the recording was read, a sentence each; these are no faults."""
+        return remarks_among(self.rollouts.notes)
 
     @cached_property
     def _searcher(self) -> Searcher:
@@ -310,6 +316,7 @@ class Investigation:
             reason=reason,
             preparation=self.preparation,
             problems=self.problems,
+            remarks=self.remarks,
             narrow_priors=self.narrow_priors,
             alarm=self.first.alarm,
             remainder=search.rounds[-1].alarm,

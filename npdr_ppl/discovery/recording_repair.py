@@ -10,7 +10,7 @@ the recording and the recording as it is cannot be explained. What was done is s
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis, fit_segment_model
@@ -29,6 +29,7 @@ from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.collection import with_commands, without_duplicates
 from npdr_ppl.rollouts.faults import without_faults
+from npdr_ppl.rollouts.notes import faults_among
 
 __all__ = ["Repair", "repair"]
 
@@ -83,6 +84,7 @@ def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
             "model(inputs) with a simulator that takes initial states and actions, such as an "
             "npdr.FunctionSimulator."
         )
+    _refuse_if_strict(rollouts, options)
     prior = Prior(with_noise(model, None), (rollouts.inputs(None, "recorded"),))
     boxes = [*prior.black_boxes.values()]
     simulators = [box.simulator for box in boxes if isinstance(box, SimulatorBlackBox)]
@@ -91,9 +93,8 @@ def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
     (simulator,) = simulators
     if options.strict:
         rollouts.check(simulator.sensors, simulator.actions, allow_extra=True)
-    told = rollouts.notes
     rollouts = _without_visible_faults(rollouts, simulator)
-    _refuse_if_strict(rollouts, options, told)
+    _refuse_if_strict(rollouts, options)
     applied: list[Remedy] = []
     if options.initial_state != "uncertain" or not has_closest_fit(prior):
         return Repair(rollouts, simulator)
@@ -110,7 +111,7 @@ def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
         applied.append(remedy)
         rollouts = remedy.apply(rollouts)
         rollouts = replace(rollouts, notes=(*rollouts.notes, remedy.sentence))
-        _refuse_if_strict(rollouts, options, told)
+        _refuse_if_strict(rollouts, options)
     return Repair(rollouts, simulator, tuple(applied))
 
 
@@ -125,16 +126,11 @@ def _takes_inputs(model: Model) -> bool:
     return True
 
 
-def _refuse_if_strict(rollouts: Rollouts, options: DataOptions, told: Sequence[str]) -> None:
-    """Raises a DataError with the first fault, if faults are to be refused.
-
-    Args:
-        rollouts: The repaired recording.
-        options: Its options.
-        told: Notes that the recording had before, about times, which are no faults.
-    """
-    if options.strict and len(rollouts.notes) > len(told):
-        raise DataError(rollouts.notes[len(told)])
+def _refuse_if_strict(rollouts: Rollouts, options: DataOptions) -> None:
+    """Raises a DataError with the first fault of a recording, if faults are to be refused."""
+    faults = faults_among(rollouts.notes)
+    if options.strict and faults:
+        raise DataError(faults[0])
 
 
 def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollouts:
@@ -185,7 +181,9 @@ def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remed
         if as_read is None
         else (as_read.segments.measured)
     )
-    best, least = _best(remedies(sensors, rollouts), ratio)
+    # A channel that the simulation explains has no fault.
+    suspects = {name for name, value in present.items() if value >= REPAIR.large_residual}
+    best, least = _best(remedies(sensors, rollouts, suspects if present else None), ratio)
     if best is not None and isinstance(best.apply, Shift):
         best, least = _refined(best.apply, ratio)
     if least < REPAIR.remedy_factor:
@@ -268,5 +266,9 @@ def _misfits(hypothesis: Hypothesis) -> dict[str, float]:
 
 
 def _mean(misfits: Mapping[str, float]) -> float:
-    """Returns the geometric mean over the channels."""
-    return math.exp(sum(math.log(max(value, 1e-12)) for value in misfits.values()) / len(misfits))
+    """Returns the root of the mean square over the channels.
+
+    A fault is often in one of many channels, and well explained channels must not hide it, as they
+    would in a geometric mean.
+    """
+    return math.sqrt(sum(value**2 for value in misfits.values()) / len(misfits))

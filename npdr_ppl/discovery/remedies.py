@@ -6,7 +6,7 @@ changed in the same way.
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -39,15 +39,20 @@ class Remedy:
     apply: Callable[[Rollouts], Rollouts]
 
 
-def remedies(sensors: Sequence[Channel], rollouts: Rollouts) -> Iterator[Remedy]:
+def remedies(
+    sensors: Sequence[Channel], rollouts: Rollouts, suspects: Collection[str] | None = None
+) -> Iterator[Remedy]:
     """Yields the remedies that can be tried on a recording.
 
     Args:
         sensors: The channels of the model that were measured.
         rollouts: The recording.
+        suspects: Names of those that may have a fault; all if ``None``.
     """
-    units = {sensor.name: sensor.unit.removesuffix("/s") for sensor in sensors}
-    pairs = [[s.rate_of, s.name] for s in sensors if s.rate_of in units]
+    measured = {sensor.name for sensor in sensors}
+    suspects = measured if suspects is None else suspects
+    units = {s.name: s.unit.removesuffix("/s") for s in sensors if s.name in suspects}
+    pairs = [[s.rate_of, s.name] for s in sensors if s.name in units and s.rate_of in units]
     for group in [[name] for name in units] + pairs:
         text = f"The sign of {' and '.join(group)} looks inverted; changed."
         yield Remedy(text, _Scaled(group, -1.0))
@@ -68,13 +73,13 @@ def remedies(sensors: Sequence[Channel], rollouts: Rollouts) -> Iterator[Remedy]
     if any(np.ptp(actions, axis=0).any() for actions in rollouts.actions if len(actions)):
         for steps in (*shifts, *(-steps for steps in long)):
             yield Shift(None, steps).remedy
-    for sensor in sensors:
+    for sensor in (sensor for sensor in sensors if sensor.name in suspects):
         column = rollouts.channel_names.index(sensor.name)
         values = np.concatenate(rollouts.measurements(column))
         if len(values) and values.min() >= 0.0 and values.max() > 0.0:
             text = f"{sensor.name} looks recorded without its sign, which was restored."
             rates = [other.name for other in sensors if other.rate_of == sensor.name]
-            position = sensor.rate_of if sensor.rate_of in units else None
+            position = sensor.rate_of if sensor.rate_of in measured else None
             yield Remedy(text, _Signed(sensor.name, position, rates[0] if rates else None))
         limits = _plateaus(rollouts, column)
         if limits:

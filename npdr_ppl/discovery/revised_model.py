@@ -1,10 +1,9 @@
 """The revised model as a Python file."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib.machinery import PathFinder
 from pathlib import Path
-from typing import Any
 
 import pyro.distributions
 from torch import Tensor
@@ -13,7 +12,7 @@ from torch.distributions import Distribution
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps, num_finer_steps
 from npdr_ppl.language.model import Model
-from npdr_ppl.language.wider_priors import ModelWithWiderPriors
+from npdr_ppl.language.wider_priors import ModelWithWiderPriors, wider_sites
 
 __all__ = ["revised_source"]
 
@@ -31,33 +30,45 @@ def revised_source(model: Model, effects: tuple[Effect, ...], fitted: Mapping[st
         effects: The effects to add.
         fitted: Parameters of the closest fit by site, which the source lists for information.
     """
-    base: Callable[..., Any] = model.base if isinstance(model, ModelWithEffects) else model
-    present = [e for e, _ in model.effects] if isinstance(model, ModelWithEffects) else []
-    every = [*present, *effects]
-    num_finer = num_finer_steps(base)
-    wider: list[str] = []
-    while isinstance(base, ModelWithFinerSteps | ModelWithWiderPriors):
-        if isinstance(base, ModelWithWiderPriors):
-            wider.append(f"{FUNCTION} = with_wider_priors({FUNCTION}, {list(base.names)!r})")
+    handlers: list[ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors] = []
+    base = model
+    while isinstance(base, ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors):
+        handlers.insert(0, base)
         base = base.base
     head, name = _base(base)
+    every = [e for h in handlers if isinstance(h, ModelWithEffects) for e, _ in h.effects]
+    every += effects
     imports = sorted({f"from {type(e).__module__} import {type(e).__name__}" for e in every})
-    handlers = [*(["add_effect"] if every else []), *(["with_finer_steps"] if num_finer else [])]
-    handlers += ["with_wider_priors"] if wider else []
-    if handlers:
-        imports = [f"from npdr_ppl import {', '.join(handlers)}", *imports]
+    functions = [
+        *(["add_effect"] if every else []),
+        *(["with_finer_steps"] if num_finer_steps(model) else []),
+        *(["with_wider_priors"] if wider_sites(model) else []),
+    ]
+    if functions:
+        imports = [f"from npdr_ppl import {', '.join(functions)}", *imports]
     if any(effect.given_priors for effect in every):
         imports = ["import pyro.distributions", "", *imports]
     lines = [head.rstrip(), "", "", *imports, "", f"{FUNCTION} = {name}"]
-    lines += [f"{FUNCTION} = with_finer_steps({FUNCTION})"] * num_finer
-    if wider:
-        lines += ["# These priors did not contain the best parameters.", *reversed(wider)]
-    for effect in every:
+    for handler in handlers:
+        lines += _handled(handler)
+    for effect in effects:
         lines += _added(effect)
     lines += ["", "# Parameters of the closest fit to the recording."]
     lines += ["CLOSEST_FIT = {"]
     lines += [f'    "{site}": {value:.6g},' for site, value in fitted.items()]
     return "\n".join([*lines, "}", ""])
+
+
+def _handled(handler: ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors) -> list[str]:
+    """Returns the lines that put a model into a handler."""
+    if isinstance(handler, ModelWithEffects):
+        return [line for effect, _ in handler.effects for line in _added(effect)]
+    if isinstance(handler, ModelWithFinerSteps):
+        return [f"{FUNCTION} = with_finer_steps({FUNCTION})"]
+    return [
+        "# These priors did not contain the best parameters.",
+        f"{FUNCTION} = with_wider_priors({FUNCTION}, {list(handler.names)!r})",
+    ]
 
 
 def _added(effect: Effect) -> list[str]:

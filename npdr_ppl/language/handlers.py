@@ -11,7 +11,6 @@ from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.noise import Noise
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox, SiteLikelihood
-from npdr_ppl.language.wider_priors import ModelWithWiderPriors
 
 __all__ = [
     "EffectMessenger",
@@ -190,10 +189,10 @@ def with_finer_steps(model: Model) -> Model:
 
 def num_finer_steps(model: Model) -> int:
     """Returns how often :func:`with_finer_steps` was applied to a model."""
-    base, number = _parts(model)[0], 0
-    while isinstance(base, ModelWithFinerSteps | ModelWithWiderPriors):
-        number += isinstance(base, ModelWithFinerSteps)
-        base = base.base
+    number = 0
+    while (base := getattr(model, "base", None)) is not None:
+        number += isinstance(model, ModelWithFinerSteps)
+        model = base
     return number
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from npdr_ppl.loop.loop_options import Action, LoopOptions
+from npdr_ppl.loop.next_excitation import ChosenExcitation
 from npdr_ppl.posterior.diagnostics import Decision
 from npdr_ppl.posterior.posterior import Posterior
 
@@ -68,6 +69,7 @@ def decision_record(
     action: Action,
     diagnosis: Mapping[str, Any] | None = None,
     *,
+    excitation: ChosenExcitation | None = None,
     is_from_check: bool = False,
 ) -> dict[str, Any]:
     """Returns a decision in the form of ``train.json``.
@@ -77,14 +79,17 @@ def decision_record(
         reason: Its reason, in a sentence.
         action: The loop's action after it.
         diagnosis: The figures; decisions of discovery or of a check have none.
+        excitation: The excitation of the rollout that was recorded.
         is_from_check: Whether a check of the new policy in simulation asked for it.
     """
+    recorded = {} if excitation is None else {"excitation": excitation.to_dict()}
     origin = {FROM_CHECK: True} if is_from_check else {}
     return {
         "decision": decision.value,
         "reason": reason,
         "action": action.value,
         "diagnosis": dict(diagnosis or {}),
+        **recorded,
         **origin,
     }
 

@@ -17,9 +17,14 @@ from torch import Tensor
 from npdr_ppl.discovery import DiscoveryOptions, discover
 from npdr_ppl.discovery.search.settings import PRIOR_ENDS
 from npdr_ppl.errors import NpdrError
-from npdr_ppl.language.handlers import ModelWithEffects, add_effect, with_finer_steps
+from npdr_ppl.language.handlers import (
+    ModelWithEffects,
+    add_effect,
+    num_finer_steps,
+    with_finer_steps,
+)
 from npdr_ppl.language.model import Model
-from npdr_ppl.language.wider_priors import with_wider_priors
+from npdr_ppl.language.wider_priors import wider_sites, with_wider_priors
 from npdr_ppl.models.effects.registry import effect_class
 from npdr_ppl.posterior.run_folder import MAX_FINER_STEPS
 from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS, DataOptions
@@ -111,9 +116,12 @@ class LoopDiscovery:
         """Returns the revision that a saved discovery describes, with the priors of the search."""
         own = {effect.name: effect for effect in self.search.effects or ()}
         model = self.model
-        for _ in range(min(result.get("finer_steps", 0), MAX_FINER_STEPS)):
+        # What the loop's own model has already is listed first.
+        finer = result.get("finer_steps", 0) - num_finer_steps(model)
+        for _ in range(min(finer, MAX_FINER_STEPS)):
             model = with_finer_steps(model)
-        for names in result.get("wider_priors", ())[: PRIOR_ENDS.most_widenings]:
+        wider = result.get("wider_priors", [])[len(wider_sites(model)) :]
+        for names in wider[: PRIOR_ENDS.most_widenings]:
             model = with_wider_priors(model, names)
         for row in result["effects"]:
             name = f"{row['port']}.{row['effect']}"

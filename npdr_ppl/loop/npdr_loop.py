@@ -62,7 +62,7 @@ from npdr_ppl.loop.loop_options import (
     Revise,
 )
 from npdr_ppl.loop.loop_result import Training, Tried, best_measured
-from npdr_ppl.loop.next_excitation import chosen_excitation
+from npdr_ppl.loop.next_excitation import ChosenExcitation, chosen_excitation
 from npdr_ppl.loop.policy_optimisation import optimise_policy
 from npdr_ppl.loop.policy_training import LoopTraining
 from npdr_ppl.loop.real_rollouts import RealRollouts
@@ -274,10 +274,10 @@ class _Loop:
             trained = None if is_last else self._train(index, settled, checks, report)
             if is_last or trained is not None:
                 break
-            self._collect_excitation(settled.posterior)
+            excitation = self._collect_excitation(settled.posterior)
             reason = checks[-1]["reason"]
             asked = Decision.NEW_ROLLOUT, reason, Action.ANOTHER_ROLLOUT
-            decisions.append(decision_record(*asked, is_from_check=True))
+            decisions.append(decision_record(*asked, excitation=excitation, is_from_check=True))
         self.posterior = settled.posterior
         prepared = settled.posterior.preparation
         assert prepared is not None  # of rollouts there always is one
@@ -342,8 +342,9 @@ class _Loop:
             )
             decision, reason = diagnosis.decision, diagnosis.reason
             action = action_for(decision, loop, may_revise=may_revise, real_return=real_return)
+            excitation = None
             if action is Action.ANOTHER_ROLLOUT:
-                self._collect_excitation(posterior)
+                excitation = self._collect_excitation(posterior)
             elif action is Action.MORE_ROUNDS:
                 pass  # inference continues; the number of rounds follows from the decisions
             elif may_revise and (action is Action.REVISED or self.discovers != "never"):
@@ -357,7 +358,11 @@ class _Loop:
             if action is Action.KEPT and decision is Decision.ACCEPT:
                 decision = Decision.STOP
                 reason = enough(real_return)
-            decisions.append(decision_record(decision, reason, action, diagnosis.to_dict()))
+            decisions.append(
+                decision_record(
+                    decision, reason, action, diagnosis.to_dict(), excitation=excitation
+                )
+            )
             if action not in (Action.MORE_ROUNDS, *NEW_ATTEMPTS):
                 return Settled(posterior, data, action)
 
@@ -368,21 +373,23 @@ class _Loop:
         steps, wanted = self.rollouts.num_steps, self.task.num_steps
         is_short = steps < LEAST_SHARE * wanted
         if self.discovers != "never" and is_short and self.rollouts.extra_left(index) > 0:
-            self._collect_excitation(None)
+            excitation = self._collect_excitation(None)
             reason = f"The rollouts ended early, after {steps} steps of {wanted}: record another."
-            decisions.append(decision_record(Decision.NEW_ROLLOUT, reason, Action.ANOTHER_ROLLOUT))
+            asked = Decision.NEW_ROLLOUT, reason, Action.ANOTHER_ROLLOUT
+            decisions.append(decision_record(*asked, excitation=excitation))
         if self.discovers == "before inference":
             is_found, reason = self._revised(index, decisions, report)
             if is_found:
                 decisions.append(decision_record(Decision.REVISE_MODEL, reason, Action.REVISED))
 
-    def _collect_excitation(self, posterior: Posterior | None) -> None:
+    def _collect_excitation(self, posterior: Posterior | None) -> ChosenExcitation:
         """Records a rollout with a more informative excitation than the policy."""
         seed = derived_seed(self.seed, "excitation", len(self.rollouts))
         excitation = chosen_excitation(
-            self.task, self.policy, self.model.proposal, posterior, seed=seed
+            self.task, self.policy, self.model.proposal, posterior, self.domain, seed=seed
         )
-        self.rollouts.collect(excitation, self.domain)
+        self.rollouts.collect(excitation.policy, self.domain)
+        return excitation
 
     def _revised(
         self, index: int, decisions: Sequence[Mapping[str, Any]], report: Reporter

@@ -31,6 +31,7 @@ from npdr_ppl.posterior.diagnostic_values import (
 )
 from npdr_ppl.posterior.exported_checks import ATTRIBUTE
 from npdr_ppl.posterior.settings import ESTIMATOR_CHECK
+from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS
 
 if TYPE_CHECKING:
     from npdr_ppl.arviz_module import Data
@@ -219,6 +220,11 @@ class _Reading:
         model = self.checks.get("model")
         if model is None:
             return f"The chains agree and the posterior explains the recording ({self._shown})."
+        if model["p_value"] is None:
+            return (
+                "The posterior agrees with the simulator. Whether the model lacks an effect was "
+                f"not tested: that takes at least {FEWEST_SEGMENTS} segments."
+            )
         return (
             "The posterior agrees with the simulator, and the recording shows no disagreement "
             f"with the model (p = {model['p_value']:.2g})."
@@ -237,12 +243,14 @@ class _Reading:
         if model is None:
             return self._of_predictions()
         if model["fired"]:
-            priors = "".join(f" Also, {text}." for text in self.checks.get("priors", ()))
+            priors = [f"{text}. " for text in self.checks.get("priors", ())]
+            even = "Even with wider priors, no" if priors else "No"
             return (
                 Decision.REVISE_MODEL,
-                f"No parameters explain the recording (p = {model['p_value']:.2g} at the best "
-                f"ones, clearest in {model['strongest']}): an effect is missing in the model. "
-                f"`npdr discover` looks for it.{priors}",
+                f"{''.join(priors)}{even} parameters explain the recording "
+                f"(p = {model['p_value']:.2g} at the best ones, clearest in "
+                f"{model['strongest']}): an effect is missing in the model. `npdr discover` looks "
+                "for it.",
             )
         ratio = _number(model.get("misfit"))
         if ratio > self.limits.noise_ratio and not self.checks.get("priors"):

@@ -4,7 +4,8 @@ The checks travel with the exported posterior, as JSON in the attribute ``checks
 :func:`npdr_ppl.diagnose` needs only the export::
 
     estimator   how the learnt posterior compares with the simulator, and whether it was corrected
-    model       whether the recording shows anything that no parameters explain
+    model       whether the recording shows anything that no parameters explain; without a p-value
+                if it is too short for this test
     priors      sentences about priors that end before the recording's parameters
 """
 
@@ -37,12 +38,10 @@ def checks_of(
         return result
     result["priors"] = [str(end) for end in preparation.ends]
     alarm = preparation.alarm
-    if alarm is None:
-        return result
     result["model"] = {
-        "p_value": alarm.p_value,
-        "fired": alarm.fired,
-        "strongest": alarm.strongest,
+        "p_value": None if alarm is None else alarm.p_value,
+        "fired": alarm is not None and alarm.fired,
+        "strongest": "" if alarm is None else alarm.strongest,
         "misfit": preparation.misfit if math.isfinite(preparation.misfit) else None,
     }
     return result

@@ -39,7 +39,7 @@ class PreparationSummary:
         used, every = self.options.num_segments(self.rollouts)
         return {
             "sentence": self.sentence(),
-            "recording": list(self.rollouts.notes),
+            "recording": [str(note) for note in self.rollouts.notes],
             "segment_length": length,
             "segments": {"used": used, "recorded": every},
             "segment_seconds": None if length is None else length * self.rollouts.time_step,
@@ -63,7 +63,10 @@ class PreparationSummary:
         )
         used, every = self.options.num_segments(self.rollouts)
         if used < every:
-            cut = f"{used} of {every} {cut}, spread evenly over the recording"
+            cut = (
+                f"{used} of {every} {cut}, one from each of {used} equal parts of the recording, "
+                "moving ones preferred"
+            )
         starts = {
             "uncertain": "estimated, uncertain initial states",
             "estimated": "estimated initial states taken as true",

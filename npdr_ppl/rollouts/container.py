@@ -10,11 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.rollouts import (
     collection,
     indices,
+    rollout_checks,
     segments,
     simulator_checks,
 )
@@ -124,9 +126,11 @@ class Rollouts(Recording):
 
     @classmethod
     def load(
-        cls, path: Path, mapping: "LogMapping | dict[str, Any] | Path | None" = None
+        cls,
+        path: Path | Sequence[Path],
+        mapping: "LogMapping | dict[str, Any] | Path | None" = None,
     ) -> "Rollouts":
-        """Reads rollouts from a file or folder.
+        """Reads rollouts from files or folders.
 
         Without a mapping, ``.csv``, ``.parquet``, ``.npz`` and ``.nc`` files have the layout of
         this class. With one, the path is a log of any format that robots write; see
@@ -134,7 +138,9 @@ class Rollouts(Recording):
         ``observation.state`` are channels, those of ``action`` are actions.
 
         Args:
-            path: The file or folder.
+            path: The file or folder, or several with the same columns, one after another. Of
+                different rates, all get the time step of the fastest; measurements keep their
+                times.
             mapping: Which signals of the log are channels and actions: a TOML file as written by
                 ``npdr inspect``, a dictionary with its content, or a ``Mapping``.
 
@@ -142,13 +148,17 @@ class Rollouts(Recording):
             DataError: The format is unknown, the file cannot be read, or a log has no mapping.
             DependencyError: A log needs a package that is not installed.
         """
-        from npdr_ppl.rollouts.logs.load_logs import is_log, recording_of_log
+        from npdr_ppl.rollouts.logs.load_logs import recording_of_logs
 
-        if mapping is not None or is_log(path):
-            return cls.of(recording_of_log(path, mapping))
-        from npdr_ppl.rollouts.io.file_formats import load
-
-        return cls.of(load(path))
+        paths = [path] if isinstance(path, str | PathLike) else path
+        if not isinstance(paths, Sequence) or not all(
+            isinstance(part, str | PathLike) for part in paths
+        ):
+            raise DataError(
+                "Rollouts.load takes a path or a list of paths, not "
+                f"{rollout_checks.shown(path, 100)}."
+            )
+        return cls.of(recording_of_logs(paths, mapping))
 
     @classmethod
     def from_dataframe(

@@ -13,6 +13,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.arrays import Array
+from npdr_ppl.rollouts.notes import Remark
 from npdr_ppl.rollouts.recording import Recording
 from npdr_ppl.rollouts.sampling import (
     MOST_BRIDGED,
@@ -278,7 +279,7 @@ def _at_step(recording: Recording, step: float) -> Recording:
     """Returns a recording with another, smaller time step."""
     notes = recording.notes
     if recording.rewards is not None:
-        notes = (*notes, "Rates differ; rewards are left out.")
+        notes = (*notes, Remark("Rates differ; rewards are left out."))
     # The commands are on the grid, whose clock is not theirs: clocks were compared before.
     made = _recording_at(
         [tracks_of(recording, index) for index in range(len(recording))],
@@ -321,8 +322,10 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str]) -> list[str]:
     late = np.concatenate([np.abs(part.sampling.lateness).max(1) for part in parts])
     if (late > JITTER).any():
         notes.append(
-            "Time stamps are uneven: simulations are compared with measurements at the times at "
-            "which they were taken."
+            Remark(
+                "Time stamps are uneven: simulations are compared with measurements at the times "
+                "at which they were taken."
+            )
         )
     used = np.sum([part.sampling.is_read.sum(0) for part in parts], axis=0).tolist()
     num_unused = np.sum([part.num_unused for part in parts], axis=0).tolist()
@@ -332,7 +335,8 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str]) -> list[str]:
         if unused
     ]
     if shared:
-        notes.append(f"{', '.join(shared)} share a time step with another and are not used.")
+        told = ", ".join(shared)
+        notes.append(Remark(f"{told} share a time step with another and are not used."))
     num_rows = sum(len(part.time) for part in parts)
     slow = [
         f"{name} ({taken / num_rows:.0%})"
@@ -340,7 +344,7 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str]) -> list[str]:
         if taken + unused < MOST_LOST * num_rows
     ]
     if slow:
-        notes.append(f"Not measured at every step: {', '.join(slow)}.")
+        notes.append(Remark(f"Not measured at every step: {', '.join(slow)}."))
     cut = sum(len(part.actions) - sum(b - a for a, b in part.spans) for part in parts)
     if cut:
         total = sum(len(part.actions) for part in parts)

@@ -169,10 +169,10 @@ def test_stages_stop_where_they_are_told_and_an_unfinished_run_goes_on(words, tm
     words = [*words[:-1], tmp_path / "stages", "--stage"]
     folder = tmp_path / "stages"
     expected = {
-        "check": ({"data_problems"}, set()),
-        "locate": ({"data_problems", "where"}, {"residual_map"}),
+        "check": ({"data_problems", "remarks"}, set()),
+        "locate": ({"data_problems", "remarks", "where"}, {"residual_map"}),
         "alarm": (
-            {"data_problems", "where", "alarm", "ranking"},
+            {"data_problems", "remarks", "where", "alarm", "ranking"},
             {"residual_map", "latent_force", "ranking", "separation"},
         ),
     }

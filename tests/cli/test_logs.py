@@ -9,7 +9,8 @@ import pytest
 from npdr_ppl.cli.resolve import load_all
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.logs import Mapping
+from npdr_ppl.rollouts.logs import Log, Mapping, Signal
+from npdr_ppl.rollouts.logs.inspection import described
 from npdr_ppl.rollouts.logs.signal_names import plain_names, role_of
 from tests.helpers.command_line import run
 
@@ -110,6 +111,100 @@ def test_logs_whose_clocks_differ_a_little_are_joined(tmp_path):
         load_all([paths[0], tmp_path / "missing.csv"], toml)
 
 
+@pytest.fixture
+def driven(tmp_path):
+    """A log in German with a torque, which may be the command."""
+    time = 0.01 * np.arange(100)
+    frame = pd.DataFrame({"Zeit": time, "winkel_deg": 50.0 * np.sin(time)})
+    frame["tau"] = np.cos(3.0 * time)
+    frame["wort"] = "text"
+    frame.to_csv(tmp_path / "zeit.csv", index=False)
+    return tmp_path / "zeit.csv"
+
+
+def test_a_time_that_is_not_recognised_is_named(monkeypatch, capsys, driven, tmp_path):
+    toml, other = tmp_path / "mapping.toml", tmp_path / "other.toml"
+    code, _, err = run(monkeypatch, capsys, "inspect", driven, "--write", toml)
+    assert code == 2 and "npdr inspect LOG --time NAME --write mapping.toml" in err
+    code, out, _ = run(monkeypatch, capsys, "inspect", driven, "--time", "Zeit", "--write", toml)
+    assert code == 0 and "time is 'Zeit'" in out
+    assert Mapping.of(toml).log.time == "Zeit"
+    assert Rollouts.load(driven, toml).lengths == (99,)
+    # A mapping without channels says how the log is read, too.
+    other.write_text('[log]\ntime = "Zeit"\n')
+    whole = tmp_path / "whole.toml"
+    code, out, _ = run(
+        monkeypatch, capsys, "inspect", driven, "--mapping", other, "--write", whole
+    )
+    assert code == 0 and "other.toml has no channels" in " ".join(out.split())
+    assert whole.read_text() == toml.read_text()
+
+
+def test_rows_without_time_stamps_have_a_time_step(monkeypatch, capsys, tmp_path):
+    (tmp_path / "x.csv").write_text("angle\n" + "1\n2\n3\n")
+    words = ["inspect", tmp_path / "x.csv", "--write", tmp_path / "m.toml", "--time-step"]
+    code, _, err = run(monkeypatch, capsys, *words, "-1")
+    assert code == 2 and "time_step is -1.0 s" in err
+    code, _, _ = run(monkeypatch, capsys, *words, "0.5")
+    assert code == 0 and Rollouts.load(tmp_path / "x.csv", tmp_path / "m.toml").time_step == 0.5
+
+
+def test_a_torque_is_proposed_as_an_action(monkeypatch, capsys, driven, tmp_path):
+    toml = tmp_path / "mapping.toml"
+    words = ["inspect", driven, "--time", "Zeit", "--write", toml]
+    code, out, _ = run(monkeypatch, capsys, *words)
+    assert code == 0 and "effort?" in out
+    shown = " ".join(out.split())
+    assert "No actions: the motion is taken as free. If tau is a command, remove the #" in shown
+    proposed = '# [actions.tau]\n# signal = "tau"\n'
+    assert proposed in toml.read_text() and "no actions yet" in toml.read_text()
+    toml.write_text(toml.read_text().replace(proposed, proposed.replace("# ", "")))
+    assert Rollouts.load(driven, toml).action_names == ("tau",)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("winkel_deg", "deg"), ("winkel [deg]", "deg"), ("rate (deg/s)", "deg/s"),
+        ("q [x]", ""), ("(" * 10**6, ""), ("", ""),
+    ],
+)  # fmt: skip
+def test_units_in_names(name, unit):
+    signals = (Signal(name, np.arange(3.0), np.arange(3.0)),)
+    ((summary,),) = [timing.signals for timing in described(Log("x", signals)).timings]
+    assert summary.unit == unit
+
+
+def test_velocities_without_a_unit_beside_degrees_get_a_remark(monkeypatch, capsys, tmp_path):
+    rows = [f"{k / 100},{k},{k * k}" for k in range(50)]
+    (tmp_path / "x.csv").write_text("\n".join(["t,joint_pos_deg,joint_vel", *rows]))
+    code, out, _ = run(monkeypatch, capsys, "inspect", tmp_path / "x.csv")
+    assert code == 0 and "'joint_vel': no unit is stated" in out and "state deg/s if" in out
+
+
+def test_how_a_log_was_read_is_printed(monkeypatch, capsys, log, driven, tmp_path):
+    toml = tmp_path / "mapping.toml"
+    toml.write_text(
+        "[log]\ntime = 'Zeit'\n[channels.angle]\nsignal = 'winkel_deg'\nunit = 'degs'\n"
+    )
+    words = ["convert", driven, driven, "--mapping", toml, "--out", tmp_path / "r.csv"]
+    code, out, _ = run(monkeypatch, capsys, *words)
+    shown = " ".join(out.split())
+    for sentence in (
+        "time is 'Zeit', taken as s.",
+        "text was left out: 'wort'.",
+        "The unit 'degs' of 'angle' is not known, so values are not converted; did you mean deg?",
+        "No actions: the motion is taken as free.",
+    ):
+        assert code == 0 and shown.count(sentence) == 1, out
+    code, out, _ = run(monkeypatch, capsys, "inspect", driven, "--mapping", toml)
+    assert code == 0 and out.count("'degs'") == 1 and out.count("No actions") == 1
+    arm = "[channels.arm]\nsignal = '/joint_states/arm/position'\n"
+    toml.write_text(arm + "[actions.u]\nsignal = '/motor/voltage_command'\n")
+    code, out, _ = run(monkeypatch, capsys, "inspect", log, "--mapping", toml)
+    assert code == 0 and "Gaps: " in out and "No actions" not in out
+
+
 @pytest.mark.parametrize(
     ("name", "role"),
     [
@@ -121,7 +216,12 @@ def test_logs_whose_clocks_differ_a_little_are_joined(tmp_path):
         ("action.arm.pos", "command"),
         ("/effort_control/data.0", "command"),
         ("voltage", "command"),
-        ("state_motor/torques/Jaw", "other"),
+        ("state_motor/torques/Jaw", "effort"),
+        ("tau", "effort"),
+        ("/arm/tau_2", "effort"),
+        ("current [A]", "effort"),
+        ("tau_cmd", "command"),
+        ("battery/power", "other"),
         ("pose/covariance.3", "other"),
     ],
 )

@@ -107,7 +107,8 @@ def test_a_fault_in_a_recording_is_repaired_and_said(monkeypatch, capsys, tmp_pa
     words = ["discover", "pendulum", "--data", data, "--segment-length", 10, "--stage", "check"]
     code, err = answered(monkeypatch, capsys, *words, "--out", out)
     assert code == 0, err
-    told = json.loads((out / "discovery.json").read_text())["data_problems"]
+    found = json.loads((out / "discovery.json").read_text())
+    told = [*found["data_problems"], *found["remarks"]]
     assert len(told) == len(notes), told
     assert all(expected in note for expected, note in zip(notes, told, strict=True))
     if name == "degrees":

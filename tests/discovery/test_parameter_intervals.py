@@ -1,16 +1,25 @@
 """How sure parameters are: weighted draws where the normal approximation bends."""
 
+from dataclasses import replace
+
+import numpy as np
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 from hidden_rigs import make_case
 from torch.distributions import MultivariateNormal
 
+import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.proof.parameter_intervals import Draws, estimates, posterior_draws
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.models.effects import Spring
+from npdr_ppl.models.pendulum import Pendulum
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.ridges import RidgeCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
+from tests.helpers.pendulum_recordings import swinging
 
 
 def fitted(effects):
@@ -66,6 +75,41 @@ def test_intervals_hold_the_mass_they_say(seed):
         # Of a normal distribution, 94 % lie within 1.881 standard deviations.
         assert (high - low) / (2.0 * estimate.sd) == pytest.approx(1.881, rel=0.1)
         assert 0.5 * (low + high) == pytest.approx(estimate.mean, abs=0.2 * estimate.sd)
+
+
+def exact(inputs):
+    """A pendulum whose errors of integration are small compared with the noise."""
+    mass = pyro.sample("mass", dist.Uniform(0.3, 1.7))
+    length = pyro.sample("length", dist.Uniform(0.3, 1.7))
+    parameters = {"mass": mass, "length": length}
+    return npdr.simulate("trajectory", Pendulum(integrator="rk4"), parameters, inputs)
+
+
+def deviations(clean, rho):
+    """Returns the reported standard deviations, with noise of this correlation from step to step.
+
+    The first measurements have no noise, so that initial states are exact.
+    """
+    generator, noisy = np.random.default_rng(0), []
+    for readings in clean.readings:
+        noise = generator.standard_normal(readings.shape) * [0.01, 0.05]
+        for k in range(1, len(noise)):
+            noise[k] = rho * noise[k - 1] + (1.0 - rho**2) ** 0.5 * noise[k]
+        noise[0] = 0.0
+        noisy.append(readings + noise)
+    rollouts = replace(clean, readings=tuple(noisy))
+    hypothesis = fit_hypothesis(exact, rollouts, DataOptions(None, None, "recorded"))
+    found = estimates(hypothesis, posterior_draws(hypothesis, seed=0), {})
+    return {name: estimate.sd for name, estimate in found.items()}
+
+
+def test_correlated_noise_makes_parameters_less_certain():
+    clean = swinging(rollouts=8, steps=100, noise={"angle": 0.0, "velocity": 0.0})
+    white, correlated = deviations(clean, 0.0), deviations(clean, 0.8)
+    for name, sd in white.items():
+        # The variance of a mean grows by (1 + ρ) / (1 − ρ). Its estimate by 16 series of 100
+        # measurements, the noise and the draws have an error of about 8 % together.
+        assert correlated[name] / sd == pytest.approx((1.8 / 0.2) ** 0.5, rel=0.25)
 
 
 def test_draws_that_cannot_be_simulated_do_not_count(monkeypatch):

@@ -3,13 +3,18 @@
 import dataclasses
 
 import numpy as np
+import pyro
+import pyro.distributions as dist
 import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.recording_repair import repair
 from npdr_ppl.discovery.remedies import Shift, remedies
 from npdr_ppl.errors import DataError
+from npdr_ppl.models.cart_pole import cart_pole
 from npdr_ppl.models.pendulum import Pendulum, pendulum
+from npdr_ppl.rollouts.notes import Remark
+from tests.helpers.rig_recordings import recording_of
 
 STEP = 0.02
 
@@ -104,11 +109,96 @@ def test_strict_refuses_faults_and_nothing_else():
     velocity = 3.0 * np.cos(3.0 * STEP * np.arange(400)) + rng.normal(0.0, 1e-3, 400)
     # The torque that makes a rod of 1 kg and 1 m swing like this.
     torque = -9.0 / 3.0 * SWING[:-1] + 0.5 * 9.81 * np.sin(SWING[:-1])
-    sound = dataclasses.replace(recording(angle, velocity, torque), notes=("Rates differ.",))
+    remarks = (Remark("Rates differ."),)
+    sound = dataclasses.replace(recording(angle, velocity, torque), notes=remarks)
     strict = npdr.DataOptions(strict=True)
-    assert repair(pendulum, sound, strict).rollouts.notes == ("Rates differ.",)
+    assert repair(pendulum, sound, strict).rollouts.notes == remarks
     velocity[200] += 3.0
     spoilt = recording(angle, velocity, torque)
     with pytest.raises(DataError, match="one measurement of velocity left out"):
         repair(pendulum, spoilt, strict)
     assert len(repair(pendulum, spoilt, npdr.DataOptions()).rollouts.notes) == 1
+
+
+@pytest.mark.slow
+def test_a_fault_in_one_of_four_channels_is_not_hidden_by_the_others():
+    rollouts = recording_of("cart_pole").rollouts
+    names = rollouts.channel_names
+    inverted = np.where(np.array(names) == "cart_velocity", -1.0, 1.0)
+    spoilt = dataclasses.replace(rollouts, readings=tuple(r * inverted for r in rollouts.readings))
+    found = repair(cart_pole, spoilt, npdr.DataOptions())
+    assert [r.sentence for r in found.remedies] == [
+        "The sign of cart_velocity looks inverted; changed."
+    ]
+    assert np.allclose(found.rollouts.readings[0], rollouts.readings[0])
+    assert repair(cart_pole, rollouts, npdr.DataOptions()).remedies == ()
+
+
+def _swapped(time):
+    time[[200, 201]] = time[[201, 200]]
+
+
+def _restarted(time):
+    time[200:] -= time[200]
+
+
+def _with_gap(time):
+    time[200:] += 10.0 * STEP
+
+
+def _repeated(time):
+    time[200] = time[199]
+
+
+def _with_jitter(time):
+    time[1:-1] += np.random.default_rng(0).uniform(-0.3 * STEP, 0.3 * STEP, len(time) - 2)
+
+
+def swing_read_at(path, change):
+    """Writes a swing as a log whose time stamps were changed, and reads it."""
+    time = STEP * np.arange(400)
+    columns = {"t": time, "angle": SWING, "velocity": 3.0 * np.cos(3.0 * time), "torque": -SWING}
+    columns["t"] = time.copy()
+    change(columns["t"])
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+    lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
+    (path / "log.csv").write_text("\n".join(lines))
+    entries = {name: {"signal": name} for name in ("angle", "velocity")}
+    mapping = {"channels": entries, "actions": {"torque": {"signal": "torque"}}}
+    return npdr.Rollouts.load(path / "log.csv", mapping)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (_restarted, "The clock was restarted once"),
+        (_with_gap, "Gaps: "),
+        (_repeated, "Repeated time stamps: 1"),
+        (_swapped, "Samples out of order: 1"),
+    ],
+)
+def test_strict_refuses_faults_of_the_time_that_were_found_on_reading(change, sentence, tmp_path):
+    read = swing_read_at(tmp_path, change)
+    assert any(note.startswith(sentence) for note in read.notes)
+    with pytest.raises(DataError, match=f"^{sentence}"):
+        repair(pendulum, read, npdr.DataOptions(strict=True, initial_state="estimated"))
+
+
+def test_strict_refuses_faults_of_the_time_for_a_model_of_two_simulators_too(tmp_path):
+    def two_arms(inputs):
+        mass = pyro.sample("mass", dist.Uniform(0.3, 1.7))
+        for name in ("left", "right"):
+            npdr.simulate(name, Pendulum(), {"mass": mass, "length": mass}, inputs)
+
+    read = swing_read_at(tmp_path, _with_gap)
+    assert repair(two_arms, read, npdr.DataOptions()).rollouts is read
+    with pytest.raises(DataError, match="^Gaps: "):
+        repair(two_arms, read, npdr.DataOptions(strict=True))
+
+
+@pytest.mark.parametrize("change", [lambda time: None, _with_jitter])
+def test_strict_does_not_refuse_how_a_log_was_read(change, tmp_path):
+    read = swing_read_at(tmp_path, change)
+    assert "time is 't', taken as s." in read.notes
+    options = npdr.DataOptions(strict=True, initial_state="estimated")
+    assert repair(pendulum, read, options).rollouts.notes == read.notes

@@ -8,8 +8,12 @@ from torch.distributions import AffineTransform
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.revised_model import revised_source
+from npdr_ppl.language.handlers import num_finer_steps
+from npdr_ppl.language.prior import Prior
+from npdr_ppl.language.wider_priors import wider_sites
 from npdr_ppl.models.effects import Bias, Cogging, QuadraticDrag
 from npdr_ppl.models.pendulum import pendulum
+from tests.helpers.pendulum_recordings import swinging
 
 
 def test_the_revised_source_is_a_model_with_the_effects(tmp_path):
@@ -27,6 +31,19 @@ def test_the_revised_source_keeps_finer_steps(tmp_path):
     model = runpy.run_path(str(path))["revised_model"]
     assert repr(model) == "pendulum + hinge.bias"
     assert repr(model.base) == "pendulum in still finer steps"
+
+
+def test_the_revised_source_keeps_handlers_inside_each_other(tmp_path):
+    own = npdr.with_wider_priors(npdr.add_effect(pendulum, Bias("hinge")), ["length"])
+    path = tmp_path / "revised_model.py"
+    path.write_text(
+        revised_source(npdr.with_finer_steps(own), (QuadraticDrag("hinge"),), {"mass": 1.0})
+    )
+    model = runpy.run_path(str(path))["revised_model"]
+    assert wider_sites(model) == [["length"]] and num_finer_steps(model) == 1
+    rollouts = swinging()
+    names = Prior(model, (rollouts.inputs(50, "recorded"),)).distributions
+    assert {"hinge.bias.offset", "hinge.quadratic_drag.drag", "length", "mass"} <= set(names)
 
 
 def test_the_revised_source_keeps_priors_that_were_given(tmp_path):

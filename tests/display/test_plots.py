@@ -1,12 +1,15 @@
 """Figures are drawn for every shape of posterior, and say what they show."""
 
 import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyro
 import pyro.distributions as dist
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 import npdr_ppl as npdr
 from npdr_ppl.display.plots import (
@@ -20,7 +23,12 @@ from npdr_ppl.display.plots import (
     save_figure,
 )
 from npdr_ppl.display.plots.bands import nominal_line
-from npdr_ppl.display.plots.comparison_figures import most_informative
+from npdr_ppl.display.plots.comparison_figures import (
+    most_informative,
+    write_comparison_figures,
+)
+from npdr_ppl.display.plots.fit_figures import write_fit_figures
+from npdr_ppl.inference.registry import backend
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.evaluation import replay
@@ -81,18 +89,22 @@ def recorded(num_steps=60):
 OPTIONS = DataOptions(None, 20, "recorded", "float64")
 
 
-def test_the_nominal_line_is_the_simulators_own_prediction():
+def predicted(rollouts):
     """Semi-implicit Euler of the zoo's pendulum: 1 kg, 1 m, from each segment's first reading."""
-    rollouts = recorded()
-    readings, expected = rollouts.readings[0], []
+    readings, result = rollouts.readings[0], []
     for step in range(60):
         if step % 20 == 0:
             angle, velocity = readings[step]
-        expected.append([angle, velocity])
+        result.append([angle, velocity])
         velocity = velocity - 0.02 * 3.0 * 9.81 / 2.0 * np.sin(angle)
         angle = angle + 0.02 * velocity
+    return np.array(result)
+
+
+def test_the_nominal_line_is_the_simulators_own_prediction():
+    rollouts = recorded()
     (line,) = nominal_line(pendulum, rollouts, OPTIONS).values()
-    np.testing.assert_allclose(line, expected, atol=1e-6)
+    np.testing.assert_allclose(line, predicted(rollouts), atol=1e-6)
 
 
 def test_a_model_without_nominal_parameters_has_no_such_line():
@@ -176,3 +188,82 @@ def test_the_most_contracted_parameters_are_chosen_in_the_models_order():
     spread = {"a": 0.5, "b": 0.9, "c": 0.1}
     posterior = {name: rng.normal(0, spread[name], 500) for name in prior}
     assert most_informative({"q": posterior}, prior) == ("a", "c")
+
+
+@pytest.fixture
+def written(monkeypatch):
+    """Keeps figures by the name of the file that they would be written to."""
+    figures = {}
+
+    def keep(figure, path, **_):
+        figures[Path(path).name] = figure
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    return figures
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    """Some posterior of the recorded swing."""
+    return npdr.infer(
+        pendulum, recorded(), backend=backend("abc"), rounds=1, num_simulations=60,
+        options=dataclasses.replace(OPTIONS, embedding="all/10"), progress=False,
+    )  # fmt: skip
+
+
+def curve(axis, label):
+    """Returns the points of all lines with a legend entry, ``(T, 2)``."""
+    return np.concatenate([line.get_xydata() for line in axis.lines if line.get_label() == label])
+
+
+def check_lines(axes, rollouts):
+    """Checks the recording and the nominal simulation in the panels of both channels."""
+    time = 0.02 * np.arange(60)
+    nominal = predicted(rollouts)
+    for axis, line, readings in zip(axes, nominal.T, rollouts.readings[0].T, strict=True):
+        np.testing.assert_allclose(curve(axis, "measured"), np.stack([time, readings[:60]], -1))
+        np.testing.assert_allclose(curve(axis, "nominal"), np.stack([time, line], -1), atol=1e-6)
+
+
+def test_a_fit_draws_its_predictions_and_the_nominal_ones_with_units(posterior, written, tmp_path):
+    rollouts = recorded()
+    write_fit_figures(posterior, pendulum, rollouts, tmp_path)
+    assert set(written) == {"marginals.png", "pairs.png", "bands.png"}
+    axes = written["bands.png"].axes
+    # The recording has no units, but the simulator has.
+    assert [axis.get_ylabel() for axis in axes] == ["angle\n[rad]", "velocity\n[rad/s]"]
+    assert axes[-1].get_xlabel() == "time [s]"
+    lines = {"measured", "nominal", "most likely"}
+    assert legend(written["bands.png"]) == {*lines, "posterior 90%", "posterior 50%"}
+    check_lines(axes, rollouts)
+    # The recorded swing is not that of a nominal pendulum.
+    likely, nominal = curve(axes[0], "most likely"), curve(axes[0], "nominal")
+    assert np.abs(likely - nominal).max() > 1e-3
+    # Every segment starts from a measurement.
+    starts = [line.get_xdata()[0] for line in axes[0].lines if line.get_label()[0] == "_"]
+    assert starts == pytest.approx([0.0, 0.4, 0.8])
+    panels = [axis.get_xlabel() for axis in written["marginals.png"].axes]
+    assert panels == ["mass [kg]", "length [m]"]
+    assert legend(written["marginals.png"]) == {"prior", "posterior", "most likely"}
+
+
+def test_a_comparison_draws_the_nominal_predictions_in_every_column_with_units(
+    posterior, written, tmp_path
+):
+    rollouts, labels = recorded(), ["one", "other"]
+    found = SimpleNamespace(
+        ranking=labels, posteriors=dict.fromkeys(labels, posterior),
+        rows=dict.fromkeys(labels, SimpleNamespace(seconds={"train": 1.0})),
+    )  # fmt: skip
+    write_comparison_figures(found, pendulum, rollouts, tmp_path)
+    assert set(written) == {"marginals.png", "pairs.png", "bands.png", "seconds.png"}
+    axes = np.array(written["bands.png"].axes).reshape(2, 2)
+    assert [axis.get_title() for axis in axes[0]] == labels
+    assert [axis.get_ylabel() for axis in axes[:, 0]] == ["angle\n[rad]", "velocity\n[rad/s]"]
+    assert [axis.get_xlabel() for axis in axes[1]] == ["time [s]"] * 2
+    bands = {"posterior 90%", "posterior 50%"}
+    assert legend(written["bands.png"]) == {"measured", "nominal", *bands}
+    for column in axes.T:
+        check_lines(column, rollouts)
+    panels = [axis.get_xlabel() for axis in written["marginals.png"].axes]
+    assert panels == ["mass [kg]", "length [m]"]

@@ -13,9 +13,14 @@ import torch
 from npdr_ppl.discovery import DiscoveryOptions
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.errors import DataError
-from npdr_ppl.language.handlers import ModelWithEffects, add_effect, num_finer_steps
+from npdr_ppl.language.handlers import (
+    ModelWithEffects,
+    add_effect,
+    num_finer_steps,
+    with_finer_steps,
+)
 from npdr_ppl.language.prior import Prior
-from npdr_ppl.language.wider_priors import wider_sites
+from npdr_ppl.language.wider_priors import wider_sites, with_wider_priors
 from npdr_ppl.loop import loop_discovery
 from npdr_ppl.loop.loop_discovery import LoopDiscovery, effect_names
 from npdr_ppl.loop.loop_inference import _sites
@@ -229,6 +234,21 @@ def test_a_revision_has_the_priors_with_which_it_was_found(tmp_path):
     assert float(priors["mass"].high) == pytest.approx(1.7 + 1.4)
     assert float(priors["length"].high) > 1.7 + 1.4 + 2.0
     assert wider_sites(revision.model) == [["length"], ["length", "mass"]]
+
+
+def test_what_the_loops_own_model_has_is_not_applied_again(tmp_path):
+    own = with_finer_steps(with_wider_priors(pendulum, ["length"]))
+    found = {
+        "reason": "Nothing.", "alarm": {"p_value": 0.4}, "finer_steps": 1,
+        "wider_priors": [["length"]], "effects": [], "parameters": {},
+    }  # fmt: skip
+    (tmp_path / "discovery.json").write_text(json.dumps(found))
+    look = LoopDiscovery(own, SMALL_DATA, DiscoveryOptions(), seed=0)
+    assert look.look(at_rest(0.05), tmp_path).model is None
+    more = {**found, "finer_steps": 2, "wider_priors": [["length"], ["mass"]]}
+    (tmp_path / "discovery.json").write_text(json.dumps(more))
+    revised = look.look(at_rest(0.05), tmp_path).model
+    assert wider_sites(revised) == [["length"], ["mass"]] and num_finer_steps(revised) == 2
 
 
 def at_rest(time_step):

@@ -7,24 +7,20 @@ import subprocess
 import sys
 
 import numpy as np
-import pyro
-import pyro.distributions as dist
 import pytest
 import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.channels import Channel
 from npdr_ppl.loop import npdr_loop
 from npdr_ppl.loop.domains import domains_at
 from npdr_ppl.loop.loop_options import Action, LoopOptions
-from npdr_ppl.loop.next_excitation import chosen_excitation, proposed_excitation
 from npdr_ppl.loop.npdr_loop import train
 from npdr_ppl.loop.policy_check import Check, NextStep, check_policy, decide
 from npdr_ppl.loop.risk import MeanReturn, TailMean
 from npdr_ppl.models.effects import CoulombFriction
 from npdr_ppl.models.pendulum import Pendulum, pendulum
-from npdr_ppl.policies.playback import Playback, Sinusoid
+from npdr_ppl.policies.playback import Sinusoid
 from npdr_ppl.posterior.diagnostics import Decision, Diagnosis
 from npdr_ppl.run_files import load_tensors
 from tests.helpers.small_loop import SMALL_DATA, HandmadePendulum, small_options, small_task
@@ -74,7 +70,7 @@ def run(folder, options, task=None, **kwargs):
         model,
         HandmadePendulum(),
         task,
-        options=SMALL_DATA,
+        options=kwargs.pop("data_options", SMALL_DATA),
         loop=options,
         out=folder,
         progress=False,
@@ -134,7 +130,7 @@ def test_a_policy_that_fails_in_simulation_asks_for_a_rollout_then_trains_for_th
     assert verdicts(result) == [
         NextStep.ANOTHER_ROLLOUT, NextStep.TRAIN_FOR_THE_TAIL, NextStep.DEPLOY,
     ]  # fmt: skip
-    # The rollout is of the task's excitation, and inference has seen it.
+    # Without a likelihood, the rollout is of the task's excitation; inference has seen it.
     assert len(result.rollouts) == 2
     time = Pendulum.time_step * np.arange(40)
     assert np.allclose(result.rollouts.actions[1][:, 0], 3 * np.sin(4 * math.pi * time), atol=1e-5)
@@ -144,6 +140,9 @@ def test_a_policy_that_fails_in_simulation_asks_for_a_rollout_then_trains_for_th
     assert [decision["action"] for decision in record["decisions"]] == [
         Action.TRAINED, Action.ANOTHER_ROLLOUT, Action.TRAINED,
     ]  # fmt: skip
+    assert record["decisions"][1]["excitation"] == {
+        "name": "the task's excitation", "information": {},
+    }  # fmt: skip
     # On the prior, on each posterior, and for the tail of the second one.
     assert [risk for _, risk in searches] == [MeanReturn()] * 3 + [TailMean(0.4)]
     written = json.loads((tmp_path / "run/train.json").read_text())["iterations"][0]
@@ -281,54 +280,6 @@ def test_options_out_of_range_are_refused():
         LoopOptions(tail_share=0)
     with pytest.raises(ModelError, match="num_checked must be at least 1; got 0"):
         LoopOptions(num_checked=0)
-
-
-# Excitations.
-
-
-class NarrowPendulum(Pendulum):
-    """A pendulum that may not be moved by more than 0.2 rad from 0.5 rad."""
-
-    states = (Channel("angle", "rad", 0.3, 0.7), Pendulum.states[1])
-
-
-def narrow_pendulum(inputs):
-    parameters = {
-        "mass": pyro.sample("mass", dist.Uniform(0.3, 1.7)),
-        "length": pyro.sample("length", dist.Uniform(0.3, 1.7)),
-    }
-    return npdr.simulate("trajectory", NarrowPendulum(), parameters, inputs)
-
-
-def experiment(excitation, amplitude):
-    return {"excitation": excitation, "amplitude": {"torque": amplitude}}
-
-
-def test_the_experiment_that_discovery_proposes_is_what_is_recorded():
-    found = proposed_excitation(experiment("reversals", 2.0), Pendulum.actions, 0.02)
-    assert isinstance(found, Playback) and found.actions == ("torque",)
-    commands = found.commands[:, 0]
-    assert len(commands) == 4.0 / 0.02 + 1
-    assert set(commands[:-1].abs().tolist()) <= {0.0, 2.0} and float(commands.abs().sum()) > 300
-    assert float(commands[-1]) == 0.0
-    assert proposed_excitation(None, Pendulum.actions, 0.02) is None
-    assert proposed_excitation(experiment(None, 2.0), Pendulum.actions, 0.02) is None
-
-
-def test_an_experiment_that_the_device_would_not_last_is_not_recorded(tmp_path):
-    task = small_task(excitation=SINUSOID)
-    proposal = proposed_excitation(experiment("slow_ramp", 2.0), Pendulum.actions, 0.02)
-    chosen = {}
-    for model in (pendulum, narrow_pendulum):
-        posterior = run(tmp_path / model.__name__, small_options(iterations=1), model=model)
-        choose = task, task.policy, proposal, posterior.posterior
-        chosen[model] = chosen_excitation(*choose, seed=0)
-    assert chosen[pendulum] is proposal
-    assert chosen[narrow_pendulum] is SINUSOID
-    # Nor before anything is known of the device.
-    assert chosen_excitation(task, task.policy, proposal, None, seed=0) is SINUSOID
-    bare = dataclasses.replace(task, excitation=None)
-    assert chosen_excitation(bare, task.policy, None, None, seed=0) is task.policy
 
 
 @pytest.mark.slow

@@ -108,6 +108,22 @@ def test_hidden_dry_friction_asks_for_another_model(quick):
 
 
 @pytest.mark.slow
+def test_a_recording_that_is_too_short_for_the_model_check_does_not_blame_the_model(quick):
+    _, result = fit(
+        pendulum,
+        swinging(friction=0.15),
+        backend=quick,
+        num_simulations=200,
+        options=npdr.DataOptions(segment_length=None),
+        progress=False,
+    )
+    diagnosis = result["diagnosis"]
+    assert diagnosis["decision"] != Decision.REVISE_MODEL
+    assert diagnosis["model_p_value"] is None or np.isnan(diagnosis["model_p_value"])
+    assert "was not tested" in diagnosis["reason"]
+
+
+@pytest.mark.slow
 def test_a_parameter_that_does_nothing_asks_for_another_rollout(clean, quick):
     posterior, diagnosis = fitted(with_idle, clean, quick)
     assert diagnosis["decision"] == Decision.NEW_ROLLOUT

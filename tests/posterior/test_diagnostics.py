@@ -136,13 +136,21 @@ def test_a_decision_is_taken_once_the_reasons_before_it_are_excluded():
 
     decision, reason = decided(model, [prior], estimator, **wrong)
     assert decision is Decision.REVISE_MODEL
-    assert "clearest in drag" in reason and reason.endswith(f"Also, {prior}.")
+    # A prior that ends too early is said first, whatever else is missing.
+    assert reason.startswith(f"{prior}. Even with wider priors, no parameters explain")
+    assert "clearest in drag" in reason
+    assert decided(model, [], estimator, **wrong)[1].startswith("No parameters explain")
     # Residuals that are too large are a narrow prior's fault before they are the noise's.
     silent = {**model, "fired": False}
     assert decided(silent, [prior], estimator, **wrong) == (Decision.WIDEN, f"{prior}.")
     decision, reason = decided(silent, [], estimator, **wrong)
     assert decision is Decision.REVISE_MODEL and "3 times as large as the declared" in reason
     right = {**silent, "misfit": 1.2}
+    # A recording that is too short for the test says nothing about the model.
+    short = {**right, "p_value": None, "strongest": ""}
+    reliable = {**estimator, "pareto_k": 0.1, "is_reliable": True}
+    decision, reason = decided(short, [], reliable, sd=0.02, misfit=1.0, influential=0)
+    assert decision is Decision.ACCEPT and "was not tested: that takes at least 8" in reason
     decision, reason = decided(right, [], estimator, **wrong)
     assert decision is Decision.MORE_ROUNDS and "Pareto k 2.0 against the simulator" in reason
     decision, reason = decided(right, [], estimator, rounds_left=0, **wrong)
@@ -165,6 +173,16 @@ def test_a_decision_is_taken_once_the_reasons_before_it_are_excluded():
     # Each of fewer segments is influential.
     few = {"segments": 7, "influential": 2}
     assert decided(right, [], reliable, sd=0.02, **few)[0] is Decision.ACCEPT
+
+
+@pytest.mark.parametrize("influential", [0, 1, 2])
+def test_segments_that_decide_about_the_posterior_alone_are_counted(influential):
+    found = npdr.diagnose(exported(sd=0.02, segments=10, influential=influential))
+    assert found.influential_share == pytest.approx(influential / 10)
+    assert (found.pareto_k > 0.7) == (influential > 0)
+    # One segment of ten may be influential.
+    expected = Decision.NEW_ROLLOUT if influential > 1 else Decision.ACCEPT
+    assert found.decision is expected, found.reason
 
 
 def test_chains_that_agree_but_hardly_move_want_more_rounds():

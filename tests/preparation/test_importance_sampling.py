@@ -15,6 +15,11 @@ from npdr_ppl.preparation.importance_sampling import sample_posterior
 from npdr_ppl.preparation.ridges import RidgeCoordinates
 from tests.helpers.pendulum_recordings import product, swinging
 
+TAIL = 1e-5
+"""Factor of the part of a weight that has a Pareto tail. With a shape of 1.5, this part is about
+4000 times as large at the farthest of 256 draws, which is too little to lower their effective
+share."""
+
 
 @pytest.fixture(scope="module")
 def likelihood():
@@ -141,21 +146,51 @@ def test_a_posterior_that_is_slightly_off_agrees_where_it_is_not_corrected(likel
     assert far.learnt_effective_share < 0.8 and not far.is_reliable
 
 
+class Weighted(Density):
+    """Draws of the posterior, and a density in proportion to the posterior's over a weight.
+
+    Attributes:
+        shape: The weights have a Pareto tail of this shape; 0 for equal weights.
+    """
+
+    def __init__(self, likelihood, shape=0.0):
+        self.likelihood, self.shape = likelihood, shape
+        mean, covariance = on_a_grid(likelihood)
+        self.normal = torch.distributions.MultivariateNormal(mean, covariance)
+
+    def sample(self, num_samples):
+        return self.normal.sample((num_samples,))
+
+    def log_prob(self, z):
+        # In two dimensions, the probability of a greater distance: uniform between 0 and 1.
+        away = torch.linalg.solve_triangular(
+            self.normal.scale_tril, (z - self.normal.mean).mT, upper=False
+        )
+        beyond = (-0.5 * away.square().sum(0)).exp()
+        weight = 1.0 + TAIL * (beyond**-self.shape - 1.0)
+        prior = self.likelihood.segments.prior
+        return self.likelihood.log_prob(z) + prior.log_prob(z) - weight.log()
+
+
 def test_draws_of_the_posterior_itself_need_no_correction(likelihood):
-    class Exact(Density):
-        """The posterior up to a constant, with draws of a grid's moments."""
-
-        def sample(self, num_samples):
-            mean, covariance = on_a_grid(likelihood)
-            normal = torch.distributions.MultivariateNormal(mean, covariance)
-            return normal.sample((num_samples,))
-
-        def log_prob(self, z):
-            return likelihood.log_prob(z) + likelihood.segments.prior.log_prob(z)
-
-    check, correction = check_estimator([Exact()], likelihood, seed=0, corrects=True)
+    check, correction = check_estimator([Weighted(likelihood)], likelihood, seed=0, corrects=True)
     assert correction is None and check.is_reliable
     assert check.learnt_effective_share == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("shape", [0.2, 1.5])
+def test_weights_with_a_heavy_tail_are_refused_even_if_they_are_nearly_equal(likelihood, shape):
+    learnt = [Weighted(likelihood, shape)]
+    check, correction = check_estimator(learnt, likelihood, seed=0, corrects=True)
+    # By their effective share alone, both would be kept.
+    assert check.learnt_effective_share > 0.99
+    # The tail has 48 draws; the standard error of its shape is (1 + k) / √48.
+    assert check.learnt_pareto_k == pytest.approx(shape, abs=3.0 * (1.0 + shape) / 48**0.5)
+    is_off = shape > 0.7
+    assert check.is_corrected == is_off
+    assert (correction is not None) == is_off
+    check, _ = check_estimator(learnt, likelihood, seed=0, corrects=False)
+    assert check.is_reliable == (not is_off)
 
 
 def test_the_information_is_the_curvature_of_the_likelihood(likelihood):

@@ -7,6 +7,7 @@ import npdr_ppl as npdr
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.preparation import data_options
 from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.preparation_summary import PreparationSummary
 from npdr_ppl.preparation.segment_model import SegmentModel
 from tests.helpers.pendulum_recordings import swinging
 
@@ -61,3 +62,11 @@ def test_all_segments_are_used_where_initial_states_are_taken_as_true(rollouts, 
     options = DataOptions(segment_length=20, initial_state="estimated")
     assert options.num_segments(rollouts) == (40, 40)
     assert options.inputs(rollouts).num_segments == 40
+
+
+def test_the_sentence_says_by_what_segments_are_chosen(rollouts, few):
+    summary = PreparationSummary(rollouts, DataOptions(segment_length=20), None, False, None)
+    assert summary.sentence().startswith(
+        "Prepared: 10 of 40 segments of 20 steps (0.4 s), one from each of 10 equal parts of the "
+        "recording, moving ones preferred, "
+    )

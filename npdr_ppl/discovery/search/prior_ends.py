@@ -74,7 +74,7 @@ def widen_where_it_helps(base: SegmentModel, current: Hypothesis) -> Widened | N
     result: Widened | None = None
     priors = current.segments.prior.distributions
     for _ in range(PRIOR_ENDS.most_widenings):
-        names = [name for name in _at_end(current) if widened(priors[name]) is not None]
+        names = _at_end(current)
         if not names:
             break
         try:
@@ -95,14 +95,34 @@ def widen_where_it_helps(base: SegmentModel, current: Hypothesis) -> Widened | N
 
 
 def _at_end(hypothesis: Hypothesis) -> list[str]:
-    """Returns the scalar sites that are near an end of their priors."""
-    z = hypothesis.fit.z
-    return [
-        site.name
-        for site in hypothesis.segments.prior.sites
-        if site.shape.numel() == 1
-        and bool((z[site.coordinates].abs() > PRIOR_ENDS.near_coordinate).all())
-    ]
+    """Returns the scalar sites near an end of a prior of which a wider one has more beyond it."""
+    z, found = hypothesis.fit.z, []
+    for site in hypothesis.segments.prior.sites:
+        if site.shape.numel() != 1:
+            continue
+        place = float(z[site.coordinates][0])
+        prior = hypothesis.segments.prior.distributions[site.name]
+        is_near = abs(place) > PRIOR_ENDS.near_coordinate and widened(prior) is not None
+        if is_near and _extends(prior, hypothesis.parameters[site.name], is_lower=place < 0.0):
+            found.append(site.name)
+    return found
+
+
+def _extends(prior: Any, value: Tensor, *, is_lower: bool) -> bool:
+    """Returns whether a wider prior has more probability beyond a value.
+
+    It has not where the end is that of a strength, which is not less than zero.
+    """
+    wider = widened(prior)
+    ends = [getattr(prior.support, f"{side}_bound", None) for side in ("lower", "upper")]
+    if wider is None:
+        return ends[0 if is_lower else 1] is None
+    if any(end is not None for end in ends):
+        value = value.clamp(*(None if end is None else torch.as_tensor(end) for end in ends))
+    below, after = _probability_below(prior, value), _probability_below(wider, value)
+    if below is None or after is None:
+        return True
+    return after > below if is_lower else after < below
 
 
 def _gain(before: Hypothesis, after: Hypothesis) -> float:
@@ -112,7 +132,7 @@ def _gain(before: Hypothesis, after: Hypothesis) -> float:
 
 
 def beyond(priors: Mapping[str, Any], found: Hypothesis) -> tuple[PriorEnd, ...]:
-    """Returns the parameters whose fitted values are outside their priors."""
+    """Returns the parameters whose fitted values are outside priors that can be widened."""
     ends = []
     for name, value in found.parameters.items():
         if name not in priors:  # a parameter of an added effect
@@ -124,6 +144,8 @@ def beyond(priors: Mapping[str, Any], found: Hypothesis) -> tuple[PriorEnd, ...]
         ):
             continue
         end = "lower" if below <= PRIOR_ENDS.outside_probability else "upper"
+        if not _extends(priors[name], value, is_lower=end == "lower"):
+            continue
         ends.append(PriorEnd(name, end, described_prior(priors[name]), float(value)))
     return tuple(ends)
 

@@ -127,6 +127,9 @@ def _decisions(records: Records) -> list[Explained]:
             word = str(decision.get("decision", "–"))
             tone: Tone = "good" if word == "accept" else "warn"
             did = decision.get("action")
+            excitation = decision.get("excitation")
+            if did and excitation:
+                did = f"{did}, with {excitation['name']}"
             meaning = (
                 f"{decision.get('reason', '')} The loop {did}."
                 if did

@@ -145,14 +145,18 @@ class _RolloutCount:
 class BoundedLines:
     """The lines of a text, decoded block by block; no row may be longer than a limit.
 
+    Args:
+        data: The text.
+        encoding: How it is encoded.
+
     Attributes:
         number: Number of the present line, from 1.
         row_length: Characters since the last row ended; a quoted cell may hold several lines.
         num_blank: Number of blank lines so far.
     """
 
-    def __init__(self, data: bytes) -> None:
-        self._file = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig", newline="")
+    def __init__(self, data: bytes, encoding: str = "utf-8-sig") -> None:
+        self._file = io.TextIOWrapper(io.BytesIO(data), encoding=encoding, newline="")
         self.number = 0
         self.row_length = 0
         self.num_blank = 0

@@ -16,6 +16,7 @@ from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.clock_jumps import stamp_notes, without_jumps
 from npdr_ppl.rollouts.gridding import MOST_LOST, Gridded, on_given_grids, recording_of, tracks_of
+from npdr_ppl.rollouts.notes import Remark
 from npdr_ppl.rollouts.recording import Recording
 from npdr_ppl.rollouts.tracks import Track
 
@@ -155,7 +156,7 @@ def _uneven(
     time_step: float | None,
 ) -> Recording:
     """Returns rollouts with missing values or uneven time stamps."""
-    notes = ["The time stamps are uneven; rewards are left out."] if has_rewards else []
+    notes = [Remark("The time stamps are uneven; rewards are left out.")] if has_rewards else []
     rollouts, clocks, jumps = [], [], []
     for span in spans:
         (time,), found = without_jumps((columns["time"][span],), 1)

@@ -1,6 +1,7 @@
 """From a log and its mapping to rollouts, in one call."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,8 +17,9 @@ from npdr_ppl.rollouts.io.tables import from_table
 from npdr_ppl.rollouts.logs.formats.parquet_logs import columns_of_frame, read_frame_log
 from npdr_ppl.rollouts.logs.log import Log
 from npdr_ppl.rollouts.logs.mapping import Mapping, SignalMapping
-from npdr_ppl.rollouts.logs.read import is_log, read_log
+from npdr_ppl.rollouts.logs.read import ROS_1_SUFFIX, is_log, read_log
 from npdr_ppl.rollouts.logs.signal_names import plain_names
+from npdr_ppl.rollouts.notes import Remark
 from npdr_ppl.rollouts.recording import Recording
 
 if TYPE_CHECKING:
@@ -31,6 +33,12 @@ __all__ = [
     "recording_of_logs",
 ]
 
+LEROBOT_UNITS = Remark(
+    "LeRobot data sets state no units: values are used as logged, usually degrees or percent; a "
+    "mapping converts them."
+)
+"""What is not known of a data set that is read without a mapping."""
+
 AnyMapping = Mapping | dict[str, Any] | str | PathLike[str] | None
 
 
@@ -40,7 +48,10 @@ def recording_of_log(path: str | PathLike[str], mapping: AnyMapping) -> Recordin
         folder = Path(path)
         if (folder / "meta" / "info.json").is_file():
             log = read_log(folder)
-            return lerobot_mapping(log).apply(log)
+            recording = lerobot_mapping(log).apply(log)
+            return replace(recording, notes=(*recording.notes, LEROBOT_UNITS))
+        if folder.suffix.lower() == ROS_1_SUFFIX:
+            read_log(folder)  # raises the error that says how to convert it
         if not folder.is_dir():
             rollout_checks.check_file(folder)
         with rollout_checks.named(path):
@@ -59,12 +70,14 @@ def recording_of_logs(paths: Sequence[str | PathLike[str]], mapping: AnyMapping)
     measurements keep their own times.
 
     Args:
-        paths: The logs, at least one.
+        paths: The logs.
         mapping: As for :meth:`Rollouts.load`; ``None`` for files of rollouts.
 
     Raises:
-        DataError: A log cannot be read, or their columns differ.
+        DataError: There are no logs, one cannot be read, or their columns differ.
     """
+    if not paths:
+        raise DataError("no files are given; at least one is needed.")
     parts: list[Recording] = []
     chosen = None if mapping is None else Mapping.of(mapping)
     for path in paths:
@@ -75,6 +88,8 @@ def recording_of_logs(paths: Sequence[str | PathLike[str]], mapping: AnyMapping)
         else:
             part = chosen.apply(read_log(path, chosen.log))
         parts.append(part)
+    if len(parts) == 1:
+        return parts[0]
     return joined(at_one_rate(parts))
 
 

@@ -46,7 +46,8 @@ class Log:
     Attributes:
         source: Name of the file or folder, for messages.
         signals: The signals, in the order of the log; their names differ.
-        notes: What the reader guessed or left out, one sentence each.
+        notes: What the reader guessed or left out, one sentence each; a fault unless it is a
+            :class:`~npdr_ppl.rollouts.notes.Remark`.
         episodes: Name of the signal whose every change begins a new episode; ``""`` if the reader
             found none.
     """

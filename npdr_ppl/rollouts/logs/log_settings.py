@@ -1,15 +1,29 @@
 """How a log is read: the table ``[log]`` of a mapping."""
 
+import re
 from typing import Literal
 
 import msgspec
 
-__all__ = ["TIME_UNITS", "LogSettings", "TimeUnit"]
+__all__ = ["HOW_TO_NAME_TIME", "TIME_UNITS", "LogSettings", "TimeUnit", "time_unit_of"]
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
 TIME_UNITS: dict[TimeUnit, int] = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 """Ticks in a second, by unit of time stamps."""
+
+
+def time_unit_of(unit: str) -> TimeUnit | None:
+    """Returns the unit of time stamps that a text means, e.g. ``"msec"``; ``None`` if none."""
+    word = re.sub(r"[µμ]", "u", unit.strip().lower()).replace("sec", "s")
+    return next((known for known in TIME_UNITS if known == word), None)
+
+
+HOW_TO_NAME_TIME = (
+    "name one with `npdr inspect LOG --time NAME --write mapping.toml`, or give --time-step in "
+    "seconds; a mapping has them as time and time_step in [log]."
+)
+"""End of the message about a log whose time stamps are not recognised: what to do."""
 
 
 class LogSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

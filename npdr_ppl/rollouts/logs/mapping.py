@@ -18,6 +18,7 @@ import math
 import re
 import tomllib
 from collections.abc import Iterable
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -34,10 +35,12 @@ from npdr_ppl.rollouts.logs.assemble import rollouts_of
 from npdr_ppl.rollouts.logs.log import Log, Signal
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
 from npdr_ppl.rollouts.logs.nearest_names import missing
+from npdr_ppl.rollouts.logs.unit_remarks import rates_without_unit, unknown_units
 from npdr_ppl.rollouts.logs.units import si_unit
+from npdr_ppl.rollouts.notes import Remark
 from npdr_ppl.rollouts.recording import Recording
 
-__all__ = ["Mapping", "SignalMapping", "toml_text"]
+__all__ = ["Mapping", "SignalMapping", "settings_lines", "toml_text"]
 
 MAX_BYTES = 2**16
 """Largest mapping in bytes; one of fifty joints takes a tenth of it."""
@@ -117,9 +120,8 @@ class Mapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def toml(self) -> str:
         """Returns the mapping as TOML."""
         lines = []
-        given = {k: v for k, v in msgspec.structs.asdict(self.log).items() if v is not None}
-        if given:
-            lines += ["[log]", *(f"{k} = {toml_text(v)}" for k, v in given.items()), ""]
+        if given := settings_lines(self.log):
+            lines += ["[log]", *given.values(), ""]
         for section, entries in (("channels", self.channels), ("actions", self.actions)):
             for name, entry in entries.items():
                 lines.append(f"[{section}.{_key(name)}]")
@@ -146,12 +148,23 @@ class Mapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                     "with the key signal."
                 )
             episodes = self.log.episodes or log.episodes
-            return rollouts_of(
+            recording = rollouts_of(
                 [_converted(log, *entry) for entry in self.channels.items()],
                 [_converted(log, *entry) for entry in self.actions.items()],
                 episodes=_found(log, episodes) if episodes else None,
                 time_step=self.log.time_step,
             )
+            units = self._unit_remarks(log)
+            return replace(recording, notes=(*log.notes, *units, *recording.notes))
+
+    def _unit_remarks(self, log: Log) -> list[Remark]:
+        """Returns what looks wrong about the units of channels and actions, a sentence each."""
+        entries = {**self.channels, **self.actions}
+        stated = [
+            (name, entry.signal, entry.unit or log.by_name[entry.signal].unit)
+            for name, entry in entries.items()
+        ]
+        return [*unknown_units(stated), *rates_without_unit(stated)]
 
 
 def _found(log: Log, name: str) -> Signal:
@@ -231,6 +244,12 @@ def _plain(message: str) -> str:
 def _key(name: str) -> str:
     """Returns a name as a key of TOML."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_text(name)
+
+
+def settings_lines(settings: LogSettings) -> dict[str, str]:
+    """Returns the lines of the table ``[log]`` in TOML, by key."""
+    given = {k: v for k, v in msgspec.structs.asdict(settings).items() if v is not None}
+    return {key: f"{key} = {toml_text(value)}" for key, value in given.items()}
 
 
 def toml_text(value: object) -> str:

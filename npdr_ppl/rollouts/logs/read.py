@@ -16,6 +16,9 @@ __all__ = ["LOG_SUFFIXES", "is_log", "read_log"]
 LOG_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".h5", ".hdf5", ".mat", ".mcap", ".db3")
 """Suffixes of the files that can be read as logs."""
 
+ROS_1_SUFFIX = ".bag"
+"""Suffix of logs that have to be converted first."""
+
 Reader = Callable[[Path, LogSettings], Log]
 
 
@@ -25,7 +28,7 @@ def is_log(path: str | PathLike[str]) -> bool:
     if path.is_dir():
         return (path / "meta" / "info.json").is_file() or _is_bag(path)
     suffix = path.suffix.lower()
-    return suffix in LOG_SUFFIXES and suffix not in (".csv", ".parquet")
+    return suffix in (*LOG_SUFFIXES, ROS_1_SUFFIX) and suffix not in (".csv", ".parquet")
 
 
 def _is_bag(folder: Path) -> bool:
@@ -111,6 +114,11 @@ def _reader(path: Path) -> tuple[Reader, str]:
             "in it."
         )
     suffix = path.suffix.lower()
+    if suffix == ROS_1_SUFFIX:
+        raise DataError(
+            "bags of ROS 1 are not read; convert it with `rosbags-convert --src FILE.bag --dst "
+            "FOLDER` (pip install rosbags) and read the folder."
+        )
     if suffix not in by_suffix:
         raise DataError(
             f"the suffix {rollout_checks.shown(suffix)} is unknown; logs are folders or "

@@ -6,7 +6,8 @@ from typing import Literal
 
 __all__ = ["Role", "plain_names", "role_of"]
 
-Role = Literal["position", "velocity", "command", "other"]
+Role = Literal["position", "velocity", "command", "effort", "other"]
+"""What a signal may be; an effort (force, torque or current) may be commanded or measured."""
 
 _ROLES: tuple[tuple[Role, re.Pattern[str]], ...] = (
     ("other", re.compile(r"covariance|layout|offset|status|error|temperature|stamp|sequence")),
@@ -17,7 +18,11 @@ _ROLES: tuple[tuple[Role, re.Pattern[str]], ...] = (
             r"control|ctrl|voltage|u|effort_control|pwm|input)([^a-z]|$)|_(control|command)s?\b"
         ),
     ),
-    ("other", re.compile(r"(^|[^a-z])(effort|torques?|loads?|currents?|forces?|power)([^a-z]|$)")),
+    ("other", re.compile(r"(^|[^a-z])power([^a-z]|$)")),
+    (
+        "effort",
+        re.compile(r"(^|[^a-z])(efforts?|torques?|tau|loads?|currents?|forces?)([^a-z]|$)"),
+    ),
     (
         "velocity",
         re.compile(

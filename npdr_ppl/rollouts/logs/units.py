@@ -2,8 +2,9 @@
 
 import math
 import re
+from difflib import get_close_matches
 
-__all__ = ["si_unit"]
+__all__ = ["closest_unit", "is_known", "si_unit"]
 
 _DEGREE = math.pi / 180
 
@@ -59,13 +60,37 @@ _UNITS = {
     "s": (1.0, "s"),
     "ms": (1e-3, "s"),
     "us": (1e-6, "s"),
+    "ns": (1e-9, "s"),
     "hz": (1.0, "Hz"),
     "khz": (1e3, "Hz"),
+    "pa": (1.0, "Pa"),
+    "kpa": (1e3, "Pa"),
+    "bar": (1e5, "Pa"),
+    "j": (1.0, "J"),
+    "k": (1.0, "K"),
+    "kgm^2": (1.0, "kg m^2"),
+    "n/m": (1.0, "N/m"),
+    "nm/rad": (1.0, "N m/rad"),
     "%": (1e-2, "1"),
     "percent": (1e-2, "1"),
     "1": (1.0, "1"),
 }
 """Factor to the SI unit, and the SI unit, by unit in lower case without spaces."""
+
+
+_SPELT_OUT = {
+    **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("radian/s", "radians/s", "radpers", "radianspers"), "rad/s"),
+    **dict.fromkeys(("degpers", "degreespers", "°pers"), "deg/s"),
+    **dict.fromkeys(("metre", "metres", "meter", "meters"), "m"),
+    **dict.fromkeys(("millimetre", "millimetres", "millimeter", "millimeters"), "mm"),
+    **dict.fromkeys(("newton", "newtons"), "N"),
+    **dict.fromkeys(("newtonmetre", "newtonmetres", "newtonmeter", "newtonmeters"), "N m"),
+    **dict.fromkeys(("volt", "volts"), "V"),
+    **dict.fromkeys(("amp", "amps", "ampere", "amperes"), "A"),
+    **dict.fromkeys(("second", "seconds"), "s"),
+}
+"""The unit that is known, by a name that is not."""
 
 
 def si_unit(unit: str) -> tuple[float, str]:
@@ -77,6 +102,34 @@ def si_unit(unit: str) -> tuple[float, str]:
     Args:
         unit: Unit as a log or a person writes it, e.g. ``"mN m"`` or ``"deg/s"``.
     """
-    word = re.sub(r"[\s*·]", "", unit).lower().replace("µ", "u").replace("μ", "u")
-    word = word.replace("**", "^").replace("²", "^2").replace("s2", "s^2").replace("sec", "s")
-    return _UNITS.get(word, (1.0, unit))
+    return _UNITS.get(_plain(unit), (1.0, unit))
+
+
+def is_known(unit: str) -> bool:
+    """Returns whether a unit can be converted to SI."""
+    return _plain(unit) in _UNITS
+
+
+def closest_unit(unit: str) -> str:
+    """Returns the known unit that is spelt most alike, ``""`` if none is.
+
+    Example: ``closest_unit("degs")`` is ``"deg"``, ``closest_unit("Newton metre")`` is ``"N m"``.
+    """
+    word = _plain(unit)
+    close = [w for w in (word, word.removesuffix("s")) if w in _UNITS or w in _SPELT_OUT]
+    close += get_close_matches(word, [*_UNITS, *_SPELT_OUT], n=1, cutoff=0.7)
+    if not close:
+        return ""
+    if close[0] in _SPELT_OUT:
+        return _SPELT_OUT[close[0]]
+    factor, name = _UNITS[close[0]]
+    return name if factor == 1.0 else close[0]
+
+
+def _plain(unit: str) -> str:
+    """Returns a unit as ``_UNITS`` spells it."""
+    word = re.sub(r"[\s·]|(?<!\*)\*(?!\*)", "", unit).lower()
+    word = word.replace("µ", "u").replace("μ", "u")
+    word = word.replace("**", "^").replace("²", "^2")
+    word = re.sub(r"secs?(?![a-z])", "s", word)
+    return re.sub(r"s2$", "s^2", word)

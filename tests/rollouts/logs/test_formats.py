@@ -456,6 +456,7 @@ def test_lerobot(version, expected, tmp_path):
     rollouts = Rollouts.load(tmp_path / "set")
     assert rollouts.channel_names == ("shoulder_pos", "shoulder_vel")
     assert rollouts.action_names == ("shoulder_cmd",)
+    assert rollouts.channel_units == ("", "") and "state no units" in rollouts.notes[-1]
     assert len(rollouts) == 2
     for part in rollouts:
         # The values are those of the CSV file, in the degrees that were logged.

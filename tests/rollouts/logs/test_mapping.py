@@ -10,7 +10,8 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.logs import Log, Mapping, Signal, read_log
 from npdr_ppl.rollouts.logs.formats.time_stamps import guessed_unit, in_seconds, time_name
-from npdr_ppl.rollouts.logs.units import si_unit
+from npdr_ppl.rollouts.logs.units import closest_unit, is_known, si_unit
+from npdr_ppl.rollouts.notes import Remark, faults_among, remarks_among
 
 TIME = 0.25 * np.arange(9)
 
@@ -46,12 +47,74 @@ def test_the_logs_own_unit_is_converted_and_an_unknown_one_is_kept():
         ("mm", 1e-3, "m"), ("cm", 1e-2, "m"), ("mm/s", 1e-3, "m/s"), ("g", 1e-3, "kg"),
         ("mA", 1e-3, "A"), ("mV", 1e-3, "V"), ("mNm", 1e-3, "N m"), ("N m", 1.0, "N m"),
         ("N*m", 1.0, "N m"), ("percent", 1e-2, "1"), ("m/s²", 1.0, "m/s^2"), ("µm", 1e-6, "m"),
-        ("furlong", 1.0, "furlong"), ("", 1.0, ""),
+        ("furlong", 1.0, "furlong"), ("", 1.0, ""), ("m/s**2", 1.0, "m/s^2"),
+        ("rad/sec", 1.0, "rad/s"), ("deg/sec2", math.pi / 180, "rad/s^2"), ("msec", 1e-3, "s"),
     ],
 )  # fmt: skip
 def test_units(unit, factor, name):
     found = si_unit(unit)
     assert found == (pytest.approx(factor, rel=1e-15), name)
+
+
+@pytest.mark.parametrize(
+    ("unit", "close"),
+    [
+        ("degs", "deg"), ("Newton metre", "N m"), ("radians", "rad"), ("meters", "m"),
+        ("milimeter", "mm"), ("rmp", ""), ("furlong", ""), ("volts", "V"),
+    ],
+)  # fmt: skip
+def test_the_closest_unit_to_one_that_is_not_known(unit, close):
+    assert closest_unit(unit) == close and not is_known(unit)
+
+
+def test_what_the_reader_guessed_is_kept():
+    source = Log("x.csv", log().signals, (Remark("time is 't', taken as s."), "the file is cut."))
+    notes = Mapping.of(mapping_of("/arm/position")).apply(source).notes
+    assert notes == source.notes
+    assert faults_among(notes) == ("the file is cut.",)
+    assert remarks_among(notes) == ("time is 't', taken as s.",)
+
+
+def test_units_that_are_likely_mistakes_are_said_once():
+    entries = {
+        "angle": {"signal": "/arm/position", "unit": "degs"},
+        "rate": {"signal": "/arm/velocity", "unit": "degs"},
+    }
+    (note,) = Mapping.of({"channels": entries}).apply(log()).notes
+    assert note == (
+        "The unit 'degs' of 'angle, rate' is not known, so values are not converted; did you mean "
+        "deg?"
+    )
+    entries = {"angle": {**entries["angle"], "unit": "deg"}, "rate": {"signal": "/arm/velocity"}}
+    (note,) = Mapping.of({"channels": entries}).apply(log()).notes
+    assert note.startswith("'rate': no unit is stated, so SI is assumed, but 'angle' is in deg")
+    assert not faults_among([note])
+    entries["rate"]["unit"] = "rad/s"
+    assert not Mapping.of({"channels": entries}).apply(log()).notes
+
+
+def test_several_logs_are_read_in_one_call(tmp_path):
+    for name, step in (("a.csv", 0.01), ("b.csv", 0.02)):
+        time = step * np.arange(100)
+        pd.DataFrame({"t": time, "x": np.sin(time)}).to_csv(tmp_path / name, index=False)
+    paths = [tmp_path / "a.csv", str(tmp_path / "b.csv")]
+    both = Rollouts.load(paths, mapping_of("x"))
+    assert len(both) == 2 and both.time_step == pytest.approx(0.01)
+    assert Rollouts.load(paths[:1], mapping_of("x")) == Rollouts.load(paths[0], mapping_of("x"))
+    both.to_csv(tmp_path / "r.csv")
+    assert len(Rollouts.load((tmp_path / "r.csv", tmp_path / "r.csv"))) == 4
+    with pytest.raises(DataError, match="at least one is needed"):
+        Rollouts.load([])
+    for wrong in (3, [3], None):
+        with pytest.raises(DataError, match="takes a path or a list of paths"):
+            Rollouts.load(wrong)
+
+
+def test_bags_of_ros_1_name_the_converter(tmp_path):
+    (tmp_path / "x.bag").write_bytes(b"#ROSBAG V2.0\n")
+    for mapping in (None, mapping_of("x")):
+        with pytest.raises(DataError, match="x.bag: .*rosbags-convert --src"):
+            Rollouts.load(tmp_path / "x.bag", mapping)
 
 
 def test_mappings_are_written_and_read_back(tmp_path):

@@ -163,7 +163,7 @@ class _Topics:
             self._known[key] = self._made(encoding, kind, schema, text)
         found = self._known[key]
         if found is None:
-            self._messages.note(
+            self._messages.remark(
                 f"{rollout_checks.shown(name)} was left out: messages of the type "
                 f"{rollout_checks.shown(kind)} in {rollout_checks.shown(encoding)} are not read."
             )
@@ -208,7 +208,7 @@ def _add(messages: Messages, topic: _Topic, nanoseconds: int, data: bytes) -> No
         message, count = topic.decoder(data)
     except TooManyValuesError:
         topic.decoder = None
-        messages.note(
+        messages.remark(
             f"{rollout_checks.shown(topic.name)} was left out: a message has more than "
             f"{MAX_VALUES} values."
         )
@@ -280,7 +280,7 @@ def _add_mcap(path: Path, messages: Messages) -> None:
                 for inner in _records(data):
                     take(inner)
         except (EndOfFile, RecordLengthLimitExceeded):
-            messages.note("the file ends in the middle; what comes before was read.")
+            messages.fault("the file ends in the middle; what comes before was read.")
 
 
 class _WholeReads:

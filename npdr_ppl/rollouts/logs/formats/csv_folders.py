@@ -12,6 +12,7 @@ from npdr_ppl.rollouts.logs.formats.folders import files_in
 from npdr_ppl.rollouts.logs.formats.tables import log_of_columns
 from npdr_ppl.rollouts.logs.log import Log, Signal
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
+from npdr_ppl.rollouts.notes import Remark
 
 __all__ = ["read_csv_folder"]
 
@@ -39,17 +40,21 @@ def read_csv_folder(path: Path, settings: LogSettings) -> Log:
     for file in files:
         rollout_checks.check_file(file)
         with rollout_checks.named(file):
-            columns = read_csv_columns(file, settings.header)
+            found = read_csv_columns(file, settings.header)
+            columns = found.columns
             # A table of events has times, but no numbers.
             numeric = [
                 n for n, c in columns.items() if isinstance(c, np.ndarray) or "[" in "".join(c[:5])
             ]
             if len(numeric) < 2:
-                notes.append(f"{file.name} holds no numbers and was left out.")
+                notes.append(Remark(f"{file.name} holds no numbers and was left out."))
                 continue
             prefix = f"{file.stem}/"
-            log = log_of_columns(file.name, columns, settings, prefix=prefix, components=names)
+            log = log_of_columns(
+                file.name, columns, settings, prefix=prefix, components=names, units=found.units
+            )
         signals += log.signals
+        notes += [Remark(f"{file.stem}: {note}") for note in found.notes]
         notes += log.notes
         if sum(len(s.values) for s in signals) > LIMITS.numbers:
             raise DataError(f"its files have more than {LIMITS.numbers:.0e} numbers.")

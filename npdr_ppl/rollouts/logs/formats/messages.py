@@ -13,6 +13,7 @@ from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.logs.formats.ros_messages import MAX_ARRAY, MAX_NESTING, Layout
 from npdr_ppl.rollouts.logs.formats.time_stamps import MAX_CLOCK_DIFFERENCE, in_seconds
 from npdr_ppl.rollouts.logs.log import Log, Signal
+from npdr_ppl.rollouts.notes import Remark
 
 __all__ = ["Messages"]
 
@@ -80,10 +81,14 @@ class Messages:
         self._signals = 0
         self._allowed = min(LIMITS.numbers, max(FREE_NUMBERS, NUMBERS_PER_BYTE * file_bytes))
 
-    def note(self, sentence: str) -> None:
+    def fault(self, sentence: str) -> None:
+        """Keeps a sentence about what is wrong with the log, once."""
+        self._notes[sentence] = None
+
+    def remark(self, sentence: str) -> None:
         """Keeps a sentence about what was left out, once."""
         if len(self._notes) < 100:
-            self._notes[sentence] = None
+            self._notes[Remark(sentence)] = None
 
     def add(self, topic: str, kind: str, nanoseconds: int, message: Any) -> None:
         """Adds a message.
@@ -173,7 +178,7 @@ class Messages:
         signals = []
         for topic, entry in self._topics.items():
             if entry.has_long:
-                self.note(
+                self.remark(
                     f"{rollout_checks.shown(topic)}: arrays of more than {MAX_ARRAY} numbers were "
                     "left out."
                 )
@@ -200,7 +205,7 @@ class Messages:
         stamped = in_seconds(stamps, 10**9)
         difference = float(np.median(received - stamped))
         if abs(difference) > MAX_CLOCK_DIFFERENCE:
-            self.note(
+            self.remark(
                 f"{rollout_checks.shown(topic)}: the stamps differ from the recorder's clock by "
                 f"{difference:.3g} s, so its time is the recorder's."
             )

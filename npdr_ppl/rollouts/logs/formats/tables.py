@@ -18,8 +18,9 @@ from npdr_ppl.rollouts.logs.formats.time_stamps import (
     time_name,
 )
 from npdr_ppl.rollouts.logs.log import Log, Signal
-from npdr_ppl.rollouts.logs.log_settings import LogSettings
+from npdr_ppl.rollouts.logs.log_settings import HOW_TO_NAME_TIME, LogSettings, time_unit_of
 from npdr_ppl.rollouts.logs.nearest_names import missing
+from npdr_ppl.rollouts.notes import Remark
 
 __all__ = ["Columns", "Texts", "log_of_columns", "numbers_of"]
 
@@ -113,16 +114,17 @@ def log_of_columns(
     if chosen is not None:
         if chosen not in columns:
             raise DataError(missing("column", chosen, columns))
-        time, note = _seconds(chosen, columns[chosen], settings, in_seconds)
-        notes += [f"{about}{note}."] if note else []
+        stated = time_unit_of((units or {}).get(chosen, ""))
+        own = msgspec.structs.replace(settings, time_unit=settings.time_unit or stated)
+        time, note = _seconds(chosen, columns[chosen], own, in_seconds)
+        notes += [Remark(f"{about}{note}.")] if note else []
     elif settings.time_step is not None:
         time = np.arange(rows) * np.float64(settings.time_step)
-        notes.append(f"there is no time column; rows are {settings.time_step:g} s apart.")
+        notes.append(Remark(f"there is no time column; rows are {settings.time_step:g} s apart."))
     else:
         raise DataError(
             f"no column looks like time stamps; the columns are "
-            f"{rollout_checks.shown(', '.join(columns), 200)}; name one as time in [log], or give "
-            "a time_step."
+            f"{rollout_checks.shown(', '.join(columns), 200)}; {HOW_TO_NAME_TIME}"
         )
     numbers: dict[str, Array] = {}
     skipped: list[str] = []
@@ -139,7 +141,8 @@ def log_of_columns(
                 raise DataError(f"it has more than {LIMITS.columns} signals.")
             numbers[key] = series
     if skipped:
-        notes.append(f"{about}text was left out: {rollout_checks.shown(', '.join(skipped), 200)}.")
+        told = rollout_checks.shown(", ".join(skipped), 200)
+        notes.append(Remark(f"{about}text was left out: {told}."))
     episodes = settings.episodes or next((n for n in EPISODE_NAMES if n in numbers), "")
     if episodes in numbers:
         time = _continued(time, numbers[episodes])
@@ -147,8 +150,10 @@ def log_of_columns(
     if not settings.time:
         stamps, different = _stamps(numbers, time, settings, in_seconds)
         notes += [
-            f"{rollout_checks.shown(name)} differs from the time of the table by "
-            f"{difference:.3g} s and is not used."
+            Remark(
+                f"{rollout_checks.shown(name)} differs from the time of the table by "
+                f"{difference:.3g} s and is not used."
+            )
             for name, difference in different.items()
         ]
     signals = []
@@ -166,7 +171,9 @@ def log_of_columns(
             if keep.all()
             else Signal(f"{prefix}{name}", at[keep], values[keep], unit)
         )
-    notes += [f"the signals beside {rollout_checks.shown(s)} have its time." for s in stamps]
+    notes += [
+        Remark(f"the signals beside {rollout_checks.shown(s)} have its time.") for s in stamps
+    ]
     return Log(
         source, tuple(signals), tuple(notes), f"{prefix}{episodes}" if episodes in numbers else ""
     )

@@ -12,8 +12,9 @@ from npdr_ppl.rollouts import rollout_checks
 from npdr_ppl.rollouts.logs.formats.tables import EPISODE_NAMES
 from npdr_ppl.rollouts.logs.formats.time_stamps import is_time_name, seconds_of
 from npdr_ppl.rollouts.logs.log import Log, Signal
-from npdr_ppl.rollouts.logs.log_settings import LogSettings
+from npdr_ppl.rollouts.logs.log_settings import HOW_TO_NAME_TIME, LogSettings
 from npdr_ppl.rollouts.logs.nearest_names import missing
+from npdr_ppl.rollouts.notes import Remark
 
 __all__ = ["Leaf", "log_of_tree"]
 
@@ -53,12 +54,11 @@ def log_of_tree(source: str, leaves: Mapping[str, Leaf], settings: LogSettings) 
         is_chosen = name == settings.time if settings.time else is_time_name(name)
         if is_chosen and leaf.values.ndim == 1 and len(leaf.values) > 1:
             times[name], note = seconds_of(name, leaf.values, settings)
-            notes += [f"{note}."] if note else []
+            notes += [Remark(f"{note}.")] if note else []
     if not times and settings.time_step is None:
         raise DataError(
             f"none of its data sets looks like time stamps; they are called "
-            f"{rollout_checks.shown(', '.join(leaves), 200)}; name one as time in [log], or give "
-            "a time_step."
+            f"{rollout_checks.shown(', '.join(leaves), 200)}; {HOW_TO_NAME_TIME}"
         )
     signals: list[Signal] = []
     skipped: list[str] = []
@@ -78,10 +78,8 @@ def log_of_tree(source: str, leaves: Mapping[str, Leaf], settings: LogSettings) 
         if len(signals) > LIMITS.columns:
             raise DataError(f"it has more than {LIMITS.columns} signals.")
     if skipped:
-        notes.append(
-            "no time stamps fit the length of "
-            f"{rollout_checks.shown(', '.join(skipped), 200)}; left out."
-        )
+        told = rollout_checks.shown(", ".join(skipped), 200)
+        notes.append(Remark(f"no time stamps fit the length of {told}; left out."))
     names = [signal.name for signal in signals]
     episodes = settings.episodes or next((n for n in EPISODE_NAMES if n in names), "")
     return Log(source, tuple(signals), tuple(notes), episodes if episodes in names else "")
