@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from npdr_ppl.rollouts.arrays import Array
+from npdr_ppl.rollouts.sampling import MOST_BRIDGED
 
 __all__ = ["LARGEST", "REGULAR_SHARE", "Track", "clock_notes", "usual_step"]
 
@@ -126,10 +127,11 @@ class Track:
 
 
 def usual_step(time: Array) -> float:
-    """Returns the mean step of time stamps ``(N,)`` in s; a gap counts as several steps.
+    """Returns the mean step of time stamps ``(N,)`` in s.
 
-    If stamps come in bursts, which is usual where messages are sent together, the step is the mean
-    over whole bursts.
+    Lost messages count as steps. Longer gaps, which need not be whole numbers of steps, are left
+    out. If stamps come in bursts, which is usual where messages are sent together, the step is the
+    mean over whole bursts.
     """
     time = np.unique(time)
     together = min(STEPS_TOGETHER, len(time) - 1)
@@ -140,7 +142,11 @@ def usual_step(time: Array) -> float:
     together = min(round((len(time) - 1) / max(num_bursts, 1)) * together, len(time) - 1)
     durations = time[together:] - time[:-together]
     count = np.rint(durations / np.median(durations) * together).clip(1)
-    return float(durations[::together].sum() / count[::together].sum())
+    durations, count = durations[::together], count[::together]
+    is_whole = count <= together + MOST_BRIDGED
+    if is_whole.any():
+        durations, count = durations[is_whole], count[is_whole]
+    return float(durations.sum() / count.sum())
 
 
 def clock_notes(rollouts: Sequence[tuple[Sequence[Track], Sequence[Track]]]) -> list[str]:

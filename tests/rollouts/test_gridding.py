@@ -42,6 +42,13 @@ def test_the_usual_step_survives_jitter_and_losses():
     assert usual_step(time[kept]) == pytest.approx(STEP, rel=1e-2)
 
 
+def test_a_gap_of_no_whole_number_of_steps_does_not_change_the_usual_step():
+    time = STEP * np.arange(300)
+    time[100:] += 5.5 * STEP
+    assert usual_step(time) == pytest.approx(STEP, rel=1e-9)
+    assert made([track(time)]).time_step == STEP
+
+
 def test_regular_stamps_give_a_recording_without_sampling():
     rollouts = made([track(STEP * np.arange(100))])
     assert rollouts.samplings == () and rollouts.is_whole and rollouts.lengths == (99,)
