@@ -4,8 +4,8 @@
 
 A pendulum is simulated by Runge-Kutta steps of 1 ms. Its torque acts some milliseconds after the
 command. Commands and measurements happen at times of their own: regular, up to 5 ms earlier or
-later, or so and with 5 % lost. Each recording is fitted by the pendulum of the models with a delay;
-the exit status is 1 if an estimate errs by more than ``--tolerance``.
+later, or so and with 5 % lost. Each recording is fitted by the zoo's pendulum with a delay; the
+exit status is 1 if an estimate errs by more than ``--tolerance``.
 """
 
 import argparse

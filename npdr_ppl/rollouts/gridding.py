@@ -33,6 +33,10 @@ FEWEST_SMOOTHED = 5
 JITTER = 0.1
 """Lateness, in steps, above which it is reported; less is compensated, too."""
 
+PHASE_SHARE = 0.1
+"""Weight of the newest stamp in the running mean of a clock's phase, about the mean of 20 stamps:
+it follows a clock that drifts, and has a quarter of the jitter of one stamp."""
+
 MOST_LOST = 0.9
 """Share of the steps with a measurement below which a channel is reported as a slower one."""
 
@@ -149,9 +153,9 @@ def _bridged(track: Track) -> Track:
     Commands that were written only when they changed are left as they are.
     """
     usual, steps = track.rate, np.diff(track.time)
-    if usual is None:
+    if usual is None or not (steps > 1.5 * usual).any():
         return track
-    count = np.rint(steps / usual)
+    count = np.diff(_slots(track.time, usual))
     short = np.flatnonzero((count > 1) & (count <= MOST_BRIDGED))
     if not len(short):
         return track
@@ -161,6 +165,24 @@ def _bridged(track: Track) -> Track:
     order = np.argsort(every, kind="stable")
     values = np.concatenate((track.values, np.interp(added, track.time, track.values)))
     return Track(every[order], values[order])
+
+
+def _slots(time: Array, usual: float) -> NDArray[np.int64]:
+    """Returns which tick of a clock each time stamp belongs to, ``(N,)``, increasing.
+
+    With jitter, a stamp that is late follows a long step and precedes a short one; no tick is lost
+    there. The clock's phase is a running mean, so that it may drift.
+
+    Args:
+        time: Increasing time stamps in s.
+        usual: Seconds between two ticks.
+    """
+    slots, phase = [0], float(time[0])
+    for number, stamp in enumerate(time[1:].tolist(), start=2):
+        slots.append(max(slots[-1] + 1, round((stamp - phase) / usual)))
+        late = stamp - phase - slots[-1] * usual
+        phase += max(1.0 / number, PHASE_SHARE) * late
+    return np.array(slots)
 
 
 def _mean_held(track: Track, grid: Array) -> NDArray[np.float64]:

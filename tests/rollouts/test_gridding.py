@@ -129,6 +129,18 @@ def test_commands_that_a_log_has_lost_are_filled_by_straight_lines():
     assert np.allclose(rollouts.actions[0][[50, 120, 121], 0], STEP * np.array([50, 120, 121]))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_late_commands_are_not_taken_for_lost_ones(seed):
+    # Every second step or so is longer than 1.5 usual ones, but no command is missing.
+    sent = np.sort(jittered(1000, seed=seed, size=0.4 * STEP))
+    sign = lambda time: np.where(np.arange(len(time)) % 7 < 3, 1.0, -1.0)  # noqa: E731
+    rollouts = made([track(STEP * np.arange(1000))], [track(sent, sign)])
+    (offset,) = (max(0.0, sent[0]),)
+    fine = offset + STEP / 50 * (np.arange(50 * rollouts.lengths[0]) + 0.5)
+    held = sign(sent)[np.searchsorted(sent, fine, side="right") - 1].reshape(-1, 50).mean(1)
+    assert rollouts.actions[0][:, 0] == pytest.approx(held, abs=0.05)
+
+
 def test_one_odd_rollout_does_not_set_the_time_step():
     normal = [([track(STEP * np.arange(100))], [])] * 5
     odd = ([track(np.array([0.0, 0.001]))], [])
