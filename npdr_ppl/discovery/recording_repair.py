@@ -148,19 +148,19 @@ def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollout
     try:
         rollouts.check(simulator.sensors, simulator.actions, allow_extra=True, strict=False)
     except DataError as error:
-        raise DataError(" ".join((*rollouts.notes[-1:], str(error)))) from None
+        raise DataError(" ".join((*faults_among(rollouts.notes)[-1:], str(error)))) from None
     return rollouts
 
 
 def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remedy | None:
     """Returns the remedy that explains a recording best, if the recording is not explained."""
     as_read = _fitted(model, rollouts, options)
-    if as_read is not None and _mean(_misfits(as_read)) >= REPAIR.large_residual:
+    if as_read is not None and _rms(_misfits(as_read)) >= REPAIR.large_residual:
         # Before data are blamed, the parameters are searched for as thoroughly as for a fit.
         searched = _searched(as_read.segments)
-        if searched is not None and _mean(_misfits(searched)) < _mean(_misfits(as_read)):
+        if searched is not None and _rms(_misfits(searched)) < _rms(_misfits(as_read)):
             as_read = searched
-    if as_read is not None and _mean(_misfits(as_read)) < REPAIR.large_residual:
+    if as_read is not None and _rms(_misfits(as_read)) < REPAIR.large_residual:
         return None
     present = {} if as_read is None else _misfits(as_read)
 
@@ -174,7 +174,7 @@ def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remed
             return math.inf
         found = _misfits(tried)
         before = {name: present[name] for name in found if name in present}
-        return _mean(found) / (_mean(before) if before else 1.0)
+        return _rms(found) / (_rms(before) if before else 1.0)
 
     sensors = (
         SegmentModel(model, rollouts, options).measured
@@ -265,7 +265,7 @@ def _misfits(hypothesis: Hypothesis) -> dict[str, float]:
     return dict(zip(segments.channel_names, ratio.tolist(), strict=True))
 
 
-def _mean(misfits: Mapping[str, float]) -> float:
+def _rms(misfits: Mapping[str, float]) -> float:
     """Returns the root of the mean square over the channels.
 
     A fault is often in one of many channels, and well explained channels must not hide it, as they

@@ -11,6 +11,7 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps, num_finer_steps
+from npdr_ppl.language.layers import layers
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors, wider_sites
 
@@ -30,11 +31,7 @@ def revised_source(model: Model, effects: tuple[Effect, ...], fitted: Mapping[st
         effects: The effects to add.
         fitted: Parameters of the closest fit by site, which the source lists for information.
     """
-    handlers: list[ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors] = []
-    base = model
-    while isinstance(base, ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors):
-        handlers.insert(0, base)
-        base = base.base
+    base, *handlers = layers(model)
     head, name = _base(base)
     every = [e for h in handlers if isinstance(h, ModelWithEffects) for e, _ in h.effects]
     every += effects

@@ -8,6 +8,7 @@ from pyro.poutine.messenger import Messenger
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.layers import Layer, layers
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.noise import Noise
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox, SiteLikelihood
@@ -81,7 +82,7 @@ class EffectMessenger(Messenger):
         self._attached = True
 
 
-class ModelWithEffects:
+class ModelWithEffects(Layer):
     """A Pyro model with effects attached; calling it runs the base model inside the handlers.
 
     Attributes:
@@ -156,7 +157,7 @@ class FinerStepsMessenger(Messenger):
                 msg["fn"] = box.with_simulator(finer)
 
 
-class ModelWithFinerSteps:
+class ModelWithFinerSteps(Layer):
     """A Pyro model whose simulators integrate more accurately than the model asks for.
 
     Attributes:
@@ -189,11 +190,7 @@ def with_finer_steps(model: Model) -> Model:
 
 def num_finer_steps(model: Model) -> int:
     """Returns how often :func:`with_finer_steps` was applied to a model."""
-    number = 0
-    while (base := getattr(model, "base", None)) is not None:
-        number += isinstance(model, ModelWithFinerSteps)
-        model = base
-    return number
+    return sum(isinstance(layer, ModelWithFinerSteps) for layer in layers(model))
 
 
 class NoiseMessenger(Messenger):

@@ -9,6 +9,7 @@ from pyro.distributions.torch_distribution import ExpandedDistribution
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
 
+from npdr_ppl.language.layers import Layer, layers
 from npdr_ppl.language.model import Model
 
 __all__ = [
@@ -41,7 +42,7 @@ class WiderPriorsMessenger(Messenger):
                 msg["fn"] = wider
 
 
-class ModelWithWiderPriors:
+class ModelWithWiderPriors(Layer):
     """A Pyro model in which the priors of some sites are wider.
 
     Attributes:
@@ -82,14 +83,11 @@ def wider_sites(model: Any) -> list[list[str]]:
     Applied in this order, :func:`with_wider_priors` makes the same priors again.
 
     Args:
-        model: A Pyro model, possibly inside handlers of this package.
+        model: A Pyro model, possibly inside layers of this package.
     """
-    found: list[list[str]] = []
-    while (base := getattr(model, "base", None)) is not None:
-        if isinstance(model, ModelWithWiderPriors):
-            found.insert(0, list(model.names))
-        model = base
-    return found
+    return [
+        list(layer.names) for layer in layers(model) if isinstance(layer, ModelWithWiderPriors)
+    ]
 
 
 def widened(prior: Any) -> Any | None:

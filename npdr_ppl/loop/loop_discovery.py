@@ -23,6 +23,7 @@ from npdr_ppl.language.handlers import (
     num_finer_steps,
     with_finer_steps,
 )
+from npdr_ppl.language.layers import layers
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import wider_sites, with_wider_priors
 from npdr_ppl.models.effects.registry import effect_class
@@ -134,8 +135,12 @@ class LoopDiscovery:
 
 def effect_names(model: Model) -> list[str]:
     """Returns the names of the effects that a model has beyond its own code."""
-    attached = model.effects if isinstance(model, ModelWithEffects) else ()
-    return [effect.name for effect, _ in attached]
+    return [
+        effect.name
+        for layer in layers(model)
+        if isinstance(layer, ModelWithEffects)
+        for effect, _ in layer.effects
+    ]
 
 
 def _sentence(result: Mapping[str, Any]) -> str:

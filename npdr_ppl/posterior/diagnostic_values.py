@@ -19,7 +19,7 @@ __all__ = [
     "predictive_checks",
 ]
 
-FEWEST_SEGMENTS = 8
+FEWEST_FOR_INFLUENCE = 8
 """Least number of segments for the share of influential ones. With fewer segments, each one is
 influential."""
 
@@ -138,5 +138,5 @@ def leave_one_out(data: "Data", limit: float) -> tuple[tuple[float, float], floa
         return unknown
     found = loo(data)
     k = np.asarray(found.pareto_k)
-    share = float(np.mean(k > limit)) if k.size >= FEWEST_SEGMENTS else float("nan")
+    share = float(np.mean(k > limit)) if k.size >= FEWEST_FOR_INFLUENCE else float("nan")
     return (found.elpd, found.se), float(np.max(k)), share

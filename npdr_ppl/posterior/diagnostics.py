@@ -8,9 +8,10 @@ others; coverage and probability integral transform (PIT) of the recording under
 predictive; a Bayesian p-value of the worst segment's error; PSIS-LOO over segments with Pareto k.
 Posteriors of this package export the checks of :mod:`npdr_ppl.posterior.exported_checks` as well.
 
-The order of the decisions is that of the evidence. That the model is wrong is said first, and only
-where its best parameters leave what no parameters explain; then that a prior ends too early; then
-that the estimator has not converged; then what the recording does not determine.
+The order of the decisions is that of the evidence. That the model is wrong is decided first, and
+only where its best parameters leave what no parameters explain, also with wider priors; then that
+a prior ends too early; then that the estimator has not converged; then what the recording does not
+determine.
 """
 
 import json
@@ -254,11 +255,15 @@ class _Reading:
             )
         ratio = _number(model.get("misfit"))
         if ratio > self.limits.noise_ratio and not self.checks.get("priors"):
+            regular = (
+                "too few segments to see whether they are regular"
+                if model["p_value"] is None
+                else "nothing regular in them"
+            )
             return (
                 Decision.REVISE_MODEL,
                 f"The best parameters leave residuals {ratio:.2g} times as large as the declared "
-                "noise, and nothing regular in them: declare more noise, or none to have it "
-                "estimated.",
+                f"noise, and {regular}: declare more noise, or none to have it estimated.",
             )
         return None
 

@@ -74,7 +74,7 @@ class SavedPreparation:
         starts: The segments' estimated initial states.
         score: The score features, if they were made for the recording.
         noise: Estimated noise by sensor; ``None`` if the model kept its own.
-        num_finer_steps: Number of times that the model's integration steps were refined.
+        num_finer_steps: Number of times that the model's integration steps were refined in all.
     """
 
     starts: InitialStates | None = None
@@ -84,7 +84,8 @@ class SavedPreparation:
 
     def apply(self, model: Any) -> Any:
         """Returns a model with the noise and steps with which the posterior was inferred."""
-        for _ in range(self.num_finer_steps):
+        # The model's own finer steps are counted, too.
+        for _ in range(self.num_finer_steps - num_finer_steps(model)):
             model = with_finer_steps(model)
         return model if self.noise is None else with_noise(model, self.noise)
 

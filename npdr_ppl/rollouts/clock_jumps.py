@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.sampling import MOST_BRIDGED
-from npdr_ppl.rollouts.tracks import LARGEST, REGULAR_SHARE
+from npdr_ppl.rollouts.tracks import LARGEST, REGULAR_SHARE, usual_step
 
 __all__ = ["Jumps", "stamp_notes", "without_jumps"]
 
@@ -69,7 +69,8 @@ def stamp_notes(times: Sequence[Array], jumps: Sequence[Jumps]) -> list[str]:
     pauses = [pause for jump in jumps for pause in jump.pauses]
     if outlying:
         notes.append(
-            f"Single time stamps apart from all others: {outlying}; these samples are not used."
+            f"Wrong time stamps, far from the others or ahead of the next one: {outlying}; these "
+            "samples are not used."
         )
     if restarts:
         often = "once" if restarts == 1 else f"{restarts} times"
@@ -97,9 +98,16 @@ def _usual(time: Array) -> float:
     return float(np.median(forward)) if len(forward) else np.nan
 
 
+def _mean(time: Array) -> float:
+    """Returns the mean step in s, also of bursts, in the longest part without a restart."""
+    part = max(_between_restarts(time), key=len)
+    step = usual_step(part[np.isfinite(part)])
+    return step if np.isfinite(step) else np.nan
+
+
 def _gap(channels: Sequence[Array]) -> float:
     """Returns the length of a gap in s that no channel bridges."""
-    usual = [step for step in map(_usual, channels) if step == step]
+    usual = [step for step in map(_mean, channels) if step == step]
     longest = LONGEST_PAUSE * min(usual, default=0.0)
     return min((MOST_BRIDGED + 2.0) * max(usual, default=0.0), longest)
 
@@ -202,7 +210,7 @@ def _without_pauses(
 ) -> tuple[Sequence[Array], tuple[float, ...]]:
     """Returns time stamps with long pauses of all channels shortened, and how long they were."""
     channels = [time[np.isfinite(time)] for time in times[:num_channels]]
-    usual = min((s for s in map(_usual, channels) if s == s), default=np.inf)
+    usual = min((s for s in map(_mean, channels) if s == s), default=np.inf)
     every = np.unique(np.concatenate(channels)) if channels else np.empty(0)
     durations = np.diff(every)
     long = np.flatnonzero(durations > LONGEST_PAUSE * usual)

@@ -155,7 +155,9 @@ def _bridged(track: Track) -> Track:
     usual, steps = track.rate, np.diff(track.time)
     if usual is None or not (steps > 1.5 * usual).any():
         return track
-    count = np.diff(_slots(track.time, usual))
+    mean = track.step
+    # The median step differs from the mean one if a clock of whole milliseconds rounds.
+    count = np.diff(_slots(track.time, mean if abs(mean - usual) < 0.5 * usual else usual))
     short = np.flatnonzero((count > 1) & (count <= MOST_BRIDGED))
     if not len(short):
         return track
@@ -181,7 +183,9 @@ def _slots(time: Array, usual: float) -> NDArray[np.int64]:
     for number, stamp in enumerate(time[1:].tolist(), start=2):
         slots.append(max(slots[-1] + 1, round((stamp - phase) / usual)))
         late = stamp - phase - slots[-1] * usual
-        phase += max(1.0 / number, PHASE_SHARE) * late
+        # A long gap need not be a whole number of steps.
+        is_long = slots[-1] - slots[-2] > MOST_BRIDGED
+        phase += late * (1.0 if is_long else max(1.0 / number, PHASE_SHARE))
     return np.array(slots)
 
 

@@ -29,10 +29,10 @@ def ends(prior, value):
         (dist.Uniform(0.3, 1.7), (0.31, 1.0, 1.69), (0.3, 0.1, -2.0), (1.7, 1.8, 40.0)),
         (dist.Uniform(-2.0, -1.0), (-1.9, -1.1), (-2.0, -2.5), (-1.0, -0.5, 1.0)),
         # One in a thousand is 3.09 standard deviations above or below the mean.
-        (dist.Normal(1.0, 0.5), (1.0, -0.5, 2.5), (-0.6,), (2.6,)),
+        (dist.Normal(1.0, 0.5), (1.0, -0.5, 2.5), (-0.6, -20.0), (2.6, 40.0)),
         (dist.LogNormal(0.0, 0.5), (1.0, 0.22, 4.6), (0.2, 0.05), (4.8, 20.0)),
         # One in a thousand is 3.29 scales from zero. No strength is less than zero.
-        (dist.HalfNormal(2.0), (0.0, 1e-4, 0.1, 6.5), (), (6.7, 20.0)),
+        (dist.HalfNormal(2.0), (0.0, 1e-4, 0.1, 6.5), (), (6.7, 20.0, 90.0)),
         (dist.Uniform(0.0, 1.0), (0.0, 1e-4, 0.9), (), (1.0, 2.0)),
         (dist.Exponential(1.0), (0.0, 1e-4, 1.0, 6.8), (), (7.0,)),
     ],

@@ -151,6 +151,8 @@ def test_a_decision_is_taken_once_the_reasons_before_it_are_excluded():
     reliable = {**estimator, "pareto_k": 0.1, "is_reliable": True}
     decision, reason = decided(short, [], reliable, sd=0.02, misfit=1.0, influential=0)
     assert decision is Decision.ACCEPT and "was not tested: that takes at least 8" in reason
+    reason = decided({**short, "misfit": 3.0}, [], reliable, sd=0.02)[1]
+    assert "too few segments to see whether they are regular" in reason
     decision, reason = decided(right, [], estimator, **wrong)
     assert decision is Decision.MORE_ROUNDS and "Pareto k 2.0 against the simulator" in reason
     decision, reason = decided(right, [], estimator, rounds_left=0, **wrong)

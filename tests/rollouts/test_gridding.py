@@ -141,6 +141,19 @@ def test_late_commands_are_not_taken_for_lost_ones(seed):
     assert rollouts.actions[0][:, 0] == pytest.approx(held, abs=0.05)
 
 
+def test_a_clock_of_coarse_ticks_loses_no_commands():
+    sent = np.concatenate(([0.0], np.cumsum(np.tile([0.010, 0.010, 0.012], 200))))
+    kept = np.delete(sent, 301)
+    command = Track(kept, np.where(np.arange(len(kept)) % 2, 1.0, -1.0))
+    time = sent[-1] / 600 * np.arange(601)
+    values = made([track(time)], [command]).actions[0][:, 0]
+    fine = time[-1] / 60_000 * (np.arange(60_000) + 0.5)
+    held = command.values[np.searchsorted(kept, fine, side="right") - 1]
+    wrong = np.abs(values - held.reshape(-1, 100).mean(1)) > 0.1
+    # Only the command that was lost is filled; the values of all others are held.
+    assert 0 < wrong.sum() <= 3 and np.ptp(np.flatnonzero(wrong)) <= 2
+
+
 def test_one_odd_rollout_does_not_set_the_time_step():
     normal = [([track(STEP * np.arange(100))], [])] * 5
     odd = ([track(np.array([0.0, 0.001]))], [])
@@ -287,6 +300,19 @@ def test_bursts_have_the_mean_step(size):
     number = np.arange(4000)
     time = 0.002 * size * (number // size) + 0.0001 * (number % size)
     assert usual_step(time) == pytest.approx(0.002, rel=2e-3)
+
+
+def test_gaps_of_bursts_are_gaps_on_the_grid():
+    number = np.arange(4000)
+    time = 0.008 * (number // 4) + 0.0001 * (number % 4)
+    restarted = np.concatenate((time, time))
+    (moved,), jumps = without_jumps((restarted,), 1)
+    assert jumps == Jumps(num_restarts=1)
+    # Five steps of 2 ms; the step within a burst is 0.1 ms.
+    assert np.diff(moved)[3999] == pytest.approx(0.01, rel=0.01)
+    paused = np.where(number < 2000, time, time + 1.1)
+    (kept,), jumps = without_jumps((paused,), 1)
+    assert jumps == Jumps() and np.array_equal(kept, paused)
 
 
 @pytest.mark.parametrize("rate, least", [(100.0, 0.99), (250.0, 0.9)])

@@ -95,7 +95,7 @@ def widen_where_it_helps(base: SegmentModel, current: Hypothesis) -> Widened | N
 
 
 def _at_end(hypothesis: Hypothesis) -> list[str]:
-    """Returns the scalar sites near an end of a prior of which a wider one has more beyond it."""
+    """Returns the scalar sites whose fit is near an end that a wider prior would move."""
     z, found = hypothesis.fit.z, []
     for site in hypothesis.segments.prior.sites:
         if site.shape.numel() != 1:
@@ -103,26 +103,27 @@ def _at_end(hypothesis: Hypothesis) -> list[str]:
         place = float(z[site.coordinates][0])
         prior = hypothesis.segments.prior.distributions[site.name]
         is_near = abs(place) > PRIOR_ENDS.near_coordinate and widened(prior) is not None
-        if is_near and _extends(prior, hypothesis.parameters[site.name], is_lower=place < 0.0):
+        if is_near and _is_movable(prior, is_lower=place < 0.0):
             found.append(site.name)
     return found
 
 
-def _extends(prior: Any, value: Tensor, *, is_lower: bool) -> bool:
-    """Returns whether a wider prior has more probability beyond a value.
+def _is_movable(prior: Any, *, is_lower: bool) -> bool:
+    """Returns whether a wider prior has more probability beyond an end.
 
-    It has not where the end is that of a strength, which is not less than zero.
+    It has not below a prior that begins at zero, such as that of a friction.
     """
-    wider = widened(prior)
-    ends = [getattr(prior.support, f"{side}_bound", None) for side in ("lower", "upper")]
+    wider, share = widened(prior), PRIOR_ENDS.outside_probability
     if wider is None:
-        return ends[0 if is_lower else 1] is None
-    if any(end is not None for end in ends):
-        value = value.clamp(*(None if end is None else torch.as_tensor(end) for end in ends))
-    below, after = _probability_below(prior, value), _probability_below(wider, value)
-    if below is None or after is None:
+        return getattr(prior.support, "lower_bound" if is_lower else "upper_bound", None) is None
+    try:
+        end = prior.icdf(torch.as_tensor(share if is_lower else 1.0 - share))
+    except NotImplementedError:
         return True
-    return after > below if is_lower else after < below
+    below = _probability_below(wider, end)
+    if below is None:
+        return True
+    return below > share if is_lower else below < 1.0 - share
 
 
 def _gain(before: Hypothesis, after: Hypothesis) -> float:
@@ -132,7 +133,7 @@ def _gain(before: Hypothesis, after: Hypothesis) -> float:
 
 
 def beyond(priors: Mapping[str, Any], found: Hypothesis) -> tuple[PriorEnd, ...]:
-    """Returns the parameters whose fitted values are outside priors that can be widened."""
+    """Returns the parameters whose fitted values are beyond ends that wider priors would move."""
     ends = []
     for name, value in found.parameters.items():
         if name not in priors:  # a parameter of an added effect
@@ -144,7 +145,7 @@ def beyond(priors: Mapping[str, Any], found: Hypothesis) -> tuple[PriorEnd, ...]
         ):
             continue
         end = "lower" if below <= PRIOR_ENDS.outside_probability else "upper"
-        if not _extends(priors[name], value, is_lower=end == "lower"):
+        if not _is_movable(priors[name], is_lower=end == "lower"):
             continue
         ends.append(PriorEnd(name, end, described_prior(priors[name]), float(value)))
     return tuple(ends)
