@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from npdr_ppl.loop.loop_options import Action, LoopOptions
-from npdr_ppl.loop.next_excitation import ChosenExcitation
 from npdr_ppl.posterior.diagnostics import Decision
 from npdr_ppl.posterior.posterior import Posterior
 
@@ -69,7 +68,7 @@ def decision_record(
     action: Action,
     diagnosis: Mapping[str, Any] | None = None,
     *,
-    excitation: ChosenExcitation | None = None,
+    excitation: Mapping[str, Any] | None = None,
     is_from_check: bool = False,
 ) -> dict[str, Any]:
     """Returns a decision in the form of ``train.json``.
@@ -79,10 +78,10 @@ def decision_record(
         reason: Its reason, in a sentence.
         action: The loop's action after it.
         diagnosis: The figures; decisions of discovery or of a check have none.
-        excitation: The excitation of the rollout that was recorded.
+        excitation: The excitation of the rollout that was recorded, in the form of ``train.json``.
         is_from_check: Whether a check of the new policy in simulation asked for it.
     """
-    recorded = {} if excitation is None else {"excitation": excitation.to_dict()}
+    recorded = {} if excitation is None else {"excitation": dict(excitation)}
     origin = {FROM_CHECK: True} if is_from_check else {}
     return {
         "decision": decision.value,

@@ -2,6 +2,7 @@
 
     loop.json                         what is run: model, target, task, options, seed, versions
     rollouts/rollout_<n>.nc           real rollouts, each with its journal ``.jsonl``
+    excitation_<n>.json               the excitation of a further rollout, and how it was chosen
     policy_<k>.safetensors, .json     the result of POLOPT number k; 0 is trained on the prior
     inference_<i>_<attempt>/          runs of inference, see :mod:`npdr_ppl.posterior.run_folder`
     policy_<k>_<d>.safetensors, .json drafts of policy k: before another rollout, for the mean or
@@ -37,7 +38,7 @@ from npdr_ppl.run_files import (
     save_tensors,
     write_json,
 )
-from npdr_ppl.run_records import IterationRecord, PolicyRecord
+from npdr_ppl.run_records import ExcitationRecord, IterationRecord, PolicyRecord
 from npdr_ppl.targets.base import TargetDomain
 
 if TYPE_CHECKING:
@@ -133,6 +134,15 @@ class LoopFolder:
         if draft is not None and "check" not in figures:
             raise DataError(f"{file} lacks the check of the policy.")
         return tensors["parameters"], dict(figures)
+
+    def save_excitation(self, episode: int, excitation: Mapping[str, Any]) -> None:
+        """Saves the excitation of an episode, after its rollout."""
+        write_json(self.path / f"excitation_{episode:03d}.json", excitation)
+
+    def excitation(self, episode: int) -> dict[str, Any] | None:
+        """Returns the excitation of an episode, ``None`` if none is saved."""
+        file = self.path / f"excitation_{episode:03d}.json"
+        return dict(read_json(file, ExcitationRecord)) if file.exists() else None
 
     def save_iteration(self, index: int, record: Mapping[str, Any]) -> None:
         """Saves the record of a finished iteration."""

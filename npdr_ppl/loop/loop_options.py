@@ -60,6 +60,9 @@ class LoopOptions:
         rollouts: Number H of real rollouts in each iteration.
         extra_rollouts: Further real rollouts that diagnoses, checks before deploying and
             confirmations may ask for in the whole run.
+        compares_excitations: Whether a further rollout is of the excitation that is expected to
+            tell most about the parameters, which may be one of the standard shapes. If not, it is
+            of the task's excitation.
         rollouts_used: Whether inference uses all rollouts so far or those of the latest iteration.
         backend: The inference backend, by name or as an object with its own options.
         rounds: Number R of inference rounds in each iteration; one for backends that are not
@@ -126,6 +129,7 @@ class LoopOptions:
     iterations: int = 5
     rollouts: int = 1
     extra_rollouts: int = 0
+    compares_excitations: bool = True
     rollouts_used: Literal["all", "latest"] = "all"
     backend: str | Backend = "snpe-c"
     rounds: int = 3

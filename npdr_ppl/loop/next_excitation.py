@@ -89,6 +89,7 @@ def chosen_excitation(
     internal_model: Mapping[str, float],
     *,
     seed: int,
+    compares: bool = True,
 ) -> ChosenExcitation:
     """Returns the excitation for another rollout.
 
@@ -101,6 +102,7 @@ def chosen_excitation(
             inferred.
         internal_model: Parameters of the policies' internal model on the target.
         seed: Seed of the draws and initial states.
+        compares: Whether excitations are compared; otherwise the task's is used.
     """
     usual = (
         ChosenExcitation(CURRENT, policy)
@@ -110,10 +112,10 @@ def chosen_excitation(
     if posterior is None:
         return usual
     trial = _Trial(task, posterior, internal_model, seed)
-    if proposal is not None and trial.lasts(proposal, trial.run(proposal)):
+    if proposal is not None and trial.episodes(proposal) is not None:
         return ChosenExcitation(PROPOSED, proposal)
     prepared = posterior.preparation
-    if prepared is None or prepared.likelihood is None:
+    if not compares or prepared is None or prepared.likelihood is None:
         return usual
     candidates = {usual.name: usual.policy, CURRENT: policy, **_shapes(prepared.rollouts, trial)}
     information = {
@@ -147,29 +149,33 @@ class _Trial:
         draws = posterior.sample_mixture(NUM_COVARIANCE_DRAWS, seed=seed).double()
         self.covariance = torch.cov(draws.T).reshape(draws.shape[1], -1)
 
-    def run(self, policy: Policy) -> Episodes:
-        """Returns the recorded episodes of an excitation in all draws."""
-        parameters = self.domains.parameters
-        return self.domains.simulator.roll_out(
-            {name: value.float() for name, value in parameters.items()},
-            policy,
-            self.start,
-            self._num_steps(policy),
-            record=True,
-            internal_model=self.internal_model,
-        )
+    def episodes(self, policy: Policy) -> Episodes | None:
+        """Returns the recorded episodes of an excitation in all draws.
 
-    def lasts(self, policy: Policy, episodes: Episodes) -> bool:
-        """Returns whether the device runs through an excitation in most draws."""
-        return float(episodes.lengths.double().median()) >= LEAST_LASTING * self._num_steps(policy)
+        ``None`` if the simulator cannot run it, or the device would not last through it in most
+        draws.
+        """
+        try:
+            found = self.domains.simulator.roll_out(
+                {name: value.float() for name, value in self.domains.parameters.items()},
+                policy,
+                self.start,
+                self.task.num_steps,
+                record=True,
+                internal_model=self.internal_model,
+            )
+        except NpdrError:
+            return None
+        num_steps = self.task.num_steps
+        if isinstance(policy, Playback):
+            num_steps = min(len(policy.commands) - 1, num_steps)
+        lasts = float(found.lengths.double().median()) >= LEAST_LASTING * num_steps
+        return found if lasts else None
 
     def information(self, policy: Policy, prepared: Preparation) -> float:
-        """Returns the information gained by an excitation in nats.
-
-        It is NaN if the device would not last through it, or its recording has no likelihood.
-        """
-        episodes = self.run(policy)
-        if not self.lasts(policy, episodes):
+        """Returns the information gained by an excitation in nats; NaN if it is not known."""
+        episodes = self.episodes(policy)
+        if episodes is None:
             return math.nan
         try:
             likelihood = held_out(prepared, self._recording(episodes, prepared))
@@ -208,30 +214,34 @@ class _Trial:
             time_step=prepared.rollouts.time_step,
         )
 
-    def _num_steps(self, policy: Policy) -> int:
-        """Returns the steps of an episode; a recorded sequence may be shorter than the task's."""
-        if isinstance(policy, Playback):
-            return min(len(policy.commands) - 1, self.task.num_steps)
-        return self.task.num_steps
-
 
 def _shapes(rollouts: Rollouts, trial: _Trial) -> dict[str, Policy]:
-    """Returns excitations whose commands are not larger than those that the device has had."""
-    largest = np.max([np.abs(actions).max(0) for actions in rollouts.actions], axis=0)
-    amplitude = dict(
-        zip(rollouts.action_names, (EXPERIMENT.safe_share * largest).tolist(), strict=True)
-    )
+    """Returns excitations whose commands are within those that the device has had."""
+    least = np.min([actions.min(0) for actions in rollouts.actions], axis=0)
+    most = np.max([actions.max(0) for actions in rollouts.actions], axis=0)
+    reach, centre = EXPERIMENT.safe_share * 0.5 * (most - least), 0.5 * (most + least)
+    names = rollouts.action_names
+    amplitude = dict(zip(names, reach.tolist(), strict=True))
+    middle = dict(zip(names, centre.tolist(), strict=True))
     actions, step = trial.domains.simulator.actions, rollouts.time_step
-    return {name: _playback(name, amplitude, actions, step) for name in excitation_commands(step)}
+    return {
+        name: _playback(name, amplitude, actions, step, middle)
+        for name in excitation_commands(step)
+    }
 
 
 def _playback(
-    name: str, amplitude: Mapping[str, float], actions: Sequence[Channel], time_step: float
+    name: str,
+    amplitude: Mapping[str, float],
+    actions: Sequence[Channel],
+    time_step: float,
+    middle: Mapping[str, float] | None = None,
 ) -> Playback:
-    """Returns an excitation as commands for a device."""
+    """Returns an excitation as commands around a middle value, followed by zero commands."""
     shape = excitation_commands(time_step)[name]
     names = tuple(action.name for action in actions)
     amplitudes = np.array([amplitude.get(action, 0.0) for action in names])
+    around = np.array([(middle or {}).get(action, 0.0) for action in names])
     # The last command is held after the end, so a zero command is appended.
-    commands = np.concatenate((np.outer(shape, amplitudes), np.zeros((1, len(names)))))
+    commands = np.concatenate((around + np.outer(shape, amplitudes), np.zeros((1, len(names)))))
     return Playback(torch.tensor(commands, dtype=torch.float32), names, time_step)

@@ -62,7 +62,7 @@ from npdr_ppl.loop.loop_options import (
     Revise,
 )
 from npdr_ppl.loop.loop_result import Training, Tried, best_measured
-from npdr_ppl.loop.next_excitation import ChosenExcitation, chosen_excitation
+from npdr_ppl.loop.next_excitation import chosen_excitation
 from npdr_ppl.loop.policy_optimisation import optimise_policy
 from npdr_ppl.loop.policy_training import LoopTraining
 from npdr_ppl.loop.real_rollouts import RealRollouts
@@ -382,14 +382,25 @@ class _Loop:
             if is_found:
                 decisions.append(decision_record(Decision.REVISE_MODEL, reason, Action.REVISED))
 
-    def _collect_excitation(self, posterior: Posterior | None) -> ChosenExcitation:
-        """Records a rollout with a more informative excitation than the policy."""
-        seed = derived_seed(self.seed, "excitation", len(self.rollouts))
-        excitation = chosen_excitation(
-            self.task, self.policy, self.model.proposal, posterior, self.domain, seed=seed
+    def _collect_excitation(self, posterior: Posterior | None) -> dict[str, Any] | None:
+        """Records a rollout that should tell more; returns its excitation as in ``train.json``."""
+        episode = len(self.rollouts)
+        saved = self.folder.excitation(episode)
+        if saved is not None or self.target.is_recorded:
+            self.rollouts.collect(self.policy, self.domain)  # from disk, or recorded earlier
+            return saved
+        chosen = chosen_excitation(
+            self.task,
+            self.policy,
+            self.model.proposal,
+            posterior,
+            self.domain,
+            seed=derived_seed(self.seed, "excitation", episode),
+            compares=self.loop.compares_excitations,
         )
-        self.rollouts.collect(excitation.policy, self.domain)
-        return excitation
+        self.rollouts.collect(chosen.policy, self.domain)
+        self.folder.save_excitation(episode, chosen.to_dict())
+        return chosen.to_dict()
 
     def _revised(
         self, index: int, decisions: Sequence[Mapping[str, Any]], report: Reporter

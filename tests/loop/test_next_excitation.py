@@ -12,14 +12,20 @@ import torch
 import npdr_ppl as npdr
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.language.channels import Channel
-from npdr_ppl.loop.next_excitation import chosen_excitation, proposed_excitation
+from npdr_ppl.loop.next_excitation import (
+    _shapes,
+    _Trial,
+    chosen_excitation,
+    proposed_excitation,
+)
+from npdr_ppl.loop.npdr_loop import train
 from npdr_ppl.loop.real_rollouts import RealRollouts
 from npdr_ppl.models.pendulum import Pendulum, pendulum
-from npdr_ppl.policies.playback import Playback, Sinusoid
+from npdr_ppl.policies.playback import Chirp, Playback, Sinusoid
 from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.preparation.data_options import DataOptions
-from tests.helpers.small_loop import HandmadePendulum, small_task
+from tests.helpers.small_loop import HandmadePendulum, small_options, small_task
 
 UNCERTAIN = DataOptions(segment_length=5)
 """Initial states are uncertain, so that the recording has a likelihood."""
@@ -118,3 +124,38 @@ def test_the_excitation_that_tells_most_about_the_parameters_is_recorded():
     expected = chosen.information[chosen.name] - chosen.information["the task's excitation"]
     # What was expected is what a device with other parameters gives.
     assert information(chosen.policy) - information(still) == pytest.approx(expected, rel=0.3)
+
+
+@pytest.mark.slow
+def test_the_loop_records_the_excitation_and_remembers_it(tmp_path):
+    still = Sinusoid("torque", parameters=torch.tensor([0.01, 2.0, 0.0]))
+    task = dataclasses.replace(small_task(excitation=still), success=1e9)
+    options = small_options(iterations=1, extra_rollouts=1, least_success=0.5)
+    settings = {"options": UNCERTAIN, "loop": options, "out": tmp_path / "run", "progress": False}
+    result = train(pendulum, NoisyPendulum(), task, **settings)
+    (record,) = (d["excitation"] for d in result.iterations[0]["decisions"] if "excitation" in d)
+    known = {name: value for name, value in record["information"].items() if value is not None}
+    assert record["name"] == max(known, key=known.__getitem__)
+    assert len(result.rollouts) == 2
+    # What was recorded is read, whatever would be chosen now.
+    file = tmp_path / "run/excitation_001.json"
+    file.write_text(file.read_text().replace(record["name"], "another one"))
+    (tmp_path / "run/iteration_0.json").unlink()
+    again = train(pendulum, NoisyPendulum(), task, **settings).iterations[0]
+    assert "another one" in [d.get("excitation", {}).get("name") for d in again["decisions"]]
+
+
+@pytest.mark.slow
+def test_excitations_are_compared_only_if_asked_for_and_stay_within_past_commands():
+    task = small_task(excitation=SINUSOID)
+    pushes = Chirp("torque", parameters=torch.tensor([1.0, 0.5, 2.0, 1.0, 2.0]))
+    posterior = inferred(pendulum, recorded(task, pushes))
+    choose = task, task.policy, None, posterior, {}
+    assert chosen_excitation(*choose, seed=0, compares=False).to_dict() == {
+        "name": "the task's excitation", "information": {},
+    }  # fmt: skip
+    # The device was pushed in one direction only, by 1 to 3 N m.
+    for shape in ("reversals", "chirp", "steps"):
+        commands = _shapes(posterior.preparation.rollouts, _Trial(task, posterior, {}, 0))[shape]
+        inner = commands.commands[:-1]
+        assert 0.9 < float(inner.min()) < 1.2 and 2.5 < float(inner.max()) < 3.1

@@ -70,7 +70,7 @@ def run(folder, options, task=None, **kwargs):
         model,
         HandmadePendulum(),
         task,
-        options=kwargs.pop("data_options", SMALL_DATA),
+        options=SMALL_DATA,
         loop=options,
         out=folder,
         progress=False,

@@ -129,7 +129,7 @@ def _decisions(records: Records) -> list[Explained]:
             did = decision.get("action")
             excitation = decision.get("excitation")
             if did and excitation:
-                did = f"{did}, with {excitation['name']}"
+                did = f"{did}, with {excitation['name'].replace('_', ' ')}"
             meaning = (
                 f"{decision.get('reason', '')} The loop {did}."
                 if did
