@@ -43,7 +43,8 @@ def inspect(
     ] = None,
     time: Annotated[str, typer.Option(help="Name of the column with the time stamps.")] = "",
     time_step: Annotated[
-        float | None, typer.Option(help="Seconds between the rows of a log without time stamps.")
+        float | None,
+        typer.Option(help="Seconds between the rows of a log without stamps, else between steps."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

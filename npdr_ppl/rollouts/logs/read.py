@@ -116,7 +116,7 @@ def _reader(path: Path) -> tuple[Reader, str]:
     suffix = path.suffix.lower()
     if suffix == ROS_1_SUFFIX:
         raise DataError(
-            "bags of ROS 1 are not read; convert it with `rosbags-convert --src FILE.bag --dst "
+            "a bag of ROS 1 is not read; convert it with `rosbags-convert --src FILE.bag --dst "
             "FOLDER` (pip install rosbags) and read the folder."
         )
     if suffix not in by_suffix:
