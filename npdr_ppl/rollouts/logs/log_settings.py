@@ -12,11 +12,18 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 TIME_UNITS: dict[TimeUnit, int] = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 """Ticks in a second, by unit of time stamps."""
 
+_WORDS = re.compile("(m|u|n|milli|micro|nano)?s(?:ecs?|econds?)?")
+"""Units of time stamps in words."""
+
 
 def time_unit_of(unit: str) -> TimeUnit | None:
     """Returns the unit of time stamps that a text means, e.g. ``"msec"``; ``None`` if none."""
-    word = re.sub(r"[µμ]", "u", unit.strip().lower()).replace("sec", "s")
-    return next((known for known in TIME_UNITS if known == word), None)
+    found = _WORDS.fullmatch(re.sub(r"[µμ]", "u", unit.strip().lower()))
+    if found is None:
+        return None
+    prefix = found[1] or ""
+    prefix = {"milli": "m", "micro": "u", "nano": "n"}.get(prefix, prefix)
+    return next(known for known in TIME_UNITS if known == f"{prefix}s")
 
 
 HOW_TO_NAME_TIME = (

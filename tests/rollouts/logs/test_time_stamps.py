@@ -8,7 +8,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.logs.formats.parquet_logs import read_frame_log
 from npdr_ppl.rollouts.logs.formats.time_stamps import guessed_unit
 from npdr_ppl.rollouts.logs.inspection import described
-from npdr_ppl.rollouts.logs.log_settings import LogSettings
+from npdr_ppl.rollouts.logs.log_settings import LogSettings, time_unit_of
 
 
 def mapping_of(name, **settings):
@@ -59,3 +59,15 @@ def test_a_log_of_few_or_impossible_stamps_is_described(time):
     frame = pd.DataFrame({"time": time, "a": np.arange(float(len(time)))})
     (timing,) = described(read_frame_log(frame, LogSettings())).timings
     assert timing.gaps == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("s", "s"), ("seconds", "s"), ("Sec", "s"), ("ms", "ms"), ("msec", "ms"),
+        ("milliseconds", "ms"), ("µs", "us"), ("usecs", "us"), ("nanosecond", "ns"),
+        ("m", None), ("rad/s", None), ("", None),
+    ],
+)  # fmt: skip
+def test_units_of_time_are_known_in_words(text, unit):
+    assert time_unit_of(text) == unit
