@@ -54,8 +54,6 @@ DEMO_OPTIONS = LoopOptions(
     search_iterations=45,
     num_domains=30,
     num_initial_states=2,
-    # The demo has one policy before and one after; a check could request more of both.
-    least_success=0.0,
     deploys="last",
     discovers="after diagnosis",
     discovery=DiscoveryOptions(max_effects=2),
