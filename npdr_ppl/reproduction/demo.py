@@ -1,4 +1,4 @@
-"""The demonstration: a policy fails on a rig; discovery repairs the model; a new policy succeeds.
+"""The demonstration: a policy runs on a rig, discovery mends the model, a new policy is trained.
 
 The device is a Furuta pendulum in MuJoCo. It has MuJoCo's own dry friction of the arm and filtered
 velocities, which the paper's equations lack. A policy is trained on the prior and runs on the rig.
@@ -58,7 +58,8 @@ DEMO_OPTIONS = LoopOptions(
     discovers="after diagnosis",
     discovery=DiscoveryOptions(max_effects=2),
 )
-"""Settings for a short demo; a study needs more simulations, domains and iterations."""
+"""Settings for a short demo; a study needs more simulations, domains and iterations. The second
+policy is checked before it runs on the rig: a search this short may find none that works."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def run_demo(
     num_steps: int | None = None,
     progress: bool | Reporter | None = None,
 ) -> Demonstration:
-    """Runs the demonstration in a folder, from a policy that fails to one that works.
+    """Runs the demonstration in a folder, from a policy of the prior to one of the revised model.
 
     Args:
         out: Folder for the run and ``demo.json``; an interrupted run in it continues.

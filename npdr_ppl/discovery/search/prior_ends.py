@@ -118,7 +118,7 @@ def _is_movable(prior: Any, *, is_lower: bool) -> bool:
         return getattr(prior.support, "lower_bound" if is_lower else "upper_bound", None) is None
     try:
         end = prior.icdf(torch.as_tensor(share if is_lower else 1.0 - share))
-    except NotImplementedError:
+    except NotImplementedError:  # torch knows no quantiles of this family
         return True
     below = _probability_below(wider, end)
     if below is None:

@@ -29,7 +29,6 @@ __all__ = [
     "is_log",
     "lerobot_mapping",
     "recording_of_frame",
-    "recording_of_log",
     "recording_of_logs",
 ]
 
@@ -42,25 +41,22 @@ LEROBOT_UNITS = Remark(
 AnyMapping = Mapping | dict[str, Any] | str | PathLike[str] | None
 
 
-def recording_of_log(path: str | PathLike[str], mapping: AnyMapping) -> Recording:
-    """Reads a log; see :meth:`Rollouts.load`."""
-    if mapping is None:
-        folder = Path(path)
-        if (folder / "meta" / "info.json").is_file():
-            log = read_log(folder)
-            recording = lerobot_mapping(log).apply(log)
-            return replace(recording, notes=(*recording.notes, LEROBOT_UNITS))
-        if folder.suffix.lower() == ROS_1_SUFFIX:
-            read_log(folder)  # raises the error that says how to convert it
-        if not folder.is_dir():
-            rollout_checks.check_file(folder)
-        with rollout_checks.named(path):
-            raise DataError(
-                "a log needs a mapping that says which signals are channels and actions; run "
-                "`npdr inspect LOG --write mapping.toml` to begin one."
-            )
-    chosen = Mapping.of(mapping)
-    return chosen.apply(read_log(path, chosen.log))
+def _without_mapping(path: str | PathLike[str]) -> Recording:
+    """Reads a log without a mapping, which only a LeRobot data set can do without."""
+    folder = Path(path)
+    if (folder / "meta" / "info.json").is_file():
+        log = read_log(folder)
+        recording = lerobot_mapping(log).apply(log)
+        return replace(recording, notes=(*recording.notes, LEROBOT_UNITS))
+    if folder.suffix.lower() == ROS_1_SUFFIX:
+        read_log(folder)  # raises the error that says how to convert it
+    if not folder.is_dir():
+        rollout_checks.check_file(folder)
+    with rollout_checks.named(path):
+        raise DataError(
+            "a log needs a mapping that says which signals are channels and actions; run "
+            "`npdr inspect LOG --write mapping.toml` to begin one."
+        )
 
 
 def recording_of_logs(paths: Sequence[str | PathLike[str]], mapping: AnyMapping) -> Recording:
@@ -84,7 +80,7 @@ def recording_of_logs(paths: Sequence[str | PathLike[str]], mapping: AnyMapping)
         if chosen is None and not is_log(path):
             part = load(path)
         elif chosen is None:
-            part = recording_of_log(path, None)
+            part = _without_mapping(path)
         else:
             part = chosen.apply(read_log(path, chosen.log))
         parts.append(part)
