@@ -13,6 +13,8 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
+from torch import Tensor
+
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis, fit_segment_model
 from npdr_ppl.discovery.remedies import Remedy, Shift, remedies, without_one
 from npdr_ppl.discovery.search.base_fit import fit_base
@@ -162,20 +164,8 @@ def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remed
             as_read = searched
     if as_read is not None and _rms(_misfits(as_read)) < REPAIR.large_residual:
         return None
-    present = {} if as_read is None else _misfits(as_read)
-
-    def ratio(remedy: Remedy) -> float:
-        """Returns the misfit with a remedy, relative to that of the same channels without it."""
-        try:
-            tried = _fitted(model, remedy.apply(rollouts), options)
-        except NpdrError:
-            return math.inf
-        if tried is None:
-            return math.inf
-        found = _misfits(tried)
-        before = {name: present[name] for name in found if name in present}
-        return _rms(found) / (_rms(before) if before else 1.0)
-
+    trials = _Trials(model, rollouts, options, as_read)
+    present, ratio = trials.present, trials.ratio
     sensors = (
         SegmentModel(model, rollouts, options).measured
         if as_read is None
@@ -191,6 +181,43 @@ def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remed
     # A channel is given up only if nothing else helps.
     best, least = _best(without_one(sensors), ratio)
     return best if least < REPAIR.remedy_factor else None
+
+
+class _Trials:
+    """Fits of a recording with remedies."""
+
+    def __init__(
+        self, model: Model, rollouts: Rollouts, options: DataOptions, as_read: Hypothesis | None
+    ) -> None:
+        """Keeps the recording and its fit as it was read, ``None`` if simulations fail."""
+        self._model, self._rollouts, self._options = model, rollouts, options
+        self._as_read = None if as_read is None else as_read.parameters
+        self.present = {} if as_read is None else _misfits(as_read)
+        """Misfit of the recording as it was read, by channel."""
+        self._shifted: dict[str | None, dict[float, Mapping[str, Tensor]]] = {}
+        """Fitted parameters by channel and number of steps."""
+
+    def ratio(self, remedy: Remedy) -> float:
+        """Returns the misfit with a remedy, relative to that of the same channels without it."""
+        start, known, shift = None, {}, remedy.apply
+        if isinstance(shift, Shift):
+            # A step more moves the closest parameters a little. A fit that begins elsewhere can
+            # end in another minimum.
+            as_read = {} if self._as_read is None else {0.0: self._as_read}
+            known = self._shifted.setdefault(shift.channel, as_read)
+            if known:
+                start = known[min(known, key=lambda steps: abs(steps - shift.steps))]
+        try:
+            tried = _fitted(self._model, remedy.apply(self._rollouts), self._options, start)
+        except NpdrError:
+            return math.inf
+        if tried is None:
+            return math.inf
+        if isinstance(shift, Shift):
+            known[shift.steps] = tried.parameters
+        found = _misfits(tried)
+        before = {name: self.present[name] for name in found if name in self.present}
+        return _rms(found) / (_rms(before) if before else 1.0)
 
 
 def _best(
@@ -224,10 +251,15 @@ def _refined(shift: Shift, ratio: Callable[[Remedy], float]) -> tuple[Remedy, fl
     return remedy, least
 
 
-def _fitted(model: Model, rollouts: Rollouts, options: DataOptions) -> Hypothesis | None:
+def _fitted(
+    model: Model,
+    rollouts: Rollouts,
+    options: DataOptions,
+    start: Mapping[str, Tensor] | None = None,
+) -> Hypothesis | None:
     """Returns a rough fit from the smoother's initial states; ``None`` if simulations fail."""
     try:
-        return fit_hypothesis(model, rollouts, options, max_steps=6, is_rough=True)
+        return fit_hypothesis(model, rollouts, options, start=start, max_steps=6, is_rough=True)
     except DataError:
         return None
 

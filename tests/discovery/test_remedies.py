@@ -8,12 +8,15 @@ import pyro.distributions as dist
 import pytest
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery import recording_repair
+from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.recording_repair import repair
 from npdr_ppl.discovery.remedies import Shift, remedies
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.cart_pole import cart_pole
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.rollouts.notes import Remark
+from tests.helpers.pendulum_recordings import swinging
 from tests.helpers.rig_recordings import recording_of
 
 STEP = 0.02
@@ -132,6 +135,32 @@ def test_a_fault_in_one_of_four_channels_is_not_hidden_by_the_others():
     ]
     assert np.allclose(found.rollouts.readings[0], rollouts.readings[0])
     assert repair(cart_pole, rollouts, npdr.DataOptions()).remedies == ()
+
+
+def test_the_fit_of_a_shift_begins_at_that_of_the_nearest_shift(monkeypatch):
+    begun = {}
+
+    def fitted(model, rollouts, options, start=None):
+        found = fit_hypothesis(model, rollouts, options, start=start, max_steps=6, is_rough=True)
+        begun[id(found)] = start
+        kept.append(found)
+        return found
+
+    kept = []
+    monkeypatch.setattr(recording_repair, "_fitted", fitted)
+    rollouts = swinging(steps=240)
+    options = npdr.DataOptions(None, 30)
+    as_read = fitted(pendulum, rollouts, options)
+    trials = recording_repair._Trials(pendulum, rollouts, options, as_read)
+    for remedy in (Shift(None, 2).remedy, Shift(None, 4).remedy, Shift(None, 1).remedy):
+        trials.ratio(remedy)
+    inverted = next(r for r in remedies(Pendulum.sensors, rollouts) if "sign" in r.sentence)
+    trials.ratio(inverted)
+    _, two, four, one, sign = kept
+    assert begun[id(two)] == as_read.parameters
+    assert begun[id(four)] == two.parameters
+    assert begun[id(one)] in (as_read.parameters, two.parameters)
+    assert begun[id(sign)] is None
 
 
 def _swapped(time):
