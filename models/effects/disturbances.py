@@ -85,6 +85,7 @@ class PeriodicDisturbance(TimedForceEffect):
     )
     strength = ("sine", "cosine")
     wave = "frequency"
+    contains = ("bias",)
     law = "a sin ωt + b cos ωt"
     excitation = "hold"
     reference = LJUNG_1999
@@ -120,6 +121,7 @@ class Wind(ForceEffect):
         Parameter("direction", "rad", 0.0, "joint angle ψ that faces the wind"),
     )
     strength = ("force",)
+    contains = ("quadratic_drag",)
     law = "A u|u|/w², u = w cos(q − ψ) − q̇"
     excitation = "wide_range"
     reference = MUJOCO

@@ -118,6 +118,7 @@ class StribeckFriction(ForceEffect):
         ),
     )
     strength = ("excess",)
+    contains = ("coulomb_friction",)
     law = "−ΔF exp(−|v/v_s|) sign v"
     excitation = "slow_ramp"
     reference = ARMSTRONG_1994

@@ -38,6 +38,7 @@ class PreslidingFriction(ForceEffect):
     strength = ("magnitude",)
     incidental = ("relaxation",)
     needs_joint = True
+    contains = ("coulomb_friction",)
     law = "−F (x + τ ẋ), ẋ = (v − |v| x)/z_s"
     excitation = "reversals"
     reference = CANUDAS_1995
@@ -153,6 +154,7 @@ class FrictionDrift(TimedForceEffect):
         Parameter("time_constant", "s", 60.0, "time constant T of warming up"),
     )
     strength = ("dry", "viscous")
+    contains = ("coulomb_friction", "viscous_friction")
     law = "−(F sign v + b v) exp(−t/T)"
     excitation = "long_run"
     reference = BITTENCOURT_2012

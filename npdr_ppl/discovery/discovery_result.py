@@ -50,7 +50,7 @@ class Discovery:
         remainder: The same for the revised model.
         unexplained: Share of the misfit that the revised model leaves and one law could explain.
         where: The windows in which the original model fits worst, the worst first.
-        effects: The missing effects, in the order in which they were found.
+        effects: The missing effects; the one that explains most comes first.
         ranking: All candidates for the original model, by linear gain.
         separation: Distance between the leading candidates once parameters are refitted, in
             standard deviations, ``(n, n)``; the diagonal is the distance from no effect.

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from npdr_ppl.discovery.proof.parameter_intervals import Estimate
+from npdr_ppl.discovery.search.repeatability import Repetition
 from npdr_ppl.language.effects import Effect
 
 __all__ = ["Finding"]
@@ -23,6 +24,9 @@ class Finding:
         at_edge: Names of shape parameters with an implausible value, or with a value that the
             recording cannot distinguish from an implausible one. The law may then equal another
             law.
+        is_minor: Whether it explains too little to be named: no strength differs from zero by two
+            standard deviations, or its share is small and something remains that no law explains.
+        repetition: Its strengths in parts of the recording; ``None`` for short recordings.
     """
 
     effect: Effect
@@ -32,6 +36,13 @@ class Finding:
     share: float
     parameters: dict[str, Estimate]
     at_edge: tuple[str, ...] = ()
+    is_minor: bool = False
+    repetition: Repetition | None = None
+
+    @property
+    def is_found_again(self) -> bool:
+        """Whether no part of the recording contradicts it."""
+        return self.repetition is None or self.repetition.is_found_again
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values."""
@@ -44,4 +55,7 @@ class Finding:
             "share": self.share,
             "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
             "at_edge": list(self.at_edge),
+            "is_minor": self.is_minor,
+            "is_found_again": self.is_found_again,
+            "parts": [] if self.repetition is None else self.repetition.to_list(),
         }

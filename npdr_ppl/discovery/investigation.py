@@ -29,6 +29,7 @@ from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.effect_search import Round, Search, Searcher, explained
 from npdr_ppl.discovery.search.limits import limits
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
+from npdr_ppl.discovery.search.repeatability import Repetition, repetitions
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
 from npdr_ppl.discovery.search_progress import SearchProgress
 from npdr_ppl.discovery.segment_options import segment_options
@@ -296,10 +297,12 @@ class Investigation:
         final = search.final
         unexplained = _unexplained(search)
         every = estimates(final, self._draws(final), _units(final))
+        again = repetitions(final)
         effects = [
-            _finding(added, search, every, at_edge)
+            _finding(added, search, every, at_edge, again.get(added.effect.name))
             for added, at_edge in zip(search.added, self._at_edge, strict=True)
         ]
+        effects.sort(key=lambda found: found.share, reverse=True)
         verdict, reason = _judge(search, effects, unexplained, self.settings)
         if self.narrow_priors:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
@@ -411,10 +414,20 @@ def _judge(
             f"{strained[0].effect.name} explains the misfit with an implausible value of "
             f"{strained[0].at_edge[0]}. Another law that is similar there is the likelier cause."
         )
+    once = [(f, f.repetition) for f in effects if f.repetition and not f.is_found_again]
+    if once:
+        one, other = (estimate.part for estimate in once[0][1].estimates)
+        return "unknown", (
+            f"{once[0][0].effect.name} explains the misfit only with different values for {one} "
+            f"and {other}, so it is not the cause."
+        )
     unsure = [f for f in effects if f.probability < options.confidence]
-    sure = [f for f in effects if f.probability >= options.confidence]
+    sure = [f for f in effects if f.probability >= options.confidence and not f.is_minor]
     if sure and sum(f.share for f in unsure) <= VERDICT.minor_share * explains:
         return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
+    if not unsure:
+        names = ", ".join(f.effect.name for f in effects)
+        return "unknown", f"The effects that were found are too small to be named: {names}."
     doubtful = _most_doubtful(effects, options)
     names = " or ".join(
         n for n, p in doubtful.alternatives.items() if p >= EVIDENCE.least_probability
@@ -423,9 +436,24 @@ def _judge(
 
 
 def _finding(
-    added: Added, search: Search, every: dict[str, Estimate], at_edge: tuple[str, ...]
+    added: Added,
+    search: Search,
+    every: dict[str, Estimate],
+    at_edge: tuple[str, ...],
+    repetition: Repetition | None,
 ) -> Finding:
     effect = added.effect
+    strengths = [
+        (every[site], p.nominal)
+        for site, p in zip(effect.parameter_names, effect.parameters, strict=True)
+        if site in every and (not effect.strength or p.name in effect.strength)
+    ]
+    is_zero = bool(strengths) and all(
+        abs(estimate.mean - nominal) < VERDICT.fewest_deviations * estimate.sd
+        for estimate, nominal in strengths
+    )
+    whole = sum(other.share for other in search.added)
+    is_small = search.is_approximate and added.share <= VERDICT.minor_share * whole
     alternatives = [
         name
         for name, probability in added.alternatives.items()
@@ -446,6 +474,8 @@ def _finding(
             if site in every
         },
         at_edge,
+        is_zero or is_small,
+        repetition,
     )
 
 

@@ -199,12 +199,14 @@ class _Trials:
 
     def ratio(self, remedy: Remedy) -> float:
         """Returns the misfit with a remedy, relative to that of the same channels without it."""
-        start, known, shift = None, {}, remedy.apply
+        start, shift = None, remedy.apply
+        known: dict[float, Mapping[str, Tensor]] = {}
         if isinstance(shift, Shift):
             # A step more moves the closest parameters a little. A fit that begins elsewhere can
             # end in another minimum.
-            as_read = {} if self._as_read is None else {0.0: self._as_read}
-            known = self._shifted.setdefault(shift.channel, as_read)
+            known = self._shifted.setdefault(shift.channel, {})
+            if not known and self._as_read is not None:
+                known[0.0] = self._as_read
             if known:
                 start = known[min(known, key=lambda steps: abs(steps - shift.steps))]
         try:

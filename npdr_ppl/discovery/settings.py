@@ -93,7 +93,10 @@ class VerdictSettings:
         most_undetected: The same limit for a remainder that the alarm does not detect, although
             the evidence for it is larger than that of ``TrialSettings.certain_evidence``.
         minor_share: Share of the explained misfit. Uncertain effects that together explain no more
-            than this do not prevent the verdict ``named``.
+            than this do not prevent the verdict ``named``. Where something remains that no law
+            explains, an effect that explains no more than this is not named.
+        fewest_deviations: Distance of a strength from zero, in standard deviations, from which it
+            differs from zero.
         most_separated: Greatest number of alternatives, the likeliest, that the next experiment
             should separate.
     """
@@ -101,11 +104,13 @@ class VerdictSettings:
     most_unexplained: float = 0.01
     most_undetected: float = 0.05
     minor_share: float = 0.1
+    fewest_deviations: float = 2.0
     most_separated: int = 3
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 0.0, 1.0, "most_unexplained", "most_undetected", "minor_share")
+        check_range(self, 0.0, 10.0, "fewest_deviations")
         check_range(self, 2, 100, "most_separated")
 
 

@@ -80,6 +80,8 @@ class Effect(ABC):
             is. Priors are too wide to hit a wave's frequency, so a search takes it from the
             spectrum of the residuals and corrects for the number of frequencies it examined.
         incidental: Names of shape parameters without which the law is still the same cause.
+        contains: Ids of the simpler laws at the same port whose sum it equals at a limit of its
+            shape.
         law: The law in one formula.
         equivalence: Causes that may be indistinguishable from it.
         excitation: The experiment that reveals it best.
@@ -96,6 +98,7 @@ class Effect(ABC):
     is_noise: ClassVar[bool] = False
     wave: ClassVar[str] = ""
     incidental: ClassVar[tuple[str, ...]] = ()
+    contains: ClassVar[tuple[str, ...]] = ()
     law: ClassVar[str] = ""
     equivalence: ClassVar[tuple[EquivalenceClass, ...]] = ()
     excitation: ClassVar[Excitation] = "wide_range"

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from npdr_ppl.discovery.investigation import _judge
+from npdr_ppl.discovery.search.repeatability import PartEstimate, Repetition
 
 pytestmark = pytest.mark.slow
 
@@ -76,3 +77,22 @@ def test_an_uncertain_effect_makes_the_verdict_ambiguous_unless_it_is_minor(judg
     assert reason.endswith("which effect is missing: hinge.quadratic_drag or hinge.wind.")
     minor = replace(unsure, share=0.05 * drag.share)
     assert judge(effects=[drag, minor]) == ("named", "Missing: hinge.quadratic_drag.")
+
+
+def test_an_effect_that_is_not_found_again_is_not_named(judge, drag):
+    parts = tuple(
+        PartEstimate(part, {"drag": (value, 0.01)})
+        for part, value in (("first half", 0.1), ("second half", 0.9))
+    )
+    once = replace(drag, repetition=Repetition(parts, 100.0, 10.0, is_found_again=False))
+    verdict, reason = judge(effects=[once])
+    assert verdict == "unknown"
+    assert "different values for first half and second half" in reason
+
+
+def test_a_minor_effect_is_not_named(judge, drag):
+    minor = replace(drag, is_minor=True)
+    verdict, reason = judge(effects=[minor])
+    assert verdict == "unknown" and "too small to be named: hinge.quadratic_drag" in reason
+    other = replace(minor, share=0.05 * drag.share)
+    assert judge(effects=[drag, other]) == ("named", "Missing: hinge.quadratic_drag.")

@@ -12,7 +12,9 @@ from npdr_ppl.discovery.screening.screening import screen
 from npdr_ppl.discovery.screening.settings import GENERIC_LAWS
 from npdr_ppl.discovery.screening.variants import candidates_at, variants_of
 from npdr_ppl.discovery.search.evidence import closest, weigh
-from npdr_ppl.discovery.search.settings import EVIDENCE
+from npdr_ppl.discovery.search.parsimony import overlap
+from npdr_ppl.discovery.search.repeatability import repetitions
+from npdr_ppl.discovery.search.settings import EVIDENCE, PARSIMONY
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.language.effects import Effect
 
@@ -124,7 +126,12 @@ def tried_before(
 
 
 def weigh_alternatives(
-    base: Hypothesis, current: Hypothesis, effect: Effect, alternatives: Alternatives | None
+    base: Hypothesis,
+    current: Hypothesis,
+    effect: Effect,
+    alternatives: Alternatives | None,
+    *,
+    is_approximate: bool = False,
 ) -> tuple[Hypothesis, Added]:
     """Computes the probabilities of the alternatives and chooses the likeliest.
 
@@ -133,6 +140,8 @@ def weigh_alternatives(
         current: The model with the effect.
         effect: The effect.
         alternatives: Its alternatives.
+        is_approximate: Whether something remains that no law of the catalogue explains. A law
+            that contains a simpler one must then explain clearly more than others.
 
     Returns:
         The model with the likeliest effect, and this effect.
@@ -143,13 +152,12 @@ def weigh_alternatives(
         alternatives.without,
         {effect.name: alternatives.with_it} | alternatives.others,
     )
-    prior = [
-        log_prior(trial) - strain
-        for trial, strain in zip(trials.values(), _strains(trials, without), strict=True)
-    ]
-    weights = weigh(list(trials.values()), prior)
-    probabilities = dict(zip(trials, weights, strict=True))
+    probabilities = _probabilities(trials, without, is_approximate)
     best = max(probabilities, key=lambda name: probabilities[name])
+    while best != effect.name and not _is_found_again(trials[best], best):
+        trials = {name: trial for name, trial in trials.items() if name != best}
+        probabilities = _probabilities(trials, without, is_approximate)
+        best = max(probabilities, key=lambda name: probabilities[name])
     swapped = trials[best]
     chosen = next(e for e in swapped.effects if e.name == best)
     scale = closest([base, swapped]).fit.scale
@@ -158,6 +166,21 @@ def weigh_alternatives(
     fitting = _fitting(trials, best)
     swapped = current if best == effect.name else swapped
     return swapped, Added(chosen, effect.name, share, probabilities, fitting)
+
+
+def _probabilities(
+    trials: Mapping[str, Hypothesis], without: Hypothesis, is_approximate: bool
+) -> dict[str, float]:
+    """Returns the probability of each candidate, by name."""
+    strains = _strains(trials, without, is_approximate)
+    prior = [log_prior(t) - strain for t, strain in zip(trials.values(), strains, strict=True)]
+    return dict(zip(trials, weigh(list(trials.values()), prior), strict=True))
+
+
+def _is_found_again(trial: Hypothesis, name: str) -> bool:
+    """Returns whether an effect of a model is found again in parts of the recording."""
+    found = repetitions(trial) if trial.can_be_linearised else {}
+    return name not in found or found[name].is_found_again
 
 
 def log_prior(hypothesis: Hypothesis) -> float:
@@ -179,12 +202,18 @@ def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
     )
 
 
-def _strains(trials: Mapping[str, Hypothesis], without: Hypothesis) -> list[float]:
+def _strains(
+    trials: Mapping[str, Hypothesis], without: Hypothesis, is_approximate: bool
+) -> list[float]:
     """Returns the penalties of candidates that fit only with a shape parameter at its bound.
+
+    In approximate models, laws that contain simpler ones are penalised, too. Laws that overlap
+    with another effect of the model explain nothing of their own.
 
     Args:
         trials: The model with each candidate, by the candidate's name.
         without: The model without the candidates.
+        is_approximate: Whether something remains that no law of the catalogue explains.
     """
     best = closest(list(trials.values()))
     before = float(without.losses(best.fit.scale).sum())
@@ -193,5 +222,9 @@ def _strains(trials: Mapping[str, Hypothesis], without: Hypothesis) -> list[floa
         effect = next(effect for effect in trial.effects if effect.name == name)
         explains = before - float(trial.losses(best.fit.scale).sum())
         share = STRAIN if trial.at_edge(effect) else 0.0
+        if is_approximate and (effect.contains or share):
+            share = PARSIMONY.minor_share
+        if is_approximate and any(overlap(effect, e) for e in trial.effects if e is not effect):
+            share = 1.0
         result.append(share * best.share * max(0.0, explains))
     return result

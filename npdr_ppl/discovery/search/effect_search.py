@@ -26,7 +26,9 @@ from npdr_ppl.discovery.search.alternatives import (
 )
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps
 from npdr_ppl.discovery.search.evidence import closest, weigh
+from npdr_ppl.discovery.search.parsimony import simplest_laws
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
+from npdr_ppl.discovery.search.repeatability import repeated_effects
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.segment_options import segment_options
@@ -77,12 +79,14 @@ class Search:
         added: Its effects.
         trials: The final model with each alternative in an effect's place, by the names of the
             effect and of the alternative.
+        is_approximate: Whether something remains that no law of the catalogue explains.
     """
 
     rounds: list[Round]
     final: Hypothesis
     added: list[Added]
     trials: dict[tuple[str, str], Hypothesis]
+    is_approximate: bool = False
 
 
 class Searcher:
@@ -214,10 +218,29 @@ class Searcher:
                 break
             now = self.look(current)
             rounds.append(now)
-        current, added, trials = self.with_rivals(current, rounds)
+        # As long as something remains that no law explains, the laws are approximations.
+        is_approximate = now.alarm.fired
+        for _ in range(SEARCH.most_revisions):
+            current = repeated_effects(current, self.trials, self._report)
+            if is_approximate:
+                current = simplest_laws(
+                    rounds[0].hypothesis,
+                    current,
+                    candidates_at(rounds[0].hypothesis, self.options),
+                    self.trials,
+                    self._report,
+                )
+            current, added, trials = self.with_rivals(
+                current, rounds, is_approximate=is_approximate
+            )
+            kept = repeated_effects(current, self.trials, self._report)
+            if kept is current:
+                break
+            current = kept
+            added = [each for each in added if each.effect.name in current.names]
         if set(current.names) != set(rounds[-1].hypothesis.names):
             rounds.append(self.look(current))  # an effect was replaced, so residuals differ
-        return Search(rounds, current, added, trials)
+        return Search(rounds, current, added, trials, is_approximate)
 
     def look(self, hypothesis: Hypothesis, *, number: int | None = None) -> Round:
         """Screens all candidates at a fitted hypothesis; the last result is cached.
@@ -317,13 +340,14 @@ class Searcher:
         return current
 
     def with_rivals(
-        self, current: Hypothesis, rounds: list[Round]
+        self, current: Hypothesis, rounds: list[Round], *, is_approximate: bool = False
     ) -> tuple[Hypothesis, list[Added], dict[tuple[str, str], Hypothesis]]:
         """Compares each effect with its alternatives, and replaces it if one is likelier.
 
         Args:
             current: The fitted model with all effects.
             rounds: The results of the search so far.
+            is_approximate: Whether something remains that no law of the catalogue explains.
 
         Returns:
             The final model, its effects, and the models with each alternative; see
@@ -343,7 +367,11 @@ class Searcher:
             ):
                 waiting = waiting[1:]
                 current, found = weigh_alternatives(
-                    rounds[0].hypothesis, asked, effect, alternatives
+                    rounds[0].hypothesis,
+                    asked,
+                    effect,
+                    alternatives,
+                    is_approximate=is_approximate,
                 )
                 probability = found.alternatives[effect.name]
                 self._report(f"{effect.name}: probability {probability:.2f}")

@@ -8,12 +8,16 @@ from npdr_ppl.settings import check_range
 __all__ = [
     "BASE_FIT",
     "EVIDENCE",
+    "PARSIMONY",
     "PRIOR_ENDS",
+    "REPEATABILITY",
     "SEARCH",
     "TRIALS",
     "BaseFitSettings",
     "EvidenceSettings",
+    "ParsimonySettings",
     "PriorEndSettings",
+    "RepeatabilitySettings",
     "SearchSettings",
     "TrialSettings",
 ]
@@ -55,16 +59,21 @@ class SearchSettings:
             of the laws are this large.
         num_leading: Number of best candidates whose pairwise distances are computed.
         prior_of_any: Prior probability that any effect of the catalogue is missing.
+        most_revisions: Greatest number of times that the effects are simplified and compared with
+            their alternatives. A second time is needed if an alternative is not found again in
+            parts of the recording.
     """
 
     least_unexplained: float = 1e-4
     num_leading: int = 10
     prior_of_any: float = 0.5
+    most_revisions: int = 2
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 0.0, 1.0, "least_unexplained", "prior_of_any")
         check_range(self, 2, 1000, "num_leading")
+        check_range(self, 1, 100, "most_revisions")
 
 
 @dataclass(frozen=True)
@@ -165,8 +174,52 @@ class TrialSettings:
         check_range(self, 0.0, 1000.0, "converged_loss", "largest_growth", "certain_evidence")
 
 
+@dataclass(frozen=True)
+class ParsimonySettings:
+    """Laws that explain too little, where something remains that no law explains.
+
+    Attributes:
+        minor_share: Share of the explained misfit that may be lost by leaving out or simplifying
+            laws.
+        largest_linear_share: Share that is lost without an effect, to first order, above which
+            its removal is not tried. The other effects are fitted again and can take over.
+        most_by_shape: The same as ``minor_share`` for a law with an implausible shape.
+        least_evidence: Log evidence above which a left-out effect is added again.
+    """
+
+    minor_share: float = 0.1
+    largest_linear_share: float = 0.5
+    most_by_shape: float = 0.5
+    least_evidence: float = 30.0
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 0.0, 1.0, "minor_share", "largest_linear_share", "most_by_shape")
+        check_range(self, 0.0, 1000.0, "least_evidence")
+
+
+@dataclass(frozen=True)
+class RepeatabilitySettings:
+    """Comparison of an effect's strengths in disjoint parts of a recording.
+
+    Attributes:
+        fewest_segments: Fewest segments of a recording that is compared in parts.
+        false_alarm_rate: Probability that a real effect is reported as not found again.
+    """
+
+    fewest_segments: int = 8
+    false_alarm_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 2, 1000, "fewest_segments")
+        check_range(self, 0.0, 1.0, "false_alarm_rate")
+
+
 BASE_FIT = BaseFitSettings()
 EVIDENCE = EvidenceSettings()
 PRIOR_ENDS = PriorEndSettings()
+PARSIMONY = ParsimonySettings()
+REPEATABILITY = RepeatabilitySettings()
 SEARCH = SearchSettings()
 TRIALS = TrialSettings()

@@ -1,0 +1,138 @@
+"""The fewest and simplest laws that explain nearly as much as all that were found.
+
+A law of the catalogue is only similar to what a device does. If something remains that no law of
+the catalogue explains, a search adds laws that compensate for the difference between the first
+laws and the device: dry friction is split into three laws, and a tilt or a wave takes the rest.
+Each is significant, but none is a cause. A few laws that are left, each in its simplest form, are
+the likelier causes; the others are added again if they do not overlap.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.projection import loss_without
+from npdr_ppl.discovery.search.settings import PARSIMONY
+from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.language.effects import Effect
+
+__all__ = ["lost_share", "overlap", "simplest_laws"]
+
+
+def simplest_laws(
+    base: Hypothesis,
+    current: Hypothesis,
+    candidates: Sequence[Effect],
+    trials: Trials,
+    report: Callable[[str], None] = lambda _: None,
+) -> Hypothesis:
+    """Leaves out or simplifies laws, as long as little of the explanation is lost.
+
+    Args:
+        base: The original model.
+        current: The model with all effects that were found.
+        candidates: Effects that may be added to the original model.
+        trials: Fits the model.
+        report: Called with a sentence about each change.
+    """
+    left, minor = current, list[Effect]()
+    reference = current
+    while True:
+        changed = dict(_simpler(base, reference, left, candidates, trials))
+        implausible = {
+            (effect, instead): found
+            for (effect, instead), found in changed.items()
+            if instead and left.at_edge(effect)
+        }
+        moves = implausible or changed
+        shares = {move: lost_share(base, reference, found) for move, found in moves.items()}
+        # With an implausible shape, a law is not the cause, and what it explains more than its
+        # simple form is not explained.
+        most = PARSIMONY.most_by_shape if implausible else PARSIMONY.minor_share
+        least = min(shares, key=lambda move: shares[move], default=None)
+        if least is None or shares[least] > most:
+            break
+        (effect, instead), left = least, moves[least]
+        if implausible:
+            reference = left
+        if instead:
+            names = " and ".join(law.name for law in instead)
+            report(f"{effect.name} becomes {names}: its shape explains too little")
+        else:
+            minor.append(effect)
+    if left is current:
+        return current
+    return _with_minor(base, current, left, minor, trials)
+
+
+def _simpler(
+    base: Hypothesis,
+    full: Hypothesis,
+    left: Hypothesis,
+    candidates: Sequence[Effect],
+    trials: Trials,
+) -> Iterator[tuple[tuple[Effect, tuple[Effect, ...]], Hypothesis]]:
+    """Yields models without one effect or with simpler laws in its place, with the change."""
+    explains = full.share * _difference(base, full, full)
+    for effect in left.effects:
+        simpler = tuple(
+            law
+            for law in candidates
+            if law.port == effect.port and law.id in effect.contains and law.name not in left.names
+        )
+        others = tuple(e for e in left.effects if e.name != effect.name)
+        options: list[tuple[Effect, ...]] = [(law,) for law in simpler]
+        if len(simpler) > 1:
+            options.append(simpler)
+        # The other effects are fitted again and can take over, so the linear estimate is high.
+        is_hopeless = loss_without(left, effect) > PARSIMONY.largest_linear_share * explains
+        if others and not is_hopeless:
+            options.append(())
+        for instead in options:
+            found = trials.refitted(left, (*others, *instead))
+            if found is not None:
+                yield (effect, instead), found
+
+
+def _with_minor(
+    base: Hypothesis,
+    full: Hypothesis,
+    core: Hypothesis,
+    minor: Sequence[Effect],
+    trials: Trials,
+) -> Hypothesis:
+    """Returns the core with the removed effects that it does not contain in another form.
+
+    An effect that the core can take over was a part of one of its laws. Simulations are better
+    with the others, even if they explain little.
+    """
+    for effect in reversed(minor):
+        if any(overlap(effect, law) for law in core.effects):
+            continue
+        found = trials.refitted(core, (*core.effects, effect))
+        gained = 0.0 if found is None else core.share * _difference(core, found, full)
+        if found is not None and gained > PARSIMONY.least_evidence:
+            core = found
+    return core
+
+
+def lost_share(base: Hypothesis, full: Hypothesis, simpler: Hypothesis) -> float:
+    """Returns the share of what a model explains that a simpler one does not explain.
+
+    Args:
+        base: The original model.
+        full: The model with all effects.
+        simpler: One with fewer or simpler effects.
+    """
+    return _difference(simpler, full, full) / max(_difference(base, full, full), 1e-12)
+
+
+def overlap(one: Effect, other: Effect) -> bool:
+    """Returns whether two effects are forms of the same law at the same port."""
+    is_either = one.id in (other.id, *other.contains) or other.id in one.contains
+    return one.port == other.port and is_either
+
+
+def _difference(one: Hypothesis, other: Hypothesis, reference: Hypothesis) -> float:
+    """Returns by how much one hypothesis's loss exceeds another's, with a reference's scale."""
+    scale = reference.fit.scale
+    return float((one.losses(scale) - other.losses(scale)).sum())

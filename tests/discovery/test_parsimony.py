@@ -1,0 +1,76 @@
+"""The fewest and simplest laws."""
+
+import pytest
+
+import npdr_ppl as npdr
+from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.screening.variants import candidates_at
+from npdr_ppl.discovery.search.effect_search import Searcher
+from npdr_ppl.discovery.search.parsimony import lost_share, overlap, simplest_laws
+from npdr_ppl.models.effects import (
+    Bias,
+    CoulombFriction,
+    FrictionDrift,
+    PreslidingFriction,
+    QuadraticDrag,
+    StribeckFriction,
+    ViscousFriction,
+    Wind,
+)
+from npdr_ppl.models.pendulum import pendulum
+from tests.helpers.pendulum_recordings import swinging
+
+
+@pytest.fixture(scope="module")
+def rubbed():
+    """A searcher of a recording with dry friction, and the fit of the model without it."""
+    searcher = Searcher(pendulum, swinging(friction=0.2), npdr.DiscoveryOptions())
+    return searcher, searcher.fit_base()
+
+
+def fitted(searcher, *effects):
+    return fit_hypothesis(pendulum, searcher.rollouts, searcher.data_options, effects=effects)
+
+
+def simplest(searcher, base, current):
+    candidates = candidates_at(base, searcher.options)
+    return simplest_laws(base, current, candidates, searcher.trials)
+
+
+def test_dry_friction_in_two_laws_becomes_one(rubbed):
+    searcher, base = rubbed
+    both = fitted(searcher, PreslidingFriction("hinge"), CoulombFriction("hinge"))
+    found = simplest(searcher, base, both)
+    assert found.names == ("hinge.coulomb_friction",)
+    assert float(found.parameters["hinge.coulomb_friction.magnitude"]) == pytest.approx(
+        0.2, rel=0.1
+    )
+    assert lost_share(base, both, found) < 0.1
+
+
+@pytest.mark.parametrize("law", [PreslidingFriction, StribeckFriction, FrictionDrift])
+def test_a_law_whose_shape_explains_nothing_takes_its_simplest_form(rubbed, law):
+    searcher, base = rubbed
+    found = simplest(searcher, base, fitted(searcher, law("hinge")))
+    assert found.names == ("hinge.coulomb_friction",)
+
+
+def test_an_effect_that_explains_much_stays(rubbed):
+    searcher, base = rubbed
+    single = fitted(searcher, CoulombFriction("hinge"))
+    assert simplest(searcher, base, single) is single
+
+
+def test_an_effect_that_explains_nothing_goes(rubbed):
+    searcher, base = rubbed
+    both = fitted(searcher, CoulombFriction("hinge"), Bias("hinge"))
+    assert simplest(searcher, base, both).names == ("hinge.coulomb_friction",)
+
+
+def test_forms_of_one_law_overlap_at_the_same_port():
+    assert overlap(PreslidingFriction("arm"), CoulombFriction("arm"))
+    assert overlap(CoulombFriction("arm"), PreslidingFriction("arm"))
+    assert overlap(FrictionDrift("arm"), ViscousFriction("arm"))
+    assert overlap(Wind("arm"), QuadraticDrag("arm"))
+    assert not overlap(PreslidingFriction("arm"), CoulombFriction("pole"))
+    assert not overlap(QuadraticDrag("arm"), CoulombFriction("arm"))
