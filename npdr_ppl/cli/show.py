@@ -149,6 +149,9 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
                 )
                 name = probability = ""
         console.print(table)
+        minor = [f"{e['port']}.{e['effect']}" for e in found["effects"] if e.get("is_minor")]
+        if minor:
+            console.print(f"Too small to be named, but in the model: {escape(', '.join(minor))}.")
     if found["gap"]:
         table = Table(title="Held-out rollouts", box=SIMPLE)
         table.add_column("metric", no_wrap=True)

@@ -127,6 +127,11 @@ def _key_figures(result: Mapping[str, Any], effects: list[Any]) -> list[KeyFigur
     return figures
 
 
+def _with_sd(value: Mapping[str, Any]) -> str:
+    """Returns a mean with its standard deviation."""
+    return f"{number(value.get('mean'), '.4g')} ± {number(value.get('sd'), '.2g')}"
+
+
 def _gap(gap: Mapping[str, Any]) -> list[Part]:
     if not gap:
         return [TextPart("No gap was measured.")]
@@ -175,12 +180,15 @@ def _effects(effects: list[Any], ranking: list[Any]) -> list[Part]:
         [
             _named(effect),
             number(effect.get("probability"), ".0%"),
+            number(effect.get("share"), ".0%") + (" (small)" if effect.get("is_minor") else ""),
             ", ".join(map(str, effect.get("equivalent_to") or [])) or "–",
         ]
         for effect in effects
     ]
-    columns = ("effect", "probability", "not distinguishable from")
-    parts: list[Part] = [TablePart(columns, rows)]
+    columns = ("effect", "probability", "share of the misfit", "not distinguishable from")
+    caption = "Small effects are in the revised model, but are not named."
+    is_any_small = any(effect.get("is_minor") for effect in effects)
+    parts: list[Part] = [TablePart(columns, rows, caption if is_any_small else "")]
     parameters = [
         [
             f"{_named(effect)}, {name}",
@@ -195,6 +203,15 @@ def _effects(effects: list[Any], ranking: list[Any]) -> list[Part]:
     if parameters:
         columns = ("parameter", "mean", "sd", "94 % interval", "unit")
         parts.append(TablePart(columns, parameters, "Parameters of the effects."))
+    repeated = [
+        [f"{_named(effect)}, {name}", str(part.get("part")), _with_sd(value)]
+        for effect in effects
+        for part in effect.get("parts") or []
+        for name, value in (part.get("strengths") or {}).items()
+    ]
+    if repeated:
+        caption = "Found again? Strengths in the two parts of the recording that differ most."
+        parts.append(TablePart(("strength", "part", "mean ± sd"), repeated, caption))
     scored = {
         _named(e): float(e["probability"])
         for e in ranking or effects
