@@ -32,6 +32,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.collection import with_commands, without_duplicates
 from npdr_ppl.rollouts.faults import without_faults
 from npdr_ppl.rollouts.notes import faults_among
+from npdr_ppl.rollouts.simulator_checks import limited_commands
 
 __all__ = ["Repair", "repair"]
 
@@ -151,7 +152,8 @@ def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollout
         rollouts.check(simulator.sensors, simulator.actions, allow_extra=True, strict=False)
     except DataError as error:
         raise DataError(" ".join((*faults_among(rollouts.notes)[-1:], str(error)))) from None
-    return rollouts
+    limited = limited_commands(rollouts, simulator.actions)
+    return replace(rollouts, notes=(*rollouts.notes, *limited)) if limited else rollouts
 
 
 def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remedy | None:

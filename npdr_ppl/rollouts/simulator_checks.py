@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel
+from npdr_ppl.rollouts.notes import Remark
 from npdr_ppl.rollouts.recording import Recording
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "check_declared_units",
     "check_duplicates",
     "check_units",
+    "limited_commands",
 ]
 
 OTHER_UNITS = {"rad": ("degrees", 180 / math.pi), "m": ("millimetres", 1000.0)}
@@ -128,6 +130,31 @@ def check_units(recording: Recording, channels: Sequence[Channel]) -> None:
         if channel.name in recording.channel_names and channel.rate_of in recording.channel_names:
             unit = channel.unit.removesuffix("/s")
             _check_rate(recording, channel.name, channel.rate_of, unit)
+
+
+def limited_commands(recording: Recording, actions: Sequence[Channel]) -> tuple[Remark, ...]:
+    """Returns remarks on commands that simulators limit because a model's range ends before them.
+
+    Args:
+        recording: The data.
+        actions: A simulator's actions with their ranges.
+    """
+    remarks = []
+    for action in actions:
+        if action.name not in recording.action_names:
+            continue
+        values = np.concatenate(_column(recording, action.name))
+        beyond = (values < action.lower) | (values > action.upper)
+        if not beyond.any():
+            continue
+        unit = f" {action.unit}" if action.unit not in ("", "1") else ""
+        remarks.append(
+            Remark(
+                f"{beyond.mean():.0%} of the commands {action.name} are beyond the model's range, "
+                f"{action.lower:.4g} to {action.upper:.4g}{unit}; simulations limit them to it."
+            )
+        )
+    return tuple(remarks)
 
 
 def _column(recording: Recording, name: str) -> list[NDArray[np.float64]]:

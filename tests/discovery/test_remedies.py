@@ -137,6 +137,22 @@ def test_a_fault_in_one_of_four_channels_is_not_hidden_by_the_others():
     assert repair(cart_pole, rollouts, npdr.DataOptions()).remedies == ()
 
 
+def test_commands_beyond_the_range_of_a_model_are_said():
+    rollouts = swinging(steps=240)
+    plain = repair(pendulum, rollouts, npdr.DataOptions()).rollouts
+    assert not any("range" in note for note in plain.notes)
+    strong = dataclasses.replace(rollouts, actions=tuple(10.0 * a for a in rollouts.actions))
+    share = np.mean(np.abs(np.concatenate(strong.actions)) > 4.5)
+    (note,) = [
+        n for n in repair(pendulum, strong, npdr.DataOptions()).rollouts.notes if "range" in n
+    ]
+    assert note == (
+        f"{share:.0%} of the commands torque are beyond the model's range, -4.5 to 4.5 N m; "
+        "simulations limit them to it."
+    )
+    assert isinstance(note, Remark)
+
+
 def test_the_fit_of_a_shift_begins_at_that_of_the_nearest_shift(monkeypatch):
     begun = {}
 
