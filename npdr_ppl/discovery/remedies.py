@@ -68,7 +68,7 @@ def remedies(
             text = f"The sign of {name} looks inverted; changed."
             yield Remedy(text, _ScaledAction(name, -1.0))
     shifts = [steps for steps in REPAIR.shifts if 4 * steps < min(rollouts.lengths)]
-    long = [steps for steps in shifts if steps * rollouts.time_step > REPAIR.longest_delay]
+    long = _beyond_delays(rollouts)
     # Shifted commands that never change would only leave out the ends of the recording.
     if any(np.ptp(actions, axis=0).any() for actions in rollouts.actions if len(actions)):
         for steps in (*shifts, *(-steps for steps in long)):
@@ -99,6 +99,13 @@ def without_one(sensors: Sequence[Channel]) -> Iterator[Remedy]:
     for sensor in sensors if len(sensors) > 1 else ():
         text = f"{sensor.name} does not fit the other channels; it is not used."
         yield Remedy(text, _Without(sensor.name))
+
+
+def _beyond_delays(rollouts: Rollouts) -> list[int]:
+    """Returns shifts in steps that last longer than any device takes to answer a command."""
+    longest = REPAIR.longest_delay / rollouts.time_step
+    steps = {*REPAIR.shifts, *(round(times * longest) for times in REPAIR.long_shifts)}
+    return sorted(n for n in steps if longest < n and 4 * n < min(rollouts.lengths))
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,8 @@ class RepairSettings:
         shifts: Shifts of the commands, and of one channel, that are tried first, in steps.
         longest_delay: Longest time in seconds that a device takes to answer a command. Early time
             stamps of commands look the same, so only larger shifts are tried for them.
+        long_shifts: Shifts longer than that which are tried, too, as multiples of it. At high
+            sampling rates the other shifts are shorter.
         fewest_clipped: Fewest repeated measurements at the end of a range that can be a limit.
     """
 
@@ -39,6 +41,7 @@ class RepairSettings:
     most_remedies: int = 3
     shifts: tuple[int, ...] = (1, 2, 4, 7, 10, 13, 16, 19)
     longest_delay: float = 0.04
+    long_shifts: tuple[float, ...] = (1.25, 1.75, 2.25)
     fewest_clipped: int = 10
 
     def __post_init__(self) -> None:
@@ -52,6 +55,7 @@ class RepairSettings:
             "remedy_factor",
             "longest_delay",
         )
+        check_range(self, 1.0, 100.0, "long_shifts")
         check_range(self, 1, 1000, "most_remedies", "shifts", "fewest_clipped")
 
 
