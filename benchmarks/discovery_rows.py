@@ -49,8 +49,9 @@ def effect_id(name: str) -> str:
 
 
 def found_names(row: Row) -> list[str]:
-    """Returns the names of the effects that were found."""
-    return [f"{e['port']}.{e['effect']}" for e in row.get("effects", [])]
+    """Returns the names of the effects that were found and are not too small to be named."""
+    found = [e for e in row.get("effects", []) if not e.get("is_minor")]
+    return [f"{e['port']}.{e['effect']}" for e in found]
 
 
 def right_sets(row: Row) -> list[set[str]]:

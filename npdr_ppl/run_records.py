@@ -152,6 +152,20 @@ class EffectInterval(TypedDict, total=False):
     unit: str
 
 
+class EffectStrength(TypedDict):
+    """A strength in a part of a recording."""
+
+    mean: Number
+    sd: Number
+
+
+class EffectPart(TypedDict):
+    """An effect's strengths in a part of a recording."""
+
+    part: str
+    strengths: dict[str, EffectStrength]
+
+
 class EffectRecord(TypedDict):
     """An effect that was missing."""
 
@@ -160,6 +174,9 @@ class EffectRecord(TypedDict):
     probability: NotRequired[Number]
     equivalent_to: NotRequired[list[str] | None]
     parameters: NotRequired[dict[str, EffectInterval] | None]
+    share: NotRequired[Number]
+    is_minor: NotRequired[bool]
+    parts: NotRequired[list[EffectPart]]
 
 
 class GapRecord(TypedDict, total=False):

@@ -1,8 +1,11 @@
 """The examples run, at a size that a test can afford."""
 
 import importlib.util
+import runpy
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pyro
 import pytest
 
@@ -30,3 +33,24 @@ def test_the_fleet_learns_a_likelihood_and_samples_hyper_parameters(fleet):
     assert draws["coordinates"].shape == (6, fleet.NUM_RIGS, len(fleet.RANGES))
     assert draws["mean"].isfinite().all()
     assert len(fleet.coverage(draws, truth)) == 2 * len(fleet.RANGES)
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "mapping", "position"),
+    [
+        ("ur10e_joint.py", "joint", "ur10e_joint_2.toml", "joint_2_position"),
+        ("ur10e_joint.py", "joint", "ur10e_joint_4.toml", "joint_4_position"),
+        ("dfki_pendulum.py", "dfki_pendulum", "dfki_pendulum.toml", "position"),
+    ],
+)
+def test_a_rig_of_the_gallery_reads_its_log_and_can_be_fitted(file, name, mapping, position):
+    time = 0.01 * np.arange(300)
+    columns = {position: 0.3 * np.sin(4.0 * time), "torque": np.sin(7.0 * time)}
+    columns[position.replace("position", "velocity")] = 1.2 * np.cos(4.0 * time)
+    columns[position.replace("position", "current")] = np.sin(7.0 * time)
+    log = pd.DataFrame({"time": time, **columns})
+    rollouts = npdr.Rollouts.from_dataframe(log, EXAMPLES / "gallery" / mapping)
+    model = runpy.run_path(str(EXAMPLES / "gallery" / file))[name]
+    inputs = rollouts.inputs(20)
+    trajectories = pyro.infer.Predictive(model, num_samples=3)(inputs)["trajectory"]
+    assert trajectories.shape[0] == 3 and trajectories.isfinite().all()

@@ -86,6 +86,7 @@ class PeriodicDisturbance(TimedForceEffect):
     strength = ("sine", "cosine")
     wave = "frequency"
     contains = ("bias",)
+    beside = ("bias",)
     law = "a sin ωt + b cos ωt"
     excitation = "hold"
     reference = LJUNG_1999

@@ -119,6 +119,7 @@ class StribeckFriction(ForceEffect):
     )
     strength = ("excess",)
     contains = ("coulomb_friction",)
+    beside = ("coulomb_friction",)
     law = "−ΔF exp(−|v/v_s|) sign v"
     excitation = "slow_ramp"
     reference = ARMSTRONG_1994

@@ -421,7 +421,7 @@ def _judge(
             f"{once[0][0].effect.name} explains the misfit only with different values for {one} "
             f"and {other}, so it is not the cause."
         )
-    unsure = [f for f in effects if f.probability < options.confidence]
+    unsure = [f for f in effects if f.probability < options.confidence and not f.is_minor]
     sure = [f for f in effects if f.probability >= options.confidence and not f.is_minor]
     if sure and sum(f.share for f in unsure) <= VERDICT.minor_share * explains:
         return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."

@@ -41,7 +41,7 @@ class RepairSettings:
     most_remedies: int = 3
     shifts: tuple[int, ...] = (1, 2, 4, 7, 10, 13, 16, 19)
     longest_delay: float = 0.04
-    long_shifts: tuple[float, ...] = (1.25, 1.75, 2.25)
+    long_shifts: tuple[float, ...] = (1.25, 1.5, 1.75, 2.0, 2.25)
     fewest_clipped: int = 10
 
     def __post_init__(self) -> None:

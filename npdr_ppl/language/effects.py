@@ -82,6 +82,7 @@ class Effect(ABC):
         incidental: Names of shape parameters without which the law is still the same cause.
         contains: Ids of the simpler laws at the same port whose sum it equals at a limit of its
             shape.
+        beside: Those of them that it is attached beside, and does not replace.
         law: The law in one formula.
         equivalence: Causes that may be indistinguishable from it.
         excitation: The experiment that reveals it best.
@@ -99,6 +100,7 @@ class Effect(ABC):
     wave: ClassVar[str] = ""
     incidental: ClassVar[tuple[str, ...]] = ()
     contains: ClassVar[tuple[str, ...]] = ()
+    beside: ClassVar[tuple[str, ...]] = ()
     law: ClassVar[str] = ""
     equivalence: ClassVar[tuple[EquivalenceClass, ...]] = ()
     excitation: ClassVar[Excitation] = "wide_range"

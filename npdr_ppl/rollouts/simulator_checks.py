@@ -144,14 +144,18 @@ def limited_commands(recording: Recording, actions: Sequence[Channel]) -> tuple[
         if action.name not in recording.action_names:
             continue
         values = np.concatenate(_column(recording, action.name))
-        beyond = (values < action.lower) | (values > action.upper)
+        # Commands at a bound may be rounded to single precision.
+        bounds = [abs(b) for b in (action.lower, action.upper) if math.isfinite(b)]
+        slack = 1e-6 * max(bounds, default=0.0)
+        beyond = (values < action.lower - slack) | (values > action.upper + slack)
         if not beyond.any():
             continue
         unit = f" {action.unit}" if action.unit not in ("", "1") else ""
         remarks.append(
             Remark(
-                f"{beyond.mean():.0%} of the commands {action.name} are beyond the model's range, "
-                f"{action.lower:.4g} to {action.upper:.4g}{unit}; simulations limit them to it."
+                f"{100.0 * beyond.mean():.2g} % of the commands {action.name} are beyond the "
+                f"model's range, {action.lower:.4g} to {action.upper:.4g}{unit}; simulations "
+                "limit them to it."
             )
         )
     return tuple(remarks)

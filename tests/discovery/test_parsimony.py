@@ -1,10 +1,12 @@
 """The fewest and simplest laws."""
 
+import pyro.distributions as dist
 import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.variants import candidates_at
+from npdr_ppl.discovery.search.alternatives import _strains
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.parsimony import lost_share, overlap, simplest_laws
 from npdr_ppl.models.effects import (
@@ -73,4 +75,32 @@ def test_forms_of_one_law_overlap_at_the_same_port():
     assert overlap(FrictionDrift("arm"), ViscousFriction("arm"))
     assert overlap(Wind("arm"), QuadraticDrag("arm"))
     assert not overlap(PreslidingFriction("arm"), CoulombFriction("pole"))
+    # Friction that is greater at rest is attached beside dry friction.
+    assert not overlap(StribeckFriction("arm"), CoulombFriction("arm"))
     assert not overlap(QuadraticDrag("arm"), CoulombFriction("arm"))
+
+
+def test_an_approximate_model_wants_simple_laws_that_do_not_overlap(rubbed):
+    searcher, base = rubbed
+    names = {
+        law.id: fitted(searcher, law("hinge"))
+        for law in (CoulombFriction, PreslidingFriction, QuadraticDrag)
+    }
+    trials = {f"hinge.{name}": found for name, found in names.items()}
+    exact = dict(zip(trials, _strains(trials, base, False), strict=True))
+    approximate = dict(zip(trials, _strains(trials, base, True), strict=True))
+    assert exact["hinge.coulomb_friction"] == approximate["hinge.coulomb_friction"] == 0.0
+    assert approximate["hinge.presliding_friction"] > 5.0 * exact["hinge.presliding_friction"]
+    assert approximate["hinge.quadratic_drag"] == exact["hinge.quadratic_drag"]
+    both = fitted(searcher, CoulombFriction("hinge"), PreslidingFriction("hinge"))
+    (beside,) = _strains({"hinge.presliding_friction": both}, base, True)
+    assert beside > 5.0 * approximate["hinge.presliding_friction"]
+
+
+def test_a_law_with_an_implausible_shape_takes_its_simplest_form(rubbed):
+    # Friction that fades within 1e4 rad/s fades nowhere in this recording.
+    searcher, base = rubbed
+    priors = {"speed": dist.LogNormal(-2.3, 0.8)}
+    found = fitted(searcher, StribeckFriction("hinge", priors=priors))
+    assert found.at_edge(found.effects[0]) == ("speed",)
+    assert simplest(searcher, base, found).names == ("hinge.coulomb_friction",)

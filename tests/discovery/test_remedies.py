@@ -137,6 +137,20 @@ def test_a_fault_in_one_of_four_channels_is_not_hidden_by_the_others():
     assert repair(cart_pole, rollouts, npdr.DataOptions()).remedies == ()
 
 
+@pytest.mark.parametrize("step", [0.02, 0.002])
+def test_early_stamps_are_tried_only_beyond_the_delays_of_devices(step):
+    torque = np.sin(np.arange(400))[:-1]
+    rollouts = npdr.Rollouts.from_arrays(
+        [np.stack((SWING, SWING), axis=1)], [torque[:, None]],
+        channel_names=("angle", "velocity"), action_names=("torque",), time_step=step,
+    )  # fmt: skip
+    shifts = [r.apply.steps for r in remedies(Pendulum.sensors, rollouts)
+              if isinstance(r.apply, Shift) and r.apply.channel is None]  # fmt: skip
+    early = [-steps * step for steps in shifts if steps < 0]
+    assert early and min(early) > 0.04
+    assert max(early) >= 0.089
+
+
 def test_commands_beyond_the_range_of_a_model_are_said():
     rollouts = swinging(steps=240)
     plain = repair(pendulum, rollouts, npdr.DataOptions()).rollouts
@@ -147,8 +161,8 @@ def test_commands_beyond_the_range_of_a_model_are_said():
         n for n in repair(pendulum, strong, npdr.DataOptions()).rollouts.notes if "range" in n
     ]
     assert note == (
-        f"{share:.0%} of the commands torque are beyond the model's range, -4.5 to 4.5 N m; "
-        "simulations limit them to it."
+        f"{100.0 * share:.2g} % of the commands torque are beyond the model's range, -4.5 to "
+        "4.5 N m; simulations limit them to it."
     )
     assert isinstance(note, Remark)
 

@@ -1,6 +1,7 @@
 """Effects that are found again in parts of a recording, and others."""
 
 import dataclasses
+import math
 
 import pytest
 
@@ -8,7 +9,7 @@ import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.search.repeatability import repeated_effects, repetitions
 from npdr_ppl.discovery.search.trials import Trials
-from npdr_ppl.models.effects import Bias, CoulombFriction
+from npdr_ppl.models.effects import Bias, Cogging, CoulombFriction, Saturation
 from npdr_ppl.models.pendulum import pendulum
 from tests.helpers.pendulum_recordings import swinging
 
@@ -48,7 +49,7 @@ def test_friction_that_acts_in_one_half_only_is_not_found_again(rollouts):
     found = repetitions(fitted(joined(still, rubbed), CoulombFriction("hinge")))
     friction = found["hinge.coulomb_friction"]
     assert not friction.is_found_again
-    assert {part.part for part in friction.estimates} == {"first half", "second half"}
+    assert {part.part for part in friction.estimates} == {"the first half", "the second half"}
     assert [list(part["strengths"]) for part in friction.to_list()] == [["magnitude"]] * 2
 
 
@@ -81,3 +82,20 @@ def test_effects_that_are_not_found_again_are_removed_and_the_last_one_stays():
     assert told == ["hinge.coulomb_friction is not found again in parts of the recording"]
     alone = fitted(rollouts, CoulombFriction("hinge"))
     assert repeated_effects(alone, trials) is alone
+
+
+def test_the_size_of_a_limit_is_finite_although_no_limit_is_infinite():
+    narrow, wide = (swinging(rollouts=2, seed=s) for s in (0, 1))
+    strong = [tuple(2.5 * a for a in part.actions) for part in (narrow, wide)]
+    told = joined(
+        dataclasses.replace(narrow, actions=strong[0]),
+        dataclasses.replace(wide, actions=strong[1]),
+    )
+    found = repetitions(fitted(told, Saturation("torque")))["torque.saturation"]
+    assert math.isfinite(found.size)
+
+
+def test_waves_are_compared_in_both_components():
+    found = repetitions(fitted(swinging(), Cogging("hinge")))["hinge.cogging"]
+    assert found.is_found_again
+    assert [list(part.strengths) for part in found.estimates] == [["sine", "cosine"]] * 2

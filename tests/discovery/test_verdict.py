@@ -82,12 +82,12 @@ def test_an_uncertain_effect_makes_the_verdict_ambiguous_unless_it_is_minor(judg
 def test_an_effect_that_is_not_found_again_is_not_named(judge, drag):
     parts = tuple(
         PartEstimate(part, {"drag": (value, 0.01)})
-        for part, value in (("first half", 0.1), ("second half", 0.9))
+        for part, value in (("the first half", 0.1), ("the second half", 0.9))
     )
     once = replace(drag, repetition=Repetition(parts, 100.0, 10.0, is_found_again=False))
     verdict, reason = judge(effects=[once])
     assert verdict == "unknown"
-    assert "different values for first half and second half" in reason
+    assert "different values for the first half and the second half" in reason
 
 
 def test_a_minor_effect_is_not_named(judge, drag):

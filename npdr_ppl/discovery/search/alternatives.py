@@ -152,12 +152,21 @@ def weigh_alternatives(
         alternatives.without,
         {effect.name: alternatives.with_it} | alternatives.others,
     )
-    probabilities = _probabilities(trials, without, is_approximate)
-    best = max(probabilities, key=lambda name: probabilities[name])
-    while best != effect.name and not _is_found_again(trials[best], best):
-        trials = {name: trial for name, trial in trials.items() if name != best}
+    checked: set[str] = {effect.name}
+    while True:
         probabilities = _probabilities(trials, without, is_approximate)
-        best = max(probabilities, key=lambda name: probabilities[name])
+        # Alternatives that the recording contradicts do not make the effect uncertain.
+        asked = [
+            name
+            for name, probability in probabilities.items()
+            if probability >= EVIDENCE.least_probability and name not in checked
+        ]
+        checked.update(asked)
+        refuted = {name for name in asked if not _is_found_again(trials[name], name)}
+        if not refuted:
+            break
+        trials = {name: trial for name, trial in trials.items() if name not in refuted}
+    best = max(probabilities, key=lambda name: probabilities[name])
     swapped = trials[best]
     chosen = next(e for e in swapped.effects if e.name == best)
     scale = closest([base, swapped]).fit.scale
@@ -205,10 +214,11 @@ def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
 def _strains(
     trials: Mapping[str, Hypothesis], without: Hypothesis, is_approximate: bool
 ) -> list[float]:
-    """Returns the penalties of candidates that fit only with a shape parameter at its bound.
+    """Returns the penalties of candidates, in log density.
 
-    In approximate models, laws that contain simpler ones are penalised, too. Laws that overlap
-    with another effect of the model explain nothing of their own.
+    Laws that fit only with a shape parameter at its bound are penalised. In approximate models,
+    laws that contain simpler ones are penalised, too, and laws that overlap with another effect of
+    the model explain nothing of their own.
 
     Args:
         trials: The model with each candidate, by the candidate's name.

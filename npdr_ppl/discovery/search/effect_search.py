@@ -198,11 +198,7 @@ class Searcher:
         """
         current, now = first.hypothesis, first
         rounds = [first]
-        while (
-            now.alarm.fired
-            and len(current.effects) < max_effects
-            and now.alarm.gain > SEARCH.least_unexplained * explained(first.hypothesis, current)
-        ):
+        while len(current.effects) < max_effects and _is_something_left(first, now):
             best, weights, tried = self._extended(current, now)
             rounds[-1] = replace(now, weights=weights, trials=tried)
             if best is None or _is_negligible(first.hypothesis, current, tried[best]):
@@ -218,10 +214,13 @@ class Searcher:
                 break
             now = self.look(current)
             rounds.append(now)
-        # As long as something remains that no law explains, the laws are approximations.
-        is_approximate = now.alarm.fired
         for _ in range(SEARCH.most_revisions):
-            current = repeated_effects(current, self.trials, self._report)
+            kept = repeated_effects(current, self.trials, self._report)
+            if kept is not current:
+                current, now = kept, self.look(kept)
+                rounds.append(now)
+            # As long as something remains that no law explains, the laws are approximations.
+            is_approximate = _is_something_left(first, now)
             if is_approximate:
                 current = simplest_laws(
                     rounds[0].hypothesis,
@@ -240,6 +239,7 @@ class Searcher:
             added = [each for each in added if each.effect.name in current.names]
         if set(current.names) != set(rounds[-1].hypothesis.names):
             rounds.append(self.look(current))  # an effect was replaced, so residuals differ
+        is_approximate = _is_something_left(rounds[0], rounds[-1])
         return Search(rounds, current, added, trials, is_approximate)
 
     def look(self, hypothesis: Hypothesis, *, number: int | None = None) -> Round:
@@ -413,6 +413,12 @@ def _counted(variants: Iterator[Variant], num: int, step: Step) -> Iterator[Vari
             seen.add(variant.effect.name)
         yield variant
     step(None, "laws that are not in the catalogue")
+
+
+def _is_something_left(first: Round, now: Round) -> bool:
+    """Returns whether more is missing than differences between integrators can explain."""
+    least = SEARCH.least_unexplained * explained(first.hypothesis, now.hypothesis)
+    return now.alarm.fired and now.alarm.gain > least
 
 
 def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:

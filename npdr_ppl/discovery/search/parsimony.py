@@ -37,21 +37,22 @@ def simplest_laws(
     left, minor = current, list[Effect]()
     reference = current
     while True:
-        changed = dict(_simpler(base, reference, left, candidates, trials))
-        implausible = {
-            (effect, instead): found
-            for (effect, instead), found in changed.items()
-            if instead and left.at_edge(effect)
-        }
-        moves = implausible or changed
+        moves = dict(_simpler(base, reference, left, candidates, trials))
         shares = {move: lost_share(base, reference, found) for move, found in moves.items()}
-        # With an implausible shape, a law is not the cause, and what it explains more than its
-        # simple form is not explained.
-        most = PARSIMONY.most_by_shape if implausible else PARSIMONY.minor_share
-        least = min(shares, key=lambda move: shares[move], default=None)
-        if least is None or shares[least] > most:
+        # A law with an implausible shape is not the cause, so what it explains beyond its simple
+        # form does not count.
+        implausible = [
+            (effect, instead)
+            for effect, instead in moves
+            if instead
+            and left.at_edge(effect)
+            and shares[effect, instead] <= PARSIMONY.most_by_shape
+        ]
+        others = [move for move in moves if shares[move] <= PARSIMONY.minor_share]
+        if not implausible and not others:
             break
-        (effect, instead), left = least, moves[least]
+        effect, instead = min(implausible or others, key=lambda move: shares[move])
+        left = moves[effect, instead]
         if implausible:
             reference = left
         if instead:
@@ -59,9 +60,10 @@ def simplest_laws(
             report(f"{effect.name} becomes {names}: its shape explains too little")
         else:
             minor.append(effect)
+            report(f"{effect.name} is left out: it explains too little")
     if left is current:
         return current
-    return _with_minor(base, current, left, minor, trials)
+    return _with_minor(current, left, minor, trials, report)
 
 
 def _simpler(
@@ -83,9 +85,7 @@ def _simpler(
         options: list[tuple[Effect, ...]] = [(law,) for law in simpler]
         if len(simpler) > 1:
             options.append(simpler)
-        # The other effects are fitted again and can take over, so the linear estimate is high.
-        is_hopeless = loss_without(left, effect) > PARSIMONY.largest_linear_share * explains
-        if others and not is_hopeless:
+        if others and not _is_essential(left, effect, explains):
             options.append(())
         for instead in options:
             found = trials.refitted(left, (*others, *instead))
@@ -93,12 +93,22 @@ def _simpler(
                 yield (effect, instead), found
 
 
+def _is_essential(hypothesis: Hypothesis, effect: Effect, explains: float) -> bool:
+    """Returns whether the removal of an effect is not worth a try.
+
+    The other effects are fitted again and can take over, so the linear estimate is too high.
+    """
+    if not hypothesis.can_be_linearised:
+        return False
+    return loss_without(hypothesis, effect) > PARSIMONY.largest_linear_share * explains
+
+
 def _with_minor(
-    base: Hypothesis,
     full: Hypothesis,
     core: Hypothesis,
     minor: Sequence[Effect],
     trials: Trials,
+    report: Callable[[str], None],
 ) -> Hypothesis:
     """Returns the core with the removed effects that it does not contain in another form.
 
@@ -108,10 +118,12 @@ def _with_minor(
     for effect in reversed(minor):
         if any(overlap(effect, law) for law in core.effects):
             continue
-        found = trials.refitted(core, (*core.effects, effect))
+        start = {site: full.parameters[site] for site in effect.parameter_names}
+        found = trials.refitted(core, (*core.effects, effect), start=start)
         gained = 0.0 if found is None else core.share * _difference(core, found, full)
         if found is not None and gained > PARSIMONY.least_evidence:
             core = found
+            report(f"{effect.name} is added again: it improves the simulation")
     return core
 
 
@@ -127,9 +139,15 @@ def lost_share(base: Hypothesis, full: Hypothesis, simpler: Hypothesis) -> float
 
 
 def overlap(one: Effect, other: Effect) -> bool:
-    """Returns whether two effects are forms of the same law at the same port."""
-    is_either = one.id in (other.id, *other.contains) or other.id in one.contains
-    return one.port == other.port and is_either
+    """Returns whether one of two effects at a port takes the place of the other."""
+    if one.port != other.port:
+        return False
+    return one.id == other.id or _replaces(one, other) or _replaces(other, one)
+
+
+def _replaces(one: Effect, other: Effect) -> bool:
+    """Returns whether a law contains another one and is not attached beside it."""
+    return other.id in one.contains and other.id not in one.beside
 
 
 def _difference(one: Hypothesis, other: Hypothesis, reference: Hypothesis) -> float:

@@ -28,7 +28,7 @@ class PartEstimate:
     """An effect's strengths in one part of a recording.
 
     Attributes:
-        part: Which part, e.g. ``"first half"``.
+        part: Which part, e.g. ``"the first half"``.
         strengths: Mean and standard deviation by short name.
     """
 
@@ -60,6 +60,11 @@ class Repetition:
     size: float
     is_found_again: bool
 
+    @property
+    def contradiction(self) -> float:
+        """The squared distance relative to the squared size."""
+        return self.distance / max(self.size, 1e-12)
+
     def to_list(self) -> list[dict[str, object]]:
         """Returns the estimates as JSON-serialisable values."""
         return [estimate.to_dict() for estimate in self.estimates]
@@ -77,10 +82,11 @@ def repetitions(hypothesis: Hypothesis) -> dict[str, Repetition]:
 
     Returns:
         The comparison by the effect's name; empty if the recording has fewer than
-        ``REPEATABILITY.fewest_segments`` segments.
+        ``REPEATABILITY.fewest_segments`` segments, or simulations fail close to the fit.
     """
     num = len(hypothesis.fit.offsets)
-    if num < REPEATABILITY.fewest_segments or not hypothesis.effects:
+    is_long = num >= REPEATABILITY.fewest_segments
+    if not is_long or not hypothesis.effects or not hypothesis.can_be_linearised:
         return {}
     pairs = list(_pairs(hypothesis.segments.inputs.rollout))
     by_part = _ByPart(hypothesis)
@@ -88,9 +94,7 @@ def repetitions(hypothesis: Hypothesis) -> dict[str, Repetition]:
     for effect in hypothesis.effects:
         found = [_compared(by_part, effect, pair, len(pairs)) for pair in pairs]
         contradicted = [each for each in found if not each.is_found_again]
-        result[effect.name] = max(
-            contradicted or found, key=lambda each: each.distance / max(each.size, 1e-12)
-        )
+        result[effect.name] = max(contradicted or found, key=lambda each: each.contradiction)
     return result
 
 
@@ -112,9 +116,7 @@ def repeated_effects(
         contradicted = [e for e in contradicted if not found[e.name].is_found_again]
         if not contradicted:
             break
-        worst = max(
-            contradicted, key=lambda e: found[e.name].distance / max(found[e.name].size, 1e-12)
-        )
+        worst = max(contradicted, key=lambda e: found[e.name].contradiction)
         without = trials.without(current, worst)
         if without is None:
             break
@@ -127,7 +129,7 @@ def _pairs(rollout: Tensor) -> Iterator[tuple[tuple[str, Tensor], tuple[str, Ten
     """Yields pairs of disjoint parts: both halves, and each of several rollouts with the rest."""
     index = torch.arange(len(rollout))
     half = len(rollout) // 2
-    yield ("first half", index[:half]), ("second half", index[half:])
+    yield ("the first half", index[:half]), ("the second half", index[half:])
     names = rollout.unique().tolist()
     for name in names if len(names) > 2 else ():
         own = rollout == name
@@ -190,15 +192,14 @@ def _compared(
         if not effect.strength or p.name in effect.strength
     }
     sites = list(strengths)
-    nominal = torch.tensor([p.nominal for p in strengths.values()], dtype=torch.float64)
+    # An infinite nominal value, as that of a limit, is no distance; the value itself is the size.
+    nominal = torch.tensor(
+        [p.nominal if math.isfinite(p.nominal) else 0.0 for p in strengths.values()],
+        dtype=torch.float64,
+    )
     (first, one), (second, other) = (by_part.estimate(sites, index) for _, index in pair)
     metric = torch.linalg.pinv(one + other, hermitian=True)
-    difference = first - second
-    # The mean of both, each weighted by what it tells.
-    weights = torch.linalg.pinv(one, hermitian=True), torch.linalg.pinv(other, hermitian=True)
-    mean = torch.linalg.pinv(sum(weights), hermitian=True) @ (
-        weights[0] @ (first - nominal) + weights[1] @ (second - nominal)
-    )
+    difference, mean = first - second, 0.5 * (first + second) - nominal
     distance, size = float(difference @ metric @ difference), float(mean @ metric @ mean)
     limit = stats.chi2.isf(REPEATABILITY.false_alarm_rate / num_pairs, len(sites))
     estimates = tuple(

@@ -137,23 +137,35 @@ class Trials:
         return result
 
     def refitted(
-        self, current: Hypothesis, effects: tuple[Effect, ...] | None = None
+        self,
+        current: Hypothesis,
+        effects: tuple[Effect, ...] | None = None,
+        *,
+        start: Mapping[str, Tensor] | None = None,
     ) -> Hypothesis | None:
         """Fits the model with effects, from the parameters of a hypothesis.
 
         Args:
             current: The hypothesis.
             effects: The effects; those of the hypothesis by default.
+            start: Initial guess of parameters that the hypothesis does not have, by site.
 
         Returns:
             ``None`` if the model cannot be simulated with them.
         """
         chosen = current.effects if effects is None else effects
         segments = self._along(chosen, current.segments.starts)
-        return None if segments is None else self.refitted_along(segments, current, chosen)
+        if segments is None:
+            return None
+        return self.refitted_along(segments, current, chosen, start=start)
 
     def refitted_along(
-        self, segments: SegmentModel, current: Hypothesis, effects: tuple[Effect, ...]
+        self,
+        segments: SegmentModel,
+        current: Hypothesis,
+        effects: tuple[Effect, ...],
+        *,
+        start: Mapping[str, Tensor] | None = None,
     ) -> Hypothesis | None:
         """Fits a model that is bound to the recording; see :meth:`refitted`.
 
@@ -161,12 +173,14 @@ class Trials:
             segments: The model, effects included, and the recording.
             current: The hypothesis from whose parameters the fit begins.
             effects: The model's effects.
+            start: Initial guess of parameters that the hypothesis does not have, by site.
         """
         kept = {name for effect in effects for name in effect.parameter_names}
         gone = {name for effect in current.effects for name in effect.parameter_names} - kept
-        start = {name: value for name, value in current.parameters.items() if name not in gone}
+        begin = {name: value for name, value in current.parameters.items() if name not in gone}
+        begin |= start or {}
         (found,) = self._fits(
-            [_Fit(segments, effects, start, current.fit.offsets)], current.simulator
+            [_Fit(segments, effects, begin, current.fit.offsets)], current.simulator
         )
         return found
 

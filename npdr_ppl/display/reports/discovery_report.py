@@ -71,8 +71,9 @@ def discovery_report(folder: Path) -> Report:
 
 def _verdict(result: Mapping[str, Any], effects: list[Any]) -> Headline:
     word = str(result["verdict"])
-    best = _named(effects[0]) if effects else "an effect"
-    others = ", ".join(_named(effect) for effect in effects[1:])
+    large = [effect for effect in effects if not effect.get("is_minor")] or effects
+    best = _named(large[0]) if large else "an effect"
+    others = ", ".join(_named(effect) for effect in large[1:])
     p_value = number((result.get("alarm") or {}).get("p_value"))
     gained = _gained(result.get("gap") or {})
     verdicts = {
@@ -89,7 +90,7 @@ def _verdict(result: Mapping[str, Any], effects: list[Any]) -> Headline:
         ),
         "unknown": Headline(
             "something unknown is missing",
-            "The model does not fit the recording, and no effect of the catalogue explains it.",
+            str(result.get("reason") or "No effect of the catalogue explains the recording."),
             "bad",
         ),
     }
