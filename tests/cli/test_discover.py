@@ -246,6 +246,24 @@ def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, t
     assert "way" not in shown
 
 
+def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
+    text = StringIO()
+    monkeypatch.setattr(show, "_console", lambda: Console(file=text, width=100))
+    strength = {"mean": 0.1, "sd": 0.01, "hdi_94": [0.08, 0.12], "unit": "N m"}
+    found = {
+        "data_problems": [], "verdict": "named", "reason": "Missing: hinge.bias.", "gap": {},
+        "effects": [
+            {"effect": effect, "port": "hinge", "probability": 0.99, "is_minor": is_minor,
+             "parameters": {"size": strength}}
+            for effect, is_minor in (("bias", False), ("wind", True))
+        ],
+        "remainder": {"fired": False, "unexplained": 0.0}, "counts": {}, "next_experiment": None,
+    }  # fmt: skip
+    show.show_discovery(found, tmp_path)
+    shown = " ".join(text.getvalue().split())
+    assert "Too small to be named, but in the model: hinge.wind." in shown
+
+
 def test_the_command_has_the_defaults_of_the_options():
     declared = inspect.signature(discover.discover).parameters
     for name in ("max_effects", "false_alarm_rate"):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 
 import plotly.graph_objects as go
@@ -96,6 +97,25 @@ def test_discovery_shows_what_changed(runs):
     assert "93% in rmse" in report.verdict.sentence
     (diff,) = [part for s in report.sections for part in s.parts if isinstance(part, DiffPart)]
     assert [line for line in diff.lines if line[0] == "+"][1:] == ["+    friction = '<script>'"]
+
+
+def test_small_effects_and_parts_of_the_recording_are_shown(runs, tmp_path):
+    folder = shutil.copytree(runs["discover"], tmp_path / "run")
+    content = json.loads((folder / "discovery.json").read_text())
+    content["effects"][0] |= {
+        "share": 0.04,
+        "is_minor": True,
+        "parts": [
+            {"part": part, "strengths": {"magnitude": {"mean": mean, "sd": 0.02}}}
+            for part, mean in (("the first half", 0.41), ("the second half", 0.39))
+        ],
+    }
+    bias = {"effect": "bias", "port": "hinge", "probability": 1.0, "share": 0.9}
+    content["effects"].append(bias)
+    (folder / "discovery.json").write_text(json.dumps(content))
+    text = write_report(folder).read_text()
+    assert "4% (small)" in text and "missing: bias at hinge" in text
+    assert "the second half" in text and "0.39 ± 0.02" in text
 
 
 @pytest.mark.parametrize("verdict", ["none", "named", "ambiguous", "unknown"])
