@@ -8,11 +8,12 @@ from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.alternatives import _strains
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.search.parsimony import lost_share, overlap, simplest_laws
+from npdr_ppl.discovery.search.parsimony import _with_minor, lost_share, overlap, simplest_laws
 from npdr_ppl.models.effects import (
     Bias,
     CoulombFriction,
     FrictionDrift,
+    PeriodicDisturbance,
     PreslidingFriction,
     QuadraticDrag,
     StribeckFriction,
@@ -104,3 +105,15 @@ def test_a_law_with_an_implausible_shape_takes_its_simplest_form(rubbed):
     found = fitted(searcher, StribeckFriction("hinge", priors=priors))
     assert found.at_edge(found.effects[0]) == ("speed",)
     assert simplest(searcher, base, found).names == ("hinge.coulomb_friction",)
+
+
+def test_a_simple_form_that_explains_too_little_is_left_out(rubbed):
+    searcher, base = rubbed
+    effects = (CoulombFriction("hinge"), Bias("hinge"), PeriodicDisturbance("hinge"))
+    found = simplest(searcher, base, fitted(searcher, *effects))
+    assert found.names == ("hinge.coulomb_friction",)
+    before = fitted(searcher, PreslidingFriction("hinge"), QuadraticDrag("hinge"))
+    told = []
+    start = {"hinge.bias.offset": before.fit.z.new_zeros(())}
+    again = _with_minor(before, before, [(Bias("hinge"), start)], searcher.trials, told.append)
+    assert again is before and told == []

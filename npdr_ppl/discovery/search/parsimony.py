@@ -7,7 +7,9 @@ Each is significant, but none is a cause. A few laws that are left, each in its 
 the likelier causes; the others are added again if they do not overlap.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.projection import loss_without
@@ -34,7 +36,7 @@ def simplest_laws(
         trials: Fits the model.
         report: Called with a sentence about each change.
     """
-    left, minor = current, list[Effect]()
+    left, minor = current, list[tuple[Effect, Mapping[str, Tensor]]]()
     reference = current
     while True:
         moves = dict(_simpler(base, reference, left, candidates, trials))
@@ -52,14 +54,15 @@ def simplest_laws(
         if not implausible and not others:
             break
         effect, instead = min(implausible or others, key=lambda move: shares[move])
-        left = moves[effect, instead]
+        before, left = left, moves[effect, instead]
         if implausible:
             reference = left
         if instead:
             names = " and ".join(law.name for law in instead)
             report(f"{effect.name} becomes {names}: its shape explains too little")
         else:
-            minor.append(effect)
+            # It may have come as another law's simple form, which the first model does not have.
+            minor.append((effect, {s: before.parameters[s] for s in effect.parameter_names}))
             report(f"{effect.name} is left out: it explains too little")
     if left is current:
         return current
@@ -106,7 +109,7 @@ def _is_essential(hypothesis: Hypothesis, effect: Effect, explains: float) -> bo
 def _with_minor(
     full: Hypothesis,
     core: Hypothesis,
-    minor: Sequence[Effect],
+    minor: Sequence[tuple[Effect, Mapping[str, Tensor]]],
     trials: Trials,
     report: Callable[[str], None],
 ) -> Hypothesis:
@@ -115,10 +118,9 @@ def _with_minor(
     An effect that the core can take over was a part of one of its laws. Simulations are better
     with the others, even if they explain little.
     """
-    for effect in reversed(minor):
+    for effect, start in reversed(minor):
         if any(overlap(effect, law) for law in core.effects):
             continue
-        start = {site: full.parameters[site] for site in effect.parameter_names}
         found = trials.refitted(core, (*core.effects, effect), start=start)
         gained = 0.0 if found is None else core.share * _difference(core, found, full)
         if found is not None and gained > PARSIMONY.least_evidence:
