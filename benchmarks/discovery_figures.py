@@ -54,7 +54,7 @@ def reliability(rows: Iterable[Row]) -> list[Bin]:
     pairs = [
         (first_probability(row), is_first_right(row))
         for row in rows
-        if row["condition"] in ("one", "inseparable", "two") and row["effects"]
+        if row["condition"] in ("one", "inseparable", "two") and found_names(row)
     ]
     bins = []
     for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):

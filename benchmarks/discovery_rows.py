@@ -49,9 +49,13 @@ def effect_id(name: str) -> str:
 
 
 def found_names(row: Row) -> list[str]:
-    """Returns the names of the effects that were found and are not too small to be named."""
-    found = [e for e in row.get("effects", []) if not e.get("is_minor")]
-    return [f"{e['port']}.{e['effect']}" for e in found]
+    """Returns the names of :func:`large_effects`."""
+    return [f"{e['port']}.{e['effect']}" for e in large_effects(row)]
+
+
+def large_effects(row: Row) -> list[Row]:
+    """Returns the effects that were found and are not too small to be named."""
+    return [e for e in row.get("effects", []) if not e.get("is_minor")]
 
 
 def right_sets(row: Row) -> list[set[str]]:
@@ -75,7 +79,7 @@ def first_probability(row: Row) -> float:
     Of the first effect, and of those that no recording of the rig can tell from it: where one of
     them is hidden, the first effect counts as right.
     """
-    first, rig = row["effects"][0], RIGS[row["rig"]]
+    first, rig = large_effects(row)[0], RIGS[row["rig"]]
     table = rig.inseparable if row["condition"] == "inseparable" else rig.same
     others = table.get((first["port"], first["effect"]), ())
     alone = {
@@ -89,9 +93,9 @@ def is_class_right(row: Row) -> bool:
     """Returns whether the truth is the first effect or among what could stand in its place."""
     if is_first_right(row):
         return True
-    if not row.get("effects"):
+    if not large_effects(row):
         return False
-    first = row["effects"][0]
+    first = large_effects(row)[0]
     return any(stands_for(first, name) for right in right_sets(row) for name in right)
 
 
@@ -106,9 +110,9 @@ def stands_for(finding: Row, name: str) -> bool:
 
 def is_confident_and_wrong(row: Row) -> bool:
     """Returns whether a wrong name was given without doubt."""
-    if row.get("verdict") != "named" or not row["effects"]:
+    if row.get("verdict") != "named" or not large_effects(row):
         return False
-    return row["effects"][0]["probability"] >= CONFIDENT and not is_first_right(row)
+    return large_effects(row)[0]["probability"] >= CONFIDENT and not is_first_right(row)
 
 
 def has_all(row: Row) -> bool:

@@ -443,15 +443,12 @@ def _finding(
     repetition: Repetition | None,
 ) -> Finding:
     effect = added.effect
-    strengths = [
-        (every[site], p.nominal)
-        for site, p in zip(effect.parameter_names, effect.parameters, strict=True)
-        if site in every and (not effect.strength or p.name in effect.strength)
+    sizes = [
+        abs(every[site].mean - p.nominal) / max(every[site].sd, 1e-300)
+        for p in effect.strengths
+        if (site := f"{effect.name}.{p.name}") in every
     ]
-    is_zero = bool(strengths) and all(
-        abs(estimate.mean - nominal) < VERDICT.fewest_deviations * estimate.sd
-        for estimate, nominal in strengths
-    )
+    is_zero = bool(sizes) and max(sizes) < VERDICT.fewest_deviations
     whole = sum(other.share for other in search.added)
     is_small = search.is_approximate and added.share <= VERDICT.minor_share * whole
     alternatives = [

@@ -164,7 +164,7 @@ class Effect(ABC):
         result = {}
         for parameter in self.parameters:
             result[parameter.name] = parameter.nominal
-            if parameter.name in (self.strength or (parameter.name,)):
+            if parameter in self.strengths:
                 prior = priors[parameter.name]
                 offset = prior.mean - parameter.nominal
                 result[parameter.name] += float((prior.variance + offset**2).sqrt())
@@ -180,6 +180,12 @@ class Effect(ABC):
             p.name: p.unit.format(port=port.unit, coordinate=port.coordinate)
             for p in self.parameters
         }
+
+    @property
+    def strengths(self) -> tuple[Parameter, ...]:
+        """The parameters that scale it from zero; see :attr:`strength`."""
+        chosen = self.strength or tuple(p.name for p in self.parameters)
+        return tuple(p for p in self.parameters if p.name in chosen)
 
     @property
     def name(self) -> str:

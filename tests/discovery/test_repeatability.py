@@ -84,7 +84,7 @@ def test_effects_that_are_not_found_again_are_removed_and_the_last_one_stays():
     assert repeated_effects(alone, trials) is alone
 
 
-def test_the_size_of_a_limit_is_finite_although_no_limit_is_infinite():
+def test_the_size_of_a_limit_is_finite_although_its_nominal_value_is_not():
     narrow, wide = (swinging(rollouts=2, seed=s) for s in (0, 1))
     strong = [tuple(2.5 * a for a in part.actions) for part in (narrow, wide)]
     told = joined(

@@ -175,11 +175,9 @@ def loss_without(hypothesis: Hypothesis, effect: Effect) -> float:
         effect: One of its effects.
     """
     segments, fit = hypothesis.segments, hypothesis.fit
-    strengths = effect.strength or tuple(p.name for p in effect.parameters)
     resting = {
         f"{effect.name}.{p.name}": torch.tensor([p.nominal], dtype=torch.float64)
-        for p in effect.parameters
-        if p.name in strengths
+        for p in effect.strengths
     }
     box = segments.black_box(fit.z[None])
     starts = fit.offsets[None]

@@ -131,7 +131,7 @@ def _probe(
     port = simulator.port(effect.port)
     priors = effect.priors(port)
     probe = effect.probe(port)
-    strengths = effect.strength or tuple(p.name for p in effect.parameters)
+    strengths = tuple(p.name for p in effect.strengths)
     resting = {p.name: p.nominal for p in effect.parameters}
     if effect.port in inputs.action_names:
         probe = _within_reach(effect, probe, inputs)

@@ -14,8 +14,9 @@ from npdr_ppl.discovery.screening.variants import candidates_at, variants_of
 from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.parsimony import overlap
 from npdr_ppl.discovery.search.repeatability import repetitions
-from npdr_ppl.discovery.search.settings import EVIDENCE, PARSIMONY
+from npdr_ppl.discovery.search.settings import EVIDENCE
 from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.language.effects import Effect
 
 __all__ = [
@@ -233,7 +234,7 @@ def _strains(
         explains = before - float(trial.losses(best.fit.scale).sum())
         share = STRAIN if trial.at_edge(effect) else 0.0
         if is_approximate and (effect.contains or share):
-            share = PARSIMONY.minor_share
+            share = VERDICT.minor_share
         if is_approximate and any(overlap(effect, e) for e in trial.effects if e is not effect):
             share = 1.0
         result.append(share * best.share * max(0.0, explains))

@@ -214,21 +214,26 @@ class Searcher:
                 break
             now = self.look(current)
             rounds.append(now)
+        return self._revised(current, rounds)
+
+    def _revised(self, current: Hypothesis, rounds: list[Round]) -> Search:
+        """Returns the effects that are found again, in their simplest form, and alternatives.
+
+        Args:
+            current: The model with all effects that were found.
+            rounds: The results before each addition, to which those of revised models are added.
+        """
+        base = rounds[0].hypothesis
+        added: list[Added] = []
+        trials: dict[tuple[str, str], Hypothesis] = {}
+        is_approximate = False
         for _ in range(SEARCH.most_revisions):
-            kept = repeated_effects(current, self.trials, self._report)
-            if kept is not current:
-                current, now = kept, self.look(kept)
-                rounds.append(now)
+            current = repeated_effects(current, self.trials, self._report)
             # As long as something remains that no law explains, the laws are approximations.
-            is_approximate = _is_something_left(first, now)
+            is_approximate = _is_something_left(rounds[0], self._looked(current, rounds))
             if is_approximate:
-                current = simplest_laws(
-                    rounds[0].hypothesis,
-                    current,
-                    candidates_at(rounds[0].hypothesis, self.options),
-                    self.trials,
-                    self._report,
-                )
+                candidates = candidates_at(base, self.options)
+                current = simplest_laws(base, current, candidates, self.trials, self._report)
             current, added, trials = self.with_rivals(
                 current, rounds, is_approximate=is_approximate
             )
@@ -237,10 +242,14 @@ class Searcher:
                 break
             current = kept
             added = [each for each in added if each.effect.name in current.names]
-        if set(current.names) != set(rounds[-1].hypothesis.names):
-            rounds.append(self.look(current))  # an effect was replaced, so residuals differ
-        is_approximate = _is_something_left(rounds[0], rounds[-1])
+        is_approximate = _is_something_left(rounds[0], self._looked(current, rounds))
         return Search(rounds, current, added, trials, is_approximate)
+
+    def _looked(self, current: Hypothesis, rounds: list[Round]) -> Round:
+        """Returns the last round, after one is added if it has other effects than a hypothesis."""
+        if set(current.names) != set(rounds[-1].hypothesis.names):
+            rounds.append(self.look(current))
+        return rounds[-1]
 
     def look(self, hypothesis: Hypothesis, *, number: int | None = None) -> Round:
         """Screens all candidates at a fitted hypothesis; the last result is cached.

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.projection import loss_without
-from npdr_ppl.discovery.search.settings import PARSIMONY
+from npdr_ppl.discovery.search.settings import PARSIMONY, TRIALS
 from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.language.effects import Effect
 
 __all__ = ["lost_share", "overlap", "simplest_laws"]
@@ -50,7 +51,7 @@ def simplest_laws(
             and left.at_edge(effect)
             and shares[effect, instead] <= PARSIMONY.most_by_shape
         ]
-        others = [move for move in moves if shares[move] <= PARSIMONY.minor_share]
+        others = [move for move in moves if shares[move] <= VERDICT.minor_share]
         if not implausible and not others:
             break
         effect, instead = min(implausible or others, key=lambda move: shares[move])
@@ -78,6 +79,8 @@ def _simpler(
 ) -> Iterator[tuple[tuple[Effect, tuple[Effect, ...]], Hypothesis]]:
     """Yields models without one effect or with simpler laws in its place, with the change."""
     explains = full.share * _difference(base, full, full)
+    moves: list[tuple[Effect, tuple[Effect, ...]]] = []
+    sets: list[tuple[Effect, ...]] = []
     for effect in left.effects:
         simpler = tuple(
             law
@@ -90,10 +93,11 @@ def _simpler(
             options.append(simpler)
         if others and not _is_essential(left, effect, explains):
             options.append(())
-        for instead in options:
-            found = trials.refitted(left, (*others, *instead))
-            if found is not None:
-                yield (effect, instead), found
+        moves += [(effect, instead) for instead in options]
+        sets += [(*others, *instead) for instead in options]
+    for move, found in zip(moves, trials.each_refitted(left, sets), strict=True):
+        if found is not None:
+            yield move, found
 
 
 def _is_essential(hypothesis: Hypothesis, effect: Effect, explains: float) -> bool:
@@ -123,7 +127,7 @@ def _with_minor(
             continue
         found = trials.refitted(core, (*core.effects, effect), start=start)
         gained = 0.0 if found is None else core.share * _difference(core, found, full)
-        if found is not None and gained > PARSIMONY.least_evidence:
+        if found is not None and gained > TRIALS.certain_evidence:
             core = found
             report(f"{effect.name} is added again: it improves the simulation")
     return core

@@ -112,11 +112,13 @@ def repeated_effects(
     """
     while len(current.effects) > 1:
         found = repetitions(current)
-        contradicted = [e for e in current.effects if e.name in found]
-        contradicted = [e for e in contradicted if not found[e.name].is_found_again]
-        if not contradicted:
+        refuted = {name: each for name, each in found.items() if not each.is_found_again}
+        if not refuted:
             break
-        worst = max(contradicted, key=lambda e: found[e.name].contradiction)
+        worst = max(
+            (effect for effect in current.effects if effect.name in refuted),
+            key=lambda effect: refuted[effect.name].contradiction,
+        )
         without = trials.without(current, worst)
         if without is None:
             break
@@ -186,15 +188,10 @@ def _compared(
     num_pairs: int,
 ) -> Repetition:
     """Compares an effect's strengths in two parts."""
-    strengths = {
-        site: p
-        for site, p in zip(effect.parameter_names, effect.parameters, strict=True)
-        if not effect.strength or p.name in effect.strength
-    }
-    sites = list(strengths)
+    sites = [f"{effect.name}.{p.name}" for p in effect.strengths]
     # An infinite nominal value, as that of a limit, is no distance; the value itself is the size.
     nominal = torch.tensor(
-        [p.nominal if math.isfinite(p.nominal) else 0.0 for p in strengths.values()],
+        [p.nominal if math.isfinite(p.nominal) else 0.0 for p in effect.strengths],
         dtype=torch.float64,
     )
     (first, one), (second, other) = (by_part.estimate(sites, index) for _, index in pair)
@@ -208,7 +205,7 @@ def _compared(
             {
                 p.name: (float(value), math.sqrt(max(0.0, float(variance))))
                 for p, value, variance in zip(
-                    strengths.values(), found, covariance.diagonal(), strict=True
+                    effect.strengths, found, covariance.diagonal(), strict=True
                 )
             },
         )

@@ -175,14 +175,24 @@ class Trials:
             effects: The model's effects.
             start: Initial guess of parameters that the hypothesis does not have, by site.
         """
-        kept = {name for effect in effects for name in effect.parameter_names}
-        gone = {name for effect in current.effects for name in effect.parameter_names} - kept
-        begin = {name: value for name, value in current.parameters.items() if name not in gone}
-        begin |= start or {}
-        (found,) = self._fits(
-            [_Fit(segments, effects, begin, current.fit.offsets)], current.simulator
-        )
+        asked = _refit(segments, current, effects, start or {})
+        (found,) = self._fits([asked], current.simulator)
         return found
+
+    def each_refitted(
+        self, current: Hypothesis, sets: Sequence[tuple[Effect, ...]]
+    ) -> Iterator[Hypothesis | None]:
+        """Fits the model with each of several sets of effects; see :meth:`refitted`.
+
+        Args:
+            current: The hypothesis from whose parameters the fits begin.
+            sets: The sets of effects.
+        """
+        asked = []
+        for effects in sets:
+            segments = self._along(effects, current.segments.starts)
+            asked.append(None if segments is None else _refit(segments, current, effects, {}))
+        return self._fits(asked, current.simulator)
 
     def with_own_starts(self, current: Hypothesis) -> Hypothesis:
         """Refits a hypothesis with initial states that are estimated along its own motion.
@@ -273,6 +283,19 @@ class Trials:
             hypothesis = Hypothesis(fit.segments.model, fit.effects, fit.segments, result[0])
             hypothesis.__dict__["difference"] = result[1]  # else it would be simulated again
             yield hypothesis
+
+
+def _refit(
+    segments: SegmentModel,
+    current: Hypothesis,
+    effects: tuple[Effect, ...],
+    start: Mapping[str, Tensor],
+) -> _Fit:
+    """Returns the fit of a model from a hypothesis's parameters and further ones."""
+    kept = {name for effect in effects for name in effect.parameter_names}
+    gone = {name for effect in current.effects for name in effect.parameter_names} - kept
+    begin = {name: value for name, value in current.parameters.items() if name not in gone}
+    return _Fit(segments, effects, {**begin, **start}, current.fit.offsets)
 
 
 def _fitted(asked: _Fit) -> tuple[SegmentFit, Tensor] | None:
