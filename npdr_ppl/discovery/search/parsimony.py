@@ -1,6 +1,6 @@
 """The fewest and simplest laws that explain nearly as much as all that were found.
 
-A law of the catalogue is only similar to what a device does. If something remains that no law of
+A law of the catalogue only approximates a device. If something remains that no law of
 the catalogue explains, a search adds laws that compensate for the difference between the first
 laws and the device: dry friction is split into three laws, and a tilt or a wave takes the rest.
 Each is significant, but none is a cause. A few laws that are left, each in its simplest form, are
