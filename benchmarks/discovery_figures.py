@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from discovery_rows import (
+    PAIRS,
     REMOVED,
     Row,
     effect_id,
@@ -54,7 +55,7 @@ def reliability(rows: Iterable[Row]) -> list[Bin]:
     pairs = [
         (first_probability(row), is_first_right(row))
         for row in rows
-        if row["condition"] in ("one", "inseparable", "two") and found_names(row)
+        if row["condition"] in ("one", "inseparable", *PAIRS) and found_names(row)
     ]
     bins = []
     for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
@@ -93,7 +94,7 @@ def confusion(rows: Iterable[Row]) -> dict[str, Counter[str]]:
     """
     table: dict[str, Counter[str]] = defaultdict(Counter)
     for row in rows:
-        if row["condition"] in ("bad_data", "absorbed", "two"):
+        if row["condition"] in ("bad_data", "absorbed", *PAIRS):
             continue
         truth = effect_id(row["truth"][0]) if row["truth"] else "nothing"
         names = found_names(row)

@@ -10,6 +10,7 @@ from hidden_rigs import RIGS
 
 __all__ = [
     "Judged",
+    "PAIRS",
     "REMOVED",
     "Row",
     "effect_id",
@@ -39,6 +40,9 @@ CONFIDENT = 0.9
 
 REMOVED = ("without", "beyond")
 """Conditions in which the true effect's entry is taken from the catalogue."""
+
+PAIRS = ("two", "two_at_one_place")
+"""Conditions in which two effects are hidden."""
 
 Row = dict[str, Any]
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from discovery_figures import calibration_error, calibration_error_by_chance, reliability
 from discovery_rows import (
+    PAIRS,
     Row,
     effect_id,
     estimates,
@@ -64,17 +65,14 @@ def summary_lines(rows: Sequence[Row]) -> list[Line]:
     for row in rows:
         of[row["condition"]].append(row)
     nulls = [row for row in rows if row["condition"].startswith("null")]
-    two = of["two"]
     missing = of["outside"] + of["without"] + of["beyond"]
     return [
         *_null_lines(nulls),
         *_one_lines(of["one"]),
         _rate("inseparable: class reported", of["inseparable"], is_class_right, lower=0.95),
         _wrong("inseparable: confident wrong name", of["inseparable"], upper=0.02),
-        _rate("two effects: both", two, has_all, lower=0.80),
-        _rate("… by name or class", two, has_all_classes),
-        _rate("two effects: at least one", two, has_any, lower=0.98, baselines=_naming(two)),
-        _rate("two effects: spurious third", two, has_too_many, upper=0.05),
+        *_pair_lines("two effects", of["two"], both=0.80, third=0.05),
+        *_pair_lines("two at one place", of["two_at_one_place"], both=0.90, third=0.03),
         *(
             _rate(
                 f"{where}: “unknown”",
@@ -231,7 +229,7 @@ def gap_closed(rows: Iterable[Row]) -> list[float]:
 
 
 def _has_visible_gap(row: Row) -> bool:
-    if row["condition"] not in ("one", "two") or not row["d"] >= STRONG or not row.get("gap"):
+    if row["condition"] not in ("one", *PAIRS) or not row["d"] >= STRONG or not row.get("gap"):
         return False
     if row.get("true_model") is None:
         return False
@@ -244,6 +242,15 @@ def _true_error(row: Row) -> float:
 
 def _ratio(row: Row, one: str, other: str) -> float:
     return row["gap"]["rmse"][one] / row["gap"]["rmse"][other]
+
+
+def _pair_lines(where: str, rows: Sequence[Row], *, both: float, third: float) -> list[Line]:
+    return [
+        _rate(f"{where}: both", rows, has_all, lower=both),
+        _rate("… by name or class", rows, has_all_classes),
+        _rate(f"{where}: at least one", rows, has_any, lower=0.98, baselines=_naming(rows)),
+        _rate(f"{where}: spurious third", rows, has_too_many, upper=third),
+    ]
 
 
 def _parameter_lines(rows: Sequence[Row]) -> list[Line]:

@@ -28,14 +28,15 @@ Condition = Literal[
     "null_outliers",
     "one",
     "two",
+    "two_at_one_place",
     "inseparable",
     "outside",
     "absorbed",
     "bad_data",
 ]
-"""What is hidden: nothing, under four kinds of noise; one effect; two; one of a class that the
-excitation cannot split; one that no catalogue has; one that the model's parameters swallow; or
-nothing, in data that were spoilt."""
+"""What is hidden: nothing, under four kinds of noise; one effect; two at different ports; two at
+one joint or command; one of a class that the excitation cannot split; one that no catalogue has;
+one that the model's parameters swallow; or nothing, in data that were spoilt."""
 
 CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 """All conditions."""
@@ -124,6 +125,8 @@ def places(rig: str, condition: Condition, seed: int = 0) -> tuple[tuple[Place, 
         return tuple((("data", kind),) for kind in FAULTS)
     if condition == "two":
         return (_pair(chosen, seed),)
+    if condition == "two_at_one_place":
+        return chosen.pairs
     groups: dict[str, Sequence[Place]] = {
         "one": chosen.effects,
         "inseparable": tuple(chosen.inseparable),

@@ -49,6 +49,24 @@ def _at(port: str, *groups: tuple[str, ...]) -> tuple[Place, ...]:
     return tuple((port, effect_id) for group in groups for effect_id in group)
 
 
+def _pairs(joint: str, command: str, *others: tuple[str, str]) -> tuple[tuple[Place, Place], ...]:
+    """Returns ten pairs: those of all rigs, at one joint and one command, and others there."""
+    at_joint = (
+        ("coulomb_friction", "quadratic_drag"),
+        ("coulomb_friction", "stribeck_friction"),
+        ("coulomb_friction", "hardening_spring"),
+        ("coulomb_friction", "periodic_disturbance"),
+        ("spring", "bias"),
+        ("backlash", "coulomb_friction"),
+        *others,
+    )
+    at_command = (("input_delay", "actuator_lag"), ("dead_zone", "actuator_lag"))
+    return (
+        *(((joint, one), (joint, other)) for one, other in at_joint),
+        *(((command, one), (command, other)) for one, other in at_command),
+    )
+
+
 _Alternatives = dict[Place, tuple[tuple[Place, ...], ...]]
 
 
@@ -97,6 +115,12 @@ PENDULUM = Rig(
         ("angle", "encoder_bias"),
         ("angle", "encoder_scale"),
         ("clock", "clock_skew"),
+    ),
+    pairs=_pairs(
+        "hinge",
+        "torque",
+        ("coulomb_friction", "viscous_friction"),
+        ("coulomb_friction", "cogging"),
     ),
     absorbed=(("torque", "actuator_gain"), ("payload", "payload")),
     inseparable={
@@ -224,6 +248,12 @@ CART_POLE = Rig(
         ("pole_angle", "encoder_scale"),
         ("clock", "clock_skew"),
     ),
+    pairs=_pairs(
+        "rail",
+        "force",
+        ("coulomb_friction", "load_dependent_friction"),
+        ("joint_elasticity", "coulomb_friction"),
+    ),
     absorbed=(
         ("force", "actuator_gain"),
         ("payload", "payload"),
@@ -267,6 +297,12 @@ EMPS = Rig(
         ("velocity", "sensor_low_pass"),
         ("position", "encoder_scale"),
         ("clock", "clock_skew"),
+    ),
+    pairs=_pairs(
+        "carriage",
+        "voltage",
+        ("coulomb_friction", "load_dependent_friction"),
+        ("joint_elasticity", "coulomb_friction"),
     ),
     absorbed=(
         ("voltage", "actuator_gain"),

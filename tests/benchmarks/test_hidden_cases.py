@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from discovery_rows import PAIRS
 from hidden_rigs import CONDITIONS, RIGS, cases, make_case, places
 from hidden_rigs.measurement import Measurement, noisy
 
@@ -55,9 +56,9 @@ def test_conditions(condition):
     # Of conditions with many places one strength will do: the loop over strengths is shared.
     strengths = [2.0] if number > 6 else [0.5, 2.0]
     found = list(cases(condition, seeds=[0], rigs=["emps"], strengths=strengths))
-    scaled = condition in ("one", "two", "inseparable", "outside", "absorbed")
+    scaled = condition in ("one", *PAIRS, "inseparable", "outside", "absorbed")
     assert len(found) == number * (len(strengths) if scaled else 1)
-    sizes = {"two": 2} | {c: 0 for c in CONDITIONS if c.startswith("null")}
+    sizes = dict.fromkeys(PAIRS, 2) | {c: 0 for c in CONDITIONS if c.startswith("null")}
     for case in found:
         assert case.condition == condition
         assert len(case.truth) == sizes.get(condition, 1)
@@ -72,6 +73,14 @@ def test_pairs_are_not_alternatives_of_each_other():
             ((first, second),) = places(name, "two", seed)
             assert first[0] != second[0]
             assert (second,) not in RIGS[name].inseparable.get(first, ())
+
+
+def test_pairs_at_one_place_are_effects_of_the_rig():
+    for rig in RIGS.values():
+        for pair in places(rig.name, "two_at_one_place"):
+            assert len({port for port, _ in pair}) == 1
+            assert len(set(pair)) == 2
+            assert set(pair) <= set(rig.effects)
 
 
 def test_what_comes_to_the_same_is_said():
