@@ -56,7 +56,7 @@ def _pairs(joint: str, command: str, *others: tuple[str, str]) -> tuple[tuple[Pl
         ("coulomb_friction", "stribeck_friction"),
         ("coulomb_friction", "hardening_spring"),
         ("coulomb_friction", "periodic_disturbance"),
-        ("spring", "bias"),
+        ("hardening_spring", "bias"),
         ("backlash", "coulomb_friction"),
         *others,
     )

@@ -54,6 +54,7 @@ class Spring(LinearForceEffect):
         Parameter("rest", "{coordinate}", 0.0, "position q₀ without force"),
     )
     strength = ("stiffness",)
+    beside = ("bias",)
     law = "−k (q − q₀)"
     equivalence = (POSITION_SCALE,)
     excitation = "wide_range"

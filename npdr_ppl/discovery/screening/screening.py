@@ -6,7 +6,7 @@ all parameters and the initial states. Whether the gain is larger than chance ex
 """
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 from npdr_ppl.discovery.screening.projection import Projection, Scores
 from npdr_ppl.discovery.screening.sensitivities import Variant
 
-__all__ = ["Screened", "Screening", "screen"]
+__all__ = ["Screened", "Screening", "screen", "within_limits"]
 
 DETECTABLE = 5.0
 """Separation above which an effect is detected among a hundred candidates."""
@@ -68,7 +68,7 @@ class Screening:
     def add(self, variant: Variant) -> None:
         """Keeps a candidate if no other shape or size of the same effect has a larger gain."""
         scores = self._projection.scores(variant.change)
-        sizes, gain = _within_limits(scores, variant)
+        sizes, gain = within_limits(scores.information, scores.score, (variant,))
         if gain <= 0.0:
             return
         name = variant.effect.name
@@ -101,33 +101,44 @@ def screen(projection: Projection, variants: Iterable[Variant]) -> list[Screened
     return screening.ranking()
 
 
-def _within_limits(scores: Scores, variant: Variant) -> tuple[Tensor, float]:
+def within_limits(
+    information: Tensor, score: Tensor, variants: Sequence[Variant]
+) -> tuple[Tensor, float]:
     """Returns the sizes with the largest gain that the priors allow, and the gain.
 
-    Every choice of sizes that are at a limit is tried, and the others are fitted. This is fast,
-    because there are few strengths.
+    If the best sizes are outside the limits, every choice of sizes that are at a limit is tried,
+    and the others are fitted. This is fast, because there are few strengths.
+
+    Args:
+        information: Information of all strengths, ``(k, k)``.
+        score: Their scores, ``(k,)``.
+        variants: The candidates that have these strengths, in order.
     """
-    num = len(variant.strengths)
-    precision = variant.deviation.square().reciprocal().diag()
-    information, score = scores.information + precision, scores.score
+    deviation = torch.cat([variant.deviation for variant in variants])
+    lower = torch.cat([variant.lower for variant in variants])
+    upper = torch.cat([variant.upper for variant in variants])
+    information = information + deviation.square().reciprocal().diag()
+    num = len(score)
     best, gain = torch.zeros(num, dtype=torch.float64), 0.0
+    # The first choice has no size at a limit.
     for states in itertools.product((0, 1, 2), repeat=num):
         sizes = torch.zeros(num, dtype=torch.float64)
         fixed = [k for k in range(num) if states[k]]
         for k in fixed:
-            limit = variant.lower[k] if states[k] == 1 else variant.upper[k]
-            sizes[k] = limit
+            sizes[k] = lower[k] if states[k] == 1 else upper[k]
         if not bool(sizes.isfinite().all()):
             continue
         free = [k for k in range(num) if not states[k]]
         if free:
             rest = (score - information @ sizes)[free]
             sizes[free] = torch.linalg.solve(information[free][:, free], rest)
-        if bool(((sizes < variant.lower - 1e-9) | (sizes > variant.upper + 1e-9)).any()):
+        if bool(((sizes < lower - 1e-9) | (sizes > upper + 1e-9)).any()):
             continue
         found = float(2.0 * score @ sizes - sizes @ information @ sizes)
         if found > gain:
             best, gain = sizes, found
+        if not fixed:
+            break  # it is the largest of all
     return best, gain
 
 

@@ -41,6 +41,7 @@ class Variant:
         deviation: Standard deviation of the priors in multiples of the size, by strength.
         change: Change of the whitened measurements per size, ``(S, N, k)``.
         is_hinted: Whether its shape was found on the recording itself.
+        is_linear: Whether its change is proportional to its strengths while these are small.
     """
 
     effect: Effect
@@ -52,6 +53,7 @@ class Variant:
     deviation: Tensor
     change: Tensor
     is_hinted: bool = False
+    is_linear: bool = True
 
     def parameters(self, sizes: Tensor) -> dict[str, Tensor]:
         """Returns the parameters by site name for multiples of the size, ``(k,)``."""
@@ -226,6 +228,7 @@ def _variants(probe: _Probe, rows: Tensor, rounding: float) -> list[Variant]:
                 deviation,
                 change,
                 is_hinted,
+                not _needs_size(probe.effect, strengths),
             )
         )
     return result

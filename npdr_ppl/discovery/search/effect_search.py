@@ -11,6 +11,7 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.alarm import Alarm, sound_alarm
 from npdr_ppl.discovery.screening.latent_force import Responses, responses
+from npdr_ppl.discovery.screening.pairs import Pair, ranked_pairs
 from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.screening.sensitivities import Variant
@@ -26,7 +27,7 @@ from npdr_ppl.discovery.search.alternatives import (
 )
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps
 from npdr_ppl.discovery.search.evidence import closest, weigh
-from npdr_ppl.discovery.search.parsimony import simplest_laws
+from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
 from npdr_ppl.discovery.search.repeatability import repeated_effects
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
@@ -55,6 +56,7 @@ class Round:
         ranking: The candidates by linear gain.
         separation: Distances between the best candidates; see :mod:`separation`.
         responses: Changes of the measurements by pulses of force at the joints.
+        pairs: Pairs of the best candidates by joint linear gain.
         weights: Probability of each candidate fitted in full, by name; ``""`` for no effect.
         trials: The model with each of these candidates, by name.
     """
@@ -65,6 +67,7 @@ class Round:
     ranking: list[Screened]
     separation: Tensor
     responses: Responses
+    pairs: list[Pair] = field(default_factory=list)
     weights: dict[str, float] = field(default_factory=dict)
     trials: dict[str, Hypothesis] = field(default_factory=dict)
 
@@ -201,9 +204,12 @@ class Searcher:
         while len(current.effects) < max_effects and _is_something_left(first, now):
             best, weights, tried = self._extended(current, now)
             rounds[-1] = replace(now, weights=weights, trials=tried)
-            if best is None or _is_negligible(first.hypothesis, current, tried[best]):
+            if best is not None and _is_negligible(first.hypothesis, current, tried[best]):
+                best = None
+            extended = self._or_pair(rounds, current if best is None else tried[best])
+            if extended is current:
                 break
-            current = self.trials.with_own_starts(self._pruned(tried[best]))
+            current = self.trials.with_own_starts(self._pruned(extended))
             if not self.are_steps_coarse and self.with_finer_steps(current) is not current:
                 # The missing effect had hidden that the steps are too coarse: restart the search.
                 current = self.fit_base()
@@ -231,9 +237,11 @@ class Searcher:
             current = repeated_effects(current, self.trials, self._report)
             # As long as something remains that no law explains, the laws are approximations.
             is_approximate = _is_something_left(rounds[0], self._looked(current, rounds))
+            candidates = candidates_at(base, self.options)
             if is_approximate:
-                candidates = candidates_at(base, self.options)
                 current = simplest_laws(base, current, candidates, self.trials, self._report)
+            else:
+                current = plausible_laws(current, candidates, self.trials, self._report)
             current, added, trials = self.with_rivals(
                 current, rounds, is_approximate=is_approximate
             )
@@ -282,6 +290,7 @@ class Searcher:
             num_looks=looks,
         )
         separation = separation_matrix(projection, ranking[: SEARCH.num_leading])
+        pairs = ranked_pairs(projection, ranking[: SEARCH.num_paired])
         ranking = [candidate.without_change() for candidate in ranking]
         width = averaged.segments.steps_per_average
         if width > 1:
@@ -294,7 +303,7 @@ class Searcher:
         self._report(
             f"p = {alarm.p_value:.2g} ({alarm.strongest}); the best candidates are {best}"
         )
-        self._last = Round(hypothesis, averaged, alarm, ranking, separation, found)
+        self._last = Round(hypothesis, averaged, alarm, ranking, separation, found, pairs)
         return self._last
 
     def _extended(
@@ -334,6 +343,39 @@ class Searcher:
             return None, weights, trials
         self._report(f"adding {best}")
         return best, weights, trials
+
+    def _or_pair(self, rounds: list[Round], current: Hypothesis) -> Hypothesis:
+        """Returns the best pair of effects if it is likelier than the last two effects.
+
+        The last but one effect may stand for two others. So the pairs without it are tried.
+
+        Args:
+            rounds: The results before each addition.
+            current: The model after the last addition.
+        """
+        if len(rounds) < 2:
+            return current
+        before, after = rounds[-2], rounds[-1].hypothesis
+        new = set(after.names) - set(before.hypothesis.names)
+        pairs = [pair for pair in before.pairs if not pair.names & new][: TRIALS.pairs]
+        if len(new) != 1 or not pairs:
+            return current
+        step = self._progress.stage("pairs of effects", may_end_early=True)
+        tried = self.trials.with_pairs(before.hypothesis, pairs, self._report, step)
+        if not tried:
+            return current
+        tried = self.trials.converged(tried)
+        hypotheses = [current, *tried.values()]
+        each = math.log(SEARCH.prior_of_any / max(1, len(before.ranking)))
+        prior = [each * len(h.effects) + log_prior(h) for h in hypotheses]
+        weights = weigh(hypotheses, prior)
+        best = max(range(len(weights)), key=weights.__getitem__)
+        # A pair that is only slightly likelier may be so by chance.
+        if best == 0 or weights[best] <= self.options.confidence:
+            return current
+        names = [e.name for e in hypotheses[best].effects if e.name not in before.hypothesis.names]
+        self._report(f"{' and '.join(names)} together explain more")
+        return hypotheses[best]
 
     def _pruned(self, current: Hypothesis) -> Hypothesis:
         """Removes effects that are no longer needed after the last addition."""

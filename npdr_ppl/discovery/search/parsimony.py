@@ -7,18 +7,18 @@ Each is significant, but none is a cause. A few laws that are left, each in its 
 the likelier causes; the others are added again if they do not overlap.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.projection import loss_without
-from npdr_ppl.discovery.search.settings import PARSIMONY, TRIALS
+from npdr_ppl.discovery.search.settings import EVIDENCE, PARSIMONY, TRIALS
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.language.effects import Effect
 
-__all__ = ["lost_share", "overlap", "simplest_laws"]
+__all__ = ["lost_share", "overlap", "plausible_laws", "simplest_laws"]
 
 
 def simplest_laws(
@@ -70,6 +70,43 @@ def simplest_laws(
     return _with_minor(current, left, minor, trials, report)
 
 
+def plausible_laws(
+    current: Hypothesis,
+    candidates: Sequence[Effect],
+    trials: Trials,
+    report: Callable[[str], None] = lambda _: None,
+) -> Hypothesis:
+    """Replaces laws whose shape the recording does not tell.
+
+    If the simpler laws that a law contains fit equally well, it takes their form: a drift that
+    takes hours is friction. If another law beside it makes an implausible shape plausible, that is
+    added: a spring with a distant rest position is a spring and a constant force.
+
+    Args:
+        current: The model with all effects that were found.
+        candidates: Effects that may be added to the original model.
+        trials: Fits the model.
+        report: Called with a sentence about each change.
+    """
+    for effect in current.effects:
+        options = _simple_forms(effect, current, candidates)
+        if current.at_edge(effect):
+            beside = _new_laws(effect, effect.beside, current, candidates)
+            options += [(effect, law) for law in beside]
+        others = tuple(e for e in current.effects if e.name != effect.name)
+        found = trials.each_refitted(current, [(*others, *laws) for laws in options])
+        # The fewest laws come first.
+        for laws, trial in zip(options, found, strict=True):
+            if trial is None or any(trial.at_edge(law) for law in laws):
+                continue
+            if current.share * _difference(trial, current, current) < EVIDENCE.indistinct_loss:
+                names = " and ".join(law.name for law in laws)
+                report(f"{effect.name} becomes {names}: the recording does not tell its shape")
+                current = trial
+                break
+    return current
+
+
 def _simpler(
     base: Hypothesis,
     full: Hypothesis,
@@ -82,15 +119,8 @@ def _simpler(
     moves: list[tuple[Effect, tuple[Effect, ...]]] = []
     sets: list[tuple[Effect, ...]] = []
     for effect in left.effects:
-        simpler = tuple(
-            law
-            for law in candidates
-            if law.port == effect.port and law.id in effect.contains and law.name not in left.names
-        )
         others = tuple(e for e in left.effects if e.name != effect.name)
-        options: list[tuple[Effect, ...]] = [(law,) for law in simpler]
-        if len(simpler) > 1:
-            options.append(simpler)
+        options = _simple_forms(effect, left, candidates)
         if others and not _is_essential(left, effect, explains):
             options.append(())
         moves += [(effect, instead) for instead in options]
@@ -98,6 +128,25 @@ def _simpler(
     for move, found in zip(moves, trials.each_refitted(left, sets), strict=True):
         if found is not None:
             yield move, found
+
+
+def _simple_forms(
+    effect: Effect, current: Hypothesis, candidates: Sequence[Effect]
+) -> list[tuple[Effect, ...]]:
+    """Returns the simpler laws that an effect contains, each alone and all together."""
+    simpler = _new_laws(effect, effect.contains, current, candidates)
+    return [(law,) for law in simpler] + ([simpler] if len(simpler) > 1 else [])
+
+
+def _new_laws(
+    effect: Effect, ids: Collection[str], current: Hypothesis, candidates: Sequence[Effect]
+) -> tuple[Effect, ...]:
+    """Returns candidates at an effect's port, by their ids, that a hypothesis does not have."""
+    return tuple(
+        law
+        for law in candidates
+        if law.port == effect.port and law.id in ids and law.name not in current.names
+    )
 
 
 def _is_essential(hypothesis: Hypothesis, effect: Effect, explains: float) -> bool:

@@ -75,7 +75,8 @@ def repetitions(hypothesis: Hypothesis) -> dict[str, Repetition]:
 
     An effect is not found again if its estimates in two parts differ by more than chance allows,
     and by more than the effect's size. A part that hardly determines the effect contradicts
-    nothing.
+    nothing. Effects with local minima are not compared: a Gauss-Newton step does not find another
+    minimum.
 
     Args:
         hypothesis: The fitted model; its effects are compared.
@@ -92,6 +93,8 @@ def repetitions(hypothesis: Hypothesis) -> dict[str, Repetition]:
     by_part = _ByPart(hypothesis)
     result = {}
     for effect in hypothesis.effects:
+        if effect.has_local_minima:
+            continue
         found = [_compared(by_part, effect, pair, len(pairs)) for pair in pairs]
         contradicted = [each for each in found if not each.is_found_again]
         result[effect.name] = max(contradicted or found, key=lambda each: each.contradiction)

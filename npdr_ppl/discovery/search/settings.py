@@ -58,6 +58,7 @@ class SearchSettings:
             misfit. If a large effect was missing, differences between integrators and in details
             of the laws are this large.
         num_leading: Number of best candidates whose pairwise distances are computed.
+        num_paired: Number of best candidates whose pairs are screened.
         prior_of_any: Prior probability that any effect of the catalogue is missing.
         most_revisions: Greatest number of times that the effects are simplified and compared with
             their alternatives. A second time is needed if an alternative is not found again in
@@ -66,13 +67,14 @@ class SearchSettings:
 
     least_unexplained: float = 1e-4
     num_leading: int = 10
+    num_paired: int = 20
     prior_of_any: float = 0.5
     most_revisions: int = 2
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 0.0, 1.0, "least_unexplained", "prior_of_any")
-        check_range(self, 2, 1000, "num_leading")
+        check_range(self, 2, 1000, "num_leading", "num_paired")
         check_range(self, 1, 100, "most_revisions")
 
 
@@ -132,6 +134,7 @@ class TrialSettings:
 
     Attributes:
         shortlist: Greatest number of candidates that are fitted in full in each round.
+        pairs: Greatest number of pairs of candidates that are fitted in full in each round.
         most_steps: Greatest number of steps of a fit.
         first_steps: Greatest number of steps of a first fit, which shows whether a longer fit is
             worth it.
@@ -149,6 +152,7 @@ class TrialSettings:
     """
 
     shortlist: int = 6
+    pairs: int = 3
     most_steps: int = 12
     first_steps: int = 6
     most_converged: int = 3
@@ -165,6 +169,7 @@ class TrialSettings:
             1,
             100,
             "shortlist",
+            "pairs",
             "most_steps",
             "first_steps",
             "most_converged",

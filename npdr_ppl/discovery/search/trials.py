@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis, extended, fit_segment_model
+from npdr_ppl.discovery.screening.pairs import Pair
 from npdr_ppl.discovery.screening.repetition import keeps_in_step
 from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.search.evidence import closest
@@ -85,11 +86,16 @@ class Trials:
                 waiting[: TRIALS.candidates_per_decision],
                 waiting[TRIALS.candidates_per_decision :],
             )
-            asked = [self._trial(current, candidate) for candidate in tried]
-            for candidate, found in zip(tried, self._fits(asked, current.simulator), strict=True):
-                if found is not None:
-                    trials[candidate.name] = found
-                    report(f"tried {candidate.name}: {_shown(found)}")
+            asked = [(c, self._trial(current, c, start)) for c in tried for start in _starts(c)]
+            fits = self._fits([fit for _, fit in asked], current.simulator)
+            found: dict[str, list[Hypothesis]] = {}
+            for (candidate, _), trial in zip(asked, fits, strict=True):
+                if trial is not None:
+                    found.setdefault(candidate.name, []).append(trial)
+            for candidate in tried:
+                if candidate.name in found:
+                    trials[candidate.name] = _best(found[candidate.name])
+                    report(f"tried {candidate.name}: {_shown(trials[candidate.name])}")
                 done += 1
                 fitted(done)
             if trials:
@@ -97,6 +103,45 @@ class Trials:
                 waiting = [
                     c for c in waiting if c.gain * TRIALS.largest_growth > far * ranking[0].gain
                 ]
+        return trials
+
+    def with_pairs(
+        self,
+        current: Hypothesis,
+        pairs: Sequence[Pair],
+        report: Callable[[str], None] = lambda _: None,
+        progress: Step = lambda fraction, status: None,
+    ) -> dict[str, Hypothesis]:
+        """Fits the hypothesis with each of several pairs of candidates, from linear estimates.
+
+        Args:
+            current: The hypothesis.
+            pairs: The pairs.
+            report: Called with a sentence about each pair.
+            progress: Called with the fraction of the pairs that is fitted.
+
+        Returns:
+            The model with each pair, by the names of both; pairs that cannot be simulated are left
+            out.
+        """
+        asked = []
+        for pair in pairs:
+            added = (*current.effects, *(member.variant.effect for member in pair.members))
+            segments = self._along(added, current.segments.starts)
+            start = current.parameters | pair.parameters
+            asked.append(
+                None
+                if segments is None
+                else _Fit(segments, added, start, current.fit.offsets, is_trial=True)
+            )
+        trials: dict[str, Hypothesis] = {}
+        fits = self._fits(asked, current.simulator)
+        for number, (pair, found) in enumerate(zip(pairs, fits, strict=True), 1):
+            if found is not None:
+                name = " and ".join(member.name for member in pair.members)
+                trials[name] = found
+                report(f"tried {name}: {_shown(found)}")
+            progress(number / len(pairs), f"{number} of {len(pairs)} pairs fitted")
         return trials
 
     def converged(
@@ -251,14 +296,16 @@ class Trials:
         """Refits a hypothesis without one of its effects; see :meth:`refitted`."""
         return self.refitted(current, tuple(e for e in current.effects if e.name != effect.name))
 
-    def _trial(self, current: Hypothesis, candidate: Screened) -> _Fit | None:
-        """Returns the short fit of a hypothesis with a candidate, from its linear estimate."""
+    def _trial(
+        self, current: Hypothesis, candidate: Screened, start: Mapping[str, Tensor]
+    ) -> _Fit | None:
+        """Returns the short fit of a hypothesis with a candidate from its first parameters."""
         effects = (*current.effects, candidate.variant.effect)
         segments = self._along(effects, current.segments.starts)
         if segments is None:
             return None
-        start = current.parameters | candidate.variant.parameters(candidate.sizes)
-        return _Fit(segments, effects, start, current.fit.offsets, is_trial=True)
+        begin = current.parameters | start
+        return _Fit(segments, effects, begin, current.fit.offsets, is_trial=True)
 
     def _along(
         self, effects: tuple[Effect, ...], starts: InitialStates | None
@@ -283,6 +330,25 @@ class Trials:
             hypothesis = Hypothesis(fit.segments.model, fit.effects, fit.segments, result[0])
             hypothesis.__dict__["difference"] = result[1]  # else it would be simulated again
             yield hypothesis
+
+
+def _starts(candidate: Screened) -> list[dict[str, Tensor]]:
+    """Returns the first parameters of a candidate's fits: its linear estimate, and others.
+
+    Where changes are not linear, the linear estimate can be far from the best fit, with a local
+    minimum between them: a lag beside a delay that already explains their sum.
+    """
+    variant = candidate.variant
+    starts = [variant.parameters(candidate.sizes)]
+    if not variant.is_linear and not variant.effect.is_resonant:
+        starts.append(variant.parameters(torch.ones_like(candidate.sizes)))
+    return starts
+
+
+def _best(trials: Sequence[Hypothesis]) -> Hypothesis:
+    """Returns the hypothesis with the least loss."""
+    scale = closest(trials).fit.scale
+    return min(trials, key=lambda trial: float(trial.losses(scale).sum()))
 
 
 def _refit(
