@@ -2,19 +2,21 @@
 
 import pyro.distributions as dist
 import pytest
+from hidden_rigs import make_case
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.alternatives import _strains
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.search.parsimony import lost_share, overlap, simplest_laws
+from npdr_ppl.discovery.search.parsimony import lost_share, overlap, plausible_laws, simplest_laws
 from npdr_ppl.models.effects import (
     Bias,
     CoulombFriction,
     FrictionDrift,
     PreslidingFriction,
     QuadraticDrag,
+    Spring,
     StribeckFriction,
     ViscousFriction,
     Wind,
@@ -55,6 +57,40 @@ def test_a_law_whose_shape_explains_nothing_takes_its_simplest_form(rubbed, law)
     searcher, base = rubbed
     found = simplest(searcher, base, fitted(searcher, law("hinge")))
     assert found.names == ("hinge.coulomb_friction",)
+
+
+def plausible(searcher, base, current):
+    candidates = candidates_at(base, searcher.options)
+    return plausible_laws(current, candidates, searcher.trials)
+
+
+def test_a_drift_whose_time_the_recording_does_not_tell_is_friction(rubbed):
+    searcher, base = rubbed
+    found = plausible(searcher, base, fitted(searcher, FrictionDrift("hinge")))
+    assert found.names == ("hinge.coulomb_friction",)
+    friction = fitted(searcher, CoulombFriction("hinge"))
+    assert plausible(searcher, base, friction) is friction
+
+
+@pytest.mark.parametrize(
+    ("hidden", "law", "expected"),
+    [
+        (
+            ("coulomb_friction", "viscous_friction"),
+            FrictionDrift,
+            {"hinge.coulomb_friction", "hinge.viscous_friction"},
+        ),
+        (("spring", "bias"), Spring, {"hinge.spring", "hinge.bias"}),
+    ],
+)
+def test_a_law_with_an_unknown_shape_becomes_a_pair(hidden, law, expected):
+    places = tuple(("hinge", effect) for effect in hidden)
+    strength = (0.1, 1.0) if law is Spring else (0.3, 0.3)
+    case = make_case("pendulum", "two_at_one_place", places, strength=strength, seed=2001)
+    searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions())
+    base = searcher.fit_base()
+    current = searcher.trials.refitted(base, (law("hinge"),))
+    assert set(plausible(searcher, base, current).names) == expected
 
 
 def test_an_effect_that_explains_much_stays(rubbed):

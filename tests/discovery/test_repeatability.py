@@ -9,7 +9,7 @@ import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.search.repeatability import repeated_effects, repetitions
 from npdr_ppl.discovery.search.trials import Trials
-from npdr_ppl.models.effects import Bias, Cogging, CoulombFriction, Saturation
+from npdr_ppl.models.effects import Backlash, Bias, Cogging, CoulombFriction, Saturation
 from npdr_ppl.models.pendulum import pendulum
 from tests.helpers.pendulum_recordings import swinging
 
@@ -99,3 +99,8 @@ def test_waves_are_compared_in_both_components():
     found = repetitions(fitted(swinging(), Cogging("hinge")))["hinge.cogging"]
     assert found.is_found_again
     assert [list(part.strengths) for part in found.estimates] == [["sine", "cosine"]] * 2
+
+
+def test_effects_with_local_minima_are_not_compared():
+    found = repetitions(fitted(swinging(), Backlash("hinge"), CoulombFriction("hinge")))
+    assert set(found) == {"hinge.coulomb_friction"}
