@@ -74,6 +74,13 @@ def discover(
     false_alarm_rate: Annotated[
         float, typer.Option(help="Probability of an alarm if nothing is missing.")
     ] = 0.01,
+    repeat: Annotated[
+        bool,
+        typer.Option(
+            "--repeat",
+            help="Search both halves of the recording, too; name only what is found in both.",
+        ),
+    ] = False,
     stage: Annotated[
         LastStage, typer.Option(help="Stop after this stage and write the results so far.")
     ] = LastStage.PROVE,
@@ -119,6 +126,7 @@ def discover(
         effects=tuple(named_effects([candidates])) if candidates else None,
         max_effects=max_effects,
         false_alarm_rate=false_alarm_rate,
+        repeat=repeat,
     )
     folder = DiscoveryFolder(out)
     with claimed(out):

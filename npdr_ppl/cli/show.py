@@ -152,6 +152,11 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         minor = [f"{e['port']}.{e['effect']}" for e in found["effects"] if e.get("is_minor")]
         if minor:
             console.print(f"Too small to be named, but in the model: {escape(', '.join(minor))}.")
+        for effect in found["effects"]:
+            missed = [name for name, is_in in (effect.get("in_halves") or {}).items() if not is_in]
+            if missed:
+                name = f"{effect['port']}.{effect['effect']}"
+                console.print(f"Not found in {' and '.join(missed)}: {escape(name)}.")
     if found["gap"]:
         table = Table(title="Held-out rollouts", box=SIMPLE)
         table.add_column("metric", no_wrap=True)

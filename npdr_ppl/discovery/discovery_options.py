@@ -21,12 +21,15 @@ class DiscoveryOptions:
         max_effects: Greatest number of effects to add.
         false_alarm_rate: Probability that an alarm fires although nothing is missing.
         confidence: Probability above which one cause is named.
+        repeat: Whether both halves of the recording are searched, too. An effect that is not found
+            in both is not named. This takes about twice as long.
     """
 
     effects: tuple[Effect, ...] | None = None
     max_effects: int = 5
     false_alarm_rate: float = 0.01
     confidence: float = 0.9
+    repeat: bool = False
 
     def __post_init__(self) -> None:
         """Checks that the numbers are in range.

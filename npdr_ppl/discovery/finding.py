@@ -1,6 +1,7 @@
 """An effect that was missing, with its probability and its parameters."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from npdr_ppl.discovery.proof.parameter_intervals import Estimate
@@ -27,6 +28,8 @@ class Finding:
         is_minor: Whether it explains too little to be named: no strength differs from zero by two
             standard deviations, or its share is small and something remains that no law explains.
         repetition: Its strengths in parts of the recording; ``None`` for short recordings.
+        in_halves: Whether it was found in each half of the recording, by the half's name; empty if
+            the halves were not searched.
     """
 
     effect: Effect
@@ -38,11 +41,17 @@ class Finding:
     at_edge: tuple[str, ...] = ()
     is_minor: bool = False
     repetition: Repetition | None = None
+    in_halves: Mapping[str, bool] = field(default_factory=dict)
 
     @property
     def is_found_again(self) -> bool:
         """Whether no part of the recording contradicts it."""
         return self.repetition is None or self.repetition.is_found_again
+
+    @property
+    def can_be_named(self) -> bool:
+        """Whether it is large enough, and was found in every half that was searched."""
+        return not self.is_minor and all(self.in_halves.values())
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values."""
@@ -58,4 +67,5 @@ class Finding:
             "is_minor": self.is_minor,
             "is_found_again": self.is_found_again,
             "parts": [] if self.repetition is None else self.repetition.to_list(),
+            "in_halves": dict(self.in_halves),
         }

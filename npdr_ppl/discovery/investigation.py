@@ -27,6 +27,7 @@ from npdr_ppl.discovery.screening.encoder_resolution import counts
 from npdr_ppl.discovery.screening.equivalents import equivalents
 from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.effect_search import Round, Search, Searcher, explained
+from npdr_ppl.discovery.search.halves import found_in_halves, search_halves
 from npdr_ppl.discovery.search.limits import limits
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
 from npdr_ppl.discovery.search.repeatability import Repetition, repetitions
@@ -214,6 +215,15 @@ class Investigation:
             return self._searcher.run(first, max_effects=self.settings.max_effects)
 
     @cached_property
+    def halves(self) -> dict[str, Search]:
+        """The missing effects of each half of the recording; empty if that was not asked for."""
+        if not self.settings.repeat or not self.search.added:
+            return {}
+        first = self.search.rounds[0].hypothesis
+        with self._stage("search halves"):
+            return search_halves(self._searcher, first, max_effects=self.settings.max_effects)
+
+    @cached_property
     def _at_edge(self) -> list[tuple[str, ...]]:
         """For each effect, the shape parameters that have, or may have, an implausible value."""
         search = self.search
@@ -299,7 +309,14 @@ class Investigation:
         every = estimates(final, self._draws(final), _units(final))
         again = repetitions(final)
         effects = [
-            _finding(added, search, every, at_edge, again.get(added.effect.name))
+            _finding(
+                added,
+                search,
+                every,
+                at_edge,
+                again.get(added.effect.name),
+                found_in_halves(added.effect, self.halves),
+            )
             for added, at_edge in zip(search.added, self._at_edge, strict=True)
         ]
         effects.sort(key=lambda found: found.share, reverse=True)
@@ -421,12 +438,14 @@ def _judge(
             f"{once[0][0].effect.name} explains the misfit only with different values for {one} "
             f"and {other}, so it is not the cause."
         )
-    unsure = [f for f in effects if f.probability < options.confidence and not f.is_minor]
-    sure = [f for f in effects if f.probability >= options.confidence and not f.is_minor]
+    unsure = [f for f in effects if f.probability < options.confidence and f.can_be_named]
+    sure = [f for f in effects if f.probability >= options.confidence and f.can_be_named]
     if sure and sum(f.share for f in unsure) <= VERDICT.minor_share * explains:
         return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
     if not unsure:
         names = ", ".join(f.effect.name for f in effects)
+        if any(not all(f.in_halves.values()) for f in effects):
+            return "unknown", f"No large effect was found in both halves: {names}."
         return "unknown", f"The effects that were found are too small to be named: {names}."
     doubtful = _most_doubtful(effects, options)
     names = " or ".join(
@@ -441,6 +460,7 @@ def _finding(
     every: dict[str, Estimate],
     at_edge: tuple[str, ...],
     repetition: Repetition | None,
+    in_halves: Mapping[str, bool],
 ) -> Finding:
     effect = added.effect
     sizes = [
@@ -473,6 +493,7 @@ def _finding(
         at_edge,
         is_zero or is_small,
         repetition,
+        in_halves,
     )
 
 

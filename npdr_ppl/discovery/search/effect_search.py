@@ -1,5 +1,6 @@
 """The search: add the effect that explains most, screen again, remove effects no longer needed."""
 
+import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -188,6 +189,17 @@ class Searcher:
         self.base, self.are_priors_widened = found.segments, True
         # The misfit caused by the narrow prior can hide that the steps are too coarse.
         return self.with_finer_steps(found.hypothesis)
+
+    def along(self, index: Tensor) -> "Searcher":
+        """Returns a searcher of some of the segments, with the current steps and priors.
+
+        Args:
+            index: Indices of the segments.
+        """
+        part = copy.copy(self)
+        part.base = self.base.along(index)
+        part._last = None
+        return part
 
     def run(self, first: Round, *, max_effects: int) -> Search:
         """Adds effects until no alarm fires, no effect helps, or the greatest number is reached.

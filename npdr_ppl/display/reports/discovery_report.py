@@ -213,6 +213,15 @@ def _effects(effects: list[Any], ranking: list[Any]) -> list[Part]:
     if repeated:
         caption = "Found again? Strengths in the two parts of the recording that differ most."
         parts.append(TablePart(("strength", "part", "mean ± sd"), repeated, caption))
+    searched = [
+        [_named(effect), *("yes" if is_in else "no" for is_in in halves.values())]
+        for effect in effects
+        if (halves := effect.get("in_halves") or {})
+    ]
+    if searched:
+        names = next(e["in_halves"] for e in effects if e.get("in_halves"))
+        caption = "Found by a search of only half of the recording?"
+        parts.append(TablePart(("effect", *names), searched, caption))
     scored = {
         _named(e): float(e["probability"])
         for e in ranking or effects
