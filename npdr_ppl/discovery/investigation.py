@@ -10,7 +10,7 @@ from functools import cached_property
 from torch.distributions import Distribution
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
-from npdr_ppl.discovery.discovery_result import Discovery, Verdict
+from npdr_ppl.discovery.discovery_result import Discovery
 from npdr_ppl.discovery.finding import Finding
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.proof.held_out_gap import Gap, prove
@@ -31,10 +31,11 @@ from npdr_ppl.discovery.search.halves import found_in_halves, search_halves
 from npdr_ppl.discovery.search.limits import limits
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
 from npdr_ppl.discovery.search.repeatability import Repetition, repetitions
-from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
+from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH
 from npdr_ppl.discovery.search_progress import SearchProgress
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.discovery.settings import VERDICT
+from npdr_ppl.discovery.verdict import judge, most_doubtful
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
@@ -320,16 +321,16 @@ class Investigation:
             for added, at_edge in zip(search.added, self._at_edge, strict=True)
         ]
         effects.sort(key=lambda found: found.share, reverse=True)
-        verdict, reason = _judge(search, effects, unexplained, self.settings)
+        gap = self.gap
+        verdict, reason = judge(search, effects, unexplained, gap, self.settings)
         if self.narrow_priors:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"
-        gap = self.gap
         with self._stage("next experiment"):
             advice = None
             if verdict == "ambiguous":
-                advice = self._advice(_most_doubtful(effects, self.settings).effect.name)
+                advice = self._advice(most_doubtful(effects, self.settings).effect.name)
             self.progress.finish()
         return Discovery(
             verdict=verdict,
@@ -401,59 +402,6 @@ def discover(
         ).conclude()
 
 
-def _judge(
-    search: Search,
-    effects: list[Finding],
-    unexplained: float,
-    options: DiscoveryOptions,
-) -> tuple[Verdict, str]:
-    """Returns the verdict and the reason for it."""
-    if not effects:
-        if not search.rounds[-1].alarm.fired:
-            return "none", "This recording shows no missing effect."
-        return "unknown", "Simulation and recording disagree, and no effect explains it."
-    left = search.rounds[-1].alarm
-    # Not corrected for the number of rounds: this test only reports a remainder.
-    is_heard = left.p_value <= options.false_alarm_rate
-    # The alarm allows for every kind of noise, so it misses a remainder in only a few segments.
-    is_plain = 0.5 * search.final.share * left.gain > TRIALS.certain_evidence
-    if (is_heard and unexplained > VERDICT.most_unexplained) or (
-        is_plain and unexplained > VERDICT.most_undetected
-    ):
-        return "unknown", (
-            f"The effects that were found leave {unexplained:.0%} of the misfit unexplained. "
-            f"The strongest sign of it is {left.strongest}."
-        )
-    explains = sum(f.share for f in effects)
-    strained = [f for f in effects if f.at_edge and f.share > VERDICT.minor_share * explains]
-    if strained:
-        return "unknown", (
-            f"{strained[0].effect.name} explains the misfit with an implausible value of "
-            f"{strained[0].at_edge[0]}. Another law that is similar there is the likelier cause."
-        )
-    once = [(f, f.repetition) for f in effects if f.repetition and not f.is_found_again]
-    if once:
-        one, other = (estimate.part for estimate in once[0][1].estimates)
-        return "unknown", (
-            f"{once[0][0].effect.name} explains the misfit only with different values for {one} "
-            f"and {other}, so it is not the cause."
-        )
-    unsure = [f for f in effects if f.probability < options.confidence and f.can_be_named]
-    sure = [f for f in effects if f.probability >= options.confidence and f.can_be_named]
-    if sure and sum(f.share for f in unsure) <= VERDICT.minor_share * explains:
-        return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
-    if not unsure:
-        names = ", ".join(f.effect.name for f in effects)
-        if any(not all(f.in_halves.values()) for f in effects):
-            return "unknown", f"No large effect was found in both halves: {names}."
-        return "unknown", f"The effects that were found are too small to be named: {names}."
-    doubtful = _most_doubtful(effects, options)
-    names = " or ".join(
-        n for n, p in doubtful.alternatives.items() if p >= EVIDENCE.least_probability
-    )
-    return "ambiguous", f"The recording cannot tell which effect is missing: {names}."
-
-
 def _finding(
     added: Added,
     search: Search,
@@ -511,14 +459,6 @@ def _units(hypothesis: Hypothesis) -> dict[str, str]:
         own = effect.units(simulator.port(effect.port))
         units |= {f"{effect.name}.{name}": unit for name, unit in own.items()}
     return units
-
-
-def _most_doubtful(effects: list[Finding], options: DiscoveryOptions) -> Finding:
-    """Returns the uncertain effect that explains most."""
-    return max(
-        (found for found in effects if found.probability < options.confidence),
-        key=lambda found: found.share,
-    )
 
 
 def _like(data_options: DataOptions, rollouts: Rollouts, holdout: Rollouts) -> DataOptions:

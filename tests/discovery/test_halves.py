@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.investigation import _judge
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.halves import HALVES, found_in_halves, search_halves
+from npdr_ppl.discovery.verdict import judge
 from npdr_ppl.models.effects import (
     Bias,
     CoulombFriction,
@@ -54,7 +54,7 @@ def test_the_reason_says_that_no_effect_is_in_both_halves(rubbed_late):
         dataclasses.replace(found, repetition=None, at_edge=(), probability=1.0)
         for found in rubbed_late.effects
     ]
-    verdict, reason = _judge(search, lost, 0.0, rubbed_late.settings)
+    verdict, reason = judge(search, lost, 0.0, {}, rubbed_late.settings)
     assert verdict == "unknown"
     assert reason.startswith("No large effect was found in both halves")
 

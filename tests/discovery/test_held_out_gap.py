@@ -8,6 +8,7 @@ from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.proof.held_out_gap import Gap, prove
 from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
 from npdr_ppl.language.handlers import with_finer_steps
+from npdr_ppl.models.effects import CoulombFriction
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.preparation import data_options
 from npdr_ppl.preparation.data_options import DataOptions
@@ -107,3 +108,22 @@ def test_a_long_recording_is_proved_on_all_of_it_with_draws_along_a_part(proved,
         assert part[metric].after == pytest.approx(whole[metric].after, rel=0.05)
         assert part[metric].after == pytest.approx(part[metric].noise_floor, rel=0.12)
     assert part["crps"].after == pytest.approx(whole["crps"].after, rel=0.5)
+
+
+def test_a_gap_is_open_if_most_of_it_is_left_above_the_noise_floor():
+    assert Gap(3.0, 2.5, 1.0).is_open
+    assert Gap(0.9, 1.5, 1.0).is_open
+    assert not Gap(3.0, 1.5, 1.0).is_open
+    assert not Gap(1.15, 1.09, 1.0).is_open
+    assert Gap(1.0, 1.5, 2.0).is_open
+    assert not Gap(3.0, 2.5, None).is_open
+
+
+def test_an_effect_that_held_out_rollouts_contradict_is_not_named():
+    rubbed, free = swinging(friction=0.2), swinging(seed=1)
+    search = npdr.DiscoveryOptions(effects=(CoulombFriction("hinge"),))
+    alone = npdr.discover(pendulum, rubbed, search=search)
+    assert alone.verdict == "named"
+    found = npdr.discover(pendulum, rubbed, holdout=free, search=search)
+    assert found.verdict == "unknown"
+    assert "hinge.coulomb_friction explains the recording, but closes only 0%" in found.reason

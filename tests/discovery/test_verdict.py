@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from npdr_ppl.discovery.investigation import _judge
 from npdr_ppl.discovery.search.repeatability import PartEstimate, Repetition
+from npdr_ppl.discovery.verdict import judge as judged
 
 pytestmark = pytest.mark.slow
 
@@ -20,7 +20,8 @@ def judge(proven):
         last = search.rounds[-1]
         last = replace(last, alarm=replace(last.alarm, **{"p_value": 0.5, "gain": 0.0, **alarm}))
         search = replace(search, rounds=[*search.rounds[:-1], last])
-        return _judge(search, found.effects if effects is None else effects, unexplained, options)
+        chosen = found.effects if effects is None else effects
+        return judged(search, chosen, unexplained, {}, options)
 
     return verdict
 

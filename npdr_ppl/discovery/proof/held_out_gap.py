@@ -43,6 +43,22 @@ class Gap:
             return None
         return (self.before - self.after) / (self.before - self.noise_floor)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether most of the gap is left, or it has become larger.
+
+        It has become larger if the revised model's value is more than ``GAP.excess`` times that of
+        the original model. Most is left if it is as far above the noise floor and less than
+        ``GAP.mostly_closed`` of the gap was closed.
+        """
+        if self.noise_floor is None:
+            return False
+        if self.after > GAP.excess * self.before:
+            return True
+        if self.after <= GAP.excess * self.noise_floor:
+            return False
+        return self.closed is None or self.closed < GAP.mostly_closed
+
     def to_dict(self) -> dict[str, float | None]:
         """Returns JSON-serialisable values."""
         return {

@@ -22,15 +22,21 @@ class GapSettings:
     Attributes:
         num_draws: Number of posterior predictive trajectories.
         level: Probability of the predictive interval whose coverage is reported.
+        excess: Ratio of two errors from which they differ. The error of the true model is at most
+            this multiple of the noise floor on simulated rigs.
+        mostly_closed: Share of the gap from which it is mostly closed.
     """
 
     num_draws: int = 40
     level: float = 0.9
+    excess: float = 1.1
+    mostly_closed: float = 0.5
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, math.inf, "num_draws")
-        check_range(self, 0.0, 1.0, "level")
+        check_range(self, 0.0, 1.0, "level", "mostly_closed")
+        check_range(self, 1.0, 100.0, "excess")
 
 
 @dataclass(frozen=True)

@@ -151,19 +151,25 @@ class Trials:
         done: str | None = None,
         progress: Step = lambda fraction, status: None,
     ) -> dict[str, Hypothesis]:
-        """Fits the best trials until convergence; the others are too far behind.
+        """Fits the trials with the most evidence until convergence; the others are far behind.
 
         Args:
             trials: The model with each of several effects.
             done: Name of the effect whose fit has converged already.
             progress: Called with the fraction of these trials that has converged.
         """
-        scale = closest(list(trials.values())).fit.scale
-        losses = {name: float(trial.losses(scale).sum()) for name, trial in trials.items()}
+        best = closest(list(trials.values()))
+        losses = {
+            name: float(trial.losses(best.fit.scale).sum()) for name, trial in trials.items()
+        }
         least = min(losses.values())
+        # By loss alone, laws with more parameters would crowd out the simple law they contain.
+        cost = {
+            name: best.share * losses[name] + trial.complexity for name, trial in trials.items()
+        }
         contenders = [
             name
-            for name in sorted(losses, key=lambda name: losses[name])[: TRIALS.most_converged]
+            for name in sorted(cost, key=lambda name: cost[name])[: TRIALS.most_converged]
             if name != done
             and losses[name]
             <= least + max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))

@@ -1,0 +1,95 @@
+"""The verdict of a discovery, and the reason for it."""
+
+from collections.abc import Mapping, Sequence
+
+from npdr_ppl.discovery.discovery_options import DiscoveryOptions
+from npdr_ppl.discovery.discovery_result import Verdict
+from npdr_ppl.discovery.finding import Finding
+from npdr_ppl.discovery.proof.held_out_gap import Gap
+from npdr_ppl.discovery.search.effect_search import Search
+from npdr_ppl.discovery.search.settings import EVIDENCE, TRIALS
+from npdr_ppl.discovery.settings import VERDICT
+
+__all__ = ["judge", "most_doubtful"]
+
+
+def judge(
+    search: Search,
+    effects: Sequence[Finding],
+    unexplained: float,
+    gap: Mapping[str, Gap],
+    options: DiscoveryOptions,
+) -> tuple[Verdict, str]:
+    """Returns the verdict and the reason for it.
+
+    Args:
+        search: The search.
+        effects: The effects that were found.
+        unexplained: Share of the misfit that the final model leaves.
+        gap: Metrics on the held-out recording; empty without one.
+        options: Settings of the search.
+    """
+    if not effects:
+        if not search.rounds[-1].alarm.fired:
+            return "none", "This recording shows no missing effect."
+        return "unknown", "Simulation and recording disagree, and no effect explains it."
+    left = search.rounds[-1].alarm
+    # Not corrected for the number of rounds: this test only reports a remainder.
+    is_heard = left.p_value <= options.false_alarm_rate
+    # The alarm allows for every kind of noise, so it misses a remainder in only a few segments.
+    is_plain = 0.5 * search.final.share * left.gain > TRIALS.certain_evidence
+    if (is_heard and unexplained > VERDICT.most_unexplained) or (
+        is_plain and unexplained > VERDICT.most_undetected
+    ):
+        return "unknown", (
+            f"The effects that were found leave {unexplained:.0%} of the misfit unexplained. "
+            f"The strongest sign of it is {left.strongest}."
+        )
+    explains = sum(f.share for f in effects)
+    strained = [f for f in effects if f.at_edge and f.share > VERDICT.minor_share * explains]
+    if strained:
+        return "unknown", (
+            f"{strained[0].effect.name} explains the misfit with an implausible value of "
+            f"{strained[0].at_edge[0]}. Another law that is similar there is the likelier cause."
+        )
+    once = [(f, f.repetition) for f in effects if f.repetition and not f.is_found_again]
+    if once:
+        one, other = (estimate.part for estimate in once[0][1].estimates)
+        return "unknown", (
+            f"{once[0][0].effect.name} explains the misfit only with different values for {one} "
+            f"and {other}, so it is not the cause."
+        )
+    unsure = [f for f in effects if f.probability < options.confidence and f.can_be_named]
+    sure = [f for f in effects if f.probability >= options.confidence and f.can_be_named]
+    if sure and sum(f.share for f in unsure) <= VERDICT.minor_share * explains:
+        if gap and gap["rmse"].is_open:
+            return "unknown", _still_open(sure, gap["rmse"])
+        return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
+    if not unsure:
+        names = ", ".join(f.effect.name for f in effects)
+        if any(not all(f.in_halves.values()) for f in effects):
+            return "unknown", f"No large effect was found in both halves: {names}."
+        return "unknown", f"The effects that were found are too small to be named: {names}."
+    doubtful = most_doubtful(effects, options)
+    names = " or ".join(
+        n for n, p in doubtful.alternatives.items() if p >= EVIDENCE.least_probability
+    )
+    return "ambiguous", f"The recording cannot tell which effect is missing: {names}."
+
+
+def most_doubtful(effects: Sequence[Finding], options: DiscoveryOptions) -> Finding:
+    """Returns the uncertain effect that explains most."""
+    return max(
+        (found for found in effects if found.probability < options.confidence),
+        key=lambda found: found.share,
+    )
+
+
+def _still_open(effects: Sequence[Finding], gap: Gap) -> str:
+    """Returns why effects are not named although the recording that they were found in fits."""
+    names = ", ".join(found.effect.name for found in effects)
+    closed = max(0.0, gap.closed or 0.0)
+    return (
+        f"{names} explains the recording, but closes only {closed:.0%} of the gap on the held-out "
+        "rollouts. Something else acts there."
+    )
