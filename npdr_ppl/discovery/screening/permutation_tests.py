@@ -96,7 +96,8 @@ class LargestStatistic:
             # The tail probability decreases with the statistic, so only the largest is needed.
             most = statistics.amax(0)
             largest[size] = most.maximum(largest.get(size, most))
-            observed.setdefault(size, []).append(statistics[:, 0])
+            # A copy: a view would keep the statistics of all permutations.
+            observed.setdefault(size, []).append(statistics[:, 0].clone())
             places_by_size.setdefault(size, []).extend(places)
         tails = torch.zeros(len(self._deals), dtype=torch.float64)
         for size, statistics in largest.items():
@@ -128,7 +129,8 @@ class LargestStatistic:
             places.append(place)
             alike.append(given)
             coordinates = given[..., 0].numel() if pulses is None else self._along(pulses).size
-            if (len(alike) + 1) * coordinates * size > PERMUTATION_TEST.numbers_per_part:
+            numbers = max(coordinates, len(self._deals)) * size
+            if (len(alike) + 1) * numbers > PERMUTATION_TEST.numbers_per_part:
                 del waiting[pulses, size]
                 yield places, *self._projected(pulses, alike)
         for (pulses, _), (places, alike) in waiting.items():
