@@ -7,6 +7,7 @@
 The truths are made by :mod:`hidden_rigs`: equations, integrators and laws of their own. An
 effect's strength is set by its separation d: the distance, in standard deviations of the
 readings, between the recordings with and without it once all nominal parameters are refitted.
+Of two effects at one place, it is the smaller distance to a model with only one of them.
 Rows are written as they come, and a run given again continues. Tuning and reporting use other
 seeds, hence other parameters, excitations and noise.
 """
@@ -254,9 +255,9 @@ def separation(case: Case, catalogue: tuple[npdr.Effect, ...] = ()) -> float:
 
 
 def _separation_of_each(case: Case) -> float:
-    """Returns how far the recording is from what the model explains with only one of two effects.
+    """Returns the smaller distance between the recording and a model with one of two effects.
 
-    The smaller of both distances. The model's parameters and those of the effect are refitted.
+    The model's parameters and those of the effect are refitted.
     """
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions())
     base, null = searcher.fit_base(), _quiet(case.rig, case.seed)
@@ -367,13 +368,13 @@ def main() -> None:
         done = {_key(json.loads(line)) for line in arguments.out.read_text().splitlines()}
     first = arguments.first_seed
     seeds = list(SEEDS[arguments.part])[first : first + arguments.num_seeds]
-    every = tasks(
+    all_tasks = tasks(
         arguments.conditions.split(","),
         arguments.rigs.split(","),
         seeds,
         [float(d) for d in arguments.separations.split(",")],
     )
-    chosen = itertools.islice(every, 0, None, arguments.every)
+    chosen = itertools.islice(all_tasks, 0, None, arguments.every)
     wanted = [task for task in chosen if _key(asdict(task)) not in done]
     print(f"{len(wanted)} cases to judge, {len(done)} done", flush=True)
     with (

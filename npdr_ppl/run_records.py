@@ -177,6 +177,7 @@ class EffectRecord(TypedDict):
     share: NotRequired[Number]
     is_minor: NotRequired[bool]
     parts: NotRequired[list[EffectPart]]
+    in_halves: NotRequired[dict[str, bool]]
 
 
 class GapRecord(TypedDict, total=False):

@@ -54,7 +54,7 @@ class Rig:
         start_spread: How far from zero each joint may be when it is let go.
         measurement: Noise of the readings.
         effects: Effects of the catalogue that a finder can see here.
-        pairs: Pairs of them that act at one place, a joint or the way of one command.
+        pairs: Pairs of them that act at one place, which is a joint or a command.
         absorbed: Effects that leave no trace: the model's own parameters take their place.
         same: Effects that no recording of the rig can tell from others, with these: alternatives,
             each one effect or several together.

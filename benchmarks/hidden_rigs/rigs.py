@@ -50,7 +50,7 @@ def _at(port: str, *groups: tuple[str, ...]) -> tuple[Place, ...]:
 
 
 def _pairs(joint: str, command: str, *others: tuple[str, str]) -> tuple[tuple[Place, Place], ...]:
-    """Returns ten pairs: those of all rigs, at one joint and one command, and others there."""
+    """Returns the pairs that every rig has at a joint and a command, and others at the joint."""
     at_joint = (
         ("coulomb_friction", "quadratic_drag"),
         ("coulomb_friction", "stribeck_friction"),

@@ -156,7 +156,8 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             missed = [name for name, is_in in (effect.get("in_halves") or {}).items() if not is_in]
             if missed:
                 name = f"{effect['port']}.{effect['effect']}"
-                console.print(f"Not found in {' and '.join(missed)}: {escape(name)}.")
+                where = missed[0] if len(missed) == 1 else "either half"
+                console.print(f"{escape(name)} was not found in {where}.")
     if found["gap"]:
         table = Table(title="Held-out rollouts", box=SIMPLE)
         table.add_column("metric", no_wrap=True)

@@ -30,7 +30,7 @@ from npdr_ppl.discovery.search.effect_search import Round, Search, Searcher, exp
 from npdr_ppl.discovery.search.halves import found_in_halves, search_halves
 from npdr_ppl.discovery.search.limits import limits
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
-from npdr_ppl.discovery.search.repeatability import Repetition, repetitions
+from npdr_ppl.discovery.search.repeatability import HALVES, Repetition, repetitions
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH
 from npdr_ppl.discovery.search_progress import SearchProgress
 from npdr_ppl.discovery.segment_options import segment_options
@@ -47,6 +47,9 @@ from npdr_ppl.rollouts.notes import faults_among, remarks_among
 __all__ = ["Investigation", "discover"]
 
 
+NOT_REPEATED = "The recording is too short to search its halves, or a half cannot be fitted."
+"""Added to the reason if both halves were to be searched, and were not."""
+
 COARSE = (
     "The model's integration steps are too coarse for this recording; the revised model takes "
     "finer ones."
@@ -62,7 +65,8 @@ class Investigation:
         model: A Pyro model with one black-box site, whose simulator has ports.
         rollouts: The recording that is used to find and fit effects.
         holdout: Rollouts that measure the improvement, best with another excitation. They are
-            never used to choose or fit anything.
+            not used to choose or fit effects; if most of the gap on them is left, no effect is
+            named.
         options: How the recording is prepared; see :func:`discover`.
         search: Settings of the search.
         seed: Seed of everything random.
@@ -222,7 +226,12 @@ class Investigation:
             return {}
         first = self.search.rounds[0].hypothesis
         with self._stage("search halves"):
-            return search_halves(self._searcher, first, max_effects=self.settings.max_effects)
+            return search_halves(
+                self._searcher,
+                first,
+                max_effects=self.settings.max_effects,
+                report=self.progress.say,
+            )
 
     @cached_property
     def _at_edge(self) -> list[tuple[str, ...]]:
@@ -325,6 +334,8 @@ class Investigation:
         verdict, reason = judge(search, effects, unexplained, gap, self.settings)
         if self.narrow_priors:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
+        if self.settings.repeat and effects and len(self.halves) < len(HALVES):
+            reason = f"{reason} {NOT_REPEATED}"
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"
         with self._stage("next experiment"):
@@ -377,7 +388,8 @@ def discover(
         model: A Pyro model with one black-box site, whose simulator has ports.
         rollouts: The recording that is used to find and fit effects.
         holdout: Rollouts that measure the improvement, best with another excitation. They are
-            never used to choose or fit anything.
+            not used to choose or fit effects; if most of the gap on them is left, no effect is
+            named.
         options: How the recording is prepared. Discovery estimates initial states and noise, and
             compares trajectories themselves: ``initial_state`` and ``noise`` must have their
             defaults, ``segment_length`` must not be ``None``, and ``embedding`` has no effect.

@@ -35,11 +35,11 @@ def judge(
         return "unknown", "Simulation and recording disagree, and no effect explains it."
     left = search.rounds[-1].alarm
     # Not corrected for the number of rounds: this test only reports a remainder.
-    is_heard = left.p_value <= options.false_alarm_rate
+    is_detected = left.p_value <= options.false_alarm_rate
     # The alarm allows for every kind of noise, so it misses a remainder in only a few segments.
-    is_plain = 0.5 * search.final.share * left.gain > TRIALS.certain_evidence
-    if (is_heard and unexplained > VERDICT.most_unexplained) or (
-        is_plain and unexplained > VERDICT.most_undetected
+    is_certain = 0.5 * search.final.share * left.gain > TRIALS.certain_evidence
+    if (is_detected and unexplained > VERDICT.most_unexplained) or (
+        is_certain and unexplained > VERDICT.most_undetected
     ):
         return "unknown", (
             f"The effects that were found leave {unexplained:.0%} of the misfit unexplained. "
@@ -59,6 +59,11 @@ def judge(
             f"{once[0][0].effect.name} explains the misfit only with different values for {one} "
             f"and {other}, so it is not the cause."
         )
+    lost = [f for f in effects if not all(f.in_halves.values())]
+    if sum(f.share for f in lost) > VERDICT.minor_share * explains:
+        missed = [half for half, is_in in lost[0].in_halves.items() if not is_in]
+        where = missed[0] if len(missed) == 1 else "either half"
+        return "unknown", f"{lost[0].effect.name} was not found in {where} of the recording."
     unsure = [f for f in effects if f.probability < options.confidence and f.can_be_named]
     sure = [f for f in effects if f.probability >= options.confidence and f.can_be_named]
     if sure and sum(f.share for f in unsure) <= VERDICT.minor_share * explains:
@@ -67,8 +72,6 @@ def judge(
         return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
     if not unsure:
         names = ", ".join(f.effect.name for f in effects)
-        if any(not all(f.in_halves.values()) for f in effects):
-            return "unknown", f"No large effect was found in both halves: {names}."
         return "unknown", f"The effects that were found are too small to be named: {names}."
     doubtful = most_doubtful(effects, options)
     names = " or ".join(
@@ -78,9 +81,9 @@ def judge(
 
 
 def most_doubtful(effects: Sequence[Finding], options: DiscoveryOptions) -> Finding:
-    """Returns the uncertain effect that explains most."""
+    """Returns the uncertain effect, of those that can be named, that explains most."""
     return max(
-        (found for found in effects if found.probability < options.confidence),
+        (f for f in effects if f.probability < options.confidence and f.can_be_named),
         key=lambda found: found.share,
     )
 
@@ -88,8 +91,13 @@ def most_doubtful(effects: Sequence[Finding], options: DiscoveryOptions) -> Find
 def _still_open(effects: Sequence[Finding], gap: Gap) -> str:
     """Returns why effects are not named although the recording that they were found in fits."""
     names = ", ".join(found.effect.name for found in effects)
-    closed = max(0.0, gap.closed or 0.0)
+    if gap.has_grown:
+        return (
+            f"With {names} the error on the held-out rollouts grows from {gap.before:.3g} to "
+            f"{gap.after:.3g}."
+        )
+    closed = gap.closed or 0.0
     return (
-        f"{names} explains the recording, but closes only {closed:.0%} of the gap on the held-out "
-        "rollouts. Something else acts there."
+        f"With {names} the model fits the recording, but closes only {closed:.0%} of the gap on "
+        "the held-out rollouts."
     )

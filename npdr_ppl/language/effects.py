@@ -82,7 +82,8 @@ class Effect(ABC):
         incidental: Names of shape parameters without which the law is still the same cause.
         contains: Ids of the simpler laws at the same port whose sum it equals at a limit of its
             shape.
-        beside: Ids of laws at the same port that it is attached beside, and does not replace.
+        beside: Ids of laws at the same port that act together with it, and that it does not
+            replace. A search adds one of them if that makes an implausible shape plausible.
         law: The law in one formula.
         equivalence: Causes that may be indistinguishable from it.
         excitation: The experiment that reveals it best.

@@ -61,7 +61,8 @@ def model_file(tmp_path_factory):
 def words(recording, model_file, tmp_path_factory):
     return [
         "discover", f"{model_file}:rod", "--data", recording, "--holdout", 3, "--candidates",
-        CANDIDATES, "--max-effects", 1, "--out", tmp_path_factory.mktemp("out") / "discovery",
+        CANDIDATES, "--max-effects", 1, "--repeat",
+        "--out", tmp_path_factory.mktemp("out") / "discovery",
     ]  # fmt: skip
 
 
@@ -83,6 +84,7 @@ def test_it_names_what_is_missing(finished):
     (effect,) = found["effects"]
     assert f"{effect['port']}.{effect['effect']}" == MISSING
     assert {"probability", "equivalent_to", "parameters"} <= set(effect)
+    assert effect["in_halves"] == {"the first half": True, "the second half": True}
     magnitude = effect["parameters"]["magnitude"]
     assert set(magnitude) == {"mean", "sd", "hdi_94", "unit"}
     assert abs(magnitude["mean"] - FRICTION) < 0.2 * FRICTION
@@ -254,7 +256,7 @@ def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
         "data_problems": [], "verdict": "named", "reason": "Missing: hinge.bias.", "gap": {},
         "effects": [
             {"effect": effect, "port": "hinge", "probability": 0.99, "is_minor": is_minor,
-             "parameters": {"size": strength}}
+             "parameters": {"size": strength}, "in_halves": {"the first half": not is_minor}}
             for effect, is_minor in (("bias", False), ("wind", True))
         ],
         "remainder": {"fired": False, "unexplained": 0.0}, "counts": {}, "next_experiment": None,
@@ -262,6 +264,8 @@ def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
     show.show_discovery(found, tmp_path)
     shown = " ".join(text.getvalue().split())
     assert "Too small to be named, but in the model: hinge.wind." in shown
+    assert "hinge.wind was not found in the first half." in shown
+    assert "hinge.bias was not found" not in shown
 
 
 def test_the_command_has_the_defaults_of_the_options():

@@ -116,9 +116,11 @@ def test_a_gap_is_open_if_most_of_it_is_left_above_the_noise_floor():
     assert not Gap(3.0, 1.5, 1.0).is_open
     assert not Gap(1.15, 1.09, 1.0).is_open
     assert Gap(1.0, 1.5, 2.0).is_open
+    assert Gap(3.0, float("nan"), 1.0).is_open
     assert not Gap(3.0, 2.5, None).is_open
 
 
+@pytest.mark.slow
 def test_an_effect_that_held_out_rollouts_contradict_is_not_named():
     rubbed, free = swinging(friction=0.2), swinging(seed=1)
     search = npdr.DiscoveryOptions(effects=(CoulombFriction("hinge"),))
@@ -126,4 +128,4 @@ def test_an_effect_that_held_out_rollouts_contradict_is_not_named():
     assert alone.verdict == "named"
     found = npdr.discover(pendulum, rubbed, holdout=free, search=search)
     assert found.verdict == "unknown"
-    assert "hinge.coulomb_friction explains the recording, but closes only 0%" in found.reason
+    assert "With hinge.coulomb_friction the error on the held-out rollouts grows" in found.reason

@@ -10,15 +10,21 @@ from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.screening import Screening
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.search.effect_search import Searcher
+from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.models.effects import (
     ActuatorLag,
     Bias,
     CoulombFriction,
+    FrictionDrift,
     HardeningSpring,
     InputDelay,
+    PreslidingFriction,
     QuadraticDrag,
+    StribeckFriction,
     ViscousFriction,
 )
+
+pytestmark = pytest.mark.slow
 
 RUBBED = ("hinge", "coulomb_friction"), ("hinge", "quadratic_drag")
 LATE = ("torque", "input_delay"), ("torque", "actuator_lag")
@@ -75,7 +81,7 @@ def test_a_pair_takes_the_place_of_an_effect_that_stood_for_both(rubbed):
     wrong = searcher.trials.refitted(first.hypothesis, (ViscousFriction("hinge"),))
     rounds = [first, searcher.look(wrong)]
     worse = searcher.trials.refitted(wrong, (*wrong.effects, Bias("hinge")))
-    found = searcher._or_pair(rounds, worse)
+    found = searcher._with_likelier_pair(rounds, worse, 5)
     assert set(found.names) == {"hinge.coulomb_friction", "hinge.quadratic_drag"}
 
 
@@ -84,8 +90,52 @@ def test_a_pair_that_explains_no_more_is_not_taken(rubbed):
     one = searcher.trials.refitted(first.hypothesis, (CoulombFriction("hinge"),))
     rounds = [first, searcher.look(one)]
     right = searcher.trials.refitted(one, (*one.effects, QuadraticDrag("hinge")))
-    assert searcher._or_pair(rounds, right) is right
-    assert searcher._or_pair(rounds[:1], one) is one
+    assert searcher._with_likelier_pair(rounds, right, 5) is right
+    assert searcher._with_likelier_pair(rounds[:1], one, 5) is one
+
+
+def test_a_pair_does_not_exceed_the_greatest_number_of_effects(rubbed):
+    searcher, first = rubbed
+    wrong = searcher.trials.refitted(first.hypothesis, (ViscousFriction("hinge"),))
+    rounds = [first, searcher.look(wrong)]
+    assert searcher._with_likelier_pair(rounds, wrong, 1) is wrong
+    assert len(searcher._with_likelier_pair(rounds, wrong, 2).effects) == 2
+
+
+def test_a_pair_that_cannot_be_simulated_is_left_out(rubbed, monkeypatch):
+    searcher, first = rubbed
+    along = Trials._along
+
+    def without_drag(self, effects, starts):
+        has_drag = "hinge.quadratic_drag" in [effect.name for effect in effects]
+        return None if has_drag else along(self, effects, starts)
+
+    monkeypatch.setattr(Trials, "_along", without_drag)
+    starts = first.hypothesis.segments.starts
+    found = searcher.trials.with_pairs(first.hypothesis, first.pairs[:3], starts)
+    kept = {pair.name for pair in first.pairs[:3] if "hinge.quadratic_drag" not in pair.names}
+    assert set(found) == kept
+
+
+def test_a_simple_law_converges_beside_three_laws_that_contain_it(rubbed, monkeypatch):
+    searcher, first = rubbed
+    law = CoulombFriction("hinge")
+    richer = (FrictionDrift("hinge"), PreslidingFriction("hinge"), StribeckFriction("hinge"))
+    base = searcher.trials.refitted(first.hypothesis, (QuadraticDrag("hinge"),))
+    trials = {
+        effect.name: searcher.trials.refitted(base, (*base.effects, effect))
+        for effect in (law, *richer)
+    }
+    asked = []
+    fits = Trials._fits
+
+    def seen(self, wanted, simulator):
+        asked.extend(fit.effects[-1].name for fit in wanted)
+        return fits(self, wanted, simulator)
+
+    monkeypatch.setattr(Trials, "_fits", seen)
+    searcher.trials.converged(trials)
+    assert law.name in asked
 
 
 def test_a_lag_beside_a_delay_that_explains_their_sum_is_found():

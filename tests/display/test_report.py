@@ -118,6 +118,18 @@ def test_small_effects_and_parts_of_the_recording_are_shown(runs, tmp_path):
     assert "the second half" in text and "0.39 ± 0.02" in text
 
 
+def test_an_effect_that_a_half_does_not_show_is_no_headline(runs, tmp_path):
+    folder = shutil.copytree(runs["discover"], tmp_path / "run")
+    content = json.loads((folder / "discovery.json").read_text())
+    content["effects"][0]["in_halves"] = {"the first half": True, "the second half": False}
+    bias = {"effect": "bias", "port": "hinge", "probability": 1.0, "share": 0.9}
+    content["effects"].append(bias)
+    (folder / "discovery.json").write_text(json.dumps(content))
+    text = write_report(folder).read_text()
+    assert "missing: bias at hinge" in text
+    assert "Found by a search of only half of the recording?" in text
+
+
 @pytest.mark.parametrize("verdict", ["none", "named", "ambiguous", "unknown"])
 def test_a_discovery_of_little_is_shown_too(tmp_path, verdict):
     (tmp_path / "discovery.json").write_text(json.dumps({"verdict": verdict}))

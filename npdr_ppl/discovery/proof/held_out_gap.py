@@ -44,20 +44,18 @@ class Gap:
         return (self.before - self.after) / (self.before - self.noise_floor)
 
     @property
-    def is_open(self) -> bool:
-        """Whether most of the gap is left, or it has become larger.
+    def has_grown(self) -> bool:
+        """Whether the revised model's error is clearly larger, or not a number."""
+        return not self.after <= GAP.excess * self.before
 
-        It has become larger if the revised model's value is more than ``GAP.excess`` times that of
-        the original model. Most is left if it is as far above the noise floor and less than
-        ``GAP.mostly_closed`` of the gap was closed.
-        """
+    @property
+    def is_open(self) -> bool:
+        """Whether most of the gap is left above the noise floor, or the error has grown."""
         if self.noise_floor is None:
             return False
-        if self.after > GAP.excess * self.before:
-            return True
-        if self.after <= GAP.excess * self.noise_floor:
-            return False
-        return self.closed is None or self.closed < GAP.mostly_closed
+        left, whole = self.after - self.noise_floor, self.before - self.noise_floor
+        is_above = self.after > GAP.excess * self.noise_floor
+        return self.has_grown or (is_above and left > (1.0 - GAP.mostly_closed) * whole)
 
     def to_dict(self) -> dict[str, float | None]:
         """Returns JSON-serialisable values."""

@@ -22,9 +22,9 @@ class GapSettings:
     Attributes:
         num_draws: Number of posterior predictive trajectories.
         level: Probability of the predictive interval whose coverage is reported.
-        excess: Ratio of two errors from which they differ. The error of the true model is at most
+        excess: Ratio of two errors above which they differ. The error of the true model is below
             this multiple of the noise floor on simulated rigs.
-        mostly_closed: Share of the gap from which it is mostly closed.
+        mostly_closed: Least share of the gap that must be closed for an effect to be named.
     """
 
     num_draws: int = 40

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.screening import Screened, within_limits
+from npdr_ppl.language.effects import Effect
 
 __all__ = ["Pair", "ranked_pairs"]
 
@@ -33,6 +34,16 @@ class Pair:
     gain: float
 
     @property
+    def name(self) -> str:
+        """Names of both effects in one text."""
+        return " and ".join(member.name for member in self.members)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """Both effects."""
+        return tuple(member.variant.effect for member in self.members)
+
+    @property
     def names(self) -> frozenset[str]:
         """Names of both effects."""
         return frozenset(member.name for member in self.members)
@@ -48,7 +59,7 @@ class Pair:
 
 
 def ranked_pairs(projection: Projection, candidates: Sequence[Screened]) -> list[Pair]:
-    """Returns every pair of candidates that need each other, the largest joint gain first.
+    """Returns the pairs of which both get a strength in their joint fit, the largest gain first.
 
     Args:
         projection: The fitted hypothesis.
@@ -58,8 +69,8 @@ def ranked_pairs(projection: Projection, candidates: Sequence[Screened]) -> list
         return []
     variants = [candidate.variant for candidate in candidates]
     scores = projection.scores(torch.cat([v.change for v in variants], dim=-1))
-    numbers = [len(variant.strengths) for variant in variants]
-    columns = torch.arange(sum(numbers)).split(numbers)
+    num_strengths = [len(variant.strengths) for variant in variants]
+    columns = torch.arange(sum(num_strengths)).split(num_strengths)
     score, information = scores.score, scores.information
     bare = [candidate.without_change() for candidate in candidates]
     pairs = []
@@ -68,7 +79,7 @@ def ranked_pairs(projection: Projection, candidates: Sequence[Screened]) -> list
         sizes, gain = within_limits(
             information[both][:, both], score[both], (variants[i], variants[j])
         )
-        one, other = sizes.split((numbers[i], numbers[j]))
+        one, other = sizes.split((num_strengths[i], num_strengths[j]))
         if bool(one.any()) and bool(other.any()):
             pairs.append(Pair((bare[i], bare[j]), (one, other), gain))
     return sorted(pairs, key=lambda pair: (-pair.gain, sorted(pair.names)))

@@ -144,9 +144,9 @@ class PermutationTestSettings:
         most_blocks: In long recordings more neighbours are joined, until at most this many blocks
             remain. More would not improve the test, and its time grows with the cube of their
             number.
-        numbers_per_part: Numbers in the changes of candidates that are processed together, or in
-            their statistics of all permutations; at least one candidate's. With their tables they
-            fit into a processor's caches.
+        numbers_per_part: Most numbers in one batch of candidates, counted in their changes and in
+            their statistics of all permutations; a batch has at least one candidate. With their
+            tables they fit into a processor's caches.
     """
 
     num_permutations: int = 2000

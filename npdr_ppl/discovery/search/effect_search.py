@@ -28,6 +28,7 @@ from npdr_ppl.discovery.search.alternatives import (
 )
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps
 from npdr_ppl.discovery.search.evidence import closest, weigh
+from npdr_ppl.discovery.search.likelier_pair import likelier_pair
 from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
 from npdr_ppl.discovery.search.repeatability import repeated_effects
@@ -216,12 +217,14 @@ class Searcher:
         while len(current.effects) < max_effects and _is_something_left(first, now):
             best, weights, tried = self._extended(current, now)
             rounds[-1] = replace(now, weights=weights, trials=tried)
-            if best is not None and _is_negligible(first.hypothesis, current, tried[best]):
-                best = None
-            extended = self._or_pair(rounds, current if best is None else tried[best])
-            if extended is current:
+            single = current if best is None else tried[best]
+            if _is_negligible(first.hypothesis, current, single):
+                single = current
+            extended = self._with_likelier_pair(rounds, single, max_effects)
+            if _is_negligible(first.hypothesis, current, extended):
                 break
-            current = self.trials.with_own_starts(self._pruned(extended))
+            tested = best if extended is single else None
+            current = self.trials.with_own_starts(self._pruned(extended, tested))
             if not self.are_steps_coarse and self.with_finer_steps(current) is not current:
                 # The missing effect had hidden that the steps are too coarse: restart the search.
                 current = self.fit_base()
@@ -232,14 +235,15 @@ class Searcher:
                 break
             now = self.look(current)
             rounds.append(now)
-        return self._revised(current, rounds)
+        return self._revised(current, rounds, max_effects)
 
-    def _revised(self, current: Hypothesis, rounds: list[Round]) -> Search:
+    def _revised(self, current: Hypothesis, rounds: list[Round], max_effects: int) -> Search:
         """Returns the effects that are found again, in their simplest form, and alternatives.
 
         Args:
             current: The model with all effects that were found.
             rounds: The results before each addition, to which those of revised models are added.
+            max_effects: Greatest number of effects.
         """
         base = rounds[0].hypothesis
         added: list[Added] = []
@@ -253,7 +257,9 @@ class Searcher:
             if is_approximate:
                 current = simplest_laws(base, current, candidates, self.trials, self._report)
             else:
-                current = plausible_laws(current, candidates, self.trials, self._report)
+                current = plausible_laws(
+                    current, candidates, self.trials, self._report, most=max_effects
+                )
             current, added, trials = self.with_rivals(
                 current, rounds, is_approximate=is_approximate
             )
@@ -356,42 +362,48 @@ class Searcher:
         self._report(f"adding {best}")
         return best, weights, trials
 
-    def _or_pair(self, rounds: list[Round], current: Hypothesis) -> Hypothesis:
-        """Returns the best pair of effects if it is likelier than the last two effects.
+    def _with_likelier_pair(
+        self, rounds: list[Round], current: Hypothesis, max_effects: int
+    ) -> Hypothesis:
+        """Returns the model with a pair in place of the effects added last, if that is likelier.
 
-        The last but one effect may stand for two others. So the pairs without it are tried.
+        The effect that was added before the last round may stand for two others. So pairs that do
+        not contain it are tried.
 
         Args:
             rounds: The results before each addition.
-            current: The model after the last addition.
+            current: The model after the last round's addition, if there was one.
+            max_effects: Greatest number of effects.
         """
         if len(rounds) < 2:
             return current
         before, after = rounds[-2], rounds[-1].hypothesis
         new = set(after.names) - set(before.hypothesis.names)
-        pairs = [pair for pair in before.pairs if not pair.names & new][: TRIALS.pairs]
-        if len(new) != 1 or not pairs:
+        pairs = [pair for pair in before.pairs if not pair.names & new]
+        if len(new) != 1 or len(before.hypothesis.effects) + 2 > max_effects:
             return current
-        step = self._progress.stage("pairs of effects", may_end_early=True)
-        tried = self.trials.with_pairs(before.hypothesis, pairs, self._report, step)
-        if not tried:
-            return current
-        tried = self.trials.converged(tried)
-        hypotheses = [current, *tried.values()]
-        each = math.log(SEARCH.prior_of_any / max(1, len(before.ranking)))
-        prior = [each * len(h.effects) + log_prior(h) for h in hypotheses]
-        weights = weigh(hypotheses, prior)
-        best = max(range(len(weights)), key=weights.__getitem__)
-        # A pair that is only slightly likelier may be so by chance.
-        if best == 0 or weights[best] <= self.options.confidence:
-            return current
-        names = [e.name for e in hypotheses[best].effects if e.name not in before.hypothesis.names]
-        self._report(f"{' and '.join(names)} together explain more")
-        return hypotheses[best]
+        found = likelier_pair(
+            before.hypothesis,
+            pairs,
+            current,
+            self.trials,
+            num_candidates=len(before.ranking),
+            confidence=self.options.confidence,
+            report=self._report,
+            progress=self._progress.stage("pairs of effects", may_end_early=True),
+        )
+        return found or current
 
-    def _pruned(self, current: Hypothesis) -> Hypothesis:
-        """Removes effects that are no longer needed after the last addition."""
-        for effect in current.effects[:-1]:
+    def _pruned(self, current: Hypothesis, tested: str | None) -> Hypothesis:
+        """Removes effects that are no longer needed after the last addition.
+
+        Args:
+            current: The model after the addition.
+            tested: Name of the effect that was compared with the model without it.
+        """
+        for effect in current.effects:
+            if effect.name == tested or len(current.effects) == 1:
+                continue
             if loss_without(current, effect) > TRIALS.certain_evidence:
                 continue
             without = self.trials.without(current, effect)
@@ -490,7 +502,9 @@ def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:
 
 
 def _is_negligible(first: Hypothesis, current: Hypothesis, extended: Hypothesis) -> bool:
-    """Returns whether the last effect explains a negligible share of all that was explained."""
+    """Returns whether the last addition explains a negligible share of all that was explained."""
+    if extended is current:
+        return True
     return explained(current, extended) < SEARCH.least_unexplained * explained(first, extended)
 
 

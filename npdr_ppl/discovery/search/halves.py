@@ -1,60 +1,70 @@
 """The whole search, repeated in each half of a recording.
 
 :mod:`~npdr_ppl.discovery.search.repeatability` compares the strengths of effects that were found.
-This asks whether they are found at all by someone who has only half of the recording.
+This asks whether a search of only half of the recording finds them at all.
 """
 
-from collections.abc import Mapping
-
-import torch
+from collections.abc import Callable, Mapping
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.effect_search import Search, Searcher
 from npdr_ppl.discovery.search.parsimony import overlap
-from npdr_ppl.discovery.search.settings import EVIDENCE, REPEATABILITY
+from npdr_ppl.discovery.search.repeatability import halves
+from npdr_ppl.discovery.search.settings import EVIDENCE
+from npdr_ppl.errors import DataError
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS
 
-__all__ = ["HALVES", "found_in_halves", "search_halves"]
-
-HALVES = "the first half", "the second half"
-"""Names of the halves."""
+__all__ = ["found_in_halves", "search_halves"]
 
 
-def search_halves(searcher: Searcher, first: Hypothesis, *, max_effects: int) -> dict[str, Search]:
+def search_halves(
+    searcher: Searcher,
+    first: Hypothesis,
+    *,
+    max_effects: int,
+    report: Callable[[str], None] = lambda _: None,
+) -> dict[str, Search]:
     """Searches both halves of a recording.
 
     Args:
         searcher: The searcher of the whole recording.
         first: The original model, fitted to the whole recording.
         max_effects: Greatest number of effects.
+        report: Called with a sentence about each half.
 
     Returns:
-        The result for each half; empty if the recording has too few segments.
+        The result for each half. A half that cannot be fitted is left out, and so are both if they
+        have fewer segments than a recording must have.
     """
     num = searcher.base.inputs.num_segments
-    if num < REPEATABILITY.fewest_segments:
+    if num < 2 * FEWEST_SEGMENTS:
         return {}
     found = {}
-    for name, index in zip(HALVES, torch.arange(num).tensor_split(2), strict=True):
+    for name, index in halves(num):
+        report(f"searching {name}")
         half = searcher.along(index)
-        own = half.fit_base(near=first.parameters)
-        found[name] = half.run(half.look(own), max_effects=max_effects)
+        try:
+            own = half.fit_base(near=first.parameters)
+            found[name] = half.run(half.look(own), max_effects=max_effects)
+        except DataError as error:
+            report(f"{name} is left out: {error}")
     return found
 
 
-def found_in_halves(effect: Effect, halves: Mapping[str, Search]) -> dict[str, bool]:
-    """Returns in which halves an effect was found.
+def found_in_halves(effect: Effect, searches: Mapping[str, Search]) -> dict[str, bool]:
+    """Returns in which halves an effect was found, by the half's name.
 
     Another form of the same law counts, and an effect that the half cannot tell from it.
 
     Args:
         effect: The effect.
-        halves: The results for both halves.
+        searches: The results for the halves.
     """
     return {
         name: any(_stands_for(added, effect) for added in search.added)
-        for name, search in halves.items()
+        for name, search in searches.items()
     }
 
 

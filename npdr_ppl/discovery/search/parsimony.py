@@ -30,6 +30,8 @@ def simplest_laws(
 ) -> Hypothesis:
     """Leaves out or simplifies laws, as long as little of the explanation is lost.
 
+    This is for models that leave something unexplained, whose laws are approximations.
+
     Args:
         base: The original model.
         current: The model with all effects that were found.
@@ -75,18 +77,23 @@ def plausible_laws(
     candidates: Sequence[Effect],
     trials: Trials,
     report: Callable[[str], None] = lambda _: None,
+    *,
+    most: int,
 ) -> Hypothesis:
     """Replaces laws whose shape the recording does not tell.
 
     If the simpler laws that a law contains fit equally well, it takes their form: a drift that
-    takes hours is friction. If another law beside it makes an implausible shape plausible, that is
-    added: a spring with a distant rest position is a spring and a constant force.
+    takes hours is friction. If another law beside it makes an implausible shape plausible, that
+    law is added: a spring with a distant rest position is a spring and a constant force.
+
+    This is for models that explain the recording; for others see :func:`simplest_laws`.
 
     Args:
         current: The model with all effects that were found.
         candidates: Effects that may be added to the original model.
         trials: Fits the model.
         report: Called with a sentence about each change.
+        most: Greatest number of effects.
     """
     for effect in current.effects:
         options = _simple_forms(effect, current, candidates)
@@ -94,14 +101,18 @@ def plausible_laws(
             beside = _new_laws(effect, effect.beside, current, candidates)
             options += [(effect, law) for law in beside]
         others = tuple(e for e in current.effects if e.name != effect.name)
+        options = [laws for laws in options if len(others) + len(laws) <= most]
         found = trials.each_refitted(current, [(*others, *laws) for laws in options])
         # The fewest laws come first.
         for laws, trial in zip(options, found, strict=True):
             if trial is None or any(trial.at_edge(law) for law in laws):
                 continue
             if current.share * _difference(trial, current, current) < EVIDENCE.indistinct_loss:
-                names = " and ".join(law.name for law in laws)
-                report(f"{effect.name} becomes {names}: the recording does not tell its shape")
+                if effect in laws:
+                    report(f"{laws[-1].name} makes the shape of {effect.name} plausible")
+                else:
+                    names = " and ".join(law.name for law in laws)
+                    report(f"{effect.name} becomes {names}: the recording does not tell its shape")
                 current = trial
                 break
     return current

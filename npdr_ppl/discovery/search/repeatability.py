@@ -20,7 +20,11 @@ from npdr_ppl.discovery.search.settings import REPEATABILITY
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.language.effects import Effect
 
-__all__ = ["PartEstimate", "Repetition", "repeated_effects", "repetitions"]
+__all__ = ["HALVES", "PartEstimate", "Repetition", "halves", "repeated_effects", "repetitions"]
+
+
+HALVES = "the first half", "the second half"
+"""Names of the halves of a recording."""
 
 
 @dataclass(frozen=True)
@@ -130,11 +134,21 @@ def repeated_effects(
     return current
 
 
+def halves(num: int) -> list[tuple[str, Tensor]]:
+    """Returns the name and the indices of each half of some segments.
+
+    Args:
+        num: Number of segments.
+    """
+    parts = torch.arange(num).tensor_split(2)
+    return list(zip(HALVES, parts, strict=True))
+
+
 def _pairs(rollout: Tensor) -> Iterator[tuple[tuple[str, Tensor], tuple[str, Tensor]]]:
     """Yields pairs of disjoint parts: both halves, and each of several rollouts with the rest."""
+    first, second = halves(len(rollout))
+    yield first, second
     index = torch.arange(len(rollout))
-    half = len(rollout) // 2
-    yield ("the first half", index[:half]), ("the second half", index[half:])
     names = rollout.unique().tolist()
     for name in names if len(names) > 2 else ():
         own = rollout == name

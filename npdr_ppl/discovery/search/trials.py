@@ -10,7 +10,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis, extended, fit_segment_mode
 from npdr_ppl.discovery.screening.pairs import Pair
 from npdr_ppl.discovery.screening.repetition import keeps_in_step
 from npdr_ppl.discovery.screening.screening import Screened
-from npdr_ppl.discovery.search.evidence import closest
+from npdr_ppl.discovery.search.evidence import closest, evidence
 from npdr_ppl.discovery.search.settings import TRIALS
 from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.errors import NpdrError
@@ -62,7 +62,10 @@ class Trials:
         report: Callable[[str], None] = lambda _: None,
         progress: Step = lambda fraction, status: None,
     ) -> dict[str, Hypothesis]:
-        """Fits the hypothesis with each candidate of the shortlist, from its linear estimate.
+        """Fits the hypothesis with each candidate of the shortlist.
+
+        Each candidate is fitted from its linear estimate, and also from its typical size if its
+        change is not linear.
 
         The best candidates come first. Those whose linear gain is too small to match the best fit
         so far are skipped. Candidates that cannot be simulated are left out.
@@ -86,7 +89,11 @@ class Trials:
                 waiting[: TRIALS.candidates_per_decision],
                 waiting[TRIALS.candidates_per_decision :],
             )
-            asked = [(c, self._trial(current, c, start)) for c in tried for start in _starts(c)]
+            asked = [
+                (c, self._trial(current, (c.variant.effect,), guess, current.segments.starts))
+                for c in tried
+                for guess in _initial_guesses(c)
+            ]
             fits = self._fits([fit for _, fit in asked], current.simulator)
             found: dict[str, list[Hypothesis]] = {}
             for (candidate, _), trial in zip(asked, fits, strict=True):
@@ -109,6 +116,7 @@ class Trials:
         self,
         current: Hypothesis,
         pairs: Sequence[Pair],
+        starts: InitialStates | None,
         report: Callable[[str], None] = lambda _: None,
         progress: Step = lambda fraction, status: None,
     ) -> dict[str, Hypothesis]:
@@ -117,6 +125,7 @@ class Trials:
         Args:
             current: The hypothesis.
             pairs: The pairs.
+            starts: Initial states of the segments.
             report: Called with a sentence about each pair.
             progress: Called with the fraction of the pairs that is fitted.
 
@@ -124,23 +133,13 @@ class Trials:
             The model with each pair, by the names of both; pairs that cannot be simulated are left
             out.
         """
-        asked = []
-        for pair in pairs:
-            added = (*current.effects, *(member.variant.effect for member in pair.members))
-            segments = self._along(added, current.segments.starts)
-            start = current.parameters | pair.parameters
-            asked.append(
-                None
-                if segments is None
-                else _Fit(segments, added, start, current.fit.offsets, is_trial=True)
-            )
+        asked = [self._trial(current, pair.effects, pair.parameters, starts) for pair in pairs]
         trials: dict[str, Hypothesis] = {}
         fits = self._fits(asked, current.simulator)
         for number, (pair, found) in enumerate(zip(pairs, fits, strict=True), 1):
             if found is not None:
-                name = " and ".join(member.name for member in pair.members)
-                trials[name] = found
-                report(f"tried {name}: {_shown(found)}")
+                trials[pair.name] = found
+                report(f"tried {pair.name}: {_shown(found)}")
             progress(number / len(pairs), f"{number} of {len(pairs)} pairs fitted")
         return trials
 
@@ -151,7 +150,9 @@ class Trials:
         done: str | None = None,
         progress: Step = lambda fraction, status: None,
     ) -> dict[str, Hypothesis]:
-        """Fits the trials with the most evidence until convergence; the others are far behind.
+        """Fits the likeliest trials until convergence.
+
+        At most ``TRIALS.most_converged``, and none whose loss is far above the least.
 
         Args:
             trials: The model with each of several effects.
@@ -164,12 +165,11 @@ class Trials:
         }
         least = min(losses.values())
         # By loss alone, laws with more parameters would crowd out the simple law they contain.
-        cost = {
-            name: best.share * losses[name] + trial.complexity for name, trial in trials.items()
-        }
+        by_block = evidence(list(trials.values()), [0.0] * len(trials), best)
+        likelihood = dict(zip(trials, by_block.sum(-1).tolist(), strict=True))
         contenders = [
             name
-            for name in sorted(cost, key=lambda name: cost[name])[: TRIALS.most_converged]
+            for name in sorted(trials, key=lambda name: -likelihood[name])[: TRIALS.most_converged]
             if name != done
             and losses[name]
             <= least + max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))
@@ -290,12 +290,22 @@ class Trials:
             progress(number / len(asked), f"{number} of {len(asked)} fits")
         return found
 
-    def apart_from_waves_in_step(self, tried: Mapping[str, Hypothesis]) -> dict[str, Hypothesis]:
-        """Removes models whose last effect is a wave that is synchronous with the motion."""
+    def apart_from_waves_in_step(
+        self, tried: Mapping[str, Hypothesis], num_new: int = 1
+    ) -> dict[str, Hypothesis]:
+        """Removes models with a new wave that is synchronous with the motion.
+
+        Args:
+            tried: The models, by name.
+            num_new: How many of each model's last effects are new.
+        """
         return {
             name: trial
             for name, trial in tried.items()
-            if not keeps_in_step(trial, trial.effects[-1], self.base.rollouts)
+            if not any(
+                keeps_in_step(trial, effect, self.base.rollouts)
+                for effect in trial.effects[-num_new:]
+            )
         }
 
     def without(self, current: Hypothesis, effect: Effect) -> Hypothesis | None:
@@ -303,15 +313,27 @@ class Trials:
         return self.refitted(current, tuple(e for e in current.effects if e.name != effect.name))
 
     def _trial(
-        self, current: Hypothesis, candidate: Screened, start: Mapping[str, Tensor]
+        self,
+        current: Hypothesis,
+        added: tuple[Effect, ...],
+        guess: Mapping[str, Tensor],
+        starts: InitialStates | None,
     ) -> _Fit | None:
-        """Returns the short fit of a hypothesis with a candidate from its first parameters."""
-        effects = (*current.effects, candidate.variant.effect)
-        segments = self._along(effects, current.segments.starts)
+        """Returns the short fit of a hypothesis with further effects from an initial guess.
+
+        Args:
+            current: The hypothesis.
+            added: The further effects.
+            guess: Initial guess of their parameters.
+            starts: Initial states of the segments.
+        """
+        effects = (*current.effects, *added)
+        segments = self._along(effects, starts)
         if segments is None:
             return None
-        begin = current.parameters | start
-        return _Fit(segments, effects, begin, current.fit.offsets, is_trial=True)
+        is_same = starts is current.segments.starts
+        offsets = current.fit.offsets if is_same else segments.no_offsets
+        return _Fit(segments, effects, current.parameters | guess, offsets, is_trial=True)
 
     def _along(
         self, effects: tuple[Effect, ...], starts: InitialStates | None
@@ -338,17 +360,18 @@ class Trials:
             yield hypothesis
 
 
-def _starts(candidate: Screened) -> list[dict[str, Tensor]]:
-    """Returns the first parameters of a candidate's fits: its linear estimate, and others.
+def _initial_guesses(candidate: Screened) -> list[dict[str, Tensor]]:
+    """Returns the initial guesses of a candidate's fits.
 
-    Where changes are not linear, the linear estimate can be far from the best fit, with a local
-    minimum between them: a lag beside a delay that already explains their sum.
+    They are the linear estimate, and the typical size if the change is not linear.
+    The linear estimate can then be far from the best fit, with a local minimum
+    between them: a lag beside a delay that already explains their sum.
     """
     variant = candidate.variant
-    starts = [variant.parameters(candidate.sizes)]
+    guesses = [variant.parameters(candidate.sizes)]
     if not variant.is_linear and not variant.effect.is_resonant:
-        starts.append(variant.parameters(torch.ones_like(candidate.sizes)))
-    return starts
+        guesses.append(variant.parameters(torch.ones_like(candidate.sizes)))
+    return guesses
 
 
 def _best(trials: Sequence[Hypothesis]) -> Hypothesis:

@@ -71,7 +71,11 @@ def discovery_report(folder: Path) -> Report:
 
 def _verdict(result: Mapping[str, Any], effects: list[Any]) -> Headline:
     word = str(result["verdict"])
-    large = [effect for effect in effects if not effect.get("is_minor")] or effects
+    large = [
+        effect
+        for effect in effects
+        if not effect.get("is_minor") and all((effect.get("in_halves") or {}).values())
+    ] or effects
     best = _named(large[0]) if large else "an effect"
     others = ", ".join(_named(effect) for effect in large[1:])
     p_value = number((result.get("alarm") or {}).get("p_value"))
