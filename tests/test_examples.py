@@ -41,6 +41,7 @@ def test_the_fleet_learns_a_likelihood_and_samples_hyper_parameters(fleet):
         ("ur10e_joint.py", "joint", "ur10e_joint_2.toml", "joint_2_position"),
         ("ur10e_joint.py", "joint", "ur10e_joint_4.toml", "joint_4_position"),
         ("dfki_pendulum.py", "dfki_pendulum", "dfki_pendulum.toml", "position"),
+        ("furuta_odrive.py", "pole", "furuta_odrive.toml", "pole_position"),
     ],
 )
 def test_a_rig_of_the_gallery_reads_its_log_and_can_be_fitted(file, name, mapping, position):

@@ -24,9 +24,10 @@ Result = TypeVar("Result")
 def num_processes(simulator: Simulator) -> int:
     """Returns the number of parallel processes: those of the enclosing ``workers`` block.
 
-    It is one if there is no such block, or if the simulator itself uses the workers.
+    It is one if there is no such block, or if the simulator itself uses the workers or threads.
     """
-    return 1 if isinstance(simulator, PooledSimulator) else num_local_processes()
+    has_own = isinstance(simulator, PooledSimulator) or simulator.uses_threads
+    return 1 if has_own else num_local_processes()
 
 
 def side_by_side(

@@ -37,6 +37,8 @@ class Simulator(ABC):
         time_step: Seconds per step.
         is_deterministic: Whether equal parameters and inputs give equal trajectories.
         is_differentiable: Whether gradients flow from trajectories to parameters.
+        uses_threads: Whether a batch is simulated on several threads, so that further processes
+            would save no time.
         effects: The effects attached, in the order of attachment.
         inverse_dynamics: The equations of motion in the form for linear regression; ``None`` if
             not declared.
@@ -50,6 +52,7 @@ class Simulator(ABC):
     time_step: float
     is_deterministic: bool = True
     is_differentiable: bool = False
+    uses_threads: bool = False
     effects: tuple[Effect, ...] = ()
     inverse_dynamics: InverseDynamics | None = None
 

@@ -9,8 +9,10 @@ import pytest
 import torch
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.side_by_side import side_by_side
+from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.models.effects import CoulombFriction, QuadraticDrag
+from npdr_ppl.models.pendulum import Pendulum
+from npdr_ppl.models.two_link_arm import TwoLinkArm
 
 
 @pytest.mark.slow
@@ -25,6 +27,12 @@ def test_two_processes_find_what_one_finds(dragged):
     kinds = [{k: v for k, v in d.to_dict().items() if k != "seconds"} for d in (alone, together)]
     assert kinds[0] == kinds[1]
     assert kinds[0]["effects"][0]["effect"] == "quadratic_drag"
+
+
+def test_an_engine_with_threads_of_its_own_gets_no_further_processes():
+    with npdr.workers("loky", 2):
+        assert num_processes(Pendulum()) == 2
+        assert num_processes(TwoLinkArm()) == 1
 
 
 def test_a_function_that_cannot_be_pickled_runs_in_this_process():

@@ -52,6 +52,8 @@ class MujocoMechanism(ClosedLoopSimulator):
         force_ports: The force ports with the coordinates they act on.
     """
 
+    uses_threads = True
+
     def __init__(
         self,
         source: str | PathLike[str] | Any,
