@@ -10,6 +10,8 @@ import pyro
 import pytest
 
 import npdr_ppl as npdr
+from npdr_ppl.models.pendulum import Pendulum
+from npdr_ppl.rollouts.collection import with_commands
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -51,6 +53,7 @@ def test_a_rig_of_the_gallery_reads_its_log_and_can_be_fitted(file, name, mappin
     columns[position.replace("position", "current")] = np.sin(7.0 * time)
     log = pd.DataFrame({"time": time, **columns})
     rollouts = npdr.Rollouts.from_dataframe(log, EXAMPLES / "gallery" / mapping)
+    rollouts = with_commands(rollouts, Pendulum.actions)  # the pole swings freely
     model = runpy.run_path(str(EXAMPLES / "gallery" / file))[name]
     inputs = rollouts.inputs(20)
     trajectories = pyro.infer.Predictive(model, num_samples=3)(inputs)["trajectory"]
