@@ -1,12 +1,16 @@
 """What discovery says is closed is measured on the held-out recording, and on nothing else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
-from npdr_ppl.discovery.proof.held_out_gap import Gap, prove
+from npdr_ppl.discovery.proof.held_out_gap import Gap, _Simulated, prove
 from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
+from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.language.handlers import with_finer_steps
 from npdr_ppl.models.effects import CoulombFriction
 from npdr_ppl.models.pendulum import pendulum
@@ -129,3 +133,18 @@ def test_an_effect_that_held_out_rollouts_contradict_is_not_named():
     found = npdr.discover(pendulum, rubbed, holdout=free, search=search)
     assert found.verdict == "unknown"
     assert "With hinge.coulomb_friction the error on the held-out rollouts grows" in found.reason
+
+
+def test_no_segment_widens_its_own_band(proven):
+    case, _, found = proven
+    hypothesis = found.search.final
+    drawn = posterior_draws(hypothesis, seed=0).resampled(3)
+    simulated = _Simulated(hypothesis, drawn, case.holdout, segment_options(case.holdout))
+    before = simulated._start_factors()
+    now = simulated._along_part
+    residual = now.residual.clone()
+    residual[::2] *= 5.0
+    simulated.__dict__["_along_part"] = replace(now, residual=residual)
+    after = simulated._start_factors()
+    assert torch.equal(after[::2], before[::2])
+    assert bool((after[1::2] > 2.0 * before[1::2]).any())

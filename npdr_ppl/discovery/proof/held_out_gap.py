@@ -1,6 +1,7 @@
 """The proof: distance to held-out recordings before and after the model was revised."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -149,7 +150,7 @@ class _Simulated:
 
     def _true_starts(self) -> Tensor:
         """Returns offsets from the estimates to initial states that may be the true ones."""
-        now = self._linearised(self.part)
+        now = self._along_part
         factors = torch.ones(self.segments.num_offsets, dtype=torch.float64)
         if now.is_finite:
             factors = error_factors(now.residual, now.by_starts)
@@ -160,6 +161,25 @@ class _Simulated:
                 now = self._linearised(self.segments.along(index))
             offsets.append(error_draws(now.residual, now.by_starts, factors))
         return torch.cat(offsets)
+
+    @cached_property
+    def _along_part(self) -> Linearisation:
+        return self._linearised(self.part)
+
+    def _start_factors(self) -> Tensor:
+        """Returns by how much the initial states' errors are larger than assumed, ``(S, m)``.
+
+        Every second segment gets the factors of the others, so that no segment's own measurements
+        make its band wider.
+        """
+        now = self._along_part
+        factors = torch.ones(self.part.no_offsets.shape, dtype=torch.float64)
+        if now.is_finite:
+            for own, others in ((0, 1), (1, 0)):
+                residual, by_starts = now.residual[others::2], now.by_starts[others::2]
+                if len(residual):
+                    factors[own::2] = error_factors(residual, by_starts)
+        return factors
 
     def _linearised(self, segments: SegmentModel) -> Linearisation:
         return segments.linearise(self.fit.z, segments.no_offsets, self.fit.scale, is_rough=True)
@@ -176,9 +196,12 @@ class _Simulated:
         )
 
     def _predictive(self) -> Tensor:
-        """Returns posterior predictive trajectories, measurement noise included."""
+        """Returns posterior predictive trajectories.
+
+        They include the errors of the estimated initial states, and measurement noise.
+        """
         shape = len(self.drawn), *self.part.no_offsets.shape
-        offsets = torch.randn(shape, dtype=torch.float64)
+        offsets = self._start_factors() * torch.randn(shape, dtype=torch.float64)
         draws = self.part.simulate(self.drawn, offsets).double()
         return draws + self.fit.scale * torch.randn(draws.shape, dtype=torch.float64)
 
