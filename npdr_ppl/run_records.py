@@ -200,6 +200,7 @@ class DiscoveryRecord(TypedDict, total=False):
     alarm: Alarm | None
     remainder: Alarm | None
     effects: list[EffectRecord] | None
+    halves: dict[str, list[str]]
     ranking: list[dict[str, Any]] | None
     where: list[dict[str, Any]] | None
     gap: dict[str, GapRecord] | None

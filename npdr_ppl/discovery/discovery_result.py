@@ -1,7 +1,7 @@
 """The result of a discovery."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -67,6 +67,8 @@ class Discovery:
         settings: Settings of the search.
         seed: Seed of all random numbers.
         seconds: Time spent, by stage.
+        halves: Names of the effects that a search of each half found, by the half's name; empty if
+            the halves were not searched.
     """
 
     verdict: Verdict
@@ -94,6 +96,7 @@ class Discovery:
     settings: DiscoveryOptions
     seed: int
     seconds: dict[str, float]
+    halves: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values, the content of ``discovery.json``."""
@@ -114,6 +117,7 @@ class Discovery:
             "finer_steps": num_finer_steps(self.revised),
             "wider_priors": wider_sites(self.revised),
             "effects": [finding.to_dict() for finding in self.effects],
+            "halves": {name: list(effects) for name, effects in self.halves.items()},
             "ranking": [describe_candidate(s, self.alarm.p_values[s.name]) for s in self.ranking],
             "separation": {
                 "names": list(self.separation_names),

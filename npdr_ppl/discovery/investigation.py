@@ -369,6 +369,10 @@ class Investigation:
             settings=self.settings,
             seed=self.seed,
             seconds=self.seconds,
+            halves={
+                name: [added.effect.name for added in half.added]
+                for name, half in self.halves.items()
+            },
         )
 
 

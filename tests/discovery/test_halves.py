@@ -42,6 +42,8 @@ def test_an_effect_of_all_rollouts_is_found_in_both_halves():
     assert friction.effect.name == "hinge.coulomb_friction"
     assert friction.in_halves == dict.fromkeys(HALVES, True)
     assert friction.to_dict()["in_halves"] == dict.fromkeys(HALVES, True)
+    both = dict.fromkeys(HALVES, ["hinge.coulomb_friction"])
+    assert found.to_dict()["halves"] == both
 
 
 def test_an_effect_of_one_half_only_is_not_named(rubbed_late):
