@@ -28,6 +28,7 @@ from torch import Tensor
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.pulse_changes import ForceChange, PulseChanges
 from npdr_ppl.discovery.screening.settings import PERMUTATION_TEST
+from npdr_ppl.memory import release_freed_memory
 
 __all__ = ["LargestStatistic", "block_sums"]
 
@@ -90,7 +91,9 @@ class LargestStatistic:
         places_by_size: dict[int, list[int]] = {}
         observed: dict[int, list[Tensor]] = {}
         largest: dict[int, Tensor] = {}
-        for places, changes, standard in self._in_batches(groups):
+        for number, (places, changes, standard) in enumerate(self._in_batches(groups)):
+            if number % PERMUTATION_TEST.batches_per_release == 0:
+                release_freed_memory()
             size = changes.shape[-1]
             statistics = self._statistics(changes, standard)
             # The tail probability decreases with the statistic, so only the largest is needed.
