@@ -333,7 +333,8 @@ class Trials:
             return None
         is_same = starts is current.segments.starts
         offsets = current.fit.offsets if is_same else segments.no_offsets
-        return _Fit(segments, effects, current.parameters | guess, offsets, is_trial=True)
+        begin = {**current.parameters, **guess}
+        return _Fit(segments, effects, begin, offsets, is_trial=True)
 
     def _along(
         self, effects: tuple[Effect, ...], starts: InitialStates | None
