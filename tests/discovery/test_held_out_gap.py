@@ -118,7 +118,7 @@ def test_a_gap_is_open_if_most_of_it_is_left_above_the_noise_floor():
     assert Gap(3.0, 2.5, 1.0).is_open
     assert Gap(0.9, 1.5, 1.0).is_open
     assert not Gap(3.0, 1.5, 1.0).is_open
-    assert not Gap(1.15, 1.09, 1.0).is_open
+    assert not Gap(1.15, 1.14, 1.0).is_open
     assert Gap(1.0, 1.5, 2.0).is_open
     assert Gap(3.0, float("nan"), 1.0).is_open
     assert not Gap(3.0, 2.5, None).is_open

@@ -29,8 +29,8 @@ class Gap:
         after: Its value for the revised model.
         noise_floor: Its value for a recording that the revised model made. It is not zero, because
             measurements and estimated initial states have errors. A model may be below it by
-            chance; that of the true model is within a tenth of it. ``None`` for a metric that has
-            no floor.
+            chance; the true model is at most a fifth above it. ``None`` for a metric that has no
+            floor.
     """
 
     before: float
