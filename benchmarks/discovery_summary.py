@@ -247,7 +247,7 @@ def _ratio(row: Row, one: str, other: str) -> float:
 def _pair_lines(where: str, rows: Sequence[Row], *, both: float, third: float) -> list[Line]:
     return [
         _rate(f"{where}: both", rows, has_all, lower=both),
-        _rate("… by name or class", rows, has_all_classes),
+        _rate(f"{where}: both, or in their classes", rows, has_all_classes),
         _rate(f"{where}: at least one", rows, has_any, lower=0.98, baselines=_naming(rows)),
         _rate(f"{where}: spurious third", rows, has_too_many, upper=third),
     ]

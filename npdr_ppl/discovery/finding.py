@@ -27,8 +27,7 @@ class Finding:
             law.
         is_minor: Whether it explains too little to be named: no strength differs from zero by two
             standard deviations, or its share is small and something remains that no law explains.
-        repetition: Its strengths in parts of the recording; ``None`` for short recordings, and for
-            effects with local minima.
+        repetition: Its strengths in parts of the recording; ``None`` for short recordings.
         in_halves: Whether it was found in each half of the recording, by the half's name; empty if
             the halves were not searched.
     """

@@ -135,7 +135,7 @@ def test_each_of_a_pair_needs_a_finding_in_whose_place_it_could_stand():
     late = finding("angle.sensor_delay", equivalent=["input_delay"])
     table = lines([row("two", pair, [bias, late]), row("two", pair, [bias])])
     assert table["two effects: both"].value == 0.0
-    assert table["… by name or class"].value == 0.5
+    assert table["two effects: both, or in their classes"].value == 0.5
 
 
 def test_what_has_no_name_is_unknown_or_has_an_impostor():

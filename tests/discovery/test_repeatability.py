@@ -7,6 +7,7 @@ import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.search import repeatability
 from npdr_ppl.discovery.search.repeatability import repeated_effects, repetitions
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.models.effects import Backlash, Bias, Cogging, CoulombFriction, Saturation
@@ -101,6 +102,18 @@ def test_waves_are_compared_in_both_components():
     assert [list(part.strengths) for part in found.estimates] == [["sine", "cosine"]] * 2
 
 
-def test_effects_with_local_minima_are_not_compared():
-    found = repetitions(fitted(swinging(), Backlash("hinge"), CoulombFriction("hinge")))
-    assert set(found) == {"hinge.coulomb_friction"}
+def test_a_contradiction_of_an_effect_with_local_minima_is_confirmed_by_fits(monkeypatch):
+    hypothesis = fitted(swinging(), Backlash("hinge"), CoulombFriction("hinge"))
+    compared = repeatability._compared
+
+    def contradicting(by_part, effect, pair, num_pairs):
+        found = compared(by_part, effect, pair, num_pairs)
+        if isinstance(by_part, repeatability._ByPart):
+            return dataclasses.replace(found, is_found_again=False)
+        return found
+
+    monkeypatch.setattr(repeatability, "_compared", contradicting)
+    found = repetitions(hypothesis)
+    # Neither half shows play, so fits of them contradict nothing.
+    assert found["hinge.backlash"].is_found_again
+    assert not found["hinge.coulomb_friction"].is_found_again

@@ -14,7 +14,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.search.settings import REPEATABILITY
 from npdr_ppl.discovery.search.trials import Trials
@@ -79,8 +79,8 @@ def repetitions(hypothesis: Hypothesis) -> dict[str, Repetition]:
 
     An effect is not found again if its estimates in two parts differ by more than chance allows,
     and by more than the effect's size. A part that hardly determines the effect contradicts
-    nothing. Effects with local minima are not compared: a Gauss-Newton step does not find another
-    minimum.
+    nothing. A contradiction of an effect with local minima counts only if fits of the parts
+    confirm it: a Gauss-Newton step does not lead to another minimum.
 
     Args:
         hypothesis: The fitted model; its effects are compared.
@@ -97,9 +97,14 @@ def repetitions(hypothesis: Hypothesis) -> dict[str, Repetition]:
     by_part = _ByPart(hypothesis)
     result = {}
     for effect in hypothesis.effects:
-        if effect.has_local_minima:
-            continue
         found = [_compared(by_part, effect, pair, len(pairs)) for pair in pairs]
+        if effect.has_local_minima:
+            found = [
+                each
+                if each.is_found_again
+                else _compared(_Refitted(hypothesis), effect, pair, len(pairs))
+                for each, pair in zip(found, pairs, strict=True)
+            ]
         contradicted = [each for each in found if not each.is_found_again]
         result[effect.name] = max(contradicted or found, key=lambda each: each.contradiction)
     return result
@@ -198,8 +203,30 @@ class _ByPart:
         return values + slopes @ step, slopes @ covariance @ slopes.mT
 
 
+class _Refitted:
+    """The same from fits of the parts.
+
+    Args:
+        hypothesis: The hypothesis, from which the fits begin.
+    """
+
+    def __init__(self, hypothesis: Hypothesis) -> None:
+        self._whole = hypothesis
+
+    def estimate(self, sites: list[str], index: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns mean and covariance of some parameters in a part; see :class:`_ByPart`."""
+        whole = self._whole
+        part = fit_segment_model(
+            whole.segments.along(index),
+            effects=whole.effects,
+            start=whole.parameters,
+            offsets=whole.fit.offsets[index],
+        )
+        return _ByPart(part).estimate(sites, torch.arange(len(index)))
+
+
 def _compared(
-    by_part: _ByPart,
+    by_part: _ByPart | _Refitted,
     effect: Effect,
     pair: tuple[tuple[str, Tensor], tuple[str, Tensor]],
     num_pairs: int,

@@ -364,13 +364,14 @@ class Trials:
 def _initial_guesses(candidate: Screened) -> list[dict[str, Tensor]]:
     """Returns the initial guesses of a candidate's fits.
 
-    They are the linear estimate, and the typical size if the change is not linear.
-    The linear estimate can then be far from the best fit, with a local minimum
-    between them: a lag beside a delay that already explains their sum.
+    They are the linear estimate, and the typical size if the change is not linear. The linear
+    estimate can then be far from the best fit, with a local minimum between them: a lag beside a
+    delay that already explains their sum. Many sizes of a resonance are screened, and fits of
+    effects with many minima restart by themselves.
     """
-    variant = candidate.variant
+    variant, effect = candidate.variant, candidate.variant.effect
     guesses = [variant.parameters(candidate.sizes)]
-    if not variant.is_linear and not variant.effect.is_resonant:
+    if not (variant.is_linear or effect.is_resonant or effect.has_local_minima):
         guesses.append(variant.parameters(torch.ones_like(candidate.sizes)))
     return guesses
 
