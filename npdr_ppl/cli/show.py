@@ -127,6 +127,9 @@ def show_discovery(found: Mapping[str, Any], out: Path) -> None:
 
 
 def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
+    # Not at the top: other commands show their results without it.
+    from npdr_ppl.discovery.search.halves import missing_where
+
     if found["effects"]:
         table = Table(title="Missing effects", box=SIMPLE, padding=(0, 1, 0, 0))
         width = min(WIDEST_NAME, max(len(f"at {row['port']}") for row in found["effects"]))
@@ -153,10 +156,9 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         if minor:
             console.print(f"Too small to be named, but in the model: {escape(', '.join(minor))}.")
         for effect in found["effects"]:
-            missed = [name for name, is_in in (effect.get("in_halves") or {}).items() if not is_in]
-            if missed:
-                name = f"{effect['port']}.{effect['effect']}"
-                where = missed[0] if len(missed) == 1 else "either half"
+            in_halves = effect.get("in_halves") or {}
+            if not all(in_halves.values()):
+                name, where = f"{effect['port']}.{effect['effect']}", missing_where(in_halves)
                 console.print(f"{escape(name)} was not found in {where}.")
     if found["gap"]:
         table = Table(title="Held-out rollouts", box=SIMPLE)

@@ -7,6 +7,7 @@ from npdr_ppl.discovery.discovery_result import Verdict
 from npdr_ppl.discovery.finding import Finding
 from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.discovery.search.effect_search import Search
+from npdr_ppl.discovery.search.halves import missing_where
 from npdr_ppl.discovery.search.settings import EVIDENCE, TRIALS
 from npdr_ppl.discovery.settings import VERDICT
 
@@ -61,8 +62,7 @@ def judge(
         )
     lost = [f for f in effects if not all(f.in_halves.values())]
     if sum(f.share for f in lost) > VERDICT.minor_share * explains:
-        missed = [half for half, is_in in lost[0].in_halves.items() if not is_in]
-        where = missed[0] if len(missed) == 1 else "either half"
+        where = missing_where(lost[0].in_halves)
         return "unknown", f"{lost[0].effect.name} was not found in {where} of the recording."
     unsure = [f for f in effects if f.probability < options.confidence and f.can_be_named]
     sure = [f for f in effects if f.probability >= options.confidence and f.can_be_named]
@@ -96,7 +96,7 @@ def _still_open(effects: Sequence[Finding], gap: Gap) -> str:
             f"With {names} the error on the held-out rollouts grows from {gap.before:.3g} to "
             f"{gap.after:.3g}."
         )
-    closed = gap.closed or 0.0
+    closed = max(0.0, gap.closed or 0.0)
     return (
         f"With {names} the model fits the recording, but closes only {closed:.0%} of the gap on "
         "the held-out rollouts."

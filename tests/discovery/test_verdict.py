@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.discovery.search.repeatability import PartEstimate, Repetition
 from npdr_ppl.discovery.verdict import judge as judged
 
@@ -15,13 +16,13 @@ def judge(proven):
     """Returns verdict and reason of the search that found the drag, with figures changed."""
     _, options, found = proven
 
-    def verdict(*, effects=None, unexplained=0.0, **alarm):
+    def verdict(*, effects=None, unexplained=0.0, gap=None, **alarm):
         search = found.search
         last = search.rounds[-1]
         last = replace(last, alarm=replace(last.alarm, **{"p_value": 0.5, "gain": 0.0, **alarm}))
         search = replace(search, rounds=[*search.rounds[:-1], last])
         chosen = found.effects if effects is None else effects
-        return judged(search, chosen, unexplained, {}, options)
+        return judged(search, chosen, unexplained, gap or {}, options)
 
     return verdict
 
@@ -97,3 +98,14 @@ def test_a_minor_effect_is_not_named(judge, drag):
     assert verdict == "unknown" and "too small to be named: hinge.quadratic_drag" in reason
     other = replace(minor, share=0.05 * drag.share)
     assert judge(effects=[drag, other]) == ("named", "Missing: hinge.quadratic_drag.")
+
+
+def test_an_open_gap_makes_the_verdict_unknown(judge):
+    verdict, reason = judge(gap={"rmse": Gap(3.0, 2.4, 1.0)})
+    assert verdict == "unknown" and "closes only 30% of the gap" in reason
+    # The error has grown, but by less than a fifth.
+    verdict, reason = judge(gap={"rmse": Gap(3.0, 3.2, 1.0)})
+    assert verdict == "unknown" and "closes only 0% of the gap" in reason
+    verdict, reason = judge(gap={"rmse": Gap(3.0, 4.0, 1.0)})
+    assert verdict == "unknown" and "grows from 3 to 4" in reason
+    assert judge(gap={"rmse": Gap(3.0, 1.1, 1.0)})[0] == "named"

@@ -148,8 +148,7 @@ class PermutationTestSettings:
             their statistics of all permutations; a batch has at least one candidate. With their
             tables they fit into a processor's caches.
         batches_per_release: Number of batches after which freed memory is returned to the system.
-            Batches differ in size, so that freed blocks are seldom reused: on a recording of 14
-            channels, 1.1 GiB were held.
+            Batches differ in size, so that freed blocks are seldom reused.
     """
 
     num_permutations: int = 2000

@@ -16,7 +16,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS
 
-__all__ = ["found_in_halves", "search_halves"]
+__all__ = ["found_in_halves", "missing_where", "search_halves"]
 
 
 def search_halves(
@@ -66,6 +66,16 @@ def found_in_halves(effect: Effect, searches: Mapping[str, Search]) -> dict[str,
         name: any(_stands_for(added, effect) for added in search.added)
         for name, search in searches.items()
     }
+
+
+def missing_where(in_halves: Mapping[str, bool]) -> str:
+    """Returns where an effect was not found: the half's name, or ``"either half"``.
+
+    Args:
+        in_halves: Whether it was found in each half; see :func:`found_in_halves`.
+    """
+    missed = [name for name, is_in in in_halves.items() if not is_in]
+    return missed[0] if len(missed) == 1 else "either half"
 
 
 def _stands_for(added: Added, effect: Effect) -> bool:
