@@ -255,7 +255,9 @@ class Investigation:
                 return draws
         with self._stage(f"posterior {len(self._drawn) + 1}"):
             self.progress.say("drawing parameters")
-            draws = posterior_draws(hypothesis, seed=self.seed)
+            # The original model only predicts; where it lacks effects, its intervals are wrong.
+            is_final = hypothesis is self.search.final
+            draws = posterior_draws(hypothesis, seed=self.seed, reaches_ends=is_final)
         self._drawn.append((hypothesis, draws))
         return draws
 

@@ -7,7 +7,8 @@ which follows curved ridges. The tail of the weights, fitted by Pareto smoothing
 they are reliable (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
 
 Along ridges, an ensemble of the draws then moves by Markov chain Monte Carlo, because importance
-sampling gives too little weight to their ends.
+sampling gives too little weight to their ends. A polynomial that is fitted to the draws leads it,
+so that few moves suffice; see :mod:`npdr_ppl.preparation.density_surrogate`.
 """
 
 import math
@@ -21,6 +22,7 @@ from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, systematic
 from npdr_ppl.inference.parts.samplers.walkers import ensemble_draws
+from npdr_ppl.preparation.density_surrogate import DensitySurrogate
 from npdr_ppl.preparation.ridges import RidgeCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING
@@ -122,7 +124,11 @@ def heavy_tailed(mean: Tensor, covariance: Tensor) -> GaussianMixture:
 
 
 def sample_posterior(
-    likelihood: SegmentLikelihood, proposals: Sequence[Density] = (), *, seed: int
+    likelihood: SegmentLikelihood,
+    proposals: Sequence[Density] = (),
+    *,
+    seed: int,
+    reaches_ends: bool = True,
 ) -> WeightedDraws:
     """Draws from the posterior of a recording by adaptive importance sampling.
 
@@ -134,11 +140,11 @@ def sample_posterior(
         proposals: Further first proposals, densities over reference coordinates; for example
             posteriors that a backend has learnt.
         seed: Seed of the draws.
+        reaches_ends: Whether draws move on to the ends of a ridge.
     """
     prior = likelihood.segments.prior
     space = RidgeCoordinates.of(likelihood, seed=seed)
     settings = IMPORTANCE_SAMPLING
-    enough = settings.enough_effective + settings.enough_per_weak_coordinate * space.num_weak
     own = [_Proposal(heavy_tailed(*space.moments()), settings.draws_per_iteration, space)]
     given = [_Proposal(density, settings.draws_of_given) for density in proposals]
     z, w, target, log_mixture = (torch.empty(0, dtype=torch.float64) for _ in range(4))
@@ -166,20 +172,28 @@ def sample_posterior(
         smoothed, k_hat = smoothed_weights(log_weights)
         size = effective_size(smoothed)
         result = WeightedDraws(z, w, space, smoothed, k_hat, size, iteration + 1)
-        if result.k_hat <= settings.reliable_k and result.effective >= enough:
+        if result.k_hat <= settings.reliable_k and result.effective >= settings.enough_effective:
             break
         adapted = _adapted(w, log_weights, seed, iteration)
         own.append(_Proposal(adapted, settings.draws_per_iteration, space))
     assert result is not None
-    if space.num_weak and result.is_reliable and result.iterations > settings.easy_iterations:
-        return _moved(result, likelihood, seed)
+    if reaches_ends and space.num_weak and result.is_reliable:
+        return _moved(result, target, likelihood, seed)
     return result
 
 
-def _moved(draws: WeightedDraws, likelihood: SegmentLikelihood, seed: int) -> WeightedDraws:
+def _moved(
+    draws: WeightedDraws, target: Tensor, likelihood: SegmentLikelihood, seed: int
+) -> WeightedDraws:
     """Returns draws of equal weight, after moves that lead them to the ends of a ridge.
 
     Importance sampling places few draws there, and Pareto smoothing makes their weights too small.
+
+    Args:
+        draws: The draws.
+        target: Their log density over reference coordinates, ``(n,)``.
+        likelihood: The recording's likelihood.
+        seed: Seed of the moves.
     """
     settings, space, prior = IMPORTANCE_SAMPLING, draws.space, likelihood.segments.prior
 
@@ -191,16 +205,18 @@ def _moved(draws: WeightedDraws, likelihood: SegmentLikelihood, seed: int) -> We
             result[inside] = likelihood.log_prob(at) + prior.log_prob(at) - space.log_jacobian(at)
         return result.nan_to_num(-math.inf, -math.inf, -math.inf)
 
+    known = torch.where(target.isfinite(), target - space.log_jacobian(draws.z), -torch.inf)
+    surrogate = DensitySurrogate.of(draws.w, draws.log_weights, known)
     with seeded(seed, "walkers"):
         first = draws.w[systematic(draws.log_weights, settings.num_walkers)]
     generator = torch.Generator().manual_seed(derived_seed(seed, "ensemble"))
     w = ensemble_draws(
         log_density,
         first,
-        # At most twice as many simulations as the draws have cost.
-        sweeps=min(settings.sweeps, 2 * len(draws.z) // settings.num_walkers),
+        sweeps=settings.sweeps if surrogate else settings.sweeps_alone,
         interval=settings.sweeps_between_draws,
         generator=generator,
+        surrogate=surrogate,
     )
     log_weights = torch.full((len(w),), -math.log(len(w)), dtype=torch.float64)
     return replace(draws, z=space.to_reference(w)[0], w=w, log_weights=log_weights)

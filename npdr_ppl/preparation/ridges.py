@@ -16,13 +16,13 @@ the weighted ones (adaptive importance sampling along the ridge), until these no
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
 
 import torch
 from torch import Tensor
 
 from npdr_ppl.inference.parts.samplers.importance_weights import longest_step
 from npdr_ppl.language.prior import Prior
+from npdr_ppl.preparation.polynomials import Polynomial, fit_polynomial, num_terms
 from npdr_ppl.preparation.sampling_coordinates import SamplingCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.settings import RIDGE
@@ -41,8 +41,7 @@ class RidgeCoordinates:
         basis: Columns map w − shear to y − centre, ``(d, d)``.
         information: Information of the recording in units of the prior's, ``(d,)`` ascending.
         num_weak: Number of weak coordinates, which come first in w.
-        coefficients: Polynomial g in the weak ones, ``(terms, d − num_weak)``.
-        degree: Its degree; 0 if no ridge was traced.
+        bend: Polynomial g in the weak ones; zero, of degree 0, if no ridge was traced.
         weak_mean: Mean of the posterior's weak coordinates, estimated from the traced
             points, ``(num_weak,)``.
         weak_covariance: Their covariance, ``(num_weak, num_weak)``.
@@ -53,8 +52,7 @@ class RidgeCoordinates:
     basis: Tensor
     information: Tensor
     num_weak: int
-    coefficients: Tensor
-    degree: int
+    bend: Polynomial
     weak_mean: Tensor
     weak_covariance: Tensor
 
@@ -77,8 +75,7 @@ class RidgeCoordinates:
             spread[:, None] * vectors,
             information,
             num_weak,
-            torch.zeros(1, len(z) - num_weak, dtype=torch.float64),
-            0,
+            Polynomial.zero(len(z) - num_weak),
             torch.zeros(num_weak, dtype=torch.float64),
             torch.diag(1.0 / (1.0 + information[:num_weak])),
         )
@@ -92,8 +89,8 @@ class RidgeCoordinates:
             "centre": self.centre,
             "basis": self.basis,
             "information": self.information,
-            "coefficients": self.coefficients,
-            "shape": torch.tensor([self.num_weak, self.degree]),
+            "coefficients": self.bend.coefficients,
+            "shape": torch.tensor([self.num_weak, self.bend.degree]),
             "weak_mean": self.weak_mean,
             "weak_covariance": self.weak_covariance,
         }
@@ -108,8 +105,7 @@ class RidgeCoordinates:
             tensors["basis"],
             tensors["information"],
             int(num_weak),
-            tensors["coefficients"],
-            int(degree),
+            Polynomial(tensors["coefficients"], int(degree)),
             tensors["weak_mean"],
             tensors["weak_covariance"],
         )
@@ -141,14 +137,14 @@ class RidgeCoordinates:
         return own - torch.linalg.slogdet(self.basis).logabsdet
 
     def _bend(self, weak: Tensor) -> Tensor:
-        return _monomials(weak, self.degree) @ self.coefficients
+        return self.bend(weak)
 
     def _traced(
         self, likelihood: SegmentLikelihood, slope: Tensor, seed: int
     ) -> "RidgeCoordinates":
         """Returns the coordinates with a polynomial fitted to the ridge."""
         k, d, found = self.num_weak, len(self.centre), self
-        number = max(RIDGE.fewest_points, RIDGE.points_per_term * _num_terms(k, 2))
+        number = max(RIDGE.fewest_points, RIDGE.points_per_term * num_terms(k, 2))
         points, values = torch.empty(0, d).double(), torch.empty(0).double()
         for round_ in range(RIDGE.most_rounds):
             factor = RIDGE.reach * torch.linalg.cholesky(found.weak_covariance)
@@ -196,7 +192,7 @@ class RidgeCoordinates:
             infinity for points that were not found.
         """
         k, d = self.num_weak, len(self.centre)
-        straight = replace(self, coefficients=torch.zeros(1, d - k).double(), degree=0)
+        straight = replace(self, bend=Polynomial.zero(d - k))
         by_w = self.basis / slope[:, None]  # ∂z/∂w at the closest fit
         stiff = self.information[k:] + 1.0
         w = torch.cat((weak, self._bend(weak)), dim=-1)
@@ -233,42 +229,13 @@ class RidgeCoordinates:
         near = near[log_density[near].isfinite()]
         # Points that are farther from the ridge than others have smaller weights.
         excess = log_density[near].max() - log_density[near]
-        weight = (1.0 + excess / excess.median().clamp_min(0.5)).rsqrt()[:, None]
-        wanted = weight * w[near, k:]
-        least, found = torch.inf, self
-        for degree in range(1, RIDGE.most_degree + 1):
-            if RIDGE.points_per_coefficient * _num_terms(k, degree) > len(near):
-                break
-            q, r = torch.linalg.qr(weight * _monomials(w[near, :k], degree))
-            leverage = q.square().sum(-1, keepdim=True).clamp(max=0.999)
-            left_out = (wanted - q @ (q.mT @ wanted)) / (1.0 - leverage)
-            error = float((left_out.square() @ (self.information[k:] + 1.0)).mean())
-            coefficients = torch.linalg.solve_triangular(r, q.mT @ wanted, upper=True)
-            if error < least and bool(coefficients.isfinite().all()):
-                least = error
-                found = replace(self, coefficients=coefficients, degree=degree)
-        return found
-
-
-def _num_terms(number: int, degree: int) -> int:
-    return sum(1 for _ in _exponents(number, degree))
-
-
-def _exponents(number: int, degree: int) -> list[tuple[int, ...]]:
-    """Returns the variables whose product is each monomial, the constant first."""
-    return [
-        chosen
-        for power in range(degree + 1)
-        for chosen in combinations_with_replacement(range(number), power)
-    ]
-
-
-def _monomials(values: Tensor, degree: int) -> Tensor:
-    """Returns all monomials of ``(n, k)`` variables up to a degree, ``(n, terms)``."""
-    columns = []
-    for chosen in _exponents(values.shape[1], degree):
-        column = torch.ones(len(values), dtype=torch.float64)
-        for index in chosen:
-            column = column * values[:, index]
-        columns.append(column)
-    return torch.stack(columns, dim=-1)
+        weight = (1.0 + excess / excess.median().clamp_min(0.5)).rsqrt()
+        bend = fit_polynomial(
+            w[near, :k],
+            w[near, k:],
+            weights=weight,
+            importance=self.information[k:] + 1.0,
+            most_degree=RIDGE.most_degree,
+            points_per_coefficient=RIDGE.points_per_coefficient,
+        )
+        return self if bend is None else replace(self, bend=bend)

@@ -10,6 +10,7 @@ from npdr_ppl.settings import check_range
 
 __all__ = [
     "DRAW_BUDGET",
+    "DENSITY_SURROGATE",
     "IMPORTANCE_SAMPLING",
     "INITIAL_STATES",
     "LINEARISATION",
@@ -18,6 +19,7 @@ __all__ = [
     "RIDGE",
     "SAMPLING_COORDINATES",
     "SEGMENT_FIT",
+    "DensitySurrogateSettings",
     "DrawBudgetSettings",
     "ImportanceSamplingSettings",
     "InitialStateSettings",
@@ -267,16 +269,9 @@ class ImportanceSamplingSettings:
         enough_effective: Effective sample size at which sampling ends, if the recording determines
             all parameters. The ends of a 90 % interval are then known to a tenth of a standard
             deviation.
-        enough_per_weak_coordinate: Increase of this size for each weak coordinate of a ridge.
-            Proposals reach the ends of a ridge only after some adaptation.
-        easy_iterations: Iterations after which draws need no moves: proposals that are this good
-            reach the ends of a ridge. Chosen for its cost: with moves after every sampling, the
-            search for effects took several times as long.
         num_walkers: Number of draws that then move along a ridge as an ensemble.
-        sweeps: Greatest number of moves of each; never more than twice as many simulations as the
-            draws have cost. On tuning recordings of a Furuta pendulum, which has three
-            weak coordinates, standard deviations from 500 effective draws were 4 to 9 % smaller
-            than those after 60 moves; after 30 moves, up to 4 %.
+        sweeps: Number of moves of each; a surrogate leads most of them.
+        sweeps_alone: Number of moves of each if there is no surrogate.
         sweeps_between_draws: Moves between draws that are kept, in the second half.
         least_effective: Effective sample size below which the draws do not represent the
             posterior.
@@ -292,11 +287,10 @@ class ImportanceSamplingSettings:
     most_iterations: int = 16
     reliable_k: float = 0.7
     enough_effective: float = 200.0
-    enough_per_weak_coordinate: float = 100.0
-    easy_iterations: int = 2
     num_walkers: int = 256
-    sweeps: int = 30
-    sweeps_between_draws: int = 5
+    sweeps: int = 8
+    sweeps_alone: int = 30
+    sweeps_between_draws: int = 2
     least_effective: float = 100.0
     draws_of_given: int = 128
     effective_per_parameter: float = 8.0
@@ -306,14 +300,34 @@ class ImportanceSamplingSettings:
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, math.inf, "draws_per_iteration", "most_iterations", "num_kernels")
-        check_range(self, 1, math.inf, "sweeps", "sweeps_between_draws")
+        check_range(self, 1, math.inf, "sweeps", "sweeps_alone", "sweeps_between_draws")
         check_range(self, 4, math.inf, "num_walkers")
-        check_range(self, 0, math.inf, "easy_iterations")
         check_range(self, 1, math.inf, "enough_effective", "least_effective", "draws_of_given")
-        check_range(self, 0.0, math.inf, "enough_per_weak_coordinate")
         check_range(self, 0.0, 1.0, "reliable_k")
         check_range(self, 1.0, math.inf, "effective_per_parameter")
         check_range(self, 0.0, math.inf, "tails")
+
+
+@dataclass(frozen=True)
+class DensitySurrogateSettings:
+    """The polynomial in place of a log density.
+
+    Attributes:
+        deepest: How much less log density than the greatest a point may have to be fitted, beyond
+            the number of parameters. It leaves out one of 10,000 draws of a normal density.
+        most_degree: Greatest degree of the polynomial.
+        points_per_coefficient: Least number of points for each coefficient.
+    """
+
+    deepest: float = 10.0
+    most_degree: int = 4
+    points_per_coefficient: int = 3
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 0.0, math.inf, "deepest")
+        check_range(self, 1, 10, "most_degree")
+        check_range(self, 1, math.inf, "points_per_coefficient")
 
 
 @dataclass(frozen=True)
@@ -364,5 +378,6 @@ INITIAL_STATES = InitialStateSettings()
 SAMPLING_COORDINATES = SamplingCoordinateSettings()
 RIDGE = RidgeSettings()
 IMPORTANCE_SAMPLING = ImportanceSamplingSettings()
+DENSITY_SURROGATE = DensitySurrogateSettings()
 DRAW_BUDGET = DrawBudgetSettings()
 LINEAR_REGRESSION = LinearRegressionSettings()

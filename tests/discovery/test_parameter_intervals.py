@@ -142,4 +142,4 @@ def test_a_ridge_is_traced_inside_the_support(monkeypatch):
     monkeypatch.setattr(SegmentLikelihood, "scores", seen)
     space = RidgeCoordinates.of(hypothesis.likelihood, seed=0)
     assert simulated[1] == (simulated[0] + 1) // 2
-    assert bool(space.coefficients.isfinite().all())
+    assert bool(space.bend.coefficients.isfinite().all())

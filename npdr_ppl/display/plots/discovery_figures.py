@@ -48,7 +48,9 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
         figures["separation"] = plot_separation(matrix, discovery.separation_names)
     seed = discovery.seed
     units = {name: estimate.unit for name, estimate in discovery.parameters.items()}
-    drawn = discovery.draws if after is None else posterior_draws(start, seed=seed)
+    drawn = discovery.draws
+    if after is not None:
+        drawn = posterior_draws(start, seed=seed, reaches_ends=False)
     prior, draws = _draws(start, drawn, seed)
     posteriors = {BEFORE: draws}
     if after is not None:

@@ -1,0 +1,96 @@
+"""Polynomials in several variables, fitted by weighted least squares."""
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import torch
+from torch import Tensor
+
+__all__ = ["Polynomial", "fit_polynomial", "num_terms"]
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """A polynomial of k variables with m values.
+
+    Attributes:
+        coefficients: Coefficients of the monomials, ``(terms, m)``.
+        degree: The degree.
+    """
+
+    coefficients: Tensor
+    degree: int
+
+    @classmethod
+    def zero(cls, num_values: int) -> "Polynomial":
+        """Returns the polynomial that is zero everywhere."""
+        return cls(torch.zeros(1, num_values, dtype=torch.float64), 0)
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Returns its values, ``(n, m)``, at points ``(n, k)``."""
+        return _monomials(points, self.degree) @ self.coefficients
+
+
+def fit_polynomial(
+    points: Tensor,
+    values: Tensor,
+    *,
+    weights: Tensor,
+    importance: Tensor,
+    most_degree: int,
+    least_degree: int = 1,
+    points_per_coefficient: int,
+) -> Polynomial | None:
+    """Returns the polynomial with the smallest leave-one-out error.
+
+    Args:
+        points: Points, ``(n, k)``.
+        values: Values there, ``(n, m)``.
+        weights: Square roots of the points' weights, ``(n,)``.
+        importance: Weights of the m squared errors in the choice of the degree, ``(m,)``.
+        most_degree: Greatest degree.
+        least_degree: Least degree.
+        points_per_coefficient: Least number of points for each coefficient.
+
+    Returns:
+        ``None`` if there are too few points, or no degree can be fitted.
+    """
+    found, least = None, torch.inf
+    weight = weights[:, None]
+    wanted = weight * values
+    for degree in range(least_degree, most_degree + 1):
+        if points_per_coefficient * num_terms(points.shape[1], degree) > len(points):
+            break
+        q, r = torch.linalg.qr(weight * _monomials(points, degree))
+        leverage = q.square().sum(-1, keepdim=True).clamp(max=0.999)
+        left_out = (wanted - q @ (q.mT @ wanted)) / (1.0 - leverage)
+        error = float((left_out.square() @ importance).mean())
+        coefficients = torch.linalg.solve_triangular(r, q.mT @ wanted, upper=True)
+        if error < least and bool(coefficients.isfinite().all()):
+            least, found = error, Polynomial(coefficients, degree)
+    return found
+
+
+def num_terms(number: int, degree: int) -> int:
+    """Returns the number of monomials of some variables up to a degree."""
+    return sum(1 for _ in _exponents(number, degree))
+
+
+def _exponents(number: int, degree: int) -> list[tuple[int, ...]]:
+    """Returns the variables whose product is each monomial, the constant first."""
+    return [
+        chosen
+        for power in range(degree + 1)
+        for chosen in combinations_with_replacement(range(number), power)
+    ]
+
+
+def _monomials(values: Tensor, degree: int) -> Tensor:
+    """Returns all monomials of ``(n, k)`` variables up to a degree, ``(n, terms)``."""
+    columns: list[Tensor] = []
+    known: dict[tuple[int, ...], Tensor] = {(): torch.ones(len(values), dtype=torch.float64)}
+    for chosen in _exponents(values.shape[1], degree):
+        if chosen:
+            known[chosen] = known[chosen[:-1]] * values[:, chosen[-1]]
+        columns.append(known[chosen])
+    return torch.stack(columns, dim=-1)
