@@ -21,7 +21,7 @@ from npdr_ppl.progress import Step
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["ClosestFit", "closest_fit", "search_prior"]
+__all__ = ["ClosestFit", "closest_fit", "search_prior", "spread_out"]
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def search_prior(
     every = segments
     ranges = (every.observed * every.is_measured).abs().amax((0, 1)).double()
     ranges = ranges.clamp_min(torch.finfo(torch.float32).tiny)
-    segments = _spread_out(every, seed)
+    segments = spread_out(every, seed)
     num_parameters = segments.prior.num_parameters
     centre = torch.zeros(num_parameters, dtype=torch.float64)
     spread = torch.ones_like(centre)
@@ -136,8 +136,15 @@ def search_prior(
     return z
 
 
-def _spread_out(segments: SegmentModel, seed: int) -> SegmentModel:
-    """Returns the model along a segment of each of equal parts of the recording."""
+def spread_out(segments: SegmentModel, seed: int) -> SegmentModel:
+    """Returns the model along a segment of each of equal parts of the recording.
+
+    Enough segments to begin a fit with; see ``PRIOR_SEARCH.most_segments``.
+
+    Args:
+        segments: The model along the recording.
+        seed: Seed of the choice.
+    """
     num, used = segments.inputs.num_segments, PRIOR_SEARCH.most_segments
     return segments if num <= used else segments.along(one_of_each_part(used, num, seed=seed))
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.preparation.effective_share import effective_share
 from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
 from npdr_ppl.preparation.settings import SEGMENT_FIT
 from npdr_ppl.preparation.solving import solve_or_zero
@@ -86,16 +87,36 @@ def fit_segments(
         return SegmentFit(z, offsets, known)
     z, offsets, left = _steps(segments, z, offsets, present, held, max_steps, is_rough=True)
     if not is_rough:
-        z, offsets, left = _steps(segments, z, offsets, left, held, max_steps, is_rough=False)
+        share = _share(segments, z, offsets, left)
+
+        def precise(z: Tensor, offsets: Tensor, scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            return _steps(
+                segments, z, offsets, scale, held, max_steps, is_rough=False, share=share
+            )
+
+        z, offsets, left = precise(z, offsets, left)
         unstuck = _unstuck_offsets(segments, z, offsets, left)
         if unstuck is not None:
-            z, offsets, left = _steps(segments, z, unstuck, left, held, max_steps, is_rough=False)
+            z, offsets, left = precise(z, unstuck, left)
         for _ in range(SEGMENT_FIT.most_restarts):
             better = _restart(segments, z, offsets, left, held)
             if better is None:
                 break
-            z, offsets, left = _steps(segments, *better, left, held, max_steps, is_rough=False)
+            z, offsets, left = precise(*better, left)
     return SegmentFit(z, offsets, left)
+
+
+def _share(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> float:
+    """Returns the effective number of independent measurements as a share of all.
+
+    Args:
+        segments: The model and the recording.
+        z: Parameters, ``(d,)``.
+        offsets: Offsets of the initial states, ``(S, m)``.
+        scale: Standard deviation of each channel's residuals, ``(C,)``.
+    """
+    residual = segments.residuals(z[None], offsets[None], scale)[0].unflatten(-1, (-1, len(scale)))
+    return float(effective_share(residual, segments.is_measured).mean())
 
 
 def _unstuck_offsets(
@@ -196,8 +217,12 @@ def _steps(
     max_steps: int,
     *,
     is_rough: bool,
+    share: float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Takes steps until they gain little.
+
+    Derivatives cost most of a step. So a few further steps use those of an earlier point,
+    corrected by what the last step has changed (Broyden 1965).
 
     Rough steps use one-sided differences and set the scale to that of the residuals after each
     step. Each segment has its own damping, because a segment in which a joint sticks would
@@ -210,8 +235,10 @@ def _steps(
         offsets: First offsets of the initial states, ``(S, m)``.
         scale: Scale of the residuals there, ``(C,)``.
         held: Mask of coordinates that are not fitted, ``(d,)``.
-        max_steps: Greatest number of steps.
+        max_steps: Greatest number of linearisations.
         is_rough: Whether steps are rough.
+        share: Effective number of measurements as a share of all; the fewer, the less log evidence
+            is in a gain.
 
     Returns:
         Parameters, offsets and the scale of the residuals.
@@ -221,9 +248,15 @@ def _steps(
         torch.full((len(offsets),), SEGMENT_FIT.first_damping).double(),
     )
     factors, present_scale = SEGMENT_FIT.near_factors, scale
-    for _ in range(max_steps):
-        now = segments.linearise(z, offsets, scale, is_rough=is_rough)
-        now = replace(now, by_parameters=now.by_parameters * ~held)
+    now, num_updates, num_linearised = None, 0, 0
+    most_updates = _most_updates(segments, held, is_rough=is_rough)
+    while True:
+        if now is None:
+            if num_linearised == max_steps:
+                break
+            now = segments.linearise(z, offsets, scale, is_rough=is_rough)
+            now = replace(now, by_parameters=now.by_parameters * ~held)
+            num_updates, num_linearised = 0, num_linearised + 1
         if not now.is_finite:
             break
         present = sum(float(part.square().sum()) for part in (now.residual, offsets, z))
@@ -237,10 +270,11 @@ def _steps(
         best = int(outcome.argmin())
         gain = present - float(outcome[best])
         is_little = gain < max(
-            SEGMENT_FIT.least_gain, SEGMENT_FIT.rough_gain * present if is_rough else 0.0
+            SEGMENT_FIT.least_gain / share, SEGMENT_FIT.rough_gain * present if is_rough else 0.0
         )
         if gain > 0.0:
             place, every = chosen[best], torch.arange(len(offsets))
+            last = z, offsets
             z, offsets = tried[best], begun[best][place, every]
             damping = min(
                 max(damping * factors[best], SEGMENT_FIT.damping_limits[0]),
@@ -252,16 +286,51 @@ def _steps(
             count = segments.num_measured.sum(0).clamp_min(1)
             left = squares[best][place, every].sum(0) / count
             present_scale = (scale * left.sqrt()).maximum(segments.least_scale)
+            before = scale
             if is_rough:
-                before, scale = scale, present_scale
+                scale = present_scale
                 is_little = is_little and bool((scale > SEGMENT_FIT.settled_scale * before).all())
+            corrected = None
+            if most_updates:
+                here = segments.residuals(z[None], offsets[None], scale)[0]
+                corrected = now.rescaled(before / scale).updated(
+                    here, z - last[0], offsets - last[1]
+                )
+            now = corrected
+        if is_little and num_updates:
+            # Only derivatives that are computed at this point can show that nothing is left.
+            now, factors = None, SEGMENT_FIT.near_factors
+            continue
         if not is_little:
             factors = SEGMENT_FIT.near_factors
         elif factors == SEGMENT_FIT.far_factors or (is_rough and gain > 0.0):
             break
         else:
             factors = SEGMENT_FIT.far_factors
+            continue
+        num_updates += 1
+        if num_updates > most_updates:
+            now = None
     return z, offsets, present_scale
+
+
+def _most_updates(segments: SegmentModel, held: Tensor, *, is_rough: bool) -> int:
+    """Returns how many steps may use corrected derivatives.
+
+    None where that saves little, or where the misfit has local minima, at which corrections lead.
+
+    Args:
+        segments: The model and the recording.
+        held: Mask of coordinates that are not fitted, ``(d,)``.
+        is_rough: Whether differences are one-sided.
+    """
+    sides = 1 if is_rough else 2
+    derivatives = sides * (len(held) + segments.num_offsets)
+    if derivatives < SEGMENT_FIT.least_ratio * len(SEGMENT_FIT.near_factors) ** 2:
+        return 0
+    return (
+        0 if bool((segments.coordinates_with_minima & ~held).any()) else SEGMENT_FIT.most_updates
+    )
 
 
 def _squares(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:

@@ -51,6 +51,32 @@ class Linearisation:
     by_parameters: Tensor
     by_starts: Tensor
 
+    def rescaled(self, factor: Tensor) -> "Linearisation":
+        """Returns it in units that are smaller by a factor per channel, ``(C,)``."""
+        ratio = factor.repeat(self.residual.shape[-1] // len(factor))
+        by_parameters, by_starts = (
+            part * ratio[:, None] for part in (self.by_parameters, self.by_starts)
+        )
+        return Linearisation(self.residual * ratio, by_parameters, by_starts)
+
+    def updated(self, residual: Tensor, step: Tensor, moves: Tensor) -> "Linearisation":
+        """Returns it at a nearby point, with the least change of derivatives that explains this.
+
+        The correction is that of Broyden (1965), per segment.
+
+        Args:
+            residual: Residuals at the point, ``(S, N)``.
+            step: Difference of the parameters, ``(d,)``.
+            moves: Differences of the offsets, ``(S, m)``.
+        """
+        both = torch.cat((step.expand(len(moves), -1), moves), dim=-1)[:, None]  # (S, 1, d + m)
+        derivatives = torch.cat((self.by_parameters, self.by_starts), dim=-1)
+        missed = (self.residual - residual)[..., None] - derivatives @ both.mT
+        length = both.square().sum(-1, keepdim=True).clamp_min(1e-300)
+        derivatives = derivatives + missed * (both / length)
+        by_parameters, by_starts = derivatives.split((len(step), moves.shape[-1]), dim=-1)
+        return Linearisation(residual, by_parameters, by_starts)
+
     @property
     def is_finite(self) -> bool:
         """Whether residuals and derivatives are finite, and their squares, which are summed later.

@@ -89,8 +89,9 @@ class SegmentFitSettings:
             deviations. A strength that is much smaller than typical for its half-normal prior has
             a coordinate of −3 or less.
         least_gain: Steps end when a step reduces the objective, in variances of the measurement
-            noise, by less than this. The default is a quarter of a unit of log evidence. A model
-            that is ten times as likely as another has 2.3 units more.
+            noise and for independent measurements, by less than this. The default is a quarter of
+            a unit of log evidence. A model that is ten times as likely as another has 2.3 units
+            more.
         outlier_misfit: Multiple of the median segment's misfit above which other initial states
             are tried.
         initial_state_restarts: Distances of these initial states, in standard deviations of the
@@ -102,6 +103,9 @@ class SegmentFitSettings:
         restart_directions: Number of random directions of restarts, per coordinate that has local
             minima.
         most_restarts: Greatest number of successive restarts.
+        most_updates: Greatest number of steps with corrected derivatives of an earlier point.
+        least_ratio: Least number of simulations for derivatives, as a multiple of those for a
+            step's tries, with which derivatives are corrected.
     """
 
     first_damping: float = 1e-2
@@ -119,6 +123,8 @@ class SegmentFitSettings:
     wide_restart_distances: tuple[float, ...] = (0.03, 0.1, 0.3)
     restart_directions: int = 6
     most_restarts: int = 4
+    most_updates: int = 3
+    least_ratio: float = 2.0
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
@@ -129,7 +135,8 @@ class SegmentFitSettings:
         check_range(self, 0.0, math.inf, "least_gain", "initial_state_restarts")
         check_range(self, 0.0, math.inf, "restart_distances", "wide_restart_distances")
         check_range(self, 1.0, math.inf, "outlier_misfit")
-        check_range(self, 0, 100, "restart_directions", "most_restarts")
+        check_range(self, 0, 100, "restart_directions", "most_restarts", "most_updates")
+        check_range(self, 0.0, math.inf, "least_ratio")
 
 
 @dataclass(frozen=True)

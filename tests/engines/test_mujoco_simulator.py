@@ -344,8 +344,10 @@ def test_substeps_divide_the_control_step():
     assert torch.equal(coarse.simulate({}, inputs), fine.simulate({}, repeated)[:, 4::5])
 
 
-@pytest.mark.parametrize(("integrator", "most"), [("Euler", 0.3), ("RK4", 0.55)])
-def test_finer_steps_err_less(integrator, most):
+@pytest.mark.parametrize(
+    ("integrator", "most", "substeps"), [("Euler", (0.5, 0.25), (1, 2)), ("RK4", (0.55,), (2,))]
+)
+def test_finer_steps_err_less(integrator, most, substeps):
     # The engine's order helps the equations, not forces of effects, which it holds for a step.
     drag = ViscousFriction("shoulder_torque")
     strength = {"shoulder_torque.viscous_friction.damping": value(0.3)}
@@ -354,15 +356,37 @@ def test_finer_steps_err_less(integrator, most):
     def readings(simulator):
         return simulator.with_effects(drag).simulate(strength, inputs)
 
-    coarse = arm(integrator=integrator)
-    finer = coarse.with_finer_steps()
+    finer = coarse = arm(integrator=integrator)
     exact = readings(arm(integrator="RK4", substeps=64))
-    assert (readings(finer) - exact).norm() < most * (readings(coarse) - exact).norm()
-    assert (finer.num_substeps(0.002), coarse.num_substeps(0.002)) == (2, 1)
-    # Without effects only the order is left.
-    exact = arm(integrator="RK4", substeps=64).simulate({}, inputs)
-    torch.testing.assert_close(finer.simulate({}, inputs), exact, rtol=1e-6, atol=1e-8)
+    natural = arm(integrator="RK4", substeps=64).simulate({}, inputs)
+    error = (readings(coarse) - exact).norm()
+    for share, number in zip(most, substeps, strict=True):
+        finer = finer.with_finer_steps()
+        assert (readings(finer) - exact).norm() < share * error
+        assert finer.num_substeps(0.002) == number
+        # Without effects only the order is left.
+        torch.testing.assert_close(finer.simulate({}, inputs), natural, rtol=1e-5, atol=1e-7)
     assert finer.with_finer_steps() is None
+    assert coarse.num_substeps(0.002) == 1
+
+
+STIFF = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
+<inertial pos="0 0 0.1" mass="1" diaginertia="0.01 0.01 0.01"/><joint name="hinge" axis="0 1 0"
+armature="0.08"/></body></worldbody><actuator><position name="servo" joint="hinge" kp="2000"
+kv="400"/></actuator></mujoco>"""
+
+
+def test_a_stiff_servo_keeps_its_integrator_in_finer_steps(tmp_path):
+    # Its velocity decays at 4000/s: steps of order four diverge from 1400/s on.
+    path = tmp_path / "servo.xml"
+    path.write_text(STIFF)
+    coarse = MujocoSimulator(path)
+    finer = coarse.with_finer_steps()
+    assert finer.num_substeps(0.002) == 4 and finer.with_finer_steps() is None
+    exact = MujocoSimulator(path, substeps=64, time_step=0.002)
+    inputs = random_inputs(coarse, num_segments=1, num_steps=100)
+    near, far, best = (s.simulate({}, inputs) for s in (finer, coarse, exact))
+    assert (near - best).norm() < 0.3 * (far - best).norm()
 
 
 @pytest.mark.parametrize("substeps", [1, 3])

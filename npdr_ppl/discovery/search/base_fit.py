@@ -24,7 +24,7 @@ from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.settings import HYPOTHESIS
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import with_finer_steps
-from npdr_ppl.preparation.closest_fit import search_prior
+from npdr_ppl.preparation.closest_fit import search_prior, spread_out
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
@@ -69,20 +69,26 @@ def fit_base(
     step = progress or (lambda fraction, status: None)
     begun: list[Hypothesis] = []
     failure: DataError | None = None
-    starts = _starts(segments, near, seed, progress)
+    starts, few = _starts(segments, near, seed, progress), spread_out(segments, seed)
     for number, start in enumerate(starts, 1):
         # How many steps a fit takes is not known.
         step(None, f"rough fit {number} of {len(starts)}")
         try:
-            begun.append(fit_segment_model(segments, start=start, is_rough=True))
+            begun.append(fit_segment_model(few, start=start, is_rough=True))
         except DataError as error:
             failure = error
-    if not begun:
+    step(None, "fit to convergence")
+    fitted: Hypothesis | None = None
+    while begun and fitted is None:
+        best = closest(begun)
+        begun = [other for other in begun if other is not best]
+        try:
+            fitted = fit_segment_model(segments, start=best.parameters)
+        except DataError as error:  # it can be simulated along some segments only
+            failure = error
+    if fitted is None:
         assert failure is not None
         raise failure
-    best = closest(begun)
-    step(None, "fit to convergence")
-    fitted = fit_segment_model(segments, start=best.parameters, offsets=best.fit.offsets)
     fitted = off_the_ends(fitted)
     step(None, "fit with better initial states")
     found = Trials(segments).with_own_starts(fitted)
@@ -116,7 +122,8 @@ def off_the_ends(fitted: Hypothesis) -> Hypothesis:
             )
         except DataError:
             break
-        if _loss(other, fitted.fit.scale) >= _loss(fitted, fitted.fit.scale):
+        gain = _loss(fitted, fitted.fit.scale) - _loss(other, fitted.fit.scale)
+        if not fitted.share * gain >= BASE_FIT.least_gain:
             break
         fitted = other
     return fitted
@@ -181,11 +188,13 @@ def _starts(
 
 
 def _step_error(current: Hypothesis, finer: SegmentModel) -> float:
-    """Returns the distance between two simulations, in units of the hypothesis's residuals.
+    """Returns the distance between two simulations, in standard deviations of the residuals.
 
-    The simulations are those of the hypothesis and of the same model with finer steps.
+    The simulations are those of the hypothesis and of the same model with finer steps. Correlated
+    residuals count as the fewer independent ones that they are worth.
     """
     fit = current.fit
     here = fit.z[None], fit.offsets[None]
     difference = finer.simulate(*here) - current.segments.simulate(*here)
-    return float(finer.whitened(difference[0], fit.scale).norm().nan_to_num(math.inf))
+    distance = finer.whitened(difference[0], fit.scale).norm().nan_to_num(math.inf)
+    return math.sqrt(current.share) * float(distance)

@@ -225,7 +225,7 @@ class Searcher:
                 break
             tested = best if extended is single else None
             current = self.trials.with_own_starts(self._pruned(extended, tested))
-            if not self.are_steps_coarse and self.with_finer_steps(current) is not current:
+            if self.with_finer_steps(current) is not current:
                 # The missing effect had hidden that the steps are too coarse: restart the search.
                 current = self.fit_base()
                 first = now = self.look(current)

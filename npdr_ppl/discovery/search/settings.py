@@ -36,15 +36,18 @@ class BaseFitSettings:
             with coarse steps.
         most_refits: Greatest number of refits from inside the priors, each from the result of the
             previous one.
+        least_gain: Least gain of such a refit in log density, a tenth of what makes one model ten
+            times as likely as another.
     """
 
     noticeable_change: float = 5.0
     coarse_probability: float = 0.9
     most_refits: int = 4
+    least_gain: float = 0.23
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
-        check_range(self, 0.0, 100.0, "noticeable_change")
+        check_range(self, 0.0, 100.0, "noticeable_change", "least_gain")
         check_range(self, 0.5, 1.0, "coarse_probability")
         check_range(self, 1, 100, "most_refits")
 

@@ -14,6 +14,7 @@ from npdr_ppl.engines.common.batching import flatten
 from npdr_ppl.engines.common.episodes import EpisodeRequest, Episodes
 from npdr_ppl.engines.common.policy_loop import LoopBody, begin, run_eagerly
 from npdr_ppl.engines.mujoco.batches import quiet
+from npdr_ppl.engines.mujoco.damping import fastest_damping
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.mujoco_linear_dynamics import bound_inverse_dynamics
 from npdr_ppl.engines.mujoco.open_loop import replay
@@ -24,9 +25,16 @@ from npdr_ppl.language.linear_dynamics import InverseDynamics
 __all__ = ["MujocoSimulator"]
 
 _FINER = 2
-"""Engine steps of :meth:`MujocoSimulator.with_finer_steps`, of order four, per engine step of the
-simulator itself. Forces of effects are constant over an engine step of any order, so only shorter
-steps make them more accurate."""
+"""How many times as many steps :meth:`MujocoSimulator.with_finer_steps` takes once the order is
+four. Forces of effects are constant over an engine step of any order, so only shorter steps make
+them more accurate."""
+
+_FINER_IF_STIFF = 4
+"""The same where steps of order four are unstable, as often as the order cannot be raised."""
+
+_MOST_DAMPED = 2.5
+"""Rate of the fastest damping, per engine step, up to which steps of order four are used. They are
+stable up to 2.8; an arm's inertia changes as it moves."""
 
 
 class MujocoSimulator(MujocoMechanism):
@@ -79,14 +87,25 @@ class MujocoSimulator(MujocoMechanism):
         return bound_inverse_dynamics(self)
 
     def with_finer_steps(self) -> Self | None:
-        """Returns a copy with twice the steps, of order four; ``None`` if this is such a copy."""
+        """Returns a copy with steps of order four, or of this one with twice as many.
+
+        Where they would be unstable, as with stiff servos, it takes four times as many steps of
+        the file's own integrator. ``None`` if this is already such a copy.
+        """
         if self.refinement > 1:
             return None
         mujoco: Any = importlib.import_module("mujoco")
+        rk4 = mujoco.mjtIntegrator.mjINT_RK4
+        engine_step = self.time_step / self.num_substeps(self.time_step)
         changed = copy.copy(self)
-        changed.refinement = _FINER
-        changed.model, changed.prepared_models = copy.copy(self.model), {}
-        changed.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        changed.prepared_models = {}
+        if fastest_damping(self.model, self.initial_positions) * engine_step > _MOST_DAMPED:
+            changed.refinement = _FINER_IF_STIFF
+        elif self.model.opt.integrator == rk4:
+            changed.refinement = _FINER
+        else:
+            changed.model = copy.copy(self.model)
+            changed.model.opt.integrator = rk4
         return changed
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
