@@ -70,6 +70,15 @@ class Hypothesis:
         segments = self.segments.averaged(HYPOTHESIS.most_measurements, HYPOTHESIS.least_averages)
         return self if segments is self.segments else replace(self, segments=segments)
 
+    def along(self, index: Tensor) -> "Hypothesis":
+        """Returns the hypothesis along some of the segments, with the same parameters.
+
+        Args:
+            index: Their indices.
+        """
+        fit = replace(self.fit, offsets=self.fit.offsets[index])
+        return Hypothesis(self.model, self.effects, self.segments.along(index), fit)
+
     @property
     def can_be_linearised(self) -> bool:
         """Whether the simulation succeeds at the fit and close to it."""

@@ -21,7 +21,7 @@ from npdr_ppl.progress import Step
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["ClosestFit", "closest_fit", "search_prior", "spread_out"]
+__all__ = ["ClosestFit", "closest_fit", "part_of", "search_prior"]
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def search_prior(
     every = segments
     ranges = (every.observed * every.is_measured).abs().amax((0, 1)).double()
     ranges = ranges.clamp_min(torch.finfo(torch.float32).tiny)
-    segments = spread_out(every, seed)
+    segments = every.along(part_of(every, seed=seed))
     num_parameters = segments.prior.num_parameters
     centre = torch.zeros(num_parameters, dtype=torch.float64)
     spread = torch.ones_like(centre)
@@ -122,7 +122,7 @@ def search_prior(
             least, z = float(error[order[0]]), tried[order[0]]
         if progress is not None:
             progress((iteration + 1) / iterations, f"error {least:.3g} of the range")
-    if segments is not every:
+    if segments.inputs.num_segments < every.inputs.num_segments:
         # Parameters that can be simulated along some segments may fail along others.
         for place in (z, *elite):
             z, least = place, float(_errors(every, place[None], every.no_offsets, ranges))
@@ -136,8 +136,8 @@ def search_prior(
     return z
 
 
-def spread_out(segments: SegmentModel, seed: int) -> SegmentModel:
-    """Returns the model along a segment of each of equal parts of the recording.
+def part_of(segments: SegmentModel, *, seed: int = 0) -> Tensor:
+    """Returns the indices of a segment of each of equal parts of the recording.
 
     Enough segments to begin a fit with; see ``PRIOR_SEARCH.most_segments``.
 
@@ -145,8 +145,8 @@ def spread_out(segments: SegmentModel, seed: int) -> SegmentModel:
         segments: The model along the recording.
         seed: Seed of the choice.
     """
-    num, used = segments.inputs.num_segments, PRIOR_SEARCH.most_segments
-    return segments if num <= used else segments.along(one_of_each_part(used, num, seed=seed))
+    num = segments.inputs.num_segments
+    return one_of_each_part(min(num, PRIOR_SEARCH.most_segments), num, seed=seed)
 
 
 def _errors(segments: SegmentModel, z: Tensor, starts: Tensor, ranges: Tensor) -> Tensor:

@@ -134,7 +134,7 @@ def test_a_simple_law_converges_beside_three_laws_that_contain_it(rubbed, monkey
         return fits(self, wanted, simulator)
 
     monkeypatch.setattr(Trials, "_fits", seen)
-    searcher.trials.converged(trials)
+    searcher.trials.converged(trials, first.hypothesis)
     assert law.name in asked
 
 

@@ -100,8 +100,8 @@ def find_alternatives(
     averaged = without.averaged()
     projection = Projection(averaged)
     ranking = screen(projection, variants_of(candidates, projection, responses(averaged)))
-    tried = {effect.name: current} | trials.extended(without, ranking)
-    tried = trials.converged(tried, done=effect.name)
+    tried = trials.extended(without, ranking)
+    tried = trials.converged(tried, without, done={effect.name: current})
     others = {name: h for name, h in tried.items() if name != effect.name}
     return Alternatives(without, current, trials.apart_from_waves_in_step(others))
 

@@ -24,7 +24,7 @@ from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.settings import HYPOTHESIS
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import with_finer_steps
-from npdr_ppl.preparation.closest_fit import search_prior, spread_out
+from npdr_ppl.preparation.closest_fit import part_of, search_prior
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
@@ -69,7 +69,8 @@ def fit_base(
     step = progress or (lambda fraction, status: None)
     begun: list[Hypothesis] = []
     failure: DataError | None = None
-    starts, few = _starts(segments, near, seed, progress), spread_out(segments, seed)
+    starts = _starts(segments, near, seed, progress)
+    few = segments.along(part_of(segments, seed=seed))
     for number, start in enumerate(starts, 1):
         # How many steps a fit takes is not known.
         step(None, f"rough fit {number} of {len(starts)}")
@@ -100,8 +101,9 @@ def off_the_ends(fitted: Hypothesis) -> Hypothesis:
     """Refits a model if parameters that the recording does not determine are at a prior's end.
 
     Along a flat direction, a fit can step anywhere. At a prior's end, a parameter hardly changes
-    with its reference coordinate. The refit begins inside the prior. The fit with the greater
-    posterior density is kept.
+    with its reference coordinate, so that the recording may say less about the coordinate than the
+    prior does, and the fit cannot leave. The refit begins inside the prior. The fit with the
+    greater posterior density is kept.
 
     Args:
         fitted: The fit.
@@ -109,7 +111,7 @@ def off_the_ends(fitted: Hypothesis) -> Hypothesis:
     for _ in range(BASE_FIT.most_refits):
         z = fitted.fit.z
         is_at_end = z.abs() > HYPOTHESIS.implausible_coordinate
-        if not bool(is_at_end.any()):
+        if not bool(is_at_end.any()) or not bool((is_at_end & _is_flat(fitted)).any()):
             break
         inside = torch.where(is_at_end, z.sign(), z)
         start = fitted.segments.prior.to_parameters(inside[None])
@@ -127,6 +129,17 @@ def off_the_ends(fitted: Hypothesis) -> Hypothesis:
             break
         fitted = other
     return fitted
+
+
+def _is_flat(fitted: Hypothesis) -> Tensor:
+    """Returns whether the prior says more about each coordinate than the recording, ``(d,)``."""
+    fit = fitted.fit
+    now = fitted.segments.linearise(fit.z, fit.offsets, fit.scale, is_rough=True)
+    if not now.is_finite:
+        return torch.ones(fit.z.shape, dtype=torch.bool)
+    eye = torch.eye(len(fit.z), dtype=torch.float64)
+    variance = torch.linalg.inv(fitted.share * now.information() + eye).diagonal()
+    return variance > 0.5
 
 
 def _loss(hypothesis: Hypothesis, scale: Tensor) -> float:

@@ -339,7 +339,9 @@ class Searcher:
         trials = self.trials.extended(current, ranking, self._report, step)
         if not trials:
             return None, {}, {}
-        trials = self.trials.converged(trials, progress=self._progress.stage(label))
+        trials = self.trials.converged(trials, current, progress=self._progress.stage(label))
+        if not trials:
+            return None, {}, {}
         each = math.log(SEARCH.prior_of_any / max(1, len(ranking)))
         hypotheses = [current, *trials.values()]
         prior = [

@@ -45,7 +45,7 @@ def likelier_pair(
     starts = current.segments.starts
     tried = trials.with_pairs(before, pairs[: TRIALS.pairs], starts, report, progress)
     if tried:
-        tried = trials.apart_from_waves_in_step(trials.converged(tried), num_new=2)
+        tried = trials.apart_from_waves_in_step(trials.converged(tried, before), num_new=2)
     if not tried:
         return None
     each = math.log(SEARCH.prior_of_any / max(1, num_candidates))

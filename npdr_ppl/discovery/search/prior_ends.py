@@ -5,7 +5,7 @@ compensate for an effect that the model lacks. Both leave a misfit. To distingui
 with the fit at their ends are widened and the model is fitted again.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,9 @@ from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
 from npdr_ppl.discovery.search.settings import PRIOR_ENDS
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.errors import NpdrError
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import described_prior, widened, with_wider_priors
+from npdr_ppl.preparation.closest_fit import part_of
 from npdr_ppl.preparation.segment_model import SegmentModel
 
 __all__ = ["PriorEnd", "Widened", "beyond", "widen_where_it_helps"]
@@ -71,27 +73,55 @@ def widen_where_it_helps(base: SegmentModel, current: Hypothesis) -> Widened | N
     Returns:
         The result, or ``None`` if no prior is too narrow.
     """
-    result: Widened | None = None
-    priors = current.segments.prior.distributions
+    priors, num = current.segments.prior.distributions, current.segments.inputs.num_segments
+    # A part of the segments shows how far to widen.
+    index = part_of(current.segments)
+    model, ratio, widest = base.model, num / len(index), current.along(index)
+    names: set[str] = set()
     for _ in range(PRIOR_ENDS.most_widenings):
-        names = _at_end(current)
-        if not names:
+        own = _at_end(widest)
+        if not own:
             break
-        try:
-            wider = base.with_model(with_wider_priors(base.model, names))
-            fitted = fit_segment_model(
-                wider.starting_from(current.segments.starts),
-                start=current.parameters,
-                offsets=current.fit.offsets,
-            )
-        except NpdrError:
+        wider = with_wider_priors(model, own)
+        fitted = _refitted(widest, wider)
+        if fitted is None or ratio * _gain(widest, fitted) < _threshold(own):
             break
-        threshold = 0.5 * float(stats.chi2.isf(PRIOR_ENDS.false_alarm_rate, len(names)))
-        if _gain(current, fitted) < threshold:
-            break
-        base, current = wider, Trials(wider).with_own_starts(fitted)
-        result = Widened(base, current, beyond(priors, current))
-    return result if result is not None and result.ends else None
+        model, widest = wider, fitted
+        names.update(own)
+    if not names:
+        return None
+    fitted = _refitted(current, model, widest.parameters)
+    if fitted is None or _gain(current, fitted) < _threshold(names):
+        return None
+    wider_base = base.with_model(model)
+    found = Trials(wider_base).with_own_starts(fitted)
+    ends = beyond(priors, found)
+    return Widened(wider_base, found, ends) if ends else None
+
+
+def _refitted(
+    current: Hypothesis, model: Model, start: Mapping[str, Tensor] | None = None
+) -> Hypothesis | None:
+    """Fits another model along a hypothesis's segments; ``None`` if it cannot be simulated.
+
+    Args:
+        current: The hypothesis, from whose parameters the fit begins by default.
+        model: The other model.
+        start: Parameters from which the fit begins instead.
+    """
+    try:
+        return fit_segment_model(
+            current.segments.with_model(model),
+            start=start or current.parameters,
+            offsets=current.fit.offsets,
+        )
+    except NpdrError:
+        return None
+
+
+def _threshold(names: Collection[str]) -> float:
+    """Returns the gain above which as many free parameters explain more than chance."""
+    return 0.5 * float(stats.chi2.isf(PRIOR_ENDS.false_alarm_rate, len(names)))
 
 
 def _at_end(hypothesis: Hypothesis) -> list[str]:

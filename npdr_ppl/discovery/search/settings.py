@@ -152,6 +152,10 @@ class TrialSettings:
             3.4 for candidates that explain a tenth or more.
         certain_evidence: Difference of log evidence above which one of two hypotheses is taken as
             certain.
+        enough_evidence: Log evidence for the best candidate, to first order, beyond which first
+            fits need no more segments: ten times what is certain.
+        fewest_segments: Least number of segments of these fits, in which all kinds of motion
+            should occur.
     """
 
     shortlist: int = 6
@@ -164,6 +168,8 @@ class TrialSettings:
     candidates_per_decision: int = 2
     largest_growth: float = 4.0
     certain_evidence: float = 30.0
+    enough_evidence: float = 300.0
+    fewest_segments: int = 24
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
@@ -177,9 +183,11 @@ class TrialSettings:
             "first_steps",
             "most_converged",
             "candidates_per_decision",
+            "fewest_segments",
         )
         check_range(self, 0.0, 1.0, "converged_share")
         check_range(self, 0.0, 1000.0, "converged_loss", "largest_growth", "certain_evidence")
+        check_range(self, 0.0, math.inf, "enough_evidence")
 
 
 @dataclass(frozen=True)

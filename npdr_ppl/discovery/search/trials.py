@@ -1,5 +1,6 @@
 """Trials: fits of the original model with different sets of effects to the recording."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.simulator import Simulator
+from npdr_ppl.preparation.data_options import one_of_each_part
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.preparation.segment_fit import SegmentFit
 from npdr_ppl.preparation.segment_model import SegmentModel
@@ -70,12 +72,32 @@ class Trials:
         The best candidates come first. Those whose linear gain is too small to match the best fit
         so far are skipped. Candidates that cannot be simulated are left out.
 
+        Where the best candidate explains very much, a part of the segments shows which candidates
+        explain most. The fits are then made along this part; :meth:`converged` fits the best of
+        them along all segments.
+
         Args:
             current: The hypothesis.
             ranking: The candidates, the best first.
             report: Called with a sentence about each candidate.
             progress: Called with the fraction of the shortlist that is fitted.
         """
+        if ranking:
+            num = _enough_segments(current, ranking[0].gain)
+            if num < current.segments.inputs.num_segments:
+                index = _part(current.segments, num)
+                few, along = Trials(self.base.along(index)), current.along(index)
+                return few._extended(along, ranking, report, progress)
+        return self._extended(current, ranking, report, progress)
+
+    def _extended(
+        self,
+        current: Hypothesis,
+        ranking: Sequence[Screened],
+        report: Callable[[str], None],
+        progress: Step,
+    ) -> dict[str, Hypothesis]:
+        """Fits the hypothesis with each candidate along its own segments."""
         trials: dict[str, Hypothesis] = {}
         waiting = list(ranking[: TRIALS.shortlist])
         done, planned = 0, len(waiting)
@@ -145,9 +167,10 @@ class Trials:
 
     def converged(
         self,
-        trials: dict[str, Hypothesis],
+        trials: Mapping[str, Hypothesis],
+        current: Hypothesis,
         *,
-        done: str | None = None,
+        done: Mapping[str, Hypothesis] | None = None,
         progress: Step = lambda fraction, status: None,
     ) -> dict[str, Hypothesis]:
         """Fits the likeliest trials until convergence.
@@ -155,35 +178,58 @@ class Trials:
         At most ``TRIALS.most_converged``, and none whose loss is far above the least.
 
         Args:
-            trials: The model with each of several effects.
-            done: Name of the effect whose fit has converged already.
+            trials: The model with each of several effects, all along the same segments.
+            current: The model without them, along all segments.
+            done: Models with further effects whose fits have converged, along all segments.
             progress: Called with the fraction of these trials that has converged.
+
+        Returns:
+            The models along all segments, those that are ``done`` included. Trials that were made
+            along a part of the segments are left out unless they were fitted again.
         """
-        best = closest(list(trials.values()))
+        result = dict(done or {})
+        if not trials:
+            return result
+        part = next(iter(trials.values())).segments
+        num_segments = current.segments.inputs.num_segments
+        is_part = part.inputs.num_segments < num_segments
+        known = result
+        if is_part:
+            index = _part(current.segments, part.inputs.num_segments)
+            known = {name: hypothesis.along(index) for name, hypothesis in result.items()}
+        compared = {**known, **trials}
+        best = closest(list(compared.values()))
         losses = {
-            name: float(trial.losses(best.fit.scale).sum()) for name, trial in trials.items()
+            name: float(trial.losses(best.fit.scale).sum()) for name, trial in compared.items()
         }
         least = min(losses.values())
         # By loss alone, laws with more parameters would crowd out the simple law they contain.
-        by_block = evidence(list(trials.values()), [0.0] * len(trials), best)
-        likelihood = dict(zip(trials, by_block.sum(-1).tolist(), strict=True))
+        by_block = evidence(list(compared.values()), [0.0] * len(compared), best)
+        likelihood = dict(zip(compared, by_block.sum(-1).tolist(), strict=True))
+        likeliest = sorted(compared, key=lambda name: -likelihood[name])
         contenders = [
             name
-            for name in sorted(trials, key=lambda name: -likelihood[name])[: TRIALS.most_converged]
-            if name != done
+            for name in likeliest[: TRIALS.most_converged]
+            if name in trials
             and losses[name]
             <= least + max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))
         ]
-        asked = [
-            _Fit(trial.segments, trial.effects, trial.parameters, trial.fit.offsets)
-            for trial in (trials[name] for name in contenders)
-        ]
-        result = dict(trials)
-        fits = self._fits(asked, next(iter(trials.values())).simulator)
+        own = [trials[name] for name in contenders]
+        if is_part:
+            asked = []
+            for trial in own:
+                segments = self._along(trial.effects, current.segments.starts)
+                assert segments is not None
+                asked.append(_refit(segments, trial, trial.effects, {}, current.fit.offsets))
+        else:
+            asked = [_refit(trial.segments, trial, trial.effects, {}) for trial in own]
+            result |= trials
+        fits = self._fits(asked, current.simulator)
         num = len(contenders)
         progress(0.0, f"0 of {num} best fits converged")
         for number, (name, longer) in enumerate(zip(contenders, fits, strict=True), 1):
-            result[name] = longer or trials[name]
+            if longer is not None:
+                result[name] = longer
             progress(number / num, f"{number} of {num} best fits converged")
         return result
 
@@ -361,6 +407,27 @@ class Trials:
             yield hypothesis
 
 
+def _enough_segments(current: Hypothesis, gain: float) -> int:
+    """Returns how many segments show which candidates explain most.
+
+    Args:
+        current: The hypothesis.
+        gain: Linear gain of the best candidate along all segments.
+    """
+    num = current.segments.inputs.num_segments
+    evidence_of_all = 0.5 * current.share * gain
+    if evidence_of_all <= TRIALS.enough_evidence:
+        return num
+    return min(
+        num, max(TRIALS.fewest_segments, math.ceil(num * TRIALS.enough_evidence / evidence_of_all))
+    )
+
+
+def _part(segments: SegmentModel, num: int) -> Tensor:
+    """Returns the indices of a number of segments from the whole recording."""
+    return one_of_each_part(num, segments.inputs.num_segments, seed=0)
+
+
 def _initial_guesses(candidate: Screened) -> list[dict[str, Tensor]]:
     """Returns the initial guesses of a candidate's fits.
 
@@ -387,12 +454,17 @@ def _refit(
     current: Hypothesis,
     effects: tuple[Effect, ...],
     start: Mapping[str, Tensor],
+    offsets: Tensor | None = None,
 ) -> _Fit:
-    """Returns the fit of a model from a hypothesis's parameters and further ones."""
+    """Returns the fit of a model from a hypothesis's parameters and further ones.
+
+    The offsets are the hypothesis's own by default.
+    """
     kept = {name for effect in effects for name in effect.parameter_names}
     gone = {name for effect in current.effects for name in effect.parameter_names} - kept
     begin = {name: value for name, value in current.parameters.items() if name not in gone}
-    return _Fit(segments, effects, {**begin, **start}, current.fit.offsets)
+    begun = current.fit.offsets if offsets is None else offsets
+    return _Fit(segments, effects, {**begin, **start}, begun)
 
 
 def _fitted(asked: _Fit) -> tuple[SegmentFit, Tensor] | None:
