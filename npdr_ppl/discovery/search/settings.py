@@ -29,9 +29,10 @@ class BaseFitSettings:
 
     Attributes:
         noticeable_change: Change of all simulated measurements together by steps of a higher
-            order, in standard deviations of the residuals. Above it, these steps are used unless
-            the recording contradicts them, because false effects would compensate for it. Refitted
-            parameters compensate for four fifths of it.
+            order that refitted parameters do not compensate for, in standard deviations of the
+            residuals. Above it, these steps are used unless the recording contradicts them,
+            because false effects would compensate for it. It is half of what an effect must change
+            to be detected.
         coarse_probability: Probability above which the recording itself is taken to be simulated
             with coarse steps.
         most_refits: Greatest number of refits from inside the priors, each from the result of the
@@ -40,7 +41,7 @@ class BaseFitSettings:
             times as likely as another.
     """
 
-    noticeable_change: float = 5.0
+    noticeable_change: float = 2.5
     coarse_probability: float = 0.9
     most_refits: int = 4
     least_gain: float = 0.23
