@@ -6,6 +6,7 @@ import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.search import trials as trials_module
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.models.effects import (
     Bias,
@@ -58,3 +59,36 @@ def test_every_effect_gets_its_own_alternatives(dragged):
         assert set(trials[effect.name, "hinge.cogging"].names) == others | {"hinge.cogging"}
     # The drag is there and the others are not, so that all is lost without it.
     assert added[0].share > 0.5 > added[2].share
+
+
+def test_candidates_are_fitted_along_a_part_where_one_explains_very_much(dragged, monkeypatch):
+    case, base = dragged
+    effects = QuadraticDrag("hinge"), ViscousFriction("hinge")
+    searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=effects))
+    ranking = searcher.look(base).ranking
+    whole = base.segments.inputs.num_segments
+    evidence = 0.5 * base.share * ranking[0].gain
+
+    def with_enough(evidence):
+        settings = replace(trials_module.TRIALS, enough_evidence=evidence, fewest_segments=3)
+        monkeypatch.setattr(trials_module, "TRIALS", settings)
+        tried = searcher.trials.extended(base, ranking)
+        assert tried
+        return tried, {trial.segments.inputs.num_segments for trial in tried.values()}
+
+    tried, sizes = with_enough(2.0 * evidence)
+    assert sizes == {whole}
+    expected = searcher.trials.converged(tried, base)["hinge.quadratic_drag"]
+    tried, sizes = with_enough(0.5 * evidence)
+    assert sizes == {-(-whole // 2)}
+    done = {"hinge.viscous_friction": searcher.trials.refitted(base, effects[1:])}
+    found = searcher.trials.converged(
+        {"hinge.quadratic_drag": tried["hinge.quadratic_drag"]}, base, done=done
+    )
+    assert set(found) == {"hinge.quadratic_drag", "hinge.viscous_friction"}
+    assert all(trial.segments.inputs.num_segments == whole for trial in found.values())
+    losses = [
+        float(trial.losses(expected.fit.scale).sum())
+        for trial in (found["hinge.quadratic_drag"], expected)
+    ]
+    assert abs(losses[0] - losses[1]) < 1.0

@@ -13,6 +13,7 @@ import torch
 import npdr_ppl as npdr
 from npdr_ppl.engines.mujoco import MujocoSimulator, Scale, batches
 from npdr_ppl.engines.mujoco import open_loop as mujoco_open_loop
+from npdr_ppl.engines.mujoco.damping import fastest_damping
 from npdr_ppl.errors import DataError, ModelError, ShapeError
 from npdr_ppl.language.channels import Parameter
 from npdr_ppl.language.inputs import Inputs
@@ -381,6 +382,8 @@ def test_a_stiff_servo_keeps_its_integrator_in_finer_steps(tmp_path):
     path = tmp_path / "servo.xml"
     path.write_text(STIFF)
     coarse = MujocoSimulator(path)
+    damping = fastest_damping(coarse.model, coarse.initial_positions)
+    assert damping == pytest.approx(400.0 / (0.08 + 0.01 + 0.1**2))
     finer = coarse.with_finer_steps()
     assert finer.num_substeps(0.002) == 4 and finer.with_finer_steps() is None
     exact = MujocoSimulator(path, substeps=64, time_step=0.002)

@@ -302,3 +302,42 @@ def _shifted(inputs: Inputs, segment: int, deviations: float) -> Inputs:
     values, errors = inputs.initial_values.clone(), inputs.initial_value_errors
     values[segment, 0] += deviations * errors[segment, 0]
     return dataclasses.replace(inputs, initial_values=values)
+
+
+def test_corrected_derivatives_lead_to_the_same_fit(segments, monkeypatch):
+    settings = [
+        dataclasses.replace(SEGMENT_FIT, most_updates=most, least_ratio=0.0) for most in (0, 3)
+    ]
+    linearise, calls, fits = SegmentModel.linearise, [], []
+
+    def counted(self, *args, **options):
+        calls[-1] += 1
+        return linearise(self, *args, **options)
+
+    monkeypatch.setattr(SegmentModel, "linearise", counted)
+    for own in settings:
+        monkeypatch.setattr(segment_fit, "SEGMENT_FIT", own)
+        calls.append(0)
+        fits.append(fit_segments(segments, START))
+    assert calls[1] < calls[0]
+    ends = [objective(segments, fit.z, fit.offsets, fits[0].scale) for fit in fits]
+    assert abs(ends[1] - ends[0]) < 2 * SEGMENT_FIT.least_gain
+
+
+def test_a_gain_counts_less_where_residuals_are_correlated(segments, monkeypatch):
+    gains = []
+    steps = segment_fit._steps
+
+    def seen(*args, **options):
+        gains.append(options.get("share"))
+        return steps(*args, **options)
+
+    monkeypatch.setattr(segment_fit, "_steps", seen)
+    fit_segments(segments, START)
+    white = gains[1]
+    assert gains[0] is None and white > 0.6
+    slow = torch.sin(torch.arange(segments.observed.shape[1]) / 6.0)[:, None]
+    segments.observed = segments.observed + 20.0 * fit_segments(segments, START).scale * slow
+    gains.clear()
+    fit_segments(segments, START)
+    assert gains[1] < 0.6 * white

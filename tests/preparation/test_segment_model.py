@@ -71,3 +71,36 @@ def test_offsets_that_move_no_initial_state_are_not_simulated(
     monkeypatch.undo()
     wanted = differences(segments, z, offsets, scale, is_rough=is_rough)
     torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9 * float(wanted.abs().max()))
+
+
+def test_corrected_derivatives_explain_the_last_step_and_leave_others_alone(segments):
+    d, m = segments.prior.num_parameters, segments.num_offsets
+    scale = torch.full((segments.observed.shape[-1],), 1e-2, dtype=torch.float64)
+    z, offsets = torch.zeros(d, dtype=torch.float64), segments.no_offsets
+    now = segments.linearise(z, offsets, scale)
+    generator = torch.Generator().manual_seed(0)
+    step = 0.3 * torch.randn(d, generator=generator).double()
+    moves = 0.3 * torch.randn(len(offsets), m, generator=generator).double()
+    there = segments.residuals((z + step)[None], (offsets + moves)[None], scale)[0]
+    found = now.updated(there, step, moves)
+
+    def change(linearisation, step, moves):
+        by_start = (linearisation.by_starts @ moves[..., None])[..., 0]
+        return linearisation.by_parameters @ step + by_start
+
+    torch.testing.assert_close(change(found, step, moves), now.residual - there)
+    # A segment's own directions at right angles to the step keep their derivatives.
+    aside = torch.zeros_like(moves)
+    aside[:, 0], aside[:, 1] = moves[:, 1], -moves[:, 0]
+    still = torch.zeros_like(step)
+    torch.testing.assert_close(change(found, still, aside), change(now, still, aside))
+
+
+def test_derivatives_in_smaller_units_are_larger(segments):
+    z, offsets = torch.zeros(segments.prior.num_parameters).double(), segments.no_offsets
+    scale = torch.tensor([1e-2, 3e-2], dtype=torch.float64)[: segments.observed.shape[-1]]
+    factor = torch.tensor([2.0, 5.0], dtype=torch.float64)[: len(scale)]
+    found = segments.linearise(z, offsets, scale).rescaled(factor)
+    expected = segments.linearise(z, offsets, scale / factor)
+    for name in ("residual", "by_parameters", "by_starts"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name))
