@@ -19,8 +19,8 @@ from npdr_ppl.discovery.revised_model import revised_source
 from npdr_ppl.discovery.screening.alarm import Alarm
 from npdr_ppl.discovery.screening.encoder_resolution import Count
 from npdr_ppl.discovery.screening.screening import Screened
-from npdr_ppl.discovery.search.effect_search import Search
 from npdr_ppl.discovery.search.prior_ends import PriorEnd
+from npdr_ppl.discovery.search.rounds import Search
 from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import wider_sites

@@ -18,9 +18,10 @@ from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.effective_share import effective_share
 from npdr_ppl.preparation.initial_states import InitialStates
+from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
-from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
+from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Hypothesis", "extended", "fit_hypothesis", "fit_segment_model", "with_effects"]

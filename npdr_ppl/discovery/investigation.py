@@ -26,11 +26,12 @@ from npdr_ppl.discovery.recording_repair import Repair, repair
 from npdr_ppl.discovery.screening.encoder_resolution import counts
 from npdr_ppl.discovery.screening.equivalents import equivalents
 from npdr_ppl.discovery.search.alternatives import Added
-from npdr_ppl.discovery.search.effect_search import Round, Search, Searcher, explained
+from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.halves import found_in_halves, search_halves
 from npdr_ppl.discovery.search.limits import limits
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
 from npdr_ppl.discovery.search.repeatability import HALVES, Repetition, repetitions
+from npdr_ppl.discovery.search.rounds import Round, Search, explained
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH
 from npdr_ppl.discovery.search_progress import SearchProgress
 from npdr_ppl.discovery.segment_options import segment_options

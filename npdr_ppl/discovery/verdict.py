@@ -6,8 +6,8 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Verdict
 from npdr_ppl.discovery.finding import Finding
 from npdr_ppl.discovery.proof.held_out_gap import Gap
-from npdr_ppl.discovery.search.effect_search import Search
 from npdr_ppl.discovery.search.halves import missing_where
+from npdr_ppl.discovery.search.rounds import Search
 from npdr_ppl.discovery.search.settings import EVIDENCE, TRIALS
 from npdr_ppl.discovery.settings import VERDICT
 

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.preparation.effective_share import effective_share
-from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
+from npdr_ppl.preparation.linearisation import Linearisation
+from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import SEGMENT_FIT
 from npdr_ppl.preparation.solving import solve_or_zero
 

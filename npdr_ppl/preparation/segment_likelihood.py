@@ -21,8 +21,9 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK
+from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_fit import SegmentFit
-from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
+from npdr_ppl.preparation.segment_model import SegmentModel
 
 __all__ = ["SegmentLikelihood"]
 

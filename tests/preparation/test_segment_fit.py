@@ -17,8 +17,9 @@ from npdr_ppl.models.effects import Backlash, CoulombFriction, StribeckFriction
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.preparation import segment_fit
 from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_fit import fit_segments
-from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
+from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import SEGMENT_FIT
 from npdr_ppl.rollouts import Rollouts
 

@@ -12,7 +12,8 @@ from npdr_ppl.discovery.proof.parameter_intervals import Draws
 from npdr_ppl.discovery.proof.settings import GAP
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.initial_states import error_draws, error_factors
-from npdr_ppl.preparation.segment_model import Linearisation, SegmentModel
+from npdr_ppl.preparation.linearisation import Linearisation
+from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts, stitch
 from npdr_ppl.rollouts.states import measurement_noise

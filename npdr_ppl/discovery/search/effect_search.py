@@ -3,18 +3,17 @@
 import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property, partial
 
 from torch import Tensor
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.screening.alarm import Alarm, sound_alarm
-from npdr_ppl.discovery.screening.latent_force import Responses, responses
-from npdr_ppl.discovery.screening.pairs import Pair, ranked_pairs
+from npdr_ppl.discovery.screening.alarm import sound_alarm
+from npdr_ppl.discovery.screening.latent_force import responses
+from npdr_ppl.discovery.screening.pairs import ranked_pairs
 from npdr_ppl.discovery.screening.projection import Projection, loss_without
-from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.screening.sensitivities import Variant
 from npdr_ppl.discovery.screening.separation import separation_matrix
 from npdr_ppl.discovery.screening.variants import candidates_at, variants_of
@@ -27,11 +26,12 @@ from npdr_ppl.discovery.search.alternatives import (
     weigh_alternatives,
 )
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps
-from npdr_ppl.discovery.search.evidence import closest, weigh
+from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.likelier_pair import likelier_pair
 from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
 from npdr_ppl.discovery.search.repeatability import repeated_effects
+from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.segment_options import segment_options
@@ -44,54 +44,7 @@ from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.progress import Reporter, Step
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["Round", "Search", "Searcher", "explained"]
-
-
-@dataclass(frozen=True)
-class Round:
-    """The results for one set of effects.
-
-    Attributes:
-        hypothesis: The fitted model with these effects.
-        averaged: The same, with averaged measurements if the recording is very long.
-        alarm: Result of the test whether another effect is missing.
-        ranking: The candidates by linear gain.
-        separation: Distances between the best candidates; see :mod:`separation`.
-        responses: Changes of the measurements by pulses of force at the joints.
-        pairs: Pairs of the best candidates by joint linear gain.
-        weights: Probability of each candidate fitted in full, by name; ``""`` for no effect.
-        trials: The model with each of these candidates, by name.
-    """
-
-    hypothesis: Hypothesis
-    averaged: Hypothesis
-    alarm: Alarm
-    ranking: list[Screened]
-    separation: Tensor
-    responses: Responses
-    pairs: list[Pair] = field(default_factory=list)
-    weights: dict[str, float] = field(default_factory=dict)
-    trials: dict[str, Hypothesis] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Search:
-    """The result of the search.
-
-    Attributes:
-        rounds: The results before each addition, and at the end.
-        final: The final model.
-        added: Its effects.
-        trials: The final model with each alternative in an effect's place, by the names of the
-            effect and of the alternative.
-        is_approximate: Whether something remains that no law of the catalogue explains.
-    """
-
-    rounds: list[Round]
-    final: Hypothesis
-    added: list[Added]
-    trials: dict[tuple[str, str], Hypothesis]
-    is_approximate: bool = False
+__all__ = ["Searcher"]
 
 
 class Searcher:
@@ -214,14 +167,14 @@ class Searcher:
         """
         current, now = first.hypothesis, first
         rounds = [first]
-        while len(current.effects) < max_effects and _is_something_left(first, now):
+        while len(current.effects) < max_effects and is_something_left(first, now):
             best, weights, tried = self._extended(current, now)
             rounds[-1] = replace(now, weights=weights, trials=tried)
             single = current if best is None else tried[best]
-            if _is_negligible(first.hypothesis, current, single):
+            if is_negligible(first.hypothesis, current, single):
                 single = current
             extended = self._with_likelier_pair(rounds, single, max_effects)
-            if _is_negligible(first.hypothesis, current, extended):
+            if is_negligible(first.hypothesis, current, extended):
                 break
             tested = best if extended is single else None
             current = self.trials.with_own_starts(self._pruned(extended, tested))
@@ -252,7 +205,7 @@ class Searcher:
         for _ in range(SEARCH.most_revisions):
             current = repeated_effects(current, self.trials, self._report)
             # As long as something remains that no law explains, the laws are approximations.
-            is_approximate = _is_something_left(rounds[0], self._looked(current, rounds))
+            is_approximate = is_something_left(rounds[0], self._looked(current, rounds))
             candidates = candidates_at(base, self.options)
             if is_approximate:
                 current = simplest_laws(base, current, candidates, self.trials, self._report)
@@ -268,7 +221,7 @@ class Searcher:
                 break
             current = kept
             added = [each for each in added if each.effect.name in current.names]
-        is_approximate = _is_something_left(rounds[0], self._looked(current, rounds))
+        is_approximate = is_something_left(rounds[0], self._looked(current, rounds))
         return Search(rounds, current, added, trials, is_approximate)
 
     def _looked(self, current: Hypothesis, rounds: list[Round]) -> Round:
@@ -492,25 +445,6 @@ def _counted(variants: Iterator[Variant], num: int, step: Step) -> Iterator[Vari
     step(None, "laws that are not in the catalogue")
 
 
-def _is_something_left(first: Round, now: Round) -> bool:
-    """Returns whether more is missing than differences between integrators can explain."""
-    least = SEARCH.least_unexplained * explained(first.hypothesis, now.hypothesis)
-    return now.alarm.fired and now.alarm.gain > least
-
-
 def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:
     """Returns the probability of the first of two hypotheses."""
     return weigh([one, other], [0.0, 0.0])[0]
-
-
-def _is_negligible(first: Hypothesis, current: Hypothesis, extended: Hypothesis) -> bool:
-    """Returns whether the last addition explains a negligible share of all that was explained."""
-    if extended is current:
-        return True
-    return explained(current, extended) < SEARCH.least_unexplained * explained(first, extended)
-
-
-def explained(first: Hypothesis, final: Hypothesis) -> float:
-    """Returns the reduction of the misfit, in units of the measurements' variance."""
-    scale = closest([first, final]).fit.scale
-    return max(0.0, 2.0 * float((first.losses(scale) - final.losses(scale)).sum()))

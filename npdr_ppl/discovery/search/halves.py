@@ -8,9 +8,10 @@ from collections.abc import Callable, Mapping
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.search.alternatives import Added
-from npdr_ppl.discovery.search.effect_search import Search, Searcher
+from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.parsimony import overlap
 from npdr_ppl.discovery.search.repeatability import halves
+from npdr_ppl.discovery.search.rounds import Search
 from npdr_ppl.discovery.search.settings import EVIDENCE
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.effects import Effect

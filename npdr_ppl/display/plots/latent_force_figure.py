@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from npdr_ppl.discovery.screening.latent_force import LatentForce, latent_force
 from npdr_ppl.discovery.screening.projection import Projection
-from npdr_ppl.discovery.search.effect_search import Round
+from npdr_ppl.discovery.search.rounds import Round
 from npdr_ppl.display.plots.marginals import add_legend
 from npdr_ppl.drawing.theme import COLORS, theme
 

@@ -1,0 +1,82 @@
+"""The rounds of a search and its result."""
+
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.alarm import Alarm
+from npdr_ppl.discovery.screening.latent_force import Responses
+from npdr_ppl.discovery.screening.pairs import Pair
+from npdr_ppl.discovery.screening.screening import Screened
+from npdr_ppl.discovery.search.alternatives import Added
+from npdr_ppl.discovery.search.evidence import closest
+from npdr_ppl.discovery.search.settings import SEARCH
+
+__all__ = ["Round", "Search", "explained", "is_negligible", "is_something_left"]
+
+
+@dataclass(frozen=True)
+class Round:
+    """The results for one set of effects.
+
+    Attributes:
+        hypothesis: The fitted model with these effects.
+        averaged: The same, with averaged measurements if the recording is very long.
+        alarm: Result of the test whether another effect is missing.
+        ranking: The candidates by linear gain.
+        separation: Distances between the best candidates; see :mod:`separation`.
+        responses: Changes of the measurements by pulses of force at the joints.
+        pairs: Pairs of the best candidates by joint linear gain.
+        weights: Probability of each candidate fitted in full, by name; ``""`` for no effect.
+        trials: The model with each of these candidates, by name.
+    """
+
+    hypothesis: Hypothesis
+    averaged: Hypothesis
+    alarm: Alarm
+    ranking: list[Screened]
+    separation: Tensor
+    responses: Responses
+    pairs: list[Pair] = field(default_factory=list)
+    weights: dict[str, float] = field(default_factory=dict)
+    trials: dict[str, Hypothesis] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Search:
+    """The result of the search.
+
+    Attributes:
+        rounds: The results before each addition, and at the end.
+        final: The final model.
+        added: Its effects.
+        trials: The final model with each alternative in an effect's place, by the names of the
+            effect and of the alternative.
+        is_approximate: Whether something remains that no law of the catalogue explains.
+    """
+
+    rounds: list[Round]
+    final: Hypothesis
+    added: list[Added]
+    trials: dict[tuple[str, str], Hypothesis]
+    is_approximate: bool = False
+
+
+def explained(first: Hypothesis, final: Hypothesis) -> float:
+    """Returns the reduction of the misfit, in units of the measurements' variance."""
+    scale = closest([first, final]).fit.scale
+    return max(0.0, 2.0 * float((first.losses(scale) - final.losses(scale)).sum()))
+
+
+def is_something_left(first: Round, now: Round) -> bool:
+    """Returns whether more is missing than differences between integrators can explain."""
+    least = SEARCH.least_unexplained * explained(first.hypothesis, now.hypothesis)
+    return now.alarm.fired and now.alarm.gain > least
+
+
+def is_negligible(first: Hypothesis, current: Hypothesis, extended: Hypothesis) -> bool:
+    """Returns whether the last addition explains a negligible share of all that was explained."""
+    if extended is current:
+        return True
+    return explained(current, extended) < SEARCH.least_unexplained * explained(first, extended)
