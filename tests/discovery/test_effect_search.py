@@ -6,8 +6,9 @@ import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
-from npdr_ppl.discovery.search import trials as trials_module
+from npdr_ppl.discovery.search import shortlist
 from npdr_ppl.discovery.search.effect_search import Searcher
+from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
 from npdr_ppl.models.effects import (
     Bias,
     Cogging,
@@ -30,7 +31,7 @@ def test_candidates_far_behind_the_best_one_are_not_fitted(dragged):
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=effects))
     ranking = searcher.look(base).ranking
     gains = {candidate.name: candidate.gain for candidate in ranking}
-    tried = searcher.trials.extended(base, ranking)
+    tried = fit_shortlist(searcher.trials, base, ranking)
     assert list(tried)[:2] == [candidate.name for candidate in ranking[:2]]
     assert next(iter(tried)) == "hinge.quadratic_drag"
     missed = gains.keys() - tried.keys()
@@ -70,20 +71,20 @@ def test_candidates_are_fitted_along_a_part_where_one_explains_very_much(dragged
     evidence = 0.5 * base.share * ranking[0].gain
 
     def with_enough(evidence):
-        settings = replace(trials_module.TRIALS, enough_evidence=evidence, fewest_segments=3)
-        monkeypatch.setattr(trials_module, "TRIALS", settings)
-        tried = searcher.trials.extended(base, ranking)
+        settings = replace(shortlist.TRIALS, enough_evidence=evidence, fewest_segments=3)
+        monkeypatch.setattr(shortlist, "TRIALS", settings)
+        tried = fit_shortlist(searcher.trials, base, ranking)
         assert tried
         return tried, {trial.segments.inputs.num_segments for trial in tried.values()}
 
     tried, sizes = with_enough(2.0 * evidence)
     assert sizes == {whole}
-    expected = searcher.trials.converged(tried, base)["hinge.quadratic_drag"]
+    expected = fit_contenders(searcher.trials, tried, base)["hinge.quadratic_drag"]
     tried, sizes = with_enough(0.5 * evidence)
     assert sizes == {-(-whole // 2)}
     done = {"hinge.viscous_friction": searcher.trials.refitted(base, effects[1:])}
-    found = searcher.trials.converged(
-        {"hinge.quadratic_drag": tried["hinge.quadratic_drag"]}, base, done=done
+    found = fit_contenders(
+        searcher.trials, {"hinge.quadratic_drag": tried["hinge.quadratic_drag"]}, base, done=done
     )
     assert set(found) == {"hinge.quadratic_drag", "hinge.viscous_friction"}
     assert all(trial.segments.inputs.num_segments == whole for trial in found.values())

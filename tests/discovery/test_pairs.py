@@ -10,6 +10,7 @@ from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.screening import Screening
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.search.effect_search import Searcher
+from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_pairs, fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.models.effects import (
     ActuatorLag,
@@ -104,15 +105,15 @@ def test_a_pair_does_not_exceed_the_greatest_number_of_effects(rubbed):
 
 def test_a_pair_that_cannot_be_simulated_is_left_out(rubbed, monkeypatch):
     searcher, first = rubbed
-    along = Trials._along
+    along = Trials.with_effects
 
     def without_drag(self, effects, starts):
         has_drag = "hinge.quadratic_drag" in [effect.name for effect in effects]
         return None if has_drag else along(self, effects, starts)
 
-    monkeypatch.setattr(Trials, "_along", without_drag)
+    monkeypatch.setattr(Trials, "with_effects", without_drag)
     starts = first.hypothesis.segments.starts
-    found = searcher.trials.with_pairs(first.hypothesis, first.pairs[:3], starts)
+    found = fit_pairs(searcher.trials, first.hypothesis, first.pairs[:3], starts)
     kept = {pair.name for pair in first.pairs[:3] if "hinge.quadratic_drag" not in pair.names}
     assert set(found) == kept
 
@@ -127,14 +128,14 @@ def test_a_simple_law_converges_beside_three_laws_that_contain_it(rubbed, monkey
         for effect in (law, *richer)
     }
     asked = []
-    fits = Trials._fits
+    fits = Trials.fits
 
     def seen(self, wanted, simulator):
         asked.extend(fit.effects[-1].name for fit in wanted)
         return fits(self, wanted, simulator)
 
-    monkeypatch.setattr(Trials, "_fits", seen)
-    searcher.trials.converged(trials, first.hypothesis)
+    monkeypatch.setattr(Trials, "fits", seen)
+    fit_contenders(searcher.trials, trials, first.hypothesis)
     assert law.name in asked
 
 
@@ -143,7 +144,7 @@ def test_a_lag_beside_a_delay_that_explains_their_sum_is_found():
     searcher = searcher_of(LATE, (1.25, 0.76), lag)
     late = searcher.trials.refitted(searcher.fit_base(), (delay,))
     candidates = searcher.look(late).ranking
-    found = searcher.trials.extended(late, candidates)["torque.actuator_lag"]
+    found = fit_shortlist(searcher.trials, late, candidates)["torque.actuator_lag"]
     true = dict(
         make_case("pendulum", "two_at_one_place", LATE, strength=(1.25, 0.76), seed=2001)
         .truth[1]

@@ -15,6 +15,7 @@ from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.parsimony import overlap
 from npdr_ppl.discovery.search.repeatability import repetitions
 from npdr_ppl.discovery.search.settings import EVIDENCE
+from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.language.effects import Effect
@@ -100,8 +101,8 @@ def find_alternatives(
     averaged = without.averaged()
     projection = Projection(averaged)
     ranking = screen(projection, variants_of(candidates, projection, responses(averaged)))
-    tried = trials.extended(without, ranking)
-    tried = trials.converged(tried, without, done={effect.name: current})
+    tried = fit_shortlist(trials, without, ranking)
+    tried = fit_contenders(trials, tried, without, done={effect.name: current})
     others = {name: h for name, h in tried.items() if name != effect.name}
     return Alternatives(without, current, trials.apart_from_waves_in_step(others))
 

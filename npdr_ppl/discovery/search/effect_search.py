@@ -33,6 +33,7 @@ from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
 from npdr_ppl.discovery.search.repeatability import repeated_effects
 from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
+from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
@@ -289,10 +290,11 @@ class Searcher:
         label = f"effect {len(current.effects) + 1}"
         # Candidates that are far behind the best one are skipped.
         step = self._progress.stage(label, may_end_early=True)
-        trials = self.trials.extended(current, ranking, self._report, step)
+        trials = fit_shortlist(self.trials, current, ranking, self._report, step)
         if not trials:
             return None, {}, {}
-        trials = self.trials.converged(trials, current, progress=self._progress.stage(label))
+        progress = self._progress.stage(label)
+        trials = fit_contenders(self.trials, trials, current, progress=progress)
         if not trials:
             return None, {}, {}
         each = math.log(SEARCH.prior_of_any / max(1, len(ranking)))

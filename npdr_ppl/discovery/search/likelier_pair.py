@@ -8,6 +8,7 @@ from npdr_ppl.discovery.screening.pairs import Pair
 from npdr_ppl.discovery.search.alternatives import log_prior
 from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.settings import SEARCH, TRIALS
+from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_pairs
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.progress import Step
 
@@ -43,9 +44,9 @@ def likelier_pair(
     """
     # Losses can be compared only if initial states and their errors are the same.
     starts = current.segments.starts
-    tried = trials.with_pairs(before, pairs[: TRIALS.pairs], starts, report, progress)
+    tried = fit_pairs(trials, before, pairs[: TRIALS.pairs], starts, report, progress)
     if tried:
-        tried = trials.apart_from_waves_in_step(trials.converged(tried, before), num_new=2)
+        tried = trials.apart_from_waves_in_step(fit_contenders(trials, tried, before), num_new=2)
     if not tried:
         return None
     each = math.log(SEARCH.prior_of_any / max(1, num_candidates))

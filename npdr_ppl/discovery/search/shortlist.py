@@ -1,0 +1,258 @@
+"""Fits of the candidates of a round: short ones of many, then long ones of the likeliest."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.pairs import Pair
+from npdr_ppl.discovery.screening.screening import Screened
+from npdr_ppl.discovery.search.evidence import closest, evidence
+from npdr_ppl.discovery.search.settings import TRIALS
+from npdr_ppl.discovery.search.trials import Trials, refit
+from npdr_ppl.preparation.data_options import one_of_each_part
+from npdr_ppl.preparation.initial_states import InitialStates
+from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.progress import Step
+
+__all__ = ["fit_contenders", "fit_pairs", "fit_shortlist"]
+
+
+def fit_shortlist(
+    trials: Trials,
+    current: Hypothesis,
+    ranking: Sequence[Screened],
+    report: Callable[[str], None] = lambda _: None,
+    progress: Step = lambda fraction, status: None,
+) -> dict[str, Hypothesis]:
+    """Fits the hypothesis with each candidate of the shortlist.
+
+    Each candidate is fitted from its linear estimate, and also from its typical size if its
+    change is not linear.
+
+    The best candidates come first. Those whose linear gain is too small to match the best fit
+    so far are skipped. Candidates that cannot be simulated are left out.
+
+    Where the best candidate explains very much, a part of the segments shows which candidates
+    explain most. The fits are then made along this part; :func:`fit_contenders` fits the best of
+    them along all segments.
+
+    Args:
+        trials: Fits the model.
+        current: The hypothesis.
+        ranking: The candidates, the best first.
+        report: Called with a sentence about each candidate.
+        progress: Called with the fraction of the shortlist that is fitted.
+    """
+    if ranking:
+        num = _enough_segments(current, ranking[0].gain)
+        if num < current.segments.inputs.num_segments:
+            index = _part(current.segments, num)
+            few, along = Trials(trials.base.along(index)), current.along(index)
+            return _fit_each(few, along, ranking, report, progress)
+    return _fit_each(trials, current, ranking, report, progress)
+
+
+def fit_contenders(
+    trials: Trials,
+    tried: Mapping[str, Hypothesis],
+    current: Hypothesis,
+    *,
+    done: Mapping[str, Hypothesis] | None = None,
+    progress: Step = lambda fraction, status: None,
+) -> dict[str, Hypothesis]:
+    """Fits the likeliest trials until convergence.
+
+    At most ``TRIALS.most_converged``, and none whose loss is far above the least.
+
+    Args:
+        trials: Fits the model.
+        tried: The model with each of several effects, all along the same segments.
+        current: The model without them, along all segments.
+        done: Models with further effects whose fits have converged, along all segments.
+        progress: Called with the fraction of these trials that has converged.
+
+    Returns:
+        The models along all segments, those that are ``done`` included. Trials that were made
+        along a part of the segments are left out unless they were fitted again.
+    """
+    result = dict(done or {})
+    if not tried:
+        return result
+    part = next(iter(tried.values())).segments
+    num_segments = current.segments.inputs.num_segments
+    is_part = part.inputs.num_segments < num_segments
+    known = result
+    if is_part:
+        index = _part(current.segments, part.inputs.num_segments)
+        known = {name: hypothesis.along(index) for name, hypothesis in result.items()}
+    compared = {**known, **tried}
+    best = closest(list(compared.values()))
+    losses = {name: float(trial.losses(best.fit.scale).sum()) for name, trial in compared.items()}
+    least = min(losses.values())
+    # By loss alone, laws with more parameters would crowd out the simple law they contain.
+    by_block = evidence(list(compared.values()), [0.0] * len(compared), best)
+    likelihood = dict(zip(compared, by_block.sum(-1).tolist(), strict=True))
+    likeliest = sorted(compared, key=lambda name: -likelihood[name])
+    contenders = [
+        name
+        for name in likeliest[: TRIALS.most_converged]
+        if name in tried
+        and losses[name] <= least + max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))
+    ]
+    own = [tried[name] for name in contenders]
+    if is_part:
+        asked = []
+        for trial in own:
+            segments = trials.with_effects(trial.effects, current.segments.starts)
+            assert segments is not None
+            asked.append(refit(segments, trial, trial.effects, {}, current.fit.offsets))
+    else:
+        asked = [refit(trial.segments, trial, trial.effects, {}) for trial in own]
+        result |= tried
+    fits = trials.fits(asked, current.simulator)
+    num = len(contenders)
+    progress(0.0, f"0 of {num} best fits converged")
+    for number, (name, longer) in enumerate(zip(contenders, fits, strict=True), 1):
+        if longer is not None:
+            result[name] = longer
+        progress(number / num, f"{number} of {num} best fits converged")
+    return result
+
+
+def fit_pairs(
+    trials: Trials,
+    current: Hypothesis,
+    pairs: Sequence[Pair],
+    starts: InitialStates | None,
+    report: Callable[[str], None] = lambda _: None,
+    progress: Step = lambda fraction, status: None,
+) -> dict[str, Hypothesis]:
+    """Fits the hypothesis with each of several pairs of candidates, from linear estimates.
+
+    Args:
+        trials: Fits the model.
+        current: The hypothesis.
+        pairs: The pairs.
+        starts: Initial states of the segments.
+        report: Called with a sentence about each pair.
+        progress: Called with the fraction of the pairs that is fitted.
+
+    Returns:
+        The model with each pair, by the names of both; pairs that cannot be simulated are left
+        out.
+    """
+    asked = [trials.extension(current, pair.effects, pair.parameters, starts) for pair in pairs]
+    tried: dict[str, Hypothesis] = {}
+    fits = trials.fits(asked, current.simulator)
+    for number, (pair, found) in enumerate(zip(pairs, fits, strict=True), 1):
+        if found is not None:
+            tried[pair.name] = found
+            report(f"tried {pair.name}: {_shown(found)}")
+        progress(number / len(pairs), f"{number} of {len(pairs)} pairs fitted")
+    return tried
+
+
+def _fit_each(
+    trials: Trials,
+    current: Hypothesis,
+    ranking: Sequence[Screened],
+    report: Callable[[str], None],
+    progress: Step,
+) -> dict[str, Hypothesis]:
+    """Fits the hypothesis with each candidate along its own segments."""
+    tried: dict[str, Hypothesis] = {}
+    waiting = list(ranking[: TRIALS.shortlist])
+    done, planned = 0, len(waiting)
+
+    def fitted(number: int) -> None:
+        progress(number / planned, f"{number} of {planned} candidates fitted")
+
+    while waiting:
+        fitted(done)
+        present, waiting = (
+            waiting[: TRIALS.candidates_per_decision],
+            waiting[TRIALS.candidates_per_decision :],
+        )
+        asked = [
+            (c, trials.extension(current, (c.variant.effect,), guess, current.segments.starts))
+            for c in present
+            for guess in _initial_guesses(c)
+        ]
+        fits = trials.fits([fit for _, fit in asked], current.simulator)
+        found: dict[str, list[Hypothesis]] = {}
+        for (candidate, _), trial in zip(asked, fits, strict=True):
+            if trial is not None:
+                found.setdefault(candidate.name, []).append(trial)
+        for candidate in present:
+            if candidate.name in found:
+                tried[candidate.name] = _best(found[candidate.name])
+                report(f"tried {candidate.name}: {_shown(tried[candidate.name])}")
+            done += 1
+            fitted(done)
+        if tried:
+            far = _far_behind(current, closest(list(tried.values())))
+            waiting = [
+                c for c in waiting if c.gain * TRIALS.largest_growth > far * ranking[0].gain
+            ]
+    return tried
+
+
+def _enough_segments(current: Hypothesis, gain: float) -> int:
+    """Returns how many segments show which candidates explain most.
+
+    Args:
+        current: The hypothesis.
+        gain: Linear gain of the best candidate along all segments.
+    """
+    num = current.segments.inputs.num_segments
+    evidence_of_all = 0.5 * current.share * gain
+    if evidence_of_all <= TRIALS.enough_evidence:
+        return num
+    return min(
+        num, max(TRIALS.fewest_segments, math.ceil(num * TRIALS.enough_evidence / evidence_of_all))
+    )
+
+
+def _part(segments: SegmentModel, num: int) -> Tensor:
+    """Returns the indices of a number of segments from the whole recording."""
+    return one_of_each_part(num, segments.inputs.num_segments, seed=0)
+
+
+def _initial_guesses(candidate: Screened) -> list[dict[str, Tensor]]:
+    """Returns the initial guesses of a candidate's fits.
+
+    They are the linear estimate, and the typical size if the change is not linear. The linear
+    estimate can then be far from the best fit, with a local minimum between them: a lag beside a
+    delay that already explains their sum. Many sizes of a resonance are screened, and fits of
+    effects with many minima restart by themselves.
+    """
+    variant, effect = candidate.variant, candidate.variant.effect
+    guesses = [variant.parameters(candidate.sizes)]
+    if not (variant.is_linear or effect.is_resonant or effect.has_local_minima):
+        guesses.append(variant.parameters(torch.ones_like(candidate.sizes)))
+    return guesses
+
+
+def _best(trials: Sequence[Hypothesis]) -> Hypothesis:
+    """Returns the hypothesis with the least loss."""
+    scale = closest(trials).fit.scale
+    return min(trials, key=lambda trial: float(trial.losses(scale).sum()))
+
+
+def _far_behind(current: Hypothesis, best: Hypothesis) -> float:
+    """Returns the share of the best trial's gain that another must reach to be an alternative."""
+    scale = best.fit.scale
+    explained = best.share * float((current.losses(scale) - best.losses(scale)).sum())
+    return 1.0 - TRIALS.certain_evidence / max(explained, TRIALS.certain_evidence)
+
+
+def _shown(hypothesis: Hypothesis) -> str:
+    return ", ".join(
+        f"{name} {scale:.3g}"
+        for name, scale in zip(
+            hypothesis.segments.channel_names, hypothesis.fit.scale.tolist(), strict=True
+        )
+    )
