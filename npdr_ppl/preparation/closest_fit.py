@@ -136,17 +136,18 @@ def search_prior(
     return z
 
 
-def part_of(segments: SegmentModel, *, seed: int = 0) -> Tensor:
+def part_of(
+    segments: SegmentModel, num: int = PRIOR_SEARCH.most_segments, *, seed: int = 0
+) -> Tensor:
     """Returns the indices of a segment of each of equal parts of the recording.
-
-    Enough segments to begin a fit with; see ``PRIOR_SEARCH.most_segments``.
 
     Args:
         segments: The model along the recording.
+        num: Number of parts; by default enough to begin a fit with.
         seed: Seed of the choice.
     """
-    num = segments.inputs.num_segments
-    return one_of_each_part(min(num, PRIOR_SEARCH.most_segments), num, seed=seed)
+    most = segments.inputs.num_segments
+    return one_of_each_part(min(num, most), most, seed=seed)
 
 
 def _errors(segments: SegmentModel, z: Tensor, starts: Tensor, ranges: Tensor) -> Tensor:

@@ -42,7 +42,7 @@ class DensitySurrogate:
             log_density: Their log density up to a constant, ``(n,)``.
 
         Returns:
-            ``None`` if there are too few points.
+            ``None`` if there are too few points, or the polynomial errs too much.
         """
         weights, d = log_weights.exp(), w.shape[1]
         mean = weights @ w
@@ -65,7 +65,7 @@ class DensitySurrogate:
             most_degree=DENSITY_SURROGATE.most_degree,
             points_per_coefficient=DENSITY_SURROGATE.points_per_coefficient,
         )
-        if polynomial is None:
+        if polynomial is None or polynomial.error > DENSITY_SURROGATE.largest_error:
             return None
         return cls(mean, factor, polynomial, float(points.norm(dim=-1).max()))
 

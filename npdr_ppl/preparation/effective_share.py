@@ -37,6 +37,8 @@ def _share(residual: Tensor, taken: Tensor) -> float:
 
     count = taken.sum(-1)
     most = int(count.max())
+    if most < LEAST_STEPS:
+        return 1.0
     # Chains have equal lengths. Whole segments do, unless single measurements are missing.
     is_missing_any = bool((taken[:, 1:] & ~taken[:, :-1]).any())
     least = most - most // LEAST_STEPS if is_missing_any else most

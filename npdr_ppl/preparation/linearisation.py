@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from npdr_ppl.preparation.settings import LINEARISATION
 from npdr_ppl.preparation.solving import is_invertible, solve_or_zero
 
 __all__ = ["Linearisation"]
@@ -33,9 +34,11 @@ class Linearisation:
         return Linearisation(self.residual * ratio, by_parameters, by_starts)
 
     def updated(self, residual: Tensor, step: Tensor, moves: Tensor) -> "Linearisation":
-        """Returns it at a nearby point, with the least change of derivatives that explains this.
+        """Returns the linearisation at a nearby point.
 
-        The correction is that of Broyden (1965), per segment.
+        In each segment, derivatives change as little as the new residuals require (Broyden 1965),
+        and less after a move that is shorter than those of the finite differences: what it changes
+        may be rounding errors.
 
         Args:
             residual: Residuals at the point, ``(S, N)``.
@@ -45,7 +48,7 @@ class Linearisation:
         both = torch.cat((step.expand(len(moves), -1), moves), dim=-1)[:, None]  # (S, 1, d + m)
         derivatives = torch.cat((self.by_parameters, self.by_starts), dim=-1)
         missed = (self.residual - residual)[..., None] - derivatives @ both.mT
-        length = both.square().sum(-1, keepdim=True).clamp_min(1e-300)
+        length = both.square().sum(-1, keepdim=True).clamp_min(LINEARISATION.parameter_step**2)
         derivatives = derivatives + missed * (both / length)
         by_parameters, by_starts = derivatives.split((len(step), moves.shape[-1]), dim=-1)
         return Linearisation(residual, by_parameters, by_starts)

@@ -1,5 +1,6 @@
 """Polynomials in several variables, fitted by weighted least squares."""
 
+import math
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
@@ -16,10 +17,12 @@ class Polynomial:
     Attributes:
         coefficients: Coefficients of the monomials, ``(terms, m)``.
         degree: The degree.
+        error: Root of the weighted mean square of the leave-one-out errors of its fit.
     """
 
     coefficients: Tensor
     degree: int
+    error: float = 0.0
 
     @classmethod
     def zero(cls, num_values: int) -> "Polynomial":
@@ -67,13 +70,13 @@ def fit_polynomial(
         error = float((left_out.square() @ importance).mean())
         coefficients = torch.linalg.solve_triangular(r, q.mT @ wanted, upper=True)
         if error < least and bool(coefficients.isfinite().all()):
-            least, found = error, Polynomial(coefficients, degree)
+            least, found = error, Polynomial(coefficients, degree, error**0.5)
     return found
 
 
 def num_terms(number: int, degree: int) -> int:
     """Returns the number of monomials of some variables up to a degree."""
-    return sum(1 for _ in _exponents(number, degree))
+    return math.comb(number + degree, degree)
 
 
 def _exponents(number: int, degree: int) -> list[tuple[int, ...]]:

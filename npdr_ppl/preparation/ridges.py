@@ -123,21 +123,18 @@ class RidgeCoordinates:
         away = self.space.from_reference(z) - self.centre
         w = torch.linalg.solve(self.basis, away.mT).mT
         weak = w[:, : self.num_weak]
-        return torch.cat((weak, w[:, self.num_weak :] - self._bend(weak)), dim=-1)
+        return torch.cat((weak, w[:, self.num_weak :] - self.bend(weak)), dim=-1)
 
     def to_reference(self, w: Tensor) -> tuple[Tensor, Tensor]:
         """Maps w ``(n, d)`` to reference coordinates; also returns which lie on the support."""
         weak = w[:, : self.num_weak]
-        moved = torch.cat((weak, w[:, self.num_weak :] + self._bend(weak)), dim=-1)
+        moved = torch.cat((weak, w[:, self.num_weak :] + self.bend(weak)), dim=-1)
         return self.space.to_reference(self.centre + moved @ self.basis.mT)
 
     def log_jacobian(self, z: Tensor) -> Tensor:
         """Returns log |∂w/∂z|, ``(n,)``."""
         own = self.space.log_jacobian(z, self.space.from_reference(z))
         return own - torch.linalg.slogdet(self.basis).logabsdet
-
-    def _bend(self, weak: Tensor) -> Tensor:
-        return self.bend(weak)
 
     def _traced(
         self, likelihood: SegmentLikelihood, slope: Tensor, seed: int
@@ -195,7 +192,7 @@ class RidgeCoordinates:
         straight = replace(self, bend=Polynomial.zero(d - k))
         by_w = self.basis / slope[:, None]  # ∂z/∂w at the closest fit
         stiff = self.information[k:] + 1.0
-        w = torch.cat((weak, self._bend(weak)), dim=-1)
+        w = torch.cat((weak, self.bend(weak)), dim=-1)
         best, value = w.clone(), torch.full((len(w),), -torch.inf, dtype=torch.float64)
         predicted, prior = value, likelihood.segments.prior
         for step in range(steps + 1):

@@ -68,7 +68,7 @@ def fit_segments(
         held: Mask of coordinates that are not fitted, ``(d,)``; none by default.
         scale: Standard deviation of each channel's errors, ``(C,)``, if known; that of the fit's
             residuals by default.
-        max_steps: Greatest number of steps until the scale is known, and again at that scale.
+        max_steps: Greatest number of linearisations until the scale is known, and again at that scale.
         is_rough: Whether to stop once the scale is known. This is enough to rank fits that differ
             much.
 
@@ -259,7 +259,10 @@ def _steps(
             now = replace(now, by_parameters=now.by_parameters * ~held)
             num_updates, num_linearised = 0, num_linearised + 1
         if not now.is_finite:
-            break
+            if not num_updates:
+                break
+            now = None
+            continue
         present = sum(float(part.square().sum()) for part in (now.residual, offsets, z))
         moves = [_step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]
         tried = torch.stack([point for point, _ in moves])
@@ -308,6 +311,7 @@ def _steps(
             break
         else:
             factors = SEGMENT_FIT.far_factors
+            now = now if gain <= 0.0 else None
             continue
         num_updates += 1
         if num_updates > most_updates:
@@ -318,7 +322,7 @@ def _steps(
 def _most_updates(segments: SegmentModel, held: Tensor, *, is_rough: bool) -> int:
     """Returns how many steps may use corrected derivatives.
 
-    None where that saves little, or where the misfit has local minima, at which corrections lead.
+    0 if corrections save little, or if the misfit has local minima, into which they can lead.
 
     Args:
         segments: The model and the recording.

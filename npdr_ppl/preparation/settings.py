@@ -104,8 +104,8 @@ class SegmentFitSettings:
             minima.
         most_restarts: Greatest number of successive restarts.
         most_updates: Greatest number of steps with corrected derivatives of an earlier point.
-        least_ratio: Least number of simulations for derivatives, as a multiple of those for a
-            step's tries, with which derivatives are corrected.
+        least_ratio: Derivatives are corrected only if they need at least this many times as many
+            simulations as the trial points of one step.
     """
 
     first_damping: float = 1e-2
@@ -321,18 +321,21 @@ class DensitySurrogateSettings:
 
     Attributes:
         deepest: How much less log density than the greatest a point may have to be fitted, beyond
-            the number of parameters. It leaves out one of 10,000 draws of a normal density.
+            the number of parameters. It leaves out hardly any draw of a normal density.
         most_degree: Greatest degree of the polynomial.
         points_per_coefficient: Least number of points for each coefficient.
+        largest_error: Greatest error of the polynomial in log density. With this error, half of
+            the moves that it leads are accepted.
     """
 
     deepest: float = 10.0
     most_degree: int = 4
     points_per_coefficient: int = 3
+    largest_error: float = 1.0
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
-        check_range(self, 0.0, math.inf, "deepest")
+        check_range(self, 0.0, math.inf, "deepest", "largest_error")
         check_range(self, 1, 10, "most_degree")
         check_range(self, 1, math.inf, "points_per_coefficient")
 

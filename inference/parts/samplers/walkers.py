@@ -29,7 +29,8 @@ SURROGATE_MOVES = 32
 """Moves under a surrogate for each evaluation of the density."""
 
 PLAIN_EVERY = 4
-"""The first of so many sweeps has no surrogate. It reaches points that the surrogate rules out."""
+"""Every fourth sweep, from the first on, uses no surrogate. It reaches points that the surrogate
+rules out."""
 
 
 LogDensity = Callable[[Tensor], Tensor]
@@ -97,8 +98,7 @@ def _led(
 def _proposed(moving: Tensor, fixed: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Returns one of three moves of each walker, and the log of its correction for volume.
 
-    Each walker's move is drawn anew, so that many moves one after another are as likely in
-    reverse.
+    Each move is drawn independently, so that a sequence of moves is reversible.
     """
     size, d = moving.shape
     first, second = (

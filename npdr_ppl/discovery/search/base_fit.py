@@ -85,7 +85,9 @@ def fit_base(
         best = closest(begun)
         begun = [other for other in begun if other is not best]
         try:
-            fitted = fit_segment_model(segments, start=best.parameters)
+            is_whole = len(best.fit.offsets) == segments.inputs.num_segments
+            offsets = best.fit.offsets if is_whole else None
+            fitted = fit_segment_model(segments, start=best.parameters, offsets=offsets)
         except DataError as error:  # it can be simulated along some segments only
             failure = error
     if fitted is None:
@@ -111,10 +113,12 @@ def off_the_ends(fitted: Hypothesis) -> Hypothesis:
     """
     for _ in range(BASE_FIT.most_refits):
         z = fitted.fit.z
-        is_at_end = z.abs() > HYPOTHESIS.implausible_coordinate
-        if not bool(is_at_end.any()) or not bool((is_at_end & _is_flat(fitted)).any()):
+        is_stuck = z.abs() > HYPOTHESIS.implausible_coordinate
+        if bool(is_stuck.any()):
+            is_stuck &= _is_flat(fitted)
+        if not bool(is_stuck.any()):
             break
-        inside = torch.where(is_at_end, z.sign(), z)
+        inside = torch.where(is_stuck, z.sign(), z)
         start = fitted.segments.prior.to_parameters(inside[None])
         try:
             other = fit_segment_model(
@@ -125,8 +129,8 @@ def off_the_ends(fitted: Hypothesis) -> Hypothesis:
             )
         except DataError:
             break
-        gain = _loss(fitted, fitted.fit.scale) - _loss(other, fitted.fit.scale)
-        if not fitted.share * gain >= BASE_FIT.least_gain:
+        before, after = (_loss(each, fitted.fit.scale, fitted.share) for each in (fitted, other))
+        if not before - after >= BASE_FIT.least_gain:
             break
         fitted = other
     return fitted
@@ -143,9 +147,16 @@ def _is_flat(fitted: Hypothesis) -> Tensor:
     return variance > 0.5
 
 
-def _loss(hypothesis: Hypothesis, scale: Tensor) -> float:
-    """Returns minus the log density of a fit, up to a constant, for a noise scale ``(C,)``."""
-    return float(hypothesis.losses(scale).sum() + 0.5 * hypothesis.fit.z.square().sum())
+def _loss(hypothesis: Hypothesis, scale: Tensor, share: float) -> float:
+    """Returns minus the log density of a fit, up to a constant.
+
+    Args:
+        hypothesis: The fit.
+        scale: Standard deviation of the measurements per channel, ``(C,)``.
+        share: Effective number of measurements as a share of all.
+    """
+    misfit = share * float(hypothesis.losses(scale).sum())
+    return misfit + 0.5 * float(hypothesis.fit.z.square().sum())
 
 
 def in_finer_steps(
@@ -170,7 +181,11 @@ def in_finer_steps(
         segments = extended(finer_base, current.effects, current.segments.starts)
         trials = Trials(finer_base)
         finer = None
-        if _step_error(current, segments) > BASE_FIT.noticeable_change:
+        # A higher order alone does not show the errors of forces that are held during a step.
+        finest = segments
+        while finest.simulator.with_finer_steps() is not None:
+            finest = finest.with_model(with_finer_steps(finest.model))
+        if _step_error(current, finest) > BASE_FIT.noticeable_change:
             finer = trials.refitted_along(segments, current, current.effects)
             if finer is not None:
                 finer = off_the_ends(finer)

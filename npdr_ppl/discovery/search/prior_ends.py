@@ -76,7 +76,9 @@ def widen_where_it_helps(base: SegmentModel, current: Hypothesis) -> Widened | N
     priors, num = current.segments.prior.distributions, current.segments.inputs.num_segments
     # A part of the segments shows how far to widen.
     index = part_of(current.segments)
-    model, ratio, widest = base.model, num / len(index), current.along(index)
+    model, ratio = base.model, num / len(index)
+    # Parameters that are free to fit the part fit it better than those of the whole recording.
+    widest = _refitted(current.along(index), model) or current.along(index)
     names: set[str] = set()
     for _ in range(PRIOR_ENDS.most_widenings):
         own = _at_end(widest)
@@ -120,7 +122,7 @@ def _refitted(
 
 
 def _threshold(names: Collection[str]) -> float:
-    """Returns the gain above which as many free parameters explain more than chance."""
+    """Returns a gain that so many free parameters exceed by chance at the false-alarm rate."""
     return 0.5 * float(stats.chi2.isf(PRIOR_ENDS.false_alarm_rate, len(names)))
 
 

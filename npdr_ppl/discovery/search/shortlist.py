@@ -11,10 +11,9 @@ from npdr_ppl.discovery.screening.pairs import Pair
 from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.search.evidence import closest, evidence
 from npdr_ppl.discovery.search.settings import TRIALS
-from npdr_ppl.discovery.search.trials import Trials, refit
-from npdr_ppl.preparation.data_options import one_of_each_part
+from npdr_ppl.discovery.search.trials import Fit, Trials, refit
+from npdr_ppl.preparation.closest_fit import part_of
 from npdr_ppl.preparation.initial_states import InitialStates
-from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.progress import Step
 
 __all__ = ["fit_contenders", "fit_pairs", "fit_shortlist"]
@@ -49,7 +48,7 @@ def fit_shortlist(
     if ranking:
         num = _enough_segments(current, ranking[0].gain)
         if num < current.segments.inputs.num_segments:
-            index = _part(current.segments, num)
+            index = part_of(current.segments, num)
             few, along = Trials(trials.base.along(index)), current.along(index)
             return _fit_each(few, along, ranking, report, progress)
     return _fit_each(trials, current, ranking, report, progress)
@@ -86,7 +85,7 @@ def fit_contenders(
     is_part = part.inputs.num_segments < num_segments
     known = result
     if is_part:
-        index = _part(current.segments, part.inputs.num_segments)
+        index = part_of(current.segments, part.inputs.num_segments)
         known = {name: hypothesis.along(index) for name, hypothesis in result.items()}
     compared = {**known, **tried}
     best = closest(list(compared.values()))
@@ -102,23 +101,31 @@ def fit_contenders(
         if name in tried
         and losses[name] <= least + max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))
     ]
-    own = [tried[name] for name in contenders]
-    if is_part:
-        asked = []
-        for trial in own:
-            segments = trials.with_effects(trial.effects, current.segments.starts)
-            assert segments is not None
-            asked.append(refit(segments, trial, trial.effects, {}, current.fit.offsets))
-    else:
-        asked = [refit(trial.segments, trial, trial.effects, {}) for trial in own]
+    if not is_part:
         result |= tried
-    fits = trials.fits(asked, current.simulator)
+
+    def asked(name: str) -> Fit:
+        trial = tried[name]
+        if not is_part:
+            return refit(trial.segments, trial, trial.effects, {})
+        segments = trials.with_effects(trial.effects, current.segments.starts)
+        assert segments is not None
+        return refit(segments, trial, trial.effects, {}, current.fit.offsets)
+
     num = len(contenders)
     progress(0.0, f"0 of {num} best fits converged")
+    fits = trials.fits([asked(name) for name in contenders], current.simulator)
     for number, (name, longer) in enumerate(zip(contenders, fits, strict=True), 1):
         if longer is not None:
             result[name] = longer
         progress(number / num, f"{number} of {num} best fits converged")
+    for name in likeliest:
+        if not is_part or not result.keys().isdisjoint(tried):
+            break
+        # None of the likeliest can be simulated along all segments.
+        if name in tried and name not in contenders:
+            (found,) = trials.fits([asked(name)], current.simulator)
+            result |= {} if found is None else {name: found}
     return result
 
 
@@ -214,11 +221,6 @@ def _enough_segments(current: Hypothesis, gain: float) -> int:
     return min(
         num, max(TRIALS.fewest_segments, math.ceil(num * TRIALS.enough_evidence / evidence_of_all))
     )
-
-
-def _part(segments: SegmentModel, num: int) -> Tensor:
-    """Returns the indices of a number of segments from the whole recording."""
-    return one_of_each_part(num, segments.inputs.num_segments, seed=0)
 
 
 def _initial_guesses(candidate: Screened) -> list[dict[str, Tensor]]:

@@ -30,7 +30,7 @@ four. Forces of effects are constant over an engine step of any order, so only s
 them more accurate."""
 
 _FINER_IF_STIFF = 4
-"""The same where steps of order four are unstable, as often as the order cannot be raised."""
+"""Factor on the number of steps where steps of order four would be unstable."""
 
 _MOST_DAMPED = 2.5
 """Rate of the fastest damping, per engine step, up to which steps of order four are used. They are
@@ -87,10 +87,11 @@ class MujocoSimulator(MujocoMechanism):
         return bound_inverse_dynamics(self)
 
     def with_finer_steps(self) -> Self | None:
-        """Returns a copy with steps of order four, or of this one with twice as many.
+        """Returns a copy with finer steps; ``None`` if there are none.
 
-        Where they would be unstable, as with stiff servos, it takes four times as many steps of
-        the file's own integrator. ``None`` if this is already such a copy.
+        The first call raises the order to four, the second doubles the number of steps. Where
+        order four would be unstable, as with stiff servos, the first call takes four times as many
+        steps of the file's own integrator.
         """
         if self.refinement > 1:
             return None
