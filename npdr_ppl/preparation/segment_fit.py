@@ -68,7 +68,8 @@ def fit_segments(
         held: Mask of coordinates that are not fitted, ``(d,)``; none by default.
         scale: Standard deviation of each channel's errors, ``(C,)``, if known; that of the fit's
             residuals by default.
-        max_steps: Greatest number of linearisations until the scale is known, and again at that scale.
+        max_steps: Greatest number of linearisations until the scale is known, and again at that
+            scale.
         is_rough: Whether to stop once the scale is known. This is enough to rank fits that differ
             much.
 

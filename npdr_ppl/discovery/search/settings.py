@@ -140,8 +140,7 @@ class TrialSettings:
         shortlist: Greatest number of candidates that are fitted in full in each round.
         pairs: Greatest number of pairs of candidates that are fitted in full in each round.
         most_steps: Greatest number of linearisations of a fit.
-        first_steps: The same of a first fit, which shows whether a longer fit is
-            worth it.
+        first_steps: The same of a first fit, which shows whether a longer fit is worth it.
         most_converged: Greatest number of candidates that are fitted until convergence.
         converged_share: Excess of a candidate's loss over the least one, as a share of it, up to
             which it is fitted until convergence.
