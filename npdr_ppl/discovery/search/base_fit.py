@@ -18,7 +18,6 @@ from npdr_ppl.discovery.hypothesis import (
     fit_segment_model,
 )
 from npdr_ppl.discovery.kept_fits import made_or_read
-from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.settings import BASE_FIT
 from npdr_ppl.discovery.search.trials import Trials
@@ -219,15 +218,12 @@ def _starts(
 def _step_error(current: Hypothesis, finer: SegmentModel) -> float:
     """Returns the distance between two simulations, in standard deviations of the residuals.
 
-    The simulations are those of the hypothesis and of the same model with finer steps. What
-    refitted parameters and initial states compensate for is left out, to first order. Correlated
-    residuals count as the fewer independent ones that they are worth.
+    The simulations are those of the hypothesis and of the same model with finer steps. Correlated
+    residuals count as the fewer independent ones that they are worth. No parameter can then be off
+    by more of its own standard deviations.
     """
     fit = current.fit
     here = fit.z[None], fit.offsets[None]
     difference = finer.simulate(*here) - current.segments.simulate(*here)
-    change = finer.whitened(difference[0], fit.scale)
-    if not bool(change.isfinite().all()):
-        return math.inf
-    left = Projection(current).projected(change[..., None])
-    return math.sqrt(current.share) * float(left.norm())
+    distance = finer.whitened(difference[0], fit.scale).norm().nan_to_num(math.inf)
+    return math.sqrt(current.share) * float(distance)

@@ -28,11 +28,10 @@ class BaseFitSettings:
     """The fit of the original model, and its integration steps.
 
     Attributes:
-        noticeable_change: Change of all simulated measurements together by steps of a higher
-            order that refitted parameters do not compensate for, in standard deviations of the
-            residuals. Above it, these steps are used unless the recording contradicts them,
-            because false effects would compensate for it. It is half of what an effect must change
-            to be detected.
+        noticeable_change: Change of all simulated measurements together by the finest steps, in
+            standard deviations of the residuals. Above it, finer steps are used unless the
+            recording contradicts them, because parameters or false effects would compensate for
+            it. It is half of what an effect must change to be detected.
         coarse_probability: Probability above which the recording itself is taken to be simulated
             with coarse steps.
         most_refits: Greatest number of refits from inside the priors, each from the result of the
