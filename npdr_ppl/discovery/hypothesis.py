@@ -16,7 +16,6 @@ from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.preparation.data_options import DataOptions
-from npdr_ppl.preparation.effective_share import effective_share
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
@@ -112,10 +111,8 @@ class Hypothesis:
     @cached_property
     def share(self) -> float:
         """Effective number of independent measurements, as a share of all measurements."""
-        assert self.segments.steps_per_average == 1
         residual = self.segments.whitened(self.difference, self.fit.scale)
-        residual = residual.unflatten(-1, (-1, len(self.fit.scale)))
-        return float(effective_share(residual, self.segments.is_measured).mean())
+        return self.segments.effective_share(residual)
 
     @cached_property
     def likelihood(self) -> SegmentLikelihood:

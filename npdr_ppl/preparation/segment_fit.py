@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.preparation.effective_share import effective_share
 from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import SEGMENT_FIT
@@ -117,8 +116,7 @@ def _share(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) ->
         offsets: Offsets of the initial states, ``(S, m)``.
         scale: Standard deviation of each channel's residuals, ``(C,)``.
     """
-    residual = segments.residuals(z[None], offsets[None], scale)[0].unflatten(-1, (-1, len(scale)))
-    return float(effective_share(residual, segments.is_measured).mean())
+    return segments.effective_share(segments.residuals(z[None], offsets[None], scale)[0])
 
 
 def _unstuck_offsets(

@@ -24,6 +24,7 @@ from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK, DataOptions
+from npdr_ppl.preparation.effective_share import effective_share
 from npdr_ppl.preparation.initial_states import (
     InitialStates,
     error_factors,
@@ -317,6 +318,16 @@ class SegmentModel:
             counts = pad(self.is_measured.double(), (0, 0, 0, missing)).unflatten(-2, (-1, width))
             whitened = steps.sum(-2) / counts.sum(-2).clamp_min(1.0).sqrt()
         return whitened.flatten(-2)
+
+    def effective_share(self, residual: Tensor) -> float:
+        """Returns the effective number of independent measurements as a share of all.
+
+        Args:
+            residual: Whitened residuals, ``(S, N)``, none of them averaged.
+        """
+        assert self.steps_per_average == 1
+        by_step = residual.unflatten(-1, (-1, len(self.channel_names)))
+        return float(effective_share(by_step, self.is_measured).mean())
 
     def root_mean_square(self, difference: Tensor) -> Tensor:
         """Returns the size of a difference of readings ``(S, K, C)`` per channel, ``(C,)``."""
