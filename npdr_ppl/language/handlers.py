@@ -24,6 +24,7 @@ __all__ = [
     "add_effect",
     "num_finer_steps",
     "remove_effect",
+    "with_coarser_steps",
     "with_finer_steps",
     "with_noise",
 ]
@@ -175,6 +176,22 @@ class ModelWithFinerSteps(Layer):
 
     def __repr__(self) -> str:
         return f"{self.__name__} in {'still ' * (num_finer_steps(self) - 1)}finer steps"
+
+
+class CoarserStepsMessenger(Messenger):
+    """Gives a program's simulators back their own steps while it runs, if that saves much."""
+
+    def _pyro_sample(self, msg: Any) -> None:
+        box = msg["fn"]
+        if isinstance(box, SimulatorBlackBox):
+            coarser = box.simulator.with_coarser_steps()
+            if coarser is not None:
+                msg["fn"] = box.with_simulator(coarser)
+
+
+def with_coarser_steps(model: Model) -> Model:
+    """Returns the model with cheaper steps; see :meth:`Simulator.with_coarser_steps`."""
+    return CoarserStepsMessenger()(model)
 
 
 def with_finer_steps(model: Model) -> Model:

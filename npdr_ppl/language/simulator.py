@@ -111,6 +111,14 @@ class Simulator(ABC):
         """Returns a copy with smaller integration errors; ``None`` if there is none."""
         return None
 
+    def with_coarser_steps(self) -> Self | None:
+        """Returns a copy that costs much less, from which finer steps differ almost constantly.
+
+        Differences between simulations of similar parameters are then almost the same in both.
+        ``None`` if there is no such copy.
+        """
+        return None
+
     @property
     def is_rate(self) -> tuple[bool, ...]:
         """Whether each state is the rate of another; the others are positions."""

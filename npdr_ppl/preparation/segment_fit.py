@@ -221,6 +221,9 @@ def _steps(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Takes steps until they gain little.
 
+    Where the simulator has coarser steps, each linearisation and the trials after it take those,
+    with what they miss at its point (:meth:`SegmentModel.in_coarser_steps`).
+
     Derivatives cost most of a step. So a few further steps use those of an earlier point,
     corrected by what the last step has changed (Broyden 1965).
 
@@ -248,13 +251,16 @@ def _steps(
         torch.full((len(offsets),), SEGMENT_FIT.first_damping).double(),
     )
     factors, present_scale = SEGMENT_FIT.near_factors, scale
-    now, num_updates, num_linearised = None, 0, 0
+    now, near, num_updates, num_linearised = None, segments, 0, 0
     most_updates = _most_updates(segments, held, is_rough=is_rough)
     while True:
         if now is None:
             if num_linearised == max_steps:
                 break
-            now = segments.linearise(z, offsets, scale, is_rough=is_rough)
+            for near in (segments.in_coarser_steps(z, offsets), segments):
+                now = near.linearise(z, offsets, scale, is_rough=is_rough)
+                if now.is_finite or near is segments:
+                    break
             now = replace(now, by_parameters=now.by_parameters * ~held)
             num_updates, num_linearised = 0, num_linearised + 1
         if not now.is_finite:
@@ -266,7 +272,7 @@ def _steps(
         moves = [_step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]
         tried = torch.stack([point for point, _ in moves])
         begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
-        squares = _squares(segments, tried, begun, scale)  # (a, b, S, C)
+        squares = _squares(near, tried, begun, scale)  # (a, b, S, C)
         losses = (squares.sum(-1) + begun.square().sum(-1)).nan_to_num(torch.inf)
         least, chosen = losses.min(1)  # (a, S)
         outcome = least.sum(-1) + tried.square().sum(-1)
@@ -295,7 +301,7 @@ def _steps(
                 is_little = is_little and bool((scale > SEGMENT_FIT.settled_scale * before).all())
             corrected = None
             if most_updates:
-                here = segments.residuals(z[None], offsets[None], scale)[0]
+                here = near.residuals(z[None], offsets[None], scale)[0]
                 corrected = now.rescaled(before / scale).updated(
                     here, z - last[0], offsets - last[1]
                 )

@@ -63,6 +63,11 @@ class SegmentLikelihood:
         return torch.eye(by_start.shape[-1], dtype=torch.float64) + by_start.mT @ by_start
 
     @cached_property
+    def _near(self) -> SegmentModel:
+        """The model in coarser steps that equal its own close to the fit."""
+        return self.segments.in_coarser_steps(self.fit.z, self.fit.offsets)
+
+    @cached_property
     def misfit(self) -> float:
         """Misfit per degree of freedom at the closest fit: one if the residuals are only noise."""
         now = self.linearisation
@@ -115,11 +120,11 @@ class SegmentLikelihood:
 
     def _residuals(self, z: Tensor) -> Iterator[Tensor]:
         """Yields whitened residuals ``(n, S, N)`` at zero offsets, in chunks."""
-        offsets = self.fit.offsets[None]
+        near, offsets = self._near, self.fit.offsets[None]
         moved = (self.linearisation.by_starts @ self.fit.offsets[..., None])[..., 0]
         for points in z.double().split(self.segments.draws_per_chunk):
             starts = offsets.expand(len(points), -1, -1)
-            yield self.segments.residuals(points, starts, self.fit.scale) + moved
+            yield near.residuals(points, starts, self.fit.scale) + moved
 
     def _squares(self, residual: Tensor) -> Tensor:
         """Returns rᵀ C⁻¹ r by segment, ``(n, S)``, for residuals ``(n, S, N)``."""

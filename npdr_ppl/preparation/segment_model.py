@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from npdr_ppl.errors import DataError, NpdrError
-from npdr_ppl.language.handlers import with_noise
+from npdr_ppl.language.handlers import with_coarser_steps, with_noise
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
@@ -140,6 +140,29 @@ class SegmentModel:
         part._smoothed = self._smoothed.segments(index)
         part._start_from(None if self.starts is None else self.starts.segments(index))
         return part
+
+    def in_coarser_steps(self, z: Tensor, offsets: Tensor) -> "SegmentModel":
+        """Returns a cheaper model with the same residuals at a point, and similar ones around it.
+
+        It takes the simulator's coarser steps. What they miss at the point is taken from the
+        measurements.
+
+        Args:
+            z: Parameters, ``(d,)``.
+            offsets: Offsets of the initial states, ``(S, m)``.
+
+        Returns:
+            This model if there are no coarser steps, or if simulations at the point fail.
+        """
+        if self.simulator.with_coarser_steps() is None:
+            return self
+        coarser = self.with_model(with_coarser_steps(self.model))
+        here = z[None], offsets[None]
+        missed = (self.simulate(*here) - coarser.simulate(*here))[0]
+        if not bool(missed.isfinite().all()):
+            return self
+        coarser.observed = self.observed - missed
+        return coarser
 
     def averaged(self, most: int, fewest: int) -> "SegmentModel":
         """Returns the model with averages of residuals, if a recording has very many.
@@ -350,6 +373,11 @@ class SegmentModel:
             scale: Standard deviation of each channel's residuals, ``(C,)``.
             is_rough: Whether one-sided differences will do, at half the price.
         """
+        near = self.in_coarser_steps(z, offsets)
+        if near is not self:
+            found = near.linearise(z, offsets, scale, is_rough=is_rough)
+            if found.is_finite:
+                return found
         step, idle = LINEARISATION.initial_state_step, self._without_influence
         eye = torch.eye(self.num_offsets, dtype=torch.float64)
         moves = step * eye[~idle]

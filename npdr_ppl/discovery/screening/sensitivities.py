@@ -78,7 +78,8 @@ def sensitivities(
         effects: The candidates.
         hints: Additional shapes to try, by effect's name: values of its parameters.
     """
-    segments, fit = hypothesis.segments, hypothesis.fit
+    fit = hypothesis.fit
+    segments = hypothesis.segments.in_coarser_steps(fit.z, fit.offsets)
     box = segments.black_box(fit.z[None])
     base = segments.run(box.simulator, box.parameters, fit.offsets[None])[0]
     probes = []

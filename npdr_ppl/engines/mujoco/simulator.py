@@ -81,6 +81,9 @@ class MujocoSimulator(MujocoMechanism):
         (Parameter(name='payload', unit='kg', nominal=0.024, description='body pole mass'),)
     """
 
+    # The simulator with the file's own steps, once finer ones are taken.
+    unrefined: Self | None = None
+
     @cached_property
     def inverse_dynamics(self) -> InverseDynamics | None:
         """The inverse dynamics in linear form, or ``None`` if the model has no such form."""
@@ -100,6 +103,7 @@ class MujocoSimulator(MujocoMechanism):
         engine_step = self.time_step / self.num_substeps(self.time_step)
         changed = copy.copy(self)
         changed.prepared_models = {}
+        changed.unrefined = self.unrefined or self
         if fastest_damping(self.model, self.initial_positions) * engine_step > _MOST_DAMPED:
             changed.refinement = _FINER_IF_STIFF
         elif self.model.opt.integrator == rk4:
@@ -107,6 +111,14 @@ class MujocoSimulator(MujocoMechanism):
         else:
             changed.model = copy.copy(self.model)
             changed.model.opt.integrator = rk4
+        return changed
+
+    def with_coarser_steps(self) -> Self | None:
+        """Returns a copy with the file's own steps; ``None`` if these are its steps."""
+        if self.unrefined is None:
+            return None
+        changed = copy.copy(self.unrefined)
+        changed.effects = self.effects
         return changed
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
