@@ -225,7 +225,8 @@ def _steps(
     with what they miss at its point (:meth:`SegmentModel.in_coarser_steps`).
 
     Derivatives cost most of a step. So a few further steps use those of an earlier point,
-    corrected by what the last step has changed (Broyden 1965).
+    corrected by what the last step has changed (Broyden 1965). Where the misfit has local minima,
+    they could lead into one, and steps end only after trials far away.
 
     Rough steps use one-sided differences and set the scale to that of the residuals after each
     step. Each segment has its own damping, because a segment in which a joint sticks would
@@ -251,8 +252,9 @@ def _steps(
         torch.full((len(offsets),), SEGMENT_FIT.first_damping).double(),
     )
     factors, present_scale = SEGMENT_FIT.near_factors, scale
+    has_minima = bool((segments.coordinates_with_minima & ~held).any())
     now, near, num_updates, num_linearised = None, segments, 0, 0
-    most_updates = _most_updates(segments, held, is_rough=is_rough)
+    most_updates = 0 if has_minima else _most_updates(segments, held, is_rough=is_rough)
     while True:
         if now is None:
             if num_linearised == max_steps:
@@ -269,6 +271,14 @@ def _steps(
             now = None
             continue
         present = sum(float(part.square().sum()) for part in (now.residual, offsets, z))
+        enough = max(
+            SEGMENT_FIT.least_gain / share, SEGMENT_FIT.rough_gain * present if is_rough else 0.0
+        )
+        if not has_minima and _possible_gain(now, z, offsets, held) < enough:
+            if not num_updates:
+                break
+            now = None
+            continue
         moves = [_step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]
         tried = torch.stack([point for point, _ in moves])
         begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
@@ -278,9 +288,7 @@ def _steps(
         outcome = least.sum(-1) + tried.square().sum(-1)
         best = int(outcome.argmin())
         gain = present - float(outcome[best])
-        is_little = gain < max(
-            SEGMENT_FIT.least_gain / share, SEGMENT_FIT.rough_gain * present if is_rough else 0.0
-        )
+        is_little = gain < enough
         if gain > 0.0:
             place, every = chosen[best], torch.arange(len(offsets))
             last = z, offsets
@@ -325,9 +333,7 @@ def _steps(
 
 
 def _most_updates(segments: SegmentModel, held: Tensor, *, is_rough: bool) -> int:
-    """Returns how many steps may use corrected derivatives.
-
-    0 if corrections save little, or if the misfit has local minima, into which they can lead.
+    """Returns how many steps may use corrected derivatives, 0 if corrections save little.
 
     Args:
         segments: The model and the recording.
@@ -338,9 +344,7 @@ def _most_updates(segments: SegmentModel, held: Tensor, *, is_rough: bool) -> in
     derivatives = sides * (len(held) + segments.num_offsets)
     if derivatives < SEGMENT_FIT.least_ratio * len(SEGMENT_FIT.near_factors) ** 2:
         return 0
-    return (
-        0 if bool((segments.coordinates_with_minima & ~held).any()) else SEGMENT_FIT.most_updates
-    )
+    return SEGMENT_FIT.most_updates
 
 
 def _squares(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
@@ -360,6 +364,65 @@ def _squares(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) 
         for point, starts in zip(points, offsets.flatten(0, 1).split(together), strict=True)
     ]
     return torch.cat(squares).unflatten(0, (a, b))
+
+
+def _possible_gain(now: Linearisation, z: Tensor, offsets: Tensor, held: Tensor) -> float:
+    """Returns by how much the best step would reduce the objective if residuals were linear.
+
+    Args:
+        now: Residuals and derivatives.
+        z: Parameters, ``(d,)``.
+        offsets: Offsets, ``(S, m)``.
+        held: Mask of coordinates that are not fitted, ``(d,)``; their derivatives are zero.
+    """
+    system = _System.of(now, z, offsets)
+    eye = torch.eye(offsets.shape[-1], dtype=torch.float64)
+    parts = solve_or_zero(system.own + eye, system.sides)[0]
+    hessian, gradient = system.reduced(parts)
+    gradient = gradient.masked_fill(held, 0.0)
+    change = solve_or_zero(hessian + torch.eye(len(z), dtype=torch.float64), gradient[:, None])[0]
+    by_offsets = (system.sides[..., -1] * parts[..., -1]).sum()
+    return float(by_offsets + gradient @ change[:, 0])
+
+
+@dataclass(frozen=True)
+class _System:
+    """The normal equations of a Gauss-Newton step, without the prior's and the damping's part.
+
+    Attributes:
+        own: Those of each segment's offsets, Gᵀ G, ``(S, m, m)``.
+        sides: Gᵀ J and the offsets' gradient, ``(S, m, d + 1)``.
+        by_parameters: Jᵀ J, ``(d, d)``.
+        gradient: The parameters' gradient, ``(d,)``.
+    """
+
+    own: Tensor
+    sides: Tensor
+    by_parameters: Tensor
+    gradient: Tensor
+
+    @classmethod
+    def of(cls, now: Linearisation, z: Tensor, offsets: Tensor) -> "_System":
+        by_z, by_start, residual = now.by_parameters, now.by_starts, now.residual[..., None]
+        pull = by_start.mT @ residual - offsets[..., None]
+        return cls(
+            by_start.mT @ by_start,
+            torch.cat((by_start.mT @ by_z, pull), dim=-1),
+            (by_z.mT @ by_z).sum(0),
+            (by_z.mT @ residual).sum(0)[:, 0] - z,
+        )
+
+    def reduced(self, parts: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the parameters' Hessian and gradient once the offsets are eliminated.
+
+        Each segment's offsets can be, because no other segment depends on them.
+
+        Args:
+            parts: The solution of each segment's own system, ``(S, m, d + 1)``.
+        """
+        d = len(self.gradient)
+        taken = (self.sides[..., :d].mT @ parts).sum(0)
+        return self.by_parameters - taken[:, :d], self.gradient - taken[:, d]
 
 
 def _step(
@@ -388,22 +451,13 @@ def _step(
     Returns:
         Parameters ``(d,)``, and offsets for each factor, ``(b, S, m)``.
     """
-    by_z, by_start = now.by_parameters, now.by_starts
-    d, m = by_z.shape[-1], by_start.shape[-1]
-    own = by_start.mT @ by_start  # (S, m, m)
-    pull = (by_start.mT @ now.residual[..., None])[..., 0] - offsets
-    cross = by_start.mT @ by_z  # (S, m, d)
-    sides = torch.cat((cross, pull[..., None]), dim=-1)
-    eye = torch.eye(m, dtype=torch.float64)
-
-    # Each segment's offsets can be eliminated, because no other segment depends on them.
+    system, d = _System.of(now, z, offsets), len(z)
+    eye = torch.eye(offsets.shape[-1], dtype=torch.float64)
     parts = {
-        f: solve_or_zero(own + (1.0 + f * dampings)[:, None, None] * eye, sides)[0]
+        f: solve_or_zero(system.own + (1.0 + f * dampings)[:, None, None] * eye, system.sides)[0]
         for f in factors
     }
-    middle = parts[1.0]
-    hessian = (by_z.mT @ by_z - cross.mT @ middle[..., :d]).sum(0)
-    gradient = (by_z.mT @ now.residual[..., None] - cross.mT @ middle[..., d:]).sum(0)[:, 0] - z
+    hessian, gradient = system.reduced(parts[1.0])
     curvature = hessian.diagonal().clamp_min(1.0)
     hessian = hessian + torch.diag(1.0 + damping * curvature)
     change = solve_or_zero(hessian, gradient.masked_fill(held, 0.0)[:, None])[0][:, 0]
