@@ -8,6 +8,7 @@ that makes a new simulator on every call is therefore compiled only once.
 import functools
 import importlib
 import importlib.util
+import inspect
 import logging
 import math
 import os
@@ -195,13 +196,8 @@ def _compile(kernel: _Kernel) -> Callable[..., Any]:
         warnings.simplefilter("ignore", DeprecationWarning)
         importlib.import_module("torch._inductor.compile_fx")
         from torch._dynamo.exc import TorchDynamoException
-    # The type stubs of torch.compile lack its latest options.
-    function = torch.compile(  # pyright: ignore[reportCallIssue]
-        kernel.function,
-        fullgraph=True,
-        options=dict(_OPTIONS),
-        recompile_limit=_RECOMPILE_LIMIT,
-        isolate_recompiles=True,
+    function = torch.compile(
+        kernel.function, fullgraph=True, options=dict(_OPTIONS), **_recompile_options()
     )
     # Stored as text, because the error object would keep all tensors of the failed attempt alive.
     failure: str | None = None
@@ -220,6 +216,17 @@ def _compile(kernel: _Kernel) -> Callable[..., Any]:
             raise CompilationError(failure) from error
 
     return run
+
+
+def _recompile_options() -> dict[str, Any]:
+    """Returns those of torch.compile's options for recompilation that the installed torch has.
+
+    Torch 2.11 has none of them. It counts the kernels of all simulators together and raises an
+    error after its own limit, which is lower.
+    """
+    wanted = {"recompile_limit": _RECOMPILE_LIMIT, "isolate_recompiles": True}
+    known = inspect.signature(torch.compile).parameters
+    return {name: value for name, value in wanted.items() if name in known}
 
 
 def mark_sizes_dynamic(tree: Any) -> None:
