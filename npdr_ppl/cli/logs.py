@@ -13,7 +13,9 @@ import typer
 
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.cli.manners import AsJson
+from npdr_ppl.cli.model_files import is_robot
 from npdr_ppl.cli.options import MappingOption, OutOption
+from npdr_ppl.cli.robots import inspect_robot
 from npdr_ppl.errors import DataError
 
 if TYPE_CHECKING:
@@ -33,13 +35,14 @@ def inspect(
     log: Annotated[
         Path,
         typer.Argument(
-            help="CSV, Parquet, HDF5, MAT, MCAP, a ROS 2 bag, a LeRobot data set, or a folder "
-            "of CSV files."
+            help="CSV, Parquet, HDF5, MAT, MCAP, a ROS 2 bag, a LeRobot data set, a folder of "
+            "CSV files, or a robot's MJCF or URDF file."
         ),
     ],
     mapping: MappingOption = None,
     write: Annotated[
-        Path | None, typer.Option(help="Write a mapping to start from to this TOML file.")
+        Path | None,
+        typer.Option(help="Write a mapping (TOML), or a robot's model (Python), to start from."),
     ] = None,
     time: Annotated[str, typer.Option(help="Name of the column with the time stamps.")] = "",
     time_step: Annotated[
@@ -49,6 +52,9 @@ def inspect(
     as_json: AsJson = False,
 ) -> None:
     """Show the signals of a log: rate, largest gap, jitter, range, unit, and what they may be.
+
+    Of a robot's MJCF or URDF file it shows the parameters of the model that is derived from it,
+    the columns that a log needs, and the ports of effects.
 
     Example: npdr inspect bag_folder --write mapping.toml
     """
@@ -61,6 +67,11 @@ def inspect(
 
     if write is not None and write.exists():
         raise DataError(f"{write} exists already; choose another name or remove it first.")
+    if is_robot(str(log)):
+        if mapping is not None or time or time_step is not None:
+            raise DataError(f"--mapping, --time and --time-step are for logs; {log} is a robot.")
+        inspect_robot(log, write, as_json)
+        return
     chosen = Mapping() if mapping is None else Mapping.of(mapping)
     stated = {"time": time or chosen.log.time, "time_step": time_step or chosen.log.time_step}
     settings = msgspec.structs.replace(chosen.log, **stated)

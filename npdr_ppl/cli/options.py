@@ -84,7 +84,10 @@ _SIMULATIONS = typer.Option(min=10, help="Simulations per round.")
 
 ModelArgument = Annotated[
     str,
-    typer.Argument(help="Zoo name, or path/to/file.py:function.", autocompletion=complete_model),
+    typer.Argument(
+        help="Zoo name, path/to/file.py:function, or a robot's MJCF or URDF file.",
+        autocompletion=complete_model,
+    ),
 ]
 DataOption = Annotated[list[Path], _DATA]
 OptionalDataOption = Annotated[list[Path] | None, _DATA]

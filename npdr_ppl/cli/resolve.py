@@ -1,14 +1,12 @@
 """Turns command-line words into models, effects, data, targets, tasks and methods."""
 
-import importlib.util
-import sys
 from collections.abc import Callable, Collection, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import cloudpickle
-
+from npdr_ppl.cli.model_files import ROBOTS, derived_model, is_robot, load_function
+from npdr_ppl.engines.common.robot_files import relative_to
 from npdr_ppl.errors import BackendError, DataError, ModelError, NpdrError
 from npdr_ppl.language.model import Model
 
@@ -40,15 +38,15 @@ T = TypeVar("T")
 DATA_FILES = (".csv", ".parquet", ".npz", ".nc")
 """File name extensions of rollouts."""
 
-SCENES = (".xml", ".mjcf", ".urdf")
-"""File name extensions of robot descriptions."""
-
 DEFAULT_TASKS = {"furuta": "furuta-swing-up", "furuta_paper": "furuta-swing-up"}
 """Default control task by name of the zoo's model."""
 
 
 def resolve_model(word: str) -> Callable[..., Any]:
-    """Returns the model that ``MODEL`` names: a zoo name, or ``path/to/file.py:function``.
+    """Returns the model that ``MODEL`` names.
+
+    It is a zoo name, ``path/to/file.py:function``, or an MJCF or URDF file, from which a model is
+    derived.
 
     Raises:
         ModelError: There is no such model.
@@ -58,6 +56,8 @@ def resolve_model(word: str) -> Callable[..., Any]:
     entries = zoo()
     if word in entries:
         return entries[word].model
+    if is_robot(word):
+        return derived_model(Path(word))
     if not _is_function(word):
         close = get_close_matches(word, entries, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"the zoo has {', '.join(entries)}."
@@ -66,42 +66,12 @@ def resolve_model(word: str) -> Callable[..., Any]:
             hint = f"add the name of the model in it, as in {word}:model."
         elif Path(f"{word.partition(':')[0]}.py").is_file():
             hint = f"did you mean {word.partition(':')[0]}.py:{word.partition(':')[2] or 'model'}?"
-        elif path.suffix.lower() in SCENES:
-            hint = (
-                f"{word} becomes one in a few lines of Python, see docs/bring_your_simulator.md."
-            )
         raise ModelError(
-            f"{word!r} is neither a model of the zoo nor path/to/file.py:function; {hint}"
+            f"{word!r} is neither a model of the zoo nor path/to/file.py:function nor a robot's "
+            f"{' or '.join(ROBOTS)}; {hint}"
         )
     path, _, function = word.rpartition(":")
-    return _load_function(Path(path), function)
-
-
-def _load_function(path: Path, function: str) -> Callable[..., Any]:
-    if not path.is_file():
-        close = get_close_matches(path.name, [p.name for p in path.parent.glob("*.py")], n=1)
-        hint = f" Did you mean {path.with_name(close[0])}:{function}?" if close else ""
-        raise ModelError(f"{path} does not exist.{hint}")
-    # The module gets a unique name: a file called json.py must not replace the library.
-    name = f"_npdr_model_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ModelError(f"{path} is not a Python file.")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    # Workers cannot import a module of this name, so its definitions are sent as code.
-    cloudpickle.register_pickle_by_value(module)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise ModelError(f"{path} cannot be loaded: {type(error).__name__}: {error}.") from error
-    model = getattr(module, function, None)
-    if not callable(model):
-        own = [n for n, v in vars(module).items() if getattr(v, "__module__", "") == name]
-        close = get_close_matches(function, own, n=1) or own[:1]
-        hint = f" Did you mean {path}:{close[0]}?" if close else ""
-        raise ModelError(f"{path} has no function {function!r}.{hint}")
-    return model
+    return load_function(Path(path), function)
 
 
 def resolve_effects(model: Model, words: Sequence[str]) -> Callable[..., Any]:
@@ -353,7 +323,9 @@ def _returned_by(word: str, kind: type[T]) -> T:
     """Calls the function that ``path/to/file.py:function`` names, and checks what it returns."""
     path, _, function = word.rpartition(":")
     try:
-        found = _load_function(Path(path), function)()
+        make = load_function(Path(path), function)
+        with relative_to(Path(path).parent):
+            found = make()
     except NpdrError:
         raise
     except Exception as error:

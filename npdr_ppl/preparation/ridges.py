@@ -4,9 +4,10 @@ If a motion determines fewer combinations than there are parameters, the posteri
 Across it are stiff directions, in which it is a thousand times narrower than the prior; along it
 are weak ones, in which it is hardly narrower. If the sheet is curved even slightly, a normal
 approximation fails. Let a be the weak and b the stiff coordinates of the prior-whitened
-information. The ridge b = g(a) is traced by Newton steps with the Jacobian of the closest fit (the
-chord method), fitted by a polynomial, and subtracted. The shear (a, b) → (a, b − g(a)) preserves
-volumes, so densities need no correction for it.
+information; weak ones are left as they are where the posterior is straight along them. The ridge
+b = g(a) is traced by Newton steps with the Jacobian of the closest fit (the chord method), fitted
+by a polynomial, and subtracted. The shear (a, b) → (a, b − g(a)) preserves volumes, so densities
+need no correction for it.
 
 The curvature at the closest fit makes a curved ridge look shorter than it is. Its length is
 therefore found from the traced points. They are weighted by the ratio of their posterior density
@@ -39,7 +40,8 @@ class RidgeCoordinates:
         space: The coordinates y from which w are computed.
         centre: The closest fit in them, ``(d,)``.
         basis: Columns map w − shear to y − centre, ``(d, d)``.
-        information: Information of the recording in units of the prior's, ``(d,)`` ascending.
+        information: Information of the recording in units of the prior's, ``(d,)``; ascending
+            among the weak coordinates and among the others.
         num_weak: Number of weak coordinates, which come first in w.
         bend: Polynomial g in the weak ones; zero, of degree 0, if no ridge was traced.
         weak_mean: Mean of the posterior's weak coordinates, estimated from the traced
@@ -59,29 +61,81 @@ class RidgeCoordinates:
     @classmethod
     def of(cls, likelihood: SegmentLikelihood, *, seed: int) -> "RidgeCoordinates":
         """Finds the coordinates of a recording's posterior."""
-        space = SamplingCoordinates.of(likelihood.segments.prior)
-        z = likelihood.fit.z
+        space, z = SamplingCoordinates.of(likelihood.segments.prior), likelihood.fit.z
         slope = space.slope(z).clamp_min(1e-12)
         spread = space.variance.sqrt()
         scaled = likelihood.information() * (spread / slope)[:, None] * (spread / slope)
         information, vectors = torch.linalg.eigh(0.5 * (scaled + scaled.mT))
         information = information.clamp_min(0.0)
         # Along a direction of width δ the ridge departs from a line by about δ², in units of the
-        # prior. The direction is weak if that exceeds the width of the stiffest one.
-        num_weak = int((information**2 < information[-1]).sum())
-        straight = cls(
+        # prior. The direction can be weak if that exceeds the width of the stiffest one.
+        can_be_weak = int((information**2 < information[-1]).sum())
+        basis = spread[:, None] * vectors
+        straight = cls._straight(space, space.from_reference(z[None])[0], basis, information, 0)
+        is_weak = torch.zeros(len(z), dtype=torch.bool)
+        if 0 < can_be_weak < len(z):
+            is_weak[:can_be_weak] = straight._are_curved(likelihood, can_be_weak)
+        order = torch.cat((is_weak.nonzero()[:, 0], (~is_weak).nonzero()[:, 0]))
+        num_weak = int(is_weak.sum())
+        found = cls._straight(
+            space, straight.centre, basis[:, order], information[order], num_weak
+        )
+        return found._traced(likelihood, slope, seed) if num_weak else found
+
+    @classmethod
+    def _straight(
+        cls,
+        space: SamplingCoordinates,
+        centre: Tensor,
+        basis: Tensor,
+        information: Tensor,
+        num_weak: int,
+    ) -> "RidgeCoordinates":
+        """Returns coordinates of which no ridge is known; see the attributes."""
+        return cls(
             space,
-            space.from_reference(z[None])[0],
-            spread[:, None] * vectors,
+            centre,
+            basis,
             information,
             num_weak,
-            Polynomial.zero(len(z) - num_weak),
+            Polynomial.zero(len(centre) - num_weak),
             torch.zeros(num_weak, dtype=torch.float64),
             torch.diag(1.0 / (1.0 + information[:num_weak])),
         )
-        if num_weak in (0, len(z)):
-            return straight
-        return straight._traced(likelihood, slope, seed)
+
+    def _are_curved(self, likelihood: SegmentLikelihood, num: int) -> Tensor:
+        """Returns which of the first coordinates the posterior is curved along, ``(num,)``.
+
+        The log density is compared with that of a normal posterior at two standard deviations,
+        along each coordinate and between each two of them.
+
+        Args:
+            likelihood: The recording's likelihood.
+            num: Number of the coordinates.
+        """
+        axes = torch.eye(num, dtype=torch.float64)
+        first, second = torch.triu_indices(num, num, 1)
+        away = torch.cat((axes, (axes[first] + axes[second]) / 2.0**0.5))
+        members = away > 0.0
+        away = 2.0 * torch.cat((away, -away))
+        w = torch.zeros(len(away) + 1, len(self.centre), dtype=torch.float64)
+        w[1:, :num] = away / (1.0 + self.information[:num]).sqrt()
+        z, inside = self.to_reference(w)
+        density = torch.full((len(w),), torch.nan, dtype=torch.float64)
+        at = z[inside]
+        density[inside] = (
+            likelihood.log_prob(at)
+            + likelihood.segments.prior.log_prob(at).double()
+            - self.log_jacobian(at)
+        )
+        # The mean of both sides, because a slope is no curvature. Points outside the prior's
+        # support show nothing.
+        missed = (density[1:] - density[0] + 0.5 * away.square().sum(-1)).unflatten(0, (2, -1))
+        departs = missed.mean(0).abs().nan_to_num(0.0, torch.inf) > RIDGE.close_gain
+        alone = departs[:num]
+        # A pair counts only if neither of its members departs by itself.
+        together = departs[num:] & ~alone[first] & ~alone[second]
+        return alone | members[num:][together].any(0)
 
     def tensors(self) -> dict[str, Tensor]:
         """Returns the tensors from which, with the prior, the coordinates can be rebuilt."""

@@ -79,7 +79,11 @@ def check_channels(
     missing += [c.name for c in channels if c.name not in recorded and c.rate_of not in recorded]
     found = ", ".join((*recording.channel_names, *recording.action_names))
     if missing:
-        raise DataError(f"the column {', '.join(missing)} is missing; the data have {found}.")
+        raise DataError(
+            f"the column {', '.join(missing)} is missing; the data have {found}. If a log has "
+            "other names, --mapping gives it the model's; npdr inspect LOG --write mapping.toml "
+            "writes one to start from."
+        )
     expected_actions = {action.name for action in actions}
     extra = [name for name in recording.action_names if name not in expected_actions]
     if not allow_extra:

@@ -175,23 +175,29 @@ def in_finer_steps(
         report: Called with a sentence when steps are refined.
     """
     is_coarse = False
-    while current.simulator.with_finer_steps() is not None:
-        finer_base = base.with_model(with_finer_steps(base.model))
-        segments = extended(finer_base, current.effects, current.segments.starts)
-        trials = Trials(finer_base)
-        finer = None
-        # A higher order alone does not show the errors of forces that are held during a step.
-        finest = segments
-        while finest.simulator.with_finer_steps() is not None:
-            finest = finest.with_model(with_finer_steps(finest.model))
-        if _step_error(current, finest) > BASE_FIT.noticeable_change:
-            finer = trials.refitted_along(segments, current, current.effects)
-            if finer is not None:
-                finer = off_the_ends(finer)
+    while True:
+        bases = [base]
+        while (finer_base := _in_finer_steps(bases[-1])) is not None:
+            bases.append(finer_base)
+        levels = [extended(each, current.effects, current.segments.starts) for each in bases]
+        # The first steps that differ little from the finest. A higher order alone does not show
+        # the errors of forces that are held during a step.
+        number = next(
+            k
+            for k, each in enumerate(levels)
+            if each is levels[-1]
+            or _step_error(current, each, levels[-1]) <= BASE_FIT.noticeable_change
+        )
+        if number == 0:
+            break
+        trials = Trials(bases[number])
+        finer = trials.refitted_along(levels[number], current, current.effects)
+        if finer is not None:
+            finer = off_the_ends(finer)
         if finer is None or weigh([current, finer], [0.0, 0.0])[0] > BASE_FIT.coarse_probability:
             break
         report("the model's integration steps are too coarse for this recording; refining them")
-        is_coarse, base = True, finer_base
+        is_coarse, base = True, bases[number]
         current = trials.with_own_starts(finer)
     return BaseFit(base, current, is_coarse)
 
@@ -215,15 +221,26 @@ def _starts(
     return [{}, {name: value[0] for name, value in found.items()}]
 
 
-def _step_error(current: Hypothesis, finer: SegmentModel) -> float:
+def _in_finer_steps(segments: SegmentModel) -> SegmentModel | None:
+    """Returns a model in its next finer steps, ``None`` if it has none."""
+    if segments.simulator.with_finer_steps() is None:
+        return None
+    return segments.with_model(with_finer_steps(segments.model))
+
+
+def _step_error(current: Hypothesis, segments: SegmentModel, finest: SegmentModel) -> float:
     """Returns the distance between two simulations, in standard deviations of the residuals.
 
-    The simulations are those of the hypothesis and of the same model with finer steps. Correlated
-    residuals count as the fewer independent ones that they are worth. No parameter can then be off
-    by more of its own standard deviations.
+    Correlated residuals count as the fewer independent ones that they are worth. No parameter can
+    then be off by more of its own standard deviations.
+
+    Args:
+        current: A hypothesis, at whose fit the model is simulated.
+        segments: The model in some steps.
+        finest: The model in its finest steps.
     """
     fit = current.fit
     here = fit.z[None], fit.offsets[None]
-    difference = finer.simulate(*here) - current.segments.simulate(*here)
-    distance = finer.whitened(difference[0], fit.scale).norm().nan_to_num(math.inf)
+    difference = finest.simulate(*here) - segments.simulate(*here)
+    distance = finest.whitened(difference[0], fit.scale).norm().nan_to_num(math.inf)
     return math.sqrt(current.share) * float(distance)

@@ -15,6 +15,7 @@ from npdr_ppl.engines.bullet.parameters import BoundParameter
 from npdr_ppl.engines.bullet.scene import Builder, Scene, Urdf
 from npdr_ppl.engines.bullet.settings import BulletSettings
 from npdr_ppl.engines.bullet.stepping import BulletSimulation, stepping
+from npdr_ppl.engines.common.robot_files import located
 from npdr_ppl.engines.common.source_files import recorded_files
 from npdr_ppl.engines.pooled.pool_simulator import Segment
 from npdr_ppl.engines.pooled.stepped_simulator import SteppedSimulator
@@ -68,7 +69,7 @@ class BulletSimulator(SteppedSimulator):
     ) -> None:
         self.settings = settings or BulletSettings()
         self.time_step = self.settings.time_step
-        self._build: Builder = scene if callable(scene) else Urdf(scene)
+        self._build: Builder = scene if callable(scene) else Urdf(located(scene))
         self._commands = tuple(
             (column, action)
             for column, action in enumerate(actions)

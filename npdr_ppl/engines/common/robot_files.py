@@ -8,6 +8,8 @@ engine gets the file.
 import math
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -17,7 +19,7 @@ from xml.etree import ElementTree
 from npdr_ppl.errors import ModelError
 from npdr_ppl.reading_limits import LIMITS
 
-__all__ = ["RobotFiles", "is_inside", "read_robot", "references"]
+__all__ = ["RobotFiles", "is_inside", "located", "read_robot", "references", "relative_to"]
 
 _ROOTS = ("mujoco", "mujocoinclude")
 
@@ -38,6 +40,8 @@ _BLOCK = 2**16
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 
+_folder: ContextVar[Path | None] = ContextVar("folder", default=None)
+
 
 @dataclass(frozen=True)
 class RobotFiles:
@@ -52,6 +56,32 @@ class RobotFiles:
     folder: Path
     texts: dict[str, str] = field(default_factory=dict)
     trees: dict[str, ElementTree.Element] = field(default_factory=dict)
+
+
+@contextmanager
+def relative_to(folder: Path) -> Iterator[None]:
+    """Lets simulators that are made in the block look for relative paths in a folder first.
+
+    Args:
+        folder: Folder of the Python file that defines the model.
+    """
+    token = _folder.set(folder.absolute())
+    try:
+        yield
+    finally:
+        _folder.reset(token)
+
+
+def located(source: Any) -> Any:
+    """Returns the path of a robot's file; anything but a relative path is returned as it is.
+
+    It is relative to the folder of :func:`relative_to` if it exists there, otherwise to the
+    working directory.
+    """
+    folder = _folder.get()
+    if folder is None or not isinstance(source, str | PathLike):
+        return source
+    return folder / source if (folder / source).is_file() else source
 
 
 def read_robot(path: str | PathLike[str]) -> RobotFiles:

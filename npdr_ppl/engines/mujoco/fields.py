@@ -83,6 +83,8 @@ _QUANTITIES: dict[str, dict[str, _Quantity]] = {
     "body": {
         "mass": _Quantity("body_mass", "kg"),
         "inertia": _Quantity("body_inertia", "kg m²", _XYZ),
+        # The inertia keeps its ratio to the mass, as if only the density changed.
+        "mass_and_inertia": _Quantity("body_mass", "kg"),
         "centre": _Quantity("body_ipos", "m", _XYZ),
         "position": _Quantity("body_pos", "m", _XYZ),
         "gravity_compensation": _Quantity("body_gravcomp", "1"),
@@ -106,7 +108,9 @@ _QUANTITIES: dict[str, dict[str, _Quantity]] = {
     "actuator": {
         "gain": _Quantity("actuator_gainprm", "1"),
         "bias": _Quantity("actuator_biasprm", "1", ("constant", "position", "velocity")),
+        # Gains of servos; see :func:`_servo_entries`.
         "kp": _Quantity("actuator_gainprm", "{force}/{position}"),
+        "kv": _Quantity("actuator_biasprm", "{force} s/{position}"),
         "gear": _Quantity("actuator_gear", "1"),
         "time_constant": _Quantity("actuator_dynprm", "s"),
         "force_range": _Quantity("actuator_forcerange", "1", ("lower", "upper")),
@@ -202,14 +206,11 @@ def find_field(model: Any, text: str) -> Field:
     units = {unit.format(**_joint_units_of(model, kind, i)) for i in chosen}
     if len(units) > 1:
         raise ModelError(f"{text!r} mixes the units {', '.join(sorted(units))}.")
-    entries = [e for i in chosen for e in _entries(model, kind, i, info, component)]
-    if quantity == "kp":
-        # A position servo's force is kp (control − position), so kp sets gain and minus bias.
-        bias = _QUANTITIES["actuator"]["bias"]
-        for e in [e for i in chosen for e in _entries(model, kind, i, bias, "position")]:
-            entries.append(e._replace(factor=-1.0))
-        if any(a.nominal != -b.nominal for a, b in zip(*_halves(entries), strict=True)):
-            raise ModelError(f"{text!r}: only position servos have a kp; bind gain and bias.")
+    read = {"kp": _servo_entries, "kv": _servo_entries, "mass_and_inertia": _solid_entries}
+    if quantity in read:
+        entries = [e for i in chosen for e in read[quantity](model, i, quantity, text)]
+    else:
+        entries = [e for i in chosen for e in _entries(model, kind, i, info, component)]
     return Field(text, units.pop(), tuple(entries))
 
 
@@ -231,8 +232,36 @@ def _joint_units_of(model: Any, kind: str, element: int) -> dict[str, str]:
     return joint_units(model, joint)
 
 
-def _halves(entries: list[Entry]) -> tuple[list[Entry], list[Entry]]:
-    return entries[: len(entries) // 2], entries[len(entries) // 2 :]
+def _servo_entries(model: Any, actuator: int, gain: str, text: str) -> list[Entry]:
+    """Returns the numbers that a gain of a servo sets.
+
+    The force of a position servo is kp (control − position) − kv velocity, so kp sets the gain and
+    minus the bias. That of a velocity servo is kv (control − velocity).
+    """
+    numbers, quantities = [], _QUANTITIES["actuator"]
+    for name, component in (("kp", ""), ("bias", "position"), ("bias", "velocity")):
+        numbers += _entries(model, "actuator", actuator, quantities[name], component)
+    control, position, velocity = numbers
+    minus_position, minus_velocity = position._replace(factor=-1.0), velocity._replace(factor=-1.0)
+    is_position_servo = control.nominal == -position.nominal != 0.0
+    if gain == "kp" and is_position_servo:
+        return [control, minus_position]
+    if gain == "kv" and is_position_servo:
+        return [minus_velocity]
+    if gain == "kv" and position.nominal == 0.0 and control.nominal == -velocity.nominal:
+        return [control, minus_velocity]
+    servos = "position servos" if gain == "kp" else "position and velocity servos"
+    raise ModelError(f"{text!r}: only {servos} have a {gain}; bind gain and bias.")
+
+
+def _solid_entries(model: Any, body: int, quantity: str, text: str) -> list[Entry]:
+    """Returns a body's mass and its inertias, which are a constant times the mass."""
+    info = _QUANTITIES["body"]
+    (mass,) = _entries(model, "body", body, info["mass"], "")
+    if mass.nominal == 0.0:
+        raise ModelError(f"{text!r}: the body has no mass, so its inertia has no ratio to it.")
+    inertias = _entries(model, "body", body, info["inertia"], "")
+    return [mass, *(e._replace(factor=e.nominal / mass.nominal) for e in inertias)]
 
 
 def _split(kind: str, rest: list[str], text: str) -> tuple[str, str, str]:

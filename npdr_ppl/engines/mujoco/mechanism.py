@@ -14,6 +14,7 @@ from torch import Tensor
 
 from npdr_ppl.engines.common.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.engines.common.effect_chain import Tables, needed_histories
+from npdr_ppl.engines.common.robot_files import located
 from npdr_ppl.engines.common.source_files import recorded_mjcf
 from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
 from npdr_ppl.engines.mujoco.batches import make_batch, prepared_copy, quiet
@@ -71,6 +72,7 @@ class MujocoMechanism(ClosedLoopSimulator):
     ) -> None:
         if substeps is not None and substeps < 1:
             raise ModelError(f"MujocoSimulator needs at least one substep, got {substeps=}.")
+        source = located(source)
         with quiet(logger.warning):
             self.model: Any = load_mjcf(source)
         self._source = recorded_mjcf(source)
