@@ -1,0 +1,249 @@
+"""A Pyro model from an MJCF file alone: which numbers are uncertain, and how much.
+
+The model is Python text, so that what runs is what a user can print and edit.
+"""
+
+import importlib
+import re
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
+from npdr_ppl.engines.mujoco.batches import quiet
+from npdr_ppl.engines.mujoco.dependent_fields import dependent_fields
+from npdr_ppl.engines.mujoco.fields import Field, actuator_names, element_names, find_field
+from npdr_ppl.errors import ModelError
+
+__all__ = ["DerivedModel", "DerivedParameter", "derive_model"]
+
+MASS_RANGE = (0.7, 1.3)
+"""Prior of a mass and its inertia, as factors on the file's values. Masses from CAD differ by
+cables, screws and paint."""
+
+ARMATURE_RANGE = (0.5, 1.5)
+"""Prior of an armature as factors on the file's value. It is the rotor's inertia times the gear
+ratio squared, and both are in data sheets."""
+
+GAIN_RANGE = (0.5, 1.5)
+"""Prior of a servo's kp and kv as factors on the file's values, which are often tuned by hand."""
+
+FRICTION_RANGE = (0.0, 2.0)
+"""Prior of joint damping and friction loss as factors on the file's values. Lubricant, wear and
+temperature change friction by such factors."""
+
+LEAST_SHARE = 0.001
+"""A body lighter than this share of what its joint carries keeps its mass: at most 0.03 % of the
+joint's load would change. Such bodies are placeholders in the file."""
+
+_TEMPLATE = '''"""Model of a robot, derived from its file."""
+
+import pyro
+import pyro.distributions as dist
+
+import npdr_ppl as npdr
+
+# What each parameter sets in the file. The inertia of a body changes with its mass.
+PARAMETERS = {{
+{parameters}
+}}
+
+# Smallest and largest value. A parameter that is not listed here keeps the file's value.
+PRIORS = {{
+{priors}
+}}
+{held}
+robot = npdr.MujocoSimulator({path}, PARAMETERS)
+
+
+def model(inputs):
+    parameters = {{name: pyro.sample(name, dist.Uniform(*ends)) for name, ends in PRIORS.items()}}
+    return npdr.simulate("trajectory", robot, parameters, inputs)
+'''
+
+
+@dataclass(frozen=True)
+class DerivedParameter:
+    """An uncertain number of the file.
+
+    Attributes:
+        name: Name of the parameter, a Python identifier.
+        field: What it sets, e.g. ``"joint elbow damping"``.
+        unit: Its unit.
+        nominal: Its value in the file.
+        low: Smallest value of the uniform prior.
+        high: Largest value of the uniform prior.
+    """
+
+    name: str
+    field: str
+    unit: str
+    nominal: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class DerivedModel:
+    """What a model of an MJCF file treats as uncertain.
+
+    Attributes:
+        title: Name of the file.
+        parameters: The uncertain numbers.
+        held: Fields that keep the file's value because positions do not determine them, each with
+            the other fields that have the same effect together.
+    """
+
+    title: str
+    parameters: tuple[DerivedParameter, ...]
+    held: dict[str, tuple[str, ...]]
+
+    def reason(self, field: str) -> str:
+        """Returns in words why a field keeps the file's value."""
+        first, *others = self.held[field] or ("",)
+        if not first:
+            return "no effect on the motion"
+        if not others:
+            return f"same effect as {first}"
+        return f"same effect as {first} and {len(others)} more together"
+
+    def source(self, path: str | PathLike[str]) -> str:
+        """Returns a Python file that defines the function ``model``.
+
+        Args:
+            path: The robot's file, as the Python file should name it.
+        """
+        parameters = [f'    "{p.name}": {_quoted(p.field)},' for p in self.parameters]
+        priors = [
+            f'    "{p.name}": ({p.low:.4g}, {p.high:.4g}),  # file: {p.nominal:.4g} {p.unit}'
+            for p in self.parameters
+        ]
+        held = [f"#   {_quoted(field)}: {_quoted(self.reason(field))}" for field in self.held]
+        if held:
+            held = ["", "# Not varied, because positions do not determine them:", *held]
+        return _TEMPLATE.format(
+            parameters="\n".join(parameters),
+            priors="\n".join(priors),
+            held="\n".join([*held, ""]),
+            path=_quoted(str(path)),
+        )
+
+
+def derive_model(source: str | PathLike[str]) -> DerivedModel:
+    """Chooses the uncertain numbers of an MJCF file, or of a URDF file that MuJoCo compiles.
+
+    These are the masses of the bodies that joints move, with their inertias; damping, armature and
+    friction loss of joints, where the file has positive values; and kp and kv of position and
+    velocity servos. The priors are uniform around the file's values. What positions do not
+    determine beside the others keeps the file's value; see
+    :func:`~npdr_ppl.engines.mujoco.dependent_fields.dependent_fields`.
+
+    Args:
+        source: Path of the file.
+
+    Raises:
+        ModelError: The file is neither MJCF nor URDF, or nothing in it moves.
+    """
+    model = load_mjcf(source)
+    title = Path(source).name
+    if model.nv == 0:
+        raise ModelError(f"{title} has no joints, so nothing in it moves.")
+    if model.na:
+        raise ModelError(
+            f"{title} has actuators with states of their own, such as filters, which recordings "
+            "do not contain; remove them, e.g. timeconst, and let npdr discover find a lag."
+        )
+    chosen: dict[str, tuple[Field, str, tuple[float, float]]] = {}
+    for kind, name, quantity, ends in [*_masses(model), *_joints(model), *_servos(model)]:
+        field = find_field(model, f"{kind} {name} {quantity}")
+        if field.nominal is not None and field.nominal > 0.0:
+            chosen[field.text] = field, f"{name}_{quantity}".removesuffix("_and_inertia"), ends
+    order = sorted((f for f, *_ in chosen.values()), key=_preference)
+    with quiet():
+        held = dependent_fields(model, order) if order else {}
+    found: list[DerivedParameter] = []
+    for text, (field, name, (low, high)) in chosen.items():
+        if text not in held:
+            own, value = _identifier(name, [p.name for p in found]), field.nominal or 0.0
+            found.append(DerivedParameter(own, text, field.unit, value, low * value, high * value))
+    if not found:
+        raise ModelError(f"{title} has no masses, friction or gains that its motion depends on.")
+    return DerivedModel(title, tuple(found), held)
+
+
+_Choice = tuple[str, str, str, tuple[float, float]]
+"""Kind and name of an element, a quantity of it, and factors on the file's value."""
+
+
+def _masses(model: Any) -> list[_Choice]:
+    chosen = []
+    for body, name in enumerate(element_names(model, "body")):
+        carried = float(model.body_subtreemass[model.body_weldid[body]])
+        is_moved = model.body_weldid[body] != 0
+        if is_moved and float(model.body_mass[body]) > LEAST_SHARE * carried:
+            chosen.append(("body", name, "mass_and_inertia", MASS_RANGE))
+    return chosen
+
+
+def _joints(model: Any) -> list[_Choice]:
+    ranges = {
+        "damping": FRICTION_RANGE,
+        "frictionloss": FRICTION_RANGE,
+        "armature": ARMATURE_RANGE,
+    }
+    names = element_names(model, "joint")
+    return [("joint", name, word, ends) for word, ends in ranges.items() for name in names]
+
+
+def _servos(model: Any) -> list[_Choice]:
+    names = actuator_names(model)
+    return [
+        ("actuator", name, word, GAIN_RANGE)
+        for word in ("kp", "kv")
+        for actuator, name in enumerate(names)
+        if word in _gains(model, actuator)
+    ]
+
+
+def _gains(model: Any, actuator: int) -> tuple[str, ...]:
+    """Returns which gains an actuator has: kp and kv of position servos, kv of velocity servos."""
+    mujoco: Any = importlib.import_module("mujoco")
+    is_fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+    is_affine = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+    gain = float(model.actuator_gainprm[actuator, 0])
+    _, position, velocity = map(float, model.actuator_biasprm[actuator, :3])
+    if not (is_fixed and is_affine and gain > 0.0):
+        return ()
+    if position == -gain:
+        return ("kp", "kv") if velocity < 0.0 else ("kp",)
+    return ("kv",) if position == 0.0 and velocity == -gain else ()
+
+
+def _preference(field: Field) -> tuple[int, float]:
+    """Returns a key that puts first what a recording should determine.
+
+    These are gains and damping, larger ones first, then dry friction and armatures, then masses,
+    lighter ones first.
+    """
+    value = field.nominal or 0.0
+    if field.text.startswith("body "):
+        return 2, value
+    return int(field.text.endswith((" frictionloss", " armature"))), -value
+
+
+def _quoted(text: str) -> str:
+    """Returns a text as a Python string in one line, whatever the names in a file are."""
+    written = repr(text)
+    return f'"{written[1:-1]}"' if '"' not in text and "'" not in text else written
+
+
+def _identifier(text: str, taken: list[str]) -> str:
+    """Returns a text as an identifier that is not taken yet."""
+    name = re.sub(r"\W", "_", text, flags=re.ASCII)
+    name = f"_{name}" if name[0].isdigit() else name
+    number, base = 1, name
+    while name in taken:
+        number += 1
+        name = f"{base}_{number}"
+    return name
