@@ -123,7 +123,7 @@ def test_a_fault_in_a_recording_is_repaired_and_said(monkeypatch, capsys, tmp_pa
         (["mine:model"], "did you mean mine.py:model?"),
         (["mine.py:modle"], "Did you mean mine.py:model?"),
         (["mne.py:model"], "mne.py does not exist. Did you mean mine.py:model?"),
-        (["arm.xml"], "see docs/bring_your_simulator.md."),
+        (["arm.xml"], "arm.xml does not exist."),
         (["pendulum", "--effect", "coulomb_friction"], "as in JOINT.coulomb_friction."),
         (["pendulum", "--effect", "hing.coulomb_friction"], "did you mean 'hinge'?"),
         (["pendulum", "--embedding", "bayesim"], "did you mean 'bayessim'?"),

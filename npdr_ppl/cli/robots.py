@@ -1,0 +1,139 @@
+"""What `npdr inspect` says about a robot's file: parameters, columns of a log, and ports."""
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from npdr_ppl.atomic_files import replacing
+from npdr_ppl.cli.model_files import check_exists
+
+if TYPE_CHECKING:
+    from npdr_ppl.engines.mujoco import MujocoSimulator
+    from npdr_ppl.engines.mujoco.derived_model import DerivedModel
+    from npdr_ppl.language.channels import Channel
+
+__all__ = ["inspect_robot"]
+
+
+def inspect_robot(path: Path, write: Path | None, as_json: bool) -> None:
+    """Prints the model that is derived from a robot's file, and the columns that a log needs.
+
+    Args:
+        path: The MJCF or URDF file.
+        write: Python file to write the model to; ``None`` for none. It must not exist.
+        as_json: Whether to print JSON.
+
+    Raises:
+        ModelError: The file is bad, or no model can be derived from it.
+    """
+    from npdr_ppl.engines.mujoco import MujocoSimulator
+    from npdr_ppl.engines.mujoco.derived_model import derive_model
+
+    check_exists(path, "*.*")
+    derived = derive_model(path)
+    robot = MujocoSimulator(path)
+    found = _described(derived, robot)
+    if as_json:
+        typer.echo(json.dumps(found, indent=2, ensure_ascii=False))
+    else:
+        for line in _lines(found):
+            typer.echo("".join(c if c.isprintable() else "?" for c in line))
+    if write is not None:
+        folder = write.absolute().parent
+        with replacing(write) as temporary:
+            source = derived.source(os.path.relpath(path.absolute(), folder))
+            temporary.write_text(source, encoding="utf-8")
+    if not as_json:
+        model = str(path)
+        if write is not None:
+            model = f"{write}:model"
+            typer.echo(f"\nWrote {write}. Edit its priors, then:")
+        else:
+            typer.echo("\nUse it as it is, or write it as Python to edit with --write FILE.py:")
+        typer.echo(f"    npdr fit {model} --data LOG --out fit")
+
+
+def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, Any]:
+    """Returns what is known of a robot, for JSON."""
+    rates = {state.name: state.rate_of for state in robot.states}
+
+    def column(channel: "Channel", role: str) -> dict[str, Any]:
+        ends = [channel.lower, channel.upper]
+        return {
+            "name": channel.name,
+            "unit": channel.unit,
+            "role": role,
+            "range": ends if all(map(math.isfinite, ends)) else None,
+            "may be left out": rates.get(channel.name) is not None,
+        }
+
+    return {
+        "file": derived.title,
+        "time step": robot.time_step,
+        "parameters": [
+            {
+                "name": p.name,
+                "sets": p.field,
+                "unit": p.unit,
+                "nominal": p.nominal,
+                "prior": [p.low, p.high],
+            }
+            for p in derived.parameters
+        ],
+        "not varied": {field: derived.reason(field) for field in derived.held},
+        "columns": [
+            *(column(c, "measurement") for c in robot.sensors),
+            *(column(c, "command") for c in robot.actions),
+        ],
+        "ports": [{"name": p.name, "kind": p.kind, "unit": p.unit} for p in robot.ports],
+    }
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    """Returns the description as text."""
+    step, parameters, columns = found["time step"], found["parameters"], found["columns"]
+    rows = [("parameter", "file", "uniform prior", "unit", "sets")]
+    for p in parameters:
+        low, high = p["prior"]
+        prior = f"{low:.4g} … {high:.4g}"
+        rows.append((p["name"], f"{p['nominal']:.4g}", prior, p["unit"], p["sets"]))
+    lines = [
+        f"{found['file']}: {len(parameters)} parameters, time step {step:g} s ({1 / step:.4g} Hz)",
+        "",
+        *_table(rows),
+    ]
+    if found["not varied"]:
+        lines += ["", "Not varied, because positions do not determine them:"]
+        lines += [f"  {field}: {reason}" for field, reason in found["not varied"].items()]
+    rows = [("column of a log", "unit", "")]
+    rows += [("time", "s", "constant steps, also other ones than the file's")]
+    for c in columns:
+        remark = "may be left out" if c["may be left out"] else ""
+        if c["role"] == "command":
+            span = "" if c["range"] is None else ", {:.4g} … {:.4g}".format(*c["range"])
+            remark = f"command{span}"
+        rows.append((c["name"], c["unit"], remark))
+    lines += ["", *_table(rows)]
+    if not any(c["role"] == "command" for c in columns):
+        lines.append("  No actuators: the motion is taken as free.")
+    lines.append("  Other names in a log: npdr inspect LOG --write mapping.toml, then --mapping.")
+    lines += ["", "Ports, where effects attach (npdr effects):"]
+    for kind in dict.fromkeys(port["kind"] for port in found["ports"]):
+        names = [port["name"] for port in found["ports"] if port["kind"] == kind]
+        lines.append(f"  {kind}: {', '.join(names)}")
+    return lines
+
+
+def _table(rows: list[tuple[str, ...]]) -> list[str]:
+    """Returns rows with columns of equal width."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            ["", *(cell.ljust(width) for cell, width in zip(row, widths, strict=True))]
+        ).rstrip()
+        for row in rows
+    ]
