@@ -222,3 +222,16 @@ def test_a_vertical_link_and_its_rotor_are_one_inertia(tmp_path):
     )
     derived = derive_model(path)
     assert derived.held == {"body table mass_and_inertia": ("joint turn armature",)}
+
+
+def test_small_friction_beside_a_stiff_servo_has_an_effect(tmp_path):
+    path = tmp_path / "servo.xml"
+    path.write_text(
+        "<mujoco><worldbody><body name='link'><joint name='j' axis='0 1 0' frictionloss='0.05'/>"
+        "<geom size='0.05' pos='0 0 -0.1' mass='0.1'/></body></worldbody>"
+        "<actuator><position joint='j' kp='1000' kv='3'/></actuator></mujoco>"
+    )
+    derived = derive_model(path)
+    names = [p.name for p in derived.parameters]
+    assert names == ["j_frictionloss", "j_command_kp", "j_command_kv"]
+    assert list(derived.held) == ["body link mass_and_inertia"]

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.engines.mujoco.fields import Field
+from npdr_ppl.engines.mujoco.ports import actuator_moments
 
 __all__ = ["dependent_fields"]
 
@@ -28,10 +29,25 @@ about five fields per degree of freedom."""
 
 STEP = 1e-4
 """Relative change of a field for central differences. Their error is about 1e-8 times the size of
-a derivative, and that of the constraint solver's tolerance is about 1e-4."""
+a derivative."""
 
-OWN_SHARE = 1e-2
-"""A field is dependent if less than this share of its column is not a combination of others."""
+OWN_SHARE = 1e-5
+"""A field is dependent if less than this share of its column is not a combination of others. Exact
+dependence leaves 1e-8 of it. A share of 1e-3 may matter in a long recording; the prior holds such
+fields where it does not."""
+
+SOLVER_TOLERANCE = 1e-14
+"""Tolerance of the constraint solver. Differences of accelerations need it smaller than usual."""
+
+SOLVER_ITERATIONS = 200
+"""Most iterations of the constraint solver; its Newton method needs about ten."""
+
+USUAL_ACCELERATION = 10.0
+"""Acceleration in rad/s² or m/s² that sets the size of random forces of actuators: that of 0.5 rad
+at 0.7 Hz. With much larger forces, friction and gravity would seem to have no effect."""
+
+NO_EFFECT = 1e-9
+"""A field has no effect at all if its column is smaller than this share of the largest one."""
 
 WORTH_NAMING = 0.01
 """Smallest contribution of another field, as a share of the column, for it to be named."""
@@ -56,7 +72,7 @@ def dependent_fields(model: Any, fields: Sequence[Field]) -> dict[str, tuple[str
     kept: list[int] = []
     found: dict[str, tuple[str, ...]] = {}
     for index, field in enumerate(fields):
-        if sizes[index] <= OWN_SHARE**2 * sizes.max():
+        if sizes[index] <= NO_EFFECT * sizes.max():
             found[field.text] = ()
             continue
         own, others = columns[:, index], columns[:, kept]
@@ -79,14 +95,10 @@ def _relative_derivatives(model: Any, fields: Sequence[Field]) -> Array:
     free = copy.copy(model)
     free.actuator_forcelimited[:] = 0
     free.jnt_actfrclimited[:] = 0
+    free.opt.tolerance, free.opt.iterations = SOLVER_TOLERANCE, SOLVER_ITERATIONS
     flags = mujoco.mjtDisableBit
     free.opt.disableflags |= int(flags.mjDSBL_CONTACT | flags.mjDSBL_LIMIT)
-    random = np.random.default_rng(0)
-    states = []
-    for _ in range(NUM_STATES):
-        positions = np.array(model.qpos0)
-        mujoco.mj_integratePos(model, positions, random.standard_normal(model.nv), 1.0)
-        states.append((positions, *map(random.standard_normal, (model.nv, model.nu))))
+    states = _random_states(free)
 
     def accelerations(field: Field | None, factor: float) -> Array:
         changed = copy.copy(free)
@@ -108,3 +120,31 @@ def _relative_derivatives(model: Any, fields: Sequence[Field]) -> Array:
     ]
     scaled = [(column / np.maximum(usual, 1e-9 * usual.max())).reshape(-1) for column in columns]
     return np.stack(scaled, axis=-1)
+
+
+def _random_states(model: Any) -> list[tuple[Array, Array, Array]]:
+    """Returns random positions, velocities and commands.
+
+    Commands are such that the forces of actuators have a usual size, also those of stiff servos.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    random = np.random.default_rng(0)
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    is_fixed = model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
+    states = []
+    for _ in range(NUM_STATES):
+        data.qpos[:], data.qvel[:] = model.qpos0, random.standard_normal(model.nv)
+        mujoco.mj_integratePos(model, data.qpos, random.standard_normal(model.nv), 1.0)
+        data.ctrl[:] = 0.0
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, inertia)
+        usual = np.abs(data.qfrc_bias) + USUAL_ACCELERATION * np.diag(inertia)
+        moments = np.abs(actuator_moments(model, data))
+        sizes = moments @ usual / np.maximum((moments**2).sum(axis=1), 1e-12)
+        wanted = sizes * random.standard_normal(model.nu)
+        gain = np.where(is_fixed, model.actuator_gainprm[:, 0], 0.0)
+        # Without a command, the force of such an actuator is its bias.
+        command = (wanted - data.actuator_force) / np.where(gain == 0.0, 1.0, gain)
+        command = np.where(gain == 0.0, random.standard_normal(model.nu), command)
+        states.append((data.qpos.copy(), data.qvel.copy(), command))
+    return states

@@ -12,7 +12,7 @@ from npdr_ppl.engines.mujoco.channels import Component, Reading
 from npdr_ppl.engines.mujoco.fields import actuated_joint, element_names, joint_units
 from npdr_ppl.language.channels import Channel, Port
 
-__all__ = ["ForcePort", "derive_ports", "driven_dofs", "force_ports"]
+__all__ = ["ForcePort", "actuator_moments", "derive_ports", "driven_dofs", "force_ports"]
 
 Array = NDArray[np.float64]
 
@@ -138,6 +138,17 @@ def driven_dofs(model: Any) -> NDArray[np.bool_]:
     mujoco: Any = importlib.import_module("mujoco")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    return np.any(actuator_moments(model, data) != 0.0, axis=0)
+
+
+def actuator_moments(model: Any, data: Any) -> Array:
+    """Returns the generalised force per unit of each actuator's force, ``(nu, nv)``.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        data: Its ``mujoco.MjData`` after ``mj_forward``.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
     moment = np.zeros((model.nu, model.nv))
     if model.nu:
         mujoco.mju_sparse2dense(
@@ -147,7 +158,7 @@ def driven_dofs(model: Any) -> NDArray[np.bool_]:
             data.moment_rowadr,
             data.moment_colind.reshape(-1),
         )
-    return np.any(moment != 0.0, axis=0)
+    return moment
 
 
 def _actuator_ratings(model: Any) -> dict[int, float]:
