@@ -235,3 +235,16 @@ def test_small_friction_beside_a_stiff_servo_has_an_effect(tmp_path):
     names = [p.name for p in derived.parameters]
     assert names == ["j_frictionloss", "j_command_kp", "j_command_kv"]
     assert list(derived.held) == ["body link mass_and_inertia"]
+
+
+def test_gains_of_a_tendons_servo_have_no_unit_of_force(tmp_path):
+    path = tmp_path / "gripper.xml"
+    path.write_text(
+        "<mujoco><worldbody><body><joint name='j' type='slide'/><geom size='0.1'/></body>"
+        "</worldbody><tendon><fixed name='t'><joint joint='j' coef='1'/></fixed></tendon>"
+        "<actuator><position name='grip' tendon='t' kp='9' kv='2'/></actuator></mujoco>"
+    )
+    assert {p.name: p.unit for p in derive_model(path).parameters} == {
+        "grip_kp": "1",
+        "grip_kv": "s",
+    }

@@ -145,7 +145,8 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
     Raises:
         ModelError: The file is neither MJCF nor URDF, or nothing in it moves.
     """
-    model = load_mjcf(source)
+    with quiet():  # MujocoSimulator logs the engine's warnings
+        model = load_mjcf(source)
     title = Path(source).name
     if model.nv == 0:
         raise ModelError(f"{title} has no joints, so nothing in it moves.")

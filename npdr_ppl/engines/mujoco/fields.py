@@ -136,6 +136,9 @@ _UNITS = {
     ("geom", "contact", "time_constant"): "s",
 }
 
+# Units of gains of an actuator that acts on several joints, whose forces have no common unit.
+_UNKNOWN = {"1/1": "1", "1 s/1": "s"}
+
 _COUNTS = {
     "body": "nbody",
     "joint": "njnt",
@@ -204,6 +207,7 @@ def find_field(model: Any, text: str) -> Field:
     info = _QUANTITIES[kind][quantity]
     unit = _UNITS.get((kind, quantity, component), info.unit)
     units = {unit.format(**_joint_units_of(model, kind, i)) for i in chosen}
+    units = {_UNKNOWN.get(unit, unit) for unit in units}
     if len(units) > 1:
         raise ModelError(f"{text!r} mixes the units {', '.join(sorted(units))}.")
     read = {"kp": _servo_entries, "kv": _servo_entries, "mass_and_inertia": _solid_entries}
