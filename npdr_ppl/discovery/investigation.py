@@ -187,11 +187,9 @@ class Investigation:
         """The fit that the search begins with, and the model's original priors."""
         given = self.given
         with self._stage("choose steps"):
-            self.progress.say("comparing with finer integration steps")
-            found = self._searcher.with_finer_steps(given)
-            priors = found.segments.prior.distributions
-            self.progress.say("checking the priors")
-            return self._searcher.with_wider_priors(found), priors
+            self.progress.say("checking integration steps and priors")
+            priors = given.segments.prior.distributions
+            return self._searcher.settled(given), priors
 
     @cached_property
     def narrow_priors(self) -> tuple[PriorEnd, ...]:

@@ -271,7 +271,7 @@ def _fitted(
 def _searched(segments: SegmentModel) -> Hypothesis | None:
     """Returns a rough fit that begins at the result of a search; ``None`` if simulations fail."""
     try:
-        found = fit_base(segments)
+        found, _ = fit_base(segments)
         return fit_segment_model(segments, start=found.parameters, max_steps=6, is_rough=True)
     except DataError:
         return None

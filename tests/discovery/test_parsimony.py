@@ -144,7 +144,7 @@ def test_a_law_with_an_implausible_shape_takes_its_simplest_form(rubbed):
 
 
 def test_a_simple_form_can_be_left_out_in_turn(dragged):
-    # Drag explains all, so bristles become dry friction, and dry friction goes.
+    # Drag explains all, so a drift becomes viscous friction, and viscous friction goes.
     case, _ = dragged
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions())
     base, told = searcher.fit_base(), []
@@ -152,12 +152,12 @@ def test_a_simple_form_can_be_left_out_in_turn(dragged):
         case.model,
         case.fit,
         searcher.data_options,
-        effects=(QuadraticDrag("hinge"), PreslidingFriction("hinge")),
+        effects=(QuadraticDrag("hinge"), FrictionDrift("hinge")),
     )
     candidates = candidates_at(base, searcher.options)
     found = simplest_laws(base, both, candidates, searcher.trials, told.append)
     assert found.names == ("hinge.quadratic_drag",)
     assert [line.split()[0] for line in told] == [
-        "hinge.presliding_friction",
-        "hinge.coulomb_friction",
+        "hinge.friction_drift",
+        "hinge.viscous_friction",
     ]

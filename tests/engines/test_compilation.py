@@ -281,3 +281,9 @@ def test_compiled_replay_agrees_with_the_eager_one_and_has_its_gradients():
         fast, fast_gradients = run("always", *sizes)
         torch.testing.assert_close(fast, eager, rtol=1e-9, atol=1e-11)
         torch.testing.assert_close(fast_gradients, eager_gradients, rtol=1e-7, atol=1e-9)
+
+
+def test_only_options_that_torch_has_are_passed(monkeypatch):
+    assert set(compilation._recompile_options()) <= {"recompile_limit", "isolate_recompiles"}
+    monkeypatch.setattr(torch, "compile", lambda function, *, fullgraph, options: function)
+    assert compilation._recompile_options() == {}

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from scipy import special
 from torch import Tensor
+from torch.nn.functional import pad
 
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.pulse_changes import ForceChange, PulseChanges
@@ -158,7 +159,9 @@ class LargestStatistic:
             columns = pulses.columns[: self._num_used].unflatten(0, (self._blocks, -1))
             standard = self._standard.unflatten(-1, columns.shape[1:3])
             parts = [_in_span(columns[:, j], standard[:, j]) for j in range(columns.shape[1])]
-            turned, residuals = (torch.stack(part, dim=1) for part in zip(*parts, strict=True))
+            most = max(len(values.mT) for _, values in parts)
+            turned = torch.stack([pad(c, (0, 0, 0, most - c.shape[1])) for c, _ in parts], 1)
+            residuals = torch.stack([pad(r, (0, most - r.shape[1])) for _, r in parts], 1)
             self._bases[pulses] = _Along(turned.flatten(0, 1), residuals.flatten(1))
         return self._bases[pulses]
 
@@ -235,8 +238,9 @@ class _Along:
 def _in_span(columns: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
     """Returns vectors in an orthonormal basis of the span of all columns.
 
-    Products among columns, and of columns with residuals, do not change. With at least as many
-    columns as measurements, a basis saves nothing, and both are returned unchanged.
+    Products among columns, and of columns with residuals, change by less than
+    ``PERMUTATION_TEST.lost_in_span`` of the columns' size. Responses to forces are smooth, so that
+    far fewer elements than measurements suffice. If they do not, both are returned unchanged.
 
     Args:
         columns: Columns of each block, ``(blocks, N, c)``.
@@ -245,11 +249,26 @@ def _in_span(columns: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         The columns, ``(blocks, n, c)``, and the residuals, ``(blocks, n)``.
     """
-    num, measurements, width = columns.shape
-    if num * width >= measurements:
+    size = columns.square().sum((0, 1)).sqrt().clamp_min(1e-150)  # parameters differ in size
+    spanned = (columns / size).transpose(0, 1).flatten(1)  # (N, blocks · c)
+    most = PERMUTATION_TEST.most_in_span
+    if 2 * most >= min(spanned.shape):
+        basis = torch.linalg.qr(spanned)[0]
+    else:  # a random sketch of the span (Halko, Martinsson & Tropp 2011)
+        generator = torch.Generator().manual_seed(0)
+        directions = torch.randn(spanned.shape[1], most, generator=generator, dtype=torch.float64)
+        basis = torch.linalg.qr(spanned @ directions)[0]
+    inside = basis.mT @ spanned
+    values, vectors = torch.linalg.eigh(inside @ inside.mT)
+    lost = PERMUTATION_TEST.lost_in_span
+    basis = basis @ vectors[:, values > lost**2 * values[-1]]
+    turned = torch.einsum("bnc,nk->bkc", columns, basis)
+    left = 1.0 - float(turned.square().sum((0, 1)).div(size.square()).min())
+    # What rounding errors leave of a square.
+    is_complete = left < max(1e-10, lost**2 * spanned.shape[1])
+    if not is_complete or basis.shape[1] >= len(basis):
         return columns, residuals
-    basis, turned = torch.linalg.qr(columns.transpose(0, 1).flatten(1))
-    return turned.unflatten(1, (num, width)).transpose(0, 1), residuals @ basis
+    return turned, residuals @ basis
 
 
 def _derangements(draws: int, size: int, generator: torch.Generator) -> Tensor:

@@ -149,6 +149,10 @@ class PermutationTestSettings:
             tables they fit into a processor's caches.
         batches_per_release: Number of batches after which freed memory is returned to the system.
             Batches differ in size, so that freed blocks are seldom reused.
+        most_in_span: Greatest number of elements of a basis of the changes that forces can cause,
+            where measurements are at least twice as many.
+        lost_in_span: Directions of these changes that are smaller than the largest by this factor
+            are left out.
     """
 
     num_permutations: int = 2000
@@ -156,13 +160,17 @@ class PermutationTestSettings:
     most_blocks: int = 100
     numbers_per_part: int = 1_000_000
     batches_per_release: int = 25
+    most_in_span: int = 256
+    lost_in_span: float = 1e-5
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
+        check_range(self, 0.0, 1.0, "lost_in_span")
         check_range(
             self,
             1,
             math.inf,
+            "most_in_span",
             "num_permutations",
             "least_blocks",
             "most_blocks",

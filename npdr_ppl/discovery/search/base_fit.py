@@ -7,7 +7,7 @@ are too coarse for the recording.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from npdr_ppl.discovery.hypothesis import (
 from npdr_ppl.discovery.kept_fits import made_or_read
 from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.settings import BASE_FIT
-from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.discovery.search.trials import Trials, refit
 from npdr_ppl.discovery.settings import HYPOTHESIS
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import with_finer_steps
@@ -29,7 +29,7 @@ from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
 
-__all__ = ["BaseFit", "fit_base", "in_finer_steps", "off_the_ends"]
+__all__ = ["BaseFit", "fit_base", "in_finer_steps", "off_the_ends", "polished"]
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,20 @@ def fit_base(
     near: Mapping[str, Tensor] | None = None,
     seed: int = 0,
     progress: Step | None = None,
-) -> Hypothesis:
+) -> tuple[Hypothesis, Mapping[str, Tensor] | None]:
     """Fits a model to a recording, without adding effects.
+
+    Where the model's steps are too coarse already for a part of the recording, one rough fit is
+    enough: its parameters compensate for the steps.
 
     Args:
         segments: The model along the recording.
         near: Parameters near which the fit is known to be; by default they are searched for.
         seed: Seed of the search.
         progress: Called with a short status, and during the search with the fraction of it done.
+
+    Returns:
+        The fit, and parameters from which a fit in finer steps may begin; ``None`` for the same.
 
     Raises:
         DataError: No parameters can be simulated along the recording, or simulations fail close
@@ -79,6 +85,7 @@ def fit_base(
         except DataError as error:
             failure = error
     step(None, "fit to convergence")
+    finer = _parameters_in_finer_steps(closest(begun), few) if begun else None
     fitted: Hypothesis | None = None
     while begun and fitted is None:
         best = closest(begun)
@@ -86,17 +93,47 @@ def fit_base(
         try:
             is_whole = len(best.fit.offsets) == segments.inputs.num_segments
             offsets = best.fit.offsets if is_whole else None
-            fitted = fit_segment_model(segments, start=best.parameters, offsets=offsets)
+            fitted = fit_segment_model(
+                segments, start=best.parameters, offsets=offsets, is_rough=finer is not None
+            )
         except DataError as error:  # it can be simulated along some segments only
             failure = error
     if fitted is None:
         assert failure is not None
         raise failure
-    fitted = off_the_ends(fitted)
-    step(None, "fit with better initial states")
-    found = Trials(segments).with_own_starts(fitted)
-    _ = found.linearisation  # computed now, because all later steps need it
-    return found
+    if finer is None:
+        fitted = off_the_ends(fitted)
+        step(None, "fit with better initial states")
+        fitted = Trials(segments).with_own_starts(fitted)
+    _ = fitted.linearisation  # computed now, because all later steps need it
+    return fitted, finer
+
+
+def _parameters_in_finer_steps(
+    fitted: Hypothesis, segments: SegmentModel
+) -> Mapping[str, Tensor] | None:
+    """Returns the fit of a model in finer steps; ``None`` if its own are fine enough.
+
+    Args:
+        fitted: The model's fit in its own steps.
+        segments: The model along the same segments.
+    """
+    try:
+        found = in_finer_steps(fitted, segments, is_rough=True)
+    except DataError:
+        return None
+    return found.hypothesis.parameters if found.are_steps_coarse else None
+
+
+def polished(rough: Hypothesis) -> Hypothesis:
+    """Returns a hypothesis fitted to convergence, with initial states along its own motion.
+
+    Args:
+        rough: The hypothesis after rough steps.
+    """
+    trials = Trials(rough.segments)
+    found = trials.refitted_along(rough.segments, rough, rough.effects)
+    return rough if found is None else trials.with_own_starts(off_the_ends(found))
 
 
 def off_the_ends(fitted: Hypothesis) -> Hypothesis:
@@ -162,6 +199,8 @@ def in_finer_steps(
     current: Hypothesis,
     base: SegmentModel,
     *,
+    near: Mapping[str, Tensor] | None = None,
+    is_rough: bool = False,
     report: Callable[[str], None] = lambda _: None,
 ) -> BaseFit:
     """Returns a fit with finer steps if the error of its own is noticeable; else unchanged.
@@ -172,13 +211,15 @@ def in_finer_steps(
     Args:
         current: A fitted hypothesis of the model.
         base: The model without the effects of the hypothesis, along the recording.
+        near: Parameters from which the first fit in finer steps begins; those of the hypothesis by
+            default.
+        is_rough: Whether a rough fit in finer steps is enough; see :func:`polished`.
         report: Called with a sentence when steps are refined.
     """
-    is_coarse = False
+    is_coarse, bases = False, [base]
+    while (finer_base := _in_finer_steps(bases[-1])) is not None:
+        bases.append(finer_base)
     while True:
-        bases = [base]
-        while (finer_base := _in_finer_steps(bases[-1])) is not None:
-            bases.append(finer_base)
         levels = [extended(each, current.effects, current.segments.starts) for each in bases]
         # The first steps that differ little from the finest. A higher order alone does not show
         # the errors of forces that are held during a step.
@@ -191,15 +232,16 @@ def in_finer_steps(
         if number == 0:
             break
         trials = Trials(bases[number])
-        finer = trials.refitted_along(levels[number], current, current.effects)
-        if finer is not None:
+        asked = refit(levels[number], current, current.effects, near or {})
+        (finer,) = trials.fits([replace(asked, is_trial=is_rough)], current.simulator)
+        if finer is not None and not is_rough:
             finer = off_the_ends(finer)
         if finer is None or weigh([current, finer], [0.0, 0.0])[0] > BASE_FIT.coarse_probability:
             break
         report("the model's integration steps are too coarse for this recording; refining them")
-        is_coarse, base = True, bases[number]
-        current = trials.with_own_starts(finer)
-    return BaseFit(base, current, is_coarse)
+        is_coarse, bases = True, bases[number:]
+        current, near = finer if is_rough else trials.with_own_starts(finer), None
+    return BaseFit(bases[0], current, is_coarse)
 
 
 def _starts(

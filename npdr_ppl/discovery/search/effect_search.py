@@ -25,7 +25,7 @@ from npdr_ppl.discovery.search.alternatives import (
     tried_before,
     weigh_alternatives,
 )
-from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps
+from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps, polished
 from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.likelier_pair import likelier_pair
 from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
@@ -88,6 +88,8 @@ class Searcher:
         self.are_steps_coarse = False
         self.are_priors_widened = False
         self._last: Round | None = None
+        # Where a fit in finer steps begins, if it is known.
+        self._near: Mapping[str, Tensor] | None = None
         self._report = report
         self._progress = progress or Reporter()
 
@@ -113,18 +115,35 @@ class Searcher:
     ) -> Hypothesis:
         """Fits the original model; see :func:`~npdr_ppl.discovery.search.base_fit.fit_base`."""
         self._report("fitting the original model")
-        return fit_base(self.base, near=near, seed=self.seed, progress=progress)
+        fitted, self._near = fit_base(self.base, near=near, seed=self.seed, progress=progress)
+        return fitted
 
-    def with_finer_steps(self, current: Hypothesis) -> Hypothesis:
+    def settled(self, given: Hypothesis) -> Hypothesis:
+        """Returns the fit with steps and priors that suffice; the given one if its own do.
+
+        All later hypotheses use the steps and priors of the returned one.
+
+        Args:
+            given: The fitted original model.
+        """
+        # Where a prior is too narrow, a precise fit takes many steps towards its end.
+        finer = self.with_finer_steps(given, is_rough=True)
+        wider = self.with_wider_priors(finer)
+        return wider if wider is not finer or finer is given else polished(finer)
+
+    def with_finer_steps(self, current: Hypothesis, *, is_rough: bool = False) -> Hypothesis:
         """Returns a hypothesis with finer steps if its own are too coarse; else unchanged.
 
         All later hypotheses use the steps of the returned one.
 
         Args:
             current: A fitted hypothesis.
+            is_rough: Whether a rough fit is enough.
         """
-        found = in_finer_steps(current, self.base, report=self._report)
-        self.base = found.segments
+        found = in_finer_steps(
+            current, self.base, near=self._near, is_rough=is_rough, report=self._report
+        )
+        self.base, self._near = found.segments, None
         self.are_steps_coarse = self.are_steps_coarse or found.are_steps_coarse
         return found.hypothesis
 
