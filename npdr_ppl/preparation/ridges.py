@@ -106,18 +106,39 @@ class RidgeCoordinates:
     def _are_curved(self, likelihood: SegmentLikelihood, num: int) -> Tensor:
         """Returns which of the first coordinates the posterior is curved along, ``(num,)``.
 
-        The log density is compared with that of a normal posterior at two standard deviations,
-        along each coordinate and between each two of them.
+        These are the most curved ones, at most ``RIDGE.most_weak``: the number of points of a
+        ridge grows with the square of theirs.
 
         Args:
             likelihood: The recording's likelihood.
             num: Number of the coordinates.
         """
         axes = torch.eye(num, dtype=torch.float64)
-        first, second = torch.triu_indices(num, num, 1)
-        away = torch.cat((axes, (axes[first] + axes[second]) / 2.0**0.5))
-        members = away > 0.0
-        away = 2.0 * torch.cat((away, -away))
+        missed = self._missed(likelihood, axes)
+        straight = (missed <= RIDGE.close_gain).nonzero()[:, 0]
+        if num - len(straight) < RIDGE.most_weak and len(straight) > 1:
+            # A ridge can be curved between two coordinates along each of which it is straight.
+            first, second = straight[torch.triu_indices(len(straight), len(straight), 1)]
+            between = self._missed(likelihood, (axes[first] + axes[second]) / 2.0**0.5)
+            for members in (first, second):
+                missed = missed.scatter_reduce(0, members, between, "amax")
+        is_curved = torch.zeros(num, dtype=torch.bool)
+        is_curved[missed.argsort(descending=True)[: RIDGE.most_weak]] = True
+        return is_curved & (missed > RIDGE.close_gain)
+
+    def _missed(self, likelihood: SegmentLikelihood, directions: Tensor) -> Tensor:
+        """Returns by how much a normal posterior is wrong at two standard deviations, ``(n,)``.
+
+        It is the difference of log densities, the mean of both sides, because a slope is no
+        curvature. It is zero where a side is outside the prior's support.
+
+        Args:
+            likelihood: The recording's likelihood.
+            directions: Directions among the first k coordinates, in standard deviations,
+                ``(n, k)``.
+        """
+        num = directions.shape[1]
+        away = 2.0 * torch.cat((directions, -directions))
         w = torch.zeros(len(away) + 1, len(self.centre), dtype=torch.float64)
         w[1:, :num] = away / (1.0 + self.information[:num]).sqrt()
         z, inside = self.to_reference(w)
@@ -128,14 +149,9 @@ class RidgeCoordinates:
             + likelihood.segments.prior.log_prob(at).double()
             - self.log_jacobian(at)
         )
-        # The mean of both sides, because a slope is no curvature. Points outside the prior's
-        # support show nothing.
-        missed = (density[1:] - density[0] + 0.5 * away.square().sum(-1)).unflatten(0, (2, -1))
-        departs = missed.mean(0).abs().nan_to_num(0.0, torch.inf) > RIDGE.close_gain
-        alone = departs[:num]
-        # A pair counts only if neither of its members departs by itself.
-        together = departs[num:] & ~alone[first] & ~alone[second]
-        return alone | members[num:][together].any(0)
+        normal = -0.5 * away.square().sum(-1)
+        missed = (density[1:] - density[0] - normal).unflatten(0, (2, -1)).mean(0)
+        return missed.abs().nan_to_num(0.0, torch.inf)
 
     def tensors(self) -> dict[str, Tensor]:
         """Returns the tensors from which, with the prior, the coordinates can be rebuilt."""

@@ -217,6 +217,7 @@ class RidgeSettings:
     Attributes:
         fewest_points: Least number of points at which a ridge is traced. Each point costs one
             simulation of the recording per chord step.
+        most_weak: Greatest number of weak coordinates along which a ridge is traced.
         points_per_term: Number of points for each term of a quadratic in the weak coordinates.
         first_chord_steps: Chord steps to each point in the first round.
         chord_steps: Chord steps in later rounds, in which a polynomial predicts the points.
@@ -239,6 +240,7 @@ class RidgeSettings:
     """
 
     fewest_points: int = 96
+    most_weak: int = 6
     points_per_term: int = 6
     first_chord_steps: int = 5
     chord_steps: int = 3
@@ -257,6 +259,7 @@ class RidgeSettings:
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, 10_000, "fewest_points", "points_per_term", "draw_factor")
+        check_range(self, 1, 100, "most_weak")
         check_range(self, 1, 100, "first_chord_steps", "chord_steps", "most_rounds")
         check_range(self, 1, 20, "most_degree", "points_per_coefficient")
         check_range(self, 0.0, 1.0, "least_found_share", "even_share", "fitted_share")
