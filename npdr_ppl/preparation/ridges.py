@@ -4,10 +4,10 @@ If a motion determines fewer combinations than there are parameters, the posteri
 Across it are stiff directions, in which it is a thousand times narrower than the prior; along it
 are weak ones, in which it is hardly narrower. If the sheet is curved even slightly, a normal
 approximation fails. Let a be the weak and b the stiff coordinates of the prior-whitened
-information; weak ones are left as they are where the posterior is straight along them. The ridge
-b = g(a) is traced by Newton steps with the Jacobian of the closest fit (the chord method), fitted
-by a polynomial, and subtracted. The shear (a, b) → (a, b − g(a)) preserves volumes, so densities
-need no correction for it.
+information; if very many are weak, only those count along which the posterior is curved most. The
+ridge b = g(a) is traced by Newton steps with the Jacobian of the closest fit (the chord method),
+fitted by a polynomial, and subtracted. The shear (a, b) → (a, b − g(a)) preserves volumes, so
+densities need no correction for it.
 
 The curvature at the closest fit makes a curved ridge look shorter than it is. Its length is
 therefore found from the traced points. They are weighted by the ratio of their posterior density
@@ -74,7 +74,10 @@ class RidgeCoordinates:
         straight = cls._straight(space, space.from_reference(z[None])[0], basis, information, 0)
         is_weak = torch.zeros(len(z), dtype=torch.bool)
         if 0 < can_be_weak < len(z):
-            is_weak[:can_be_weak] = straight._are_curved(likelihood, can_be_weak)
+            is_many = can_be_weak > RIDGE.most_weak
+            is_weak[:can_be_weak] = (
+                straight._most_curved(likelihood, can_be_weak) if is_many else True
+            )
         order = torch.cat((is_weak.nonzero()[:, 0], (~is_weak).nonzero()[:, 0]))
         num_weak = int(is_weak.sum())
         found = cls._straight(
@@ -103,11 +106,11 @@ class RidgeCoordinates:
             torch.diag(1.0 / (1.0 + information[:num_weak])),
         )
 
-    def _are_curved(self, likelihood: SegmentLikelihood, num: int) -> Tensor:
-        """Returns which of the first coordinates the posterior is curved along, ``(num,)``.
+    def _most_curved(self, likelihood: SegmentLikelihood, num: int) -> Tensor:
+        """Returns along which of the first coordinates the posterior is most curved, ``(num,)``.
 
-        These are the most curved ones, at most ``RIDGE.most_weak``: the number of points of a
-        ridge grows with the square of theirs.
+        They are ``RIDGE.most_weak`` at most, because the number of points of a ridge grows with
+        the square of theirs. Curvature is seen near the closest fit only.
 
         Args:
             likelihood: The recording's likelihood.

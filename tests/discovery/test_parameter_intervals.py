@@ -138,10 +138,6 @@ def test_a_ridge_is_traced_inside_the_support(monkeypatch):
         simulated.append(len(z))
         return scores(self, z)
 
-    # The posterior is straight along the hinge's parameters, too, and would not be traced.
-    monkeypatch.setattr(
-        RidgeCoordinates, "_are_curved", lambda self, _, num: torch.ones(num, dtype=torch.bool)
-    )
     monkeypatch.setattr(RidgeCoordinates, "to_reference", leaving)
     monkeypatch.setattr(SegmentLikelihood, "scores", seen)
     space = RidgeCoordinates.of(hypothesis.likelihood, seed=0)
