@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from npdr_ppl.discovery.screening.permutation_tests import LargestStatistic
+from npdr_ppl.discovery.screening.permutation_tests import LargestStatistic, _in_span
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.models.effects import QuadraticDrag
@@ -67,3 +67,21 @@ def test_an_effect_in_only_one_segment_is_detected():
 
     assert p_value(0.0) > 0.05
     assert p_value(6.0) < 0.01  # at least 1 / 60 if it kept its own
+
+
+def test_smooth_responses_need_few_elements_of_a_basis():
+    # Responses to pulses of force of sixty blocks, in units that differ by a factor of 1e4.
+    generator = torch.Generator().manual_seed(0)
+    time = torch.linspace(0.0, 1.0, 700, dtype=torch.float64)
+    rates = 1.0 + 5.0 * torch.rand(60, 1, 10, generator=generator, dtype=torch.float64)
+    since = (time[:, None] - torch.linspace(0.0, 0.9, 10, dtype=torch.float64)).clamp_min(0.0)
+    columns = since**2 * torch.exp(-rates * since) * torch.logspace(0, 4, 10, dtype=torch.float64)
+    residuals = torch.randn(60, 700, generator=generator, dtype=torch.float64)
+    turned, left = _in_span(columns, residuals)
+    assert turned.shape[1] < 150 and left.shape == turned.shape[:2]
+    size = columns.square().sum(1).sqrt()
+    scores = torch.einsum("bnc,an->bac", columns, residuals)
+    close = torch.einsum("bnc,an->bac", turned, left)
+    assert ((scores - close).abs() < 1e-2 * size[:, None]).all()
+    rough = torch.randn(60, 700, 10, generator=generator, dtype=torch.float64)
+    assert _in_span(rough, residuals)[0] is rough

@@ -12,6 +12,7 @@ from npdr_ppl.posterior.estimator_check import check_estimator
 from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.importance_sampling import sample_posterior
+from npdr_ppl.preparation.polynomials import Polynomial
 from npdr_ppl.preparation.ridges import RidgeCoordinates
 from tests.helpers.pendulum_recordings import product, swinging
 
@@ -73,6 +74,12 @@ def test_a_ridge_is_followed_to_the_ends_of_the_prior(ridge):
     likely = density[found.weights > found.weights.max() * 1e-3]
     assert float(likely.min()) < 0.65
     assert float(likely.max()) > 1.8
+
+
+def test_of_many_weak_coordinates_the_most_curved_are_traced(ridge):
+    space = RidgeCoordinates.of(ridge, seed=0)
+    straight = replace(space, bend=Polynomial.zero(2))
+    assert straight._most_curved(ridge, 2).tolist() == [True, False]
 
 
 def test_coordinates_along_a_ridge_and_back(ridge):

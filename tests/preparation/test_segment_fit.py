@@ -342,3 +342,24 @@ def test_a_gain_counts_less_where_residuals_are_correlated(segments, monkeypatch
     gains.clear()
     fit_segments(segments, START)
     assert gains[1] < 0.6 * white
+
+
+def test_the_possible_gain_is_the_greatest_that_a_linear_model_allows():
+    generator = torch.Generator().manual_seed(0)
+
+    def drawn(*shape):
+        return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    now = Linearisation(drawn(4, 9), drawn(4, 9, 3), drawn(4, 9, 2))
+    held = torch.tensor([False, False, True])
+    now = dataclasses.replace(now, by_parameters=now.by_parameters * ~held)
+    z, offsets = drawn(3), drawn(4, 2)
+    # All unknowns in one least-squares problem: two parameters, then the offsets.
+    rows = torch.cat(
+        (now.by_parameters[..., :2].flatten(0, 1), torch.block_diag(*now.by_starts)), 1
+    )
+    matrix = torch.cat((rows, torch.eye(10, dtype=torch.float64)))
+    target = torch.cat((now.residual.flatten(), -z[:2], -offsets.flatten()))
+    left = target - matrix @ torch.linalg.lstsq(matrix, target[:, None]).solution[:, 0]
+    expected = float(target.square().sum() - left.square().sum())
+    assert segment_fit._possible_gain(now, z, offsets, held) == pytest.approx(expected)
