@@ -174,7 +174,8 @@ class Investigation:
         """The original model, fitted to the recording."""
         searcher = self._searcher
         with self._stage("fit"):
-            fitted = searcher.fit_base(progress=self.progress.stage("fit the original model"))
+            step = self.progress.stage("fit the original model")
+            fitted = searcher.fit_base(may_be_rough=True, progress=step)
         return fitted
 
     @cached_property

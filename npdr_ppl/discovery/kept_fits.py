@@ -29,6 +29,9 @@ __all__ = ["keep_fits", "keeping", "made_or_read"]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+VERSION = 2
+"""Raised when fits end elsewhere than before, so that those of earlier versions are not read."""
+
 _FOLDER: ContextVar[Path | None] = ContextVar("kept_fits", default=None)
 
 
@@ -90,6 +93,7 @@ def _checksum(segments: SegmentModel, *rest: Any) -> str:
     points = torch.linspace(-2.0, 2.0, 5).double()[:, None].expand(-1, prior.num_parameters)
     parameters = prior.to_parameters(points)
     parts = [
+        VERSION,
         versions(),
         source_text(segments.model),
         file_text(segments.model),

@@ -179,7 +179,7 @@ class ModelWithFinerSteps(Layer):
 
 
 class CoarserStepsMessenger(Messenger):
-    """Gives a program's simulators back their own steps while it runs, if that saves much."""
+    """Gives a program's simulators back their own steps while it runs, if these were refined."""
 
     def _pyro_sample(self, msg: Any) -> None:
         box = msg["fn"]

@@ -212,7 +212,7 @@ def prepare(
         data_options=data_options,
         seed=seed,
     )
-    closest = searcher.fit_base(near=near, progress=progress)
+    closest = searcher.fit_base(near=near, may_be_rough=True, progress=progress)
     step(None, "compare with finer integration steps")
     closest = searcher.with_finer_steps(closest)
     base = BaseFit(searcher.base, closest, searcher.are_steps_coarse)

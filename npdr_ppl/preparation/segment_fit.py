@@ -222,11 +222,11 @@ def _steps(
     """Takes steps until they gain little.
 
     Where the simulator has coarser steps, each linearisation and the trials after it take those,
-    with what they miss at its point (:meth:`SegmentModel.in_coarser_steps`).
+    with what they miss at its point (:meth:`SegmentModel.corrected`).
 
     Derivatives cost most of a step. So a few further steps use those of an earlier point,
     corrected by what the last step has changed (Broyden 1965). Where the misfit has local minima,
-    they could lead into one, and steps end only after trials far away.
+    corrected derivatives could lead into one, and steps end only after trials far away.
 
     Rough steps use one-sided differences and set the scale to that of the residuals after each
     step. Each segment has its own damping, because a segment in which a joint sticks would
@@ -253,16 +253,17 @@ def _steps(
     )
     factors, present_scale = SEGMENT_FIT.near_factors, scale
     has_minima = bool((segments.coordinates_with_minima & ~held).any())
-    now, near, num_updates, num_linearised = None, segments, 0, 0
+    now, model, num_updates, num_linearised = None, segments, 0, 0
+    found: tuple[float, Tensor, Tensor, Tensor] | None = None
     most_updates = 0 if has_minima else _most_updates(segments, held, is_rough=is_rough)
     while True:
         if now is None:
             if num_linearised == max_steps:
                 break
-            for near in (segments.in_coarser_steps(z, offsets), segments):
-                now = near.linearise(z, offsets, scale, is_rough=is_rough)
-                if now.is_finite or near is segments:
-                    break
+            model, now = segments.corrected(z, offsets, scale, is_rough=is_rough)
+            if model is not segments:
+                # The squares of the last step had an earlier correction.
+                present_scale = _scale(segments, now.residual, scale)
             now = replace(now, by_parameters=now.by_parameters * ~held)
             num_updates, num_linearised = 0, num_linearised + 1
         if not now.is_finite:
@@ -274,6 +275,13 @@ def _steps(
         enough = max(
             SEGMENT_FIT.least_gain / share, SEGMENT_FIT.rough_gain * present if is_rough else 0.0
         )
+        if model is not segments and not is_rough and not num_updates:
+            # Corrections differ from point to point: gains count from one to the next.
+            if found is not None and present > found[0] - enough:
+                if present > found[0]:
+                    _, z, offsets, present_scale = found
+                break
+            found = present, z, offsets, present_scale
         if not has_minima and _possible_gain(now, z, offsets, held) < enough:
             if not num_updates:
                 break
@@ -282,7 +290,7 @@ def _steps(
         moves = [_step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]
         tried = torch.stack([point for point, _ in moves])
         begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
-        squares = _squares(near, tried, begun, scale)  # (a, b, S, C)
+        squares = _squares(model, tried, begun, scale)  # (a, b, S, C)
         losses = (squares.sum(-1) + begun.square().sum(-1)).nan_to_num(torch.inf)
         least, chosen = losses.min(1)  # (a, S)
         outcome = least.sum(-1) + tried.square().sum(-1)
@@ -309,7 +317,7 @@ def _steps(
                 is_little = is_little and bool((scale > SEGMENT_FIT.settled_scale * before).all())
             corrected = None
             if most_updates:
-                here = near.residuals(z[None], offsets[None], scale)[0]
+                here = model.residuals(z[None], offsets[None], scale)[0]
                 corrected = now.rescaled(before / scale).updated(
                     here, z - last[0], offsets - last[1]
                 )
@@ -330,6 +338,13 @@ def _steps(
         if num_updates > most_updates:
             now = None
     return z, offsets, present_scale
+
+
+def _scale(segments: SegmentModel, residual: Tensor, scale: Tensor) -> Tensor:
+    """Returns the scale of whitened residuals ``(S, N)`` in the channels' units, ``(C,)``."""
+    square = residual.square().unflatten(-1, (-1, len(scale))).sum((0, 1))
+    count = segments.num_measured.sum(0).clamp_min(1)
+    return (scale * (square / count).sqrt()).maximum(segments.least_scale)
 
 
 def _most_updates(segments: SegmentModel, held: Tensor, *, is_rough: bool) -> int:

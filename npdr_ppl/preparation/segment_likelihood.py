@@ -24,6 +24,7 @@ from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK
 from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_fit import SegmentFit
 from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.preparation.settings import LINEARISATION
 
 __all__ = ["SegmentLikelihood"]
 
@@ -63,9 +64,25 @@ class SegmentLikelihood:
         return torch.eye(by_start.shape[-1], dtype=torch.float64) + by_start.mT @ by_start
 
     @cached_property
-    def _near(self) -> SegmentModel:
-        """The model in coarser steps that equal its own close to the fit."""
-        return self.segments.in_coarser_steps(self.fit.z, self.fit.offsets)
+    def _corrected(self) -> SegmentModel:
+        """The model in coarser steps, if the likelihood is the same with them around the fit.
+
+        It is compared at two standard deviations along the direction that the recording determines
+        least, and along the one that it determines best.
+        """
+        model = self.segments.in_coarser_steps(self.fit.z, self.fit.offsets)
+        if model is self.segments:
+            return model
+        eye = torch.eye(len(self.fit.z), dtype=torch.float64)
+        values, vectors = torch.linalg.eigh(self.information() + eye)
+        ends = 2.0 * (vectors / values.sqrt()).mT[[0, -1]]
+        z = torch.cat((self.fit.z + ends, self.fit.z - ends))
+        coarser, own = (
+            torch.cat([self._squares(part).sum(-1) for part in self._residuals_of(each, z)])
+            for each in (model, self.segments)
+        )
+        error = 0.5 * self.share / self.variance * (coarser - own).abs().max()
+        return model if error < LINEARISATION.largest_step_error else self.segments
 
     @cached_property
     def misfit(self) -> float:
@@ -120,11 +137,21 @@ class SegmentLikelihood:
 
     def _residuals(self, z: Tensor) -> Iterator[Tensor]:
         """Yields whitened residuals ``(n, S, N)`` at zero offsets, in chunks."""
-        near, offsets = self._near, self.fit.offsets[None]
+        for points in z.double().split(self.segments.draws_per_chunk):
+            (residual,) = self._residuals_of(self._corrected, points)
+            failed = ~residual.flatten(1).isfinite().all(-1)
+            if self._corrected is not self.segments and bool(failed.any()):
+                # Coarser steps can be unstable where the model's own are not.
+                (residual[failed],) = self._residuals_of(self.segments, points[failed])
+            yield residual
+
+    def _residuals_of(self, model: SegmentModel, z: Tensor) -> Iterator[Tensor]:
+        """Yields whitened residuals of a model; see :meth:`_residuals`."""
+        offsets = self.fit.offsets[None]
         moved = (self.linearisation.by_starts @ self.fit.offsets[..., None])[..., 0]
         for points in z.double().split(self.segments.draws_per_chunk):
             starts = offsets.expand(len(points), -1, -1)
-            yield near.residuals(points, starts, self.fit.scale) + moved
+            yield model.residuals(points, starts, self.fit.scale) + moved
 
     def _squares(self, residual: Tensor) -> Tensor:
         """Returns rᵀ C⁻¹ r by segment, ``(n, S)``, for residuals ``(n, S, N)``."""

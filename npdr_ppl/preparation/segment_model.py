@@ -162,6 +162,8 @@ class SegmentModel:
         if not bool(missed.isfinite().all()):
             return self
         coarser.observed = self.observed - missed
+        if "_without_influence" in self.__dict__:
+            coarser.__dict__["_without_influence"] = self._without_influence
         return coarser
 
     def averaged(self, most: int, fewest: int) -> "SegmentModel":
@@ -373,11 +375,28 @@ class SegmentModel:
             scale: Standard deviation of each channel's residuals, ``(C,)``.
             is_rough: Whether one-sided differences will do, at half the price.
         """
-        near = self.in_coarser_steps(z, offsets)
-        if near is not self:
-            found = near.linearise(z, offsets, scale, is_rough=is_rough)
+        return self.corrected(z, offsets, scale, is_rough=is_rough)[1]
+
+    def corrected(
+        self, z: Tensor, offsets: Tensor, scale: Tensor, *, is_rough: bool = False
+    ) -> "tuple[SegmentModel, Linearisation]":
+        """Returns a model that is like this one near a point, and its linearisation there.
+
+        It is :meth:`in_coarser_steps`, or this model if that cannot be linearised. Residuals of
+        the linearisation are this model's own; see :meth:`linearise`.
+        """
+        coarser = self.in_coarser_steps(z, offsets)
+        if coarser is not self:
+            found = coarser._linearised(z, offsets, scale, is_rough=is_rough)
+            self.__dict__["_without_influence"] = coarser._without_influence
             if found.is_finite:
-                return found
+                return coarser, found
+        return self, self._linearised(z, offsets, scale, is_rough=is_rough)
+
+    def _linearised(
+        self, z: Tensor, offsets: Tensor, scale: Tensor, *, is_rough: bool
+    ) -> Linearisation:
+        """Returns residuals and derivatives in this model's steps; see :meth:`linearise`."""
         step, idle = LINEARISATION.initial_state_step, self._without_influence
         eye = torch.eye(self.num_offsets, dtype=torch.float64)
         moves = step * eye[~idle]
@@ -389,7 +408,7 @@ class SegmentModel:
         if checked and not torch.equal(checked[0].nan_to_num(), here.nan_to_num()):
             # The simulator uses them in another way, so that all are simulated from now on.
             self.__dict__["_without_influence"] = torch.zeros_like(idle)
-            return self.linearise(z, offsets, scale, is_rough=is_rough)
+            return self._linearised(z, offsets, scale, is_rough=is_rough)
         starts = here.new_zeros(len(eye), *here.shape)
         starts[~idle] = by_start
         return Linearisation(here, by_z.permute(1, 2, 0), starts.permute(1, 2, 0))

@@ -50,6 +50,9 @@ class LinearisationSettings:
             out in double precision.
         absolute_scale_floor: Least scale of the residuals of a channel that is zero throughout,
             in the channel's unit.
+        largest_step_error: Error of a log likelihood in corrected coarser steps, two standard
+            deviations from the fit, from which a posterior is drawn in the model's own steps. The
+            log density itself falls by two there.
     """
 
     parameter_step: float = 1e-2
@@ -57,12 +60,14 @@ class LinearisationSettings:
     start_limit: float = 4.5
     relative_scale_floor: float = 1e-6
     absolute_scale_floor: float = 1e-9
+    largest_step_error: float = 0.5
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1e-6, 1.0, "parameter_step", "initial_state_step")
         check_range(self, 1.0, 8.0, "start_limit")
         check_range(self, 0.0, 1e-2, "relative_scale_floor", "absolute_scale_floor")
+        check_range(self, 0.0, 10.0, "largest_step_error")
 
 
 @dataclass(frozen=True)
@@ -77,9 +82,8 @@ class SegmentFitSettings:
             of each segment's initial state.
         damping_limits: Smallest and greatest damping.
         near_factors: Multiples of the last successful damping that are tried first.
-        far_factors: Multiples that are tried if the near ones gain too little; the steps end only
-            after these.
-        rough_gain: Rough steps end when a step reduces the objective by less than this share.
+        far_factors: Multiples that are tried if the near ones gain less than seems possible.
+        rough_gain: Rough steps end when no step can reduce the objective by more than this share.
         settled_scale: Rough steps end only when the last step has kept each channel's scale at
             this share of its previous value or more.
         longest_step: Greatest change of a parameter's reference coordinate in one step, in
@@ -88,8 +92,10 @@ class SegmentFitSettings:
         largest_coordinate: Greatest distance of a fit from the prior's centre, in standard
             deviations. A strength that is much smaller than typical for its half-normal prior has
             a coordinate of −3 or less.
-        least_gain: Steps end when a step reduces the objective, in variances of the measurement
-            noise and for independent measurements, by less than this. The default is a quarter of
+        least_gain: Steps end when no step can reduce the objective, in variances of the
+            measurement noise and for independent measurements, by more than this. What a step can
+            gain is computed from the derivatives, or tried where the misfit has local minima. The
+            default is a quarter of
             a unit of log evidence. A model that is ten times as likely as another has 2.3 units
             more.
         outlier_misfit: Multiple of the median segment's misfit above which other initial states
@@ -217,7 +223,8 @@ class RidgeSettings:
     Attributes:
         fewest_points: Least number of points at which a ridge is traced. Each point costs one
             simulation of the recording per chord step.
-        most_weak: Greatest number of weak coordinates along which a ridge is traced.
+        most_weak: Greatest number of weak coordinates along which a ridge is traced; if there are
+            more, the most curved ones, without those along which the posterior is straight.
         points_per_term: Number of points for each term of a quadratic in the weak coordinates.
         first_chord_steps: Chord steps to each point in the first round.
         chord_steps: Chord steps in later rounds, in which a polynomial predicts the points.
@@ -225,8 +232,9 @@ class RidgeSettings:
         least_found_share: Share of the points that chord steps must find; with fewer, tracing
             ends.
         most_rounds: Greatest number of rounds.
-        close_gain: Tracing can end when the median point gains less log density than this by its
-            chord steps. The polynomial is then within the posterior's own width.
+        close_gain: Log density by which the posterior of a curved coordinate differs from a normal
+            one at two standard deviations. Tracing can end when the median point gains less than
+            this by its chord steps. The polynomial is then within the posterior's own width.
         most_degree: Greatest degree of the polynomial.
         points_per_coefficient: Least number of points for each coefficient of the polynomial.
         reach: Spread of the points along the weak coordinates, in standard deviations.

@@ -208,21 +208,21 @@ def test_a_segment_whose_derivatives_explode_says_nothing_of_the_parameters():
 
 def test_a_fit_goes_on_where_derivatives_explode(segments, monkeypatch):
     plain = fit_segments(segments, START)
-    linearise = segments.linearise
+    linearise = segments._linearised
 
     def explodes(z, offsets, scale, *, is_rough=False):
         now = linearise(z, offsets, scale, is_rough=is_rough)
         now.by_starts[3] = 1e100
         return now
 
-    monkeypatch.setattr(segments, "linearise", explodes)
+    monkeypatch.setattr(segments, "_linearised", explodes)
     found = fit_segments(segments, START)
     assert torch.equal(found.offsets[3], torch.zeros(segments.num_offsets).double())
     assert (found.z - plain.z).abs().max() < 0.2
 
 
 def test_nothing_is_restarted_where_the_parameters_cannot_be_told(segments, monkeypatch):
-    linearise = segments.linearise
+    linearise = segments._linearised
 
     def explodes(z, offsets, scale, *, is_rough=False):
         now = linearise(z, offsets, scale, is_rough=is_rough)
@@ -233,7 +233,7 @@ def test_nothing_is_restarted_where_the_parameters_cannot_be_told(segments, monk
         )
 
     fit = fit_segments(segments, START)
-    monkeypatch.setattr(segments, "linearise", explodes)
+    monkeypatch.setattr(segments, "_linearised", explodes)
     every = torch.ones(2, dtype=torch.bool)
     monkeypatch.setattr(SegmentModel, "coordinates_with_minima", every)
     assert segment_fit._restart(segments, fit.z, fit.offsets, fit.scale, ~every) is None
@@ -309,13 +309,13 @@ def test_corrected_derivatives_lead_to_the_same_fit(segments, monkeypatch):
     settings = [
         dataclasses.replace(SEGMENT_FIT, most_updates=most, least_ratio=0.0) for most in (0, 3)
     ]
-    linearise, calls, fits = SegmentModel.linearise, [], []
+    linearise, calls, fits = SegmentModel._linearised, [], []
 
     def counted(self, *args, **options):
         calls[-1] += 1
         return linearise(self, *args, **options)
 
-    monkeypatch.setattr(SegmentModel, "linearise", counted)
+    monkeypatch.setattr(SegmentModel, "_linearised", counted)
     for own in settings:
         monkeypatch.setattr(segment_fit, "SEGMENT_FIT", own)
         calls.append(0)

@@ -98,8 +98,9 @@ def responses(hypothesis: Hypothesis) -> Responses:
     Args:
         hypothesis: The fitted model.
     """
-    segments, fit = hypothesis.segments, hypothesis.fit
-    inputs, simulator = segments.inputs, hypothesis.simulator
+    fit = hypothesis.fit
+    segments = hypothesis.segments.in_coarser_steps(fit.z, fit.offsets)
+    inputs, simulator = segments.inputs, segments.simulator
     steps = inputs.num_steps
     edges = (
         torch.linspace(0, steps, min(LATENT_FORCE.num_pulses, steps) + 1).round().long().unique()

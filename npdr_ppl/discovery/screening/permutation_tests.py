@@ -238,9 +238,9 @@ class _Along:
 def _in_span(columns: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
     """Returns vectors in an orthonormal basis of the span of all columns.
 
-    Products among columns, and of columns with residuals, change by less than
-    ``PERMUTATION_TEST.lost_in_span`` of the columns' size. Responses to forces are smooth, so that
-    far fewer elements than measurements suffice. If they do not, both are returned unchanged.
+    What lies outside the basis is smaller than each column by ``PERMUTATION_TEST.lost_in_span``.
+    Responses to forces are smooth, so that far fewer elements than measurements suffice. If they
+    do not, both are returned unchanged.
 
     Args:
         columns: Columns of each block, ``(blocks, N, c)``.
@@ -260,14 +260,13 @@ def _in_span(columns: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
         basis = torch.linalg.qr(spanned @ directions)[0]
     inside = basis.mT @ spanned
     values, vectors = torch.linalg.eigh(inside @ inside.mT)
-    lost = PERMUTATION_TEST.lost_in_span
-    basis = basis @ vectors[:, values > lost**2 * values[-1]]
-    turned = torch.einsum("bnc,nk->bkc", columns, basis)
-    left = 1.0 - float(turned.square().sum((0, 1)).div(size.square()).min())
-    # What rounding errors leave of a square.
-    is_complete = left < max(1e-10, lost**2 * spanned.shape[1])
-    if not is_complete or basis.shape[1] >= len(basis):
+    # Squares of all columns together, of which each has one.
+    outside = float(spanned.square().sum() - values.sum())
+    is_kept = outside + values.cumsum(0) > PERMUTATION_TEST.lost_in_span**2
+    if outside > PERMUTATION_TEST.lost_in_span**2 or int(is_kept.sum()) >= len(basis):
         return columns, residuals
+    basis = basis @ vectors[:, is_kept]
+    turned = torch.einsum("bnc,nk->bkc", columns, basis)
     return turned, residuals @ basis
 
 

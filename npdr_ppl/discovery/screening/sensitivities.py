@@ -78,8 +78,8 @@ def sensitivities(
         effects: The candidates.
         hints: Additional shapes to try, by effect's name: values of its parameters.
     """
-    fit = hypothesis.fit
-    segments = hypothesis.segments.in_coarser_steps(fit.z, fit.offsets)
+    fit, own = hypothesis.fit, hypothesis.segments
+    segments = own.in_coarser_steps(fit.z, fit.offsets)
     box = segments.black_box(fit.z[None])
     base = segments.run(box.simulator, box.parameters, fit.offsets[None])[0]
     probes = []
@@ -94,16 +94,39 @@ def sensitivities(
     largest = float(segments.whitened(base, fit.scale).abs().max())
     rounding = SENSITIVITY.rounding_errors * torch.finfo(base.dtype).eps * largest
     for group in _groups(probes, box.simulator, segments):
-        changed = box.simulator.with_effects(*(probe.effect for probe in group))
-        parameters, sizes = _side_by_side(group), [len(probe.runs) for probe in group]
-        differences = []
-        for part in torch.arange(sum(sizes)).split(segments.draws_per_chunk):
-            own = {name: value[part] for name, value in parameters.items()}
-            starts = fit.offsets[None].expand(len(part), -1, -1)
-            moved = segments.run(changed, {**box.parameters, **own}, starts)
-            differences.append(segments.whitened(moved - base, fit.scale))
-        for probe, rows in zip(group, torch.cat(differences).split(sizes), strict=True):
+        differences = _differences(hypothesis, segments, base, group)
+        if segments is not own and not bool(differences.isfinite().all()):
+            # Coarser steps can be unstable where the model's own are not.
+            there = own.black_box(fit.z[None])
+            start = own.run(there.simulator, there.parameters, fit.offsets[None])[0]
+            differences = _differences(hypothesis, own, start, group)
+        sizes = [len(probe.runs) for probe in group]
+        for probe, rows in zip(group, differences.split(sizes), strict=True):
             yield from _variants(probe, rows, rounding)
+
+
+def _differences(
+    hypothesis: Hypothesis, segments: SegmentModel, base: Tensor, group: "list[_Probe]"
+) -> Tensor:
+    """Returns the change of the whitened measurements by each run of a group, ``(n, S, N)``.
+
+    Args:
+        hypothesis: The fitted model.
+        segments: The model in the steps in which it is simulated.
+        base: Its readings without the effects, ``(S, K, C)``.
+        group: The effects and their runs.
+    """
+    fit = hypothesis.fit
+    box = segments.black_box(fit.z[None])
+    changed = box.simulator.with_effects(*(probe.effect for probe in group))
+    parameters, num = _side_by_side(group), sum(len(probe.runs) for probe in group)
+    differences = []
+    for part in torch.arange(num).split(segments.draws_per_chunk):
+        own = {name: value[part] for name, value in parameters.items()}
+        starts = fit.offsets[None].expand(len(part), -1, -1)
+        moved = segments.run(changed, {**box.parameters, **own}, starts)
+        differences.append(segments.whitened(moved - base, fit.scale))
+    return torch.cat(differences)
 
 
 @dataclass(frozen=True)

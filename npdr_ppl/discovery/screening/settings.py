@@ -151,8 +151,7 @@ class PermutationTestSettings:
             Batches differ in size, so that freed blocks are seldom reused.
         most_in_span: Greatest number of elements of a basis of the changes that forces can cause,
             where measurements are at least twice as many.
-        lost_in_span: Directions of these changes that are smaller than the largest by this factor
-            are left out.
+        lost_in_span: Greatest part of a change that may lie outside the basis, as a share of it.
     """
 
     num_permutations: int = 2000
@@ -161,7 +160,7 @@ class PermutationTestSettings:
     numbers_per_part: int = 1_000_000
     batches_per_release: int = 25
     most_in_span: int = 256
-    lost_in_span: float = 1e-5
+    lost_in_span: float = 1e-4
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""

@@ -52,21 +52,21 @@ def fit_base(
     *,
     near: Mapping[str, Tensor] | None = None,
     seed: int = 0,
+    may_be_rough: bool = False,
     progress: Step | None = None,
 ) -> tuple[Hypothesis, Mapping[str, Tensor] | None]:
     """Fits a model to a recording, without adding effects.
-
-    Where the model's steps are too coarse already for a part of the recording, one rough fit is
-    enough: its parameters compensate for the steps.
 
     Args:
         segments: The model along the recording.
         near: Parameters near which the fit is known to be; by default they are searched for.
         seed: Seed of the search.
+        may_be_rough: Whether a rough fit is enough if the model's steps are too coarse for a part
+            of the recording already: its parameters would only compensate for the steps.
         progress: Called with a short status, and during the search with the fraction of it done.
 
     Returns:
-        The fit, and parameters from which a fit in finer steps may begin; ``None`` for the same.
+        The fit, and if it is rough, parameters from which a fit in finer steps may begin.
 
     Raises:
         DataError: No parameters can be simulated along the recording, or simulations fail close
@@ -84,8 +84,12 @@ def fit_base(
             begun.append(fit_segment_model(few, start=start, is_rough=True))
         except DataError as error:
             failure = error
-    step(None, "fit to convergence")
-    finer = _parameters_in_finer_steps(closest(begun), few) if begun else None
+    finer_parameters = None
+    if may_be_rough and begun:
+        step(None, "compare with finer integration steps")
+        finer_parameters = _parameters_in_finer_steps(closest(begun), few)
+    is_rough = finer_parameters is not None
+    step(None, "rough fit" if is_rough else "fit to convergence")
     fitted: Hypothesis | None = None
     while begun and fitted is None:
         best = closest(begun)
@@ -94,19 +98,19 @@ def fit_base(
             is_whole = len(best.fit.offsets) == segments.inputs.num_segments
             offsets = best.fit.offsets if is_whole else None
             fitted = fit_segment_model(
-                segments, start=best.parameters, offsets=offsets, is_rough=finer is not None
+                segments, start=best.parameters, offsets=offsets, is_rough=is_rough
             )
         except DataError as error:  # it can be simulated along some segments only
             failure = error
     if fitted is None:
         assert failure is not None
         raise failure
-    if finer is None:
+    if not is_rough:
         fitted = off_the_ends(fitted)
         step(None, "fit with better initial states")
         fitted = Trials(segments).with_own_starts(fitted)
     _ = fitted.linearisation  # computed now, because all later steps need it
-    return fitted, finer
+    return fitted, finer_parameters
 
 
 def _parameters_in_finer_steps(
@@ -223,12 +227,16 @@ def in_finer_steps(
         levels = [extended(each, current.effects, current.segments.starts) for each in bases]
         # The first steps that differ little from the finest. A higher order alone does not show
         # the errors of forces that are held during a step.
-        number = next(
-            k
-            for k, each in enumerate(levels)
-            if each is levels[-1]
-            or _step_error(current, each, levels[-1]) <= BASE_FIT.noticeable_change
-        )
+        here = current.fit.z[None], current.fit.offsets[None]
+        finest = levels[-1].simulate(*here) if len(levels) > 1 else None
+        number = 0
+        while (
+            finest is not None
+            and number < len(levels) - 1
+            and _distance(current, levels[number].simulate(*here) - finest)
+            > BASE_FIT.noticeable_change
+        ):
+            number += 1
         if number == 0:
             break
         trials = Trials(bases[number])
@@ -236,7 +244,9 @@ def in_finer_steps(
         (finer,) = trials.fits([replace(asked, is_trial=is_rough)], current.simulator)
         if finer is not None and not is_rough:
             finer = off_the_ends(finer)
-        if finer is None or weigh([current, finer], [0.0, 0.0])[0] > BASE_FIT.coarse_probability:
+        if finer is not None and is_rough and _are_coarse_steps_likelier(current, finer):
+            finer = polished(finer)  # a rough fit would be at a disadvantage
+        if finer is None or _are_coarse_steps_likelier(current, finer):
             break
         report("the model's integration steps are too coarse for this recording; refining them")
         is_coarse, bases = True, bases[number:]
@@ -270,19 +280,20 @@ def _in_finer_steps(segments: SegmentModel) -> SegmentModel | None:
     return segments.with_model(with_finer_steps(segments.model))
 
 
-def _step_error(current: Hypothesis, segments: SegmentModel, finest: SegmentModel) -> float:
-    """Returns the distance between two simulations, in standard deviations of the residuals.
+def _are_coarse_steps_likelier(coarse: Hypothesis, finer: Hypothesis) -> bool:
+    """Returns whether the recording itself seems to be simulated with coarse steps."""
+    return weigh([coarse, finer], [0.0, 0.0])[0] > BASE_FIT.coarse_probability
+
+
+def _distance(current: Hypothesis, difference: Tensor) -> float:
+    """Returns the size of a difference of readings, in standard deviations of the residuals.
 
     Correlated residuals count as the fewer independent ones that they are worth. No parameter can
     then be off by more of its own standard deviations.
 
     Args:
-        current: A hypothesis, at whose fit the model is simulated.
-        segments: The model in some steps.
-        finest: The model in its finest steps.
+        current: A hypothesis.
+        difference: The difference between two simulations, ``(1, S, K, C)``.
     """
-    fit = current.fit
-    here = fit.z[None], fit.offsets[None]
-    difference = finest.simulate(*here) - segments.simulate(*here)
-    distance = finest.whitened(difference[0], fit.scale).norm().nan_to_num(math.inf)
-    return math.sqrt(current.share) * float(distance)
+    whitened = current.segments.whitened(difference[0], current.fit.scale)
+    return math.sqrt(current.share) * float(whitened.norm().nan_to_num(math.inf))

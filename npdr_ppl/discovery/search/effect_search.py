@@ -88,8 +88,8 @@ class Searcher:
         self.are_steps_coarse = False
         self.are_priors_widened = False
         self._last: Round | None = None
-        # Where a fit in finer steps begins, if it is known.
-        self._near: Mapping[str, Tensor] | None = None
+        # Where a fit in finer steps begins, if the last fit of the original model is rough.
+        self._finer_parameters: Mapping[str, Tensor] | None = None
         self._report = report
         self._progress = progress or Reporter()
 
@@ -111,11 +111,20 @@ class Searcher:
         return Trials(self.base)
 
     def fit_base(
-        self, *, near: Mapping[str, Tensor] | None = None, progress: Step | None = None
+        self,
+        *,
+        near: Mapping[str, Tensor] | None = None,
+        may_be_rough: bool = False,
+        progress: Step | None = None,
     ) -> Hypothesis:
-        """Fits the original model; see :func:`~npdr_ppl.discovery.search.base_fit.fit_base`."""
+        """Fits the original model; see :func:`~npdr_ppl.discovery.search.base_fit.fit_base`.
+
+        A rough fit is converged by :meth:`settled` or :meth:`with_finer_steps`.
+        """
         self._report("fitting the original model")
-        fitted, self._near = fit_base(self.base, near=near, seed=self.seed, progress=progress)
+        fitted, self._finer_parameters = fit_base(
+            self.base, near=near, seed=self.seed, may_be_rough=may_be_rough, progress=progress
+        )
         return fitted
 
     def settled(self, given: Hypothesis) -> Hypothesis:
@@ -126,10 +135,12 @@ class Searcher:
         Args:
             given: The fitted original model.
         """
+        is_rough = self._finer_parameters is not None
         # Where a prior is too narrow, a precise fit takes many steps towards its end.
         finer = self.with_finer_steps(given, is_rough=True)
         wider = self.with_wider_priors(finer)
-        return wider if wider is not finer or finer is given else polished(finer)
+        is_converged = wider is not finer or (finer is given and not is_rough)
+        return wider if is_converged else polished(finer)
 
     def with_finer_steps(self, current: Hypothesis, *, is_rough: bool = False) -> Hypothesis:
         """Returns a hypothesis with finer steps if its own are too coarse; else unchanged.
@@ -140,11 +151,14 @@ class Searcher:
             current: A fitted hypothesis.
             is_rough: Whether a rough fit is enough.
         """
+        near, self._finer_parameters = self._finer_parameters, None
         found = in_finer_steps(
-            current, self.base, near=self._near, is_rough=is_rough, report=self._report
+            current, self.base, near=near, is_rough=is_rough, report=self._report
         )
-        self.base, self._near = found.segments, None
+        self.base = found.segments
         self.are_steps_coarse = self.are_steps_coarse or found.are_steps_coarse
+        if near is not None and not is_rough and found.hypothesis is current:
+            return polished(current)
         return found.hypothesis
 
     def with_wider_priors(self, current: Hypothesis) -> Hypothesis:
@@ -172,7 +186,7 @@ class Searcher:
         """
         part = copy.copy(self)
         part.base = self.base.along(index)
-        part._last = None
+        part._last = part._finer_parameters = None
         return part
 
     def run(self, first: Round, *, max_effects: int) -> Search:

@@ -118,7 +118,10 @@ def _relative_derivatives(model: Any, fields: Sequence[Field]) -> Array:
         (accelerations(field, 1.0 + STEP) - accelerations(field, 1.0 - STEP)) / (2.0 * STEP)
         for field in fields
     ]
-    scaled = [(column / np.maximum(usual, 1e-9 * usual.max())).reshape(-1) for column in columns]
+    scaled = [
+        (column / np.maximum(usual, max(1e-9 * usual.max(), 1e-300))).reshape(-1)
+        for column in columns
+    ]
     return np.stack(scaled, axis=-1)
 
 
