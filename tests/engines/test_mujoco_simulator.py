@@ -374,22 +374,29 @@ def test_finer_steps_err_less(integrator, most, substeps):
 STIFF = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
 <inertial pos="0 0 0.1" mass="1" diaginertia="0.01 0.01 0.01"/><joint name="hinge" axis="0 1 0"
 armature="0.08"/></body></worldbody><actuator><position name="servo" joint="hinge" kp="2000"
-kv="400"/></actuator></mujoco>"""
+kv="{kv}"/></actuator></mujoco>"""
 
 
-def test_a_stiff_servo_keeps_its_integrator_in_finer_steps(tmp_path):
-    # Its velocity decays at 4000/s: steps of order four diverge from 1400/s on.
+@pytest.mark.parametrize(
+    ("kv", "substeps"), [(126, (2, 4)), (240, (2, 4)), (400, (4, 8)), (4000, (4,))]
+)
+def test_the_finest_steps_of_stiff_servos_err_little(tmp_path, kv, substeps):
+    # With kv = 400, velocities decay at 4000/s: steps of order four diverge from 1400/s on, those
+    # of a quarter of the length do not. With ten times that, the file's integrator is kept.
     path = tmp_path / "servo.xml"
-    path.write_text(STIFF)
-    coarse = MujocoSimulator(path)
+    path.write_text(STIFF.format(kv=kv))
+    finer = coarse = MujocoSimulator(path)
     damping = fastest_damping(coarse.model, coarse.initial_positions)
-    assert damping == pytest.approx(400.0 / (0.08 + 0.01 + 0.1**2))
-    finer = coarse.with_finer_steps()
-    assert finer.num_substeps(0.002) == 4 and finer.with_finer_steps() is None
-    exact = MujocoSimulator(path, substeps=64, time_step=0.002)
+    assert damping == pytest.approx(kv / (0.08 + 0.01 + 0.1**2))
+    exact = MujocoSimulator(path, substeps=1000, time_step=0.002)
+    exact.model.opt.timestep = 2e-6
     inputs = random_inputs(coarse, num_segments=1, num_steps=100)
-    near, far, best = (s.simulate({}, inputs) for s in (finer, coarse, exact))
-    assert (near - best).norm() < 0.3 * (far - best).norm()
+    far, best = coarse.simulate({}, inputs), exact.simulate({}, inputs)
+    for number in substeps:
+        finer = finer.with_finer_steps()
+        assert finer.num_substeps(0.002) == number
+    assert (finer.simulate({}, inputs) - best).norm() < 0.02 * (far - best).norm()
+    assert finer.with_finer_steps() is None
 
 
 @pytest.mark.parametrize("substeps", [1, 3])

@@ -30,7 +30,8 @@ four. Forces of effects are constant over an engine step of any order, so only s
 them more accurate."""
 
 _FINER_IF_STIFF = 4
-"""Factor on the number of steps where steps of order four would be unstable."""
+"""Greatest factor on the number of steps with which the order becomes four, and the factor where
+even these steps would be unstable."""
 
 _MOST_DAMPED = 2.5
 """Rate of the fastest damping, per engine step, up to which steps of order four are used. They are
@@ -83,6 +84,8 @@ class MujocoSimulator(MujocoMechanism):
 
     # The simulator with the file's own steps, once finer ones are taken.
     unrefined: Self | None = None
+    # Whether the steps cannot be refined further.
+    is_finest = False
 
     @cached_property
     def inverse_dynamics(self) -> InverseDynamics | None:
@@ -92,22 +95,28 @@ class MujocoSimulator(MujocoMechanism):
     def with_finer_steps(self) -> Self | None:
         """Returns a copy with finer steps; ``None`` if there are none.
 
-        The first call raises the order to four, the second doubles the number of steps. Where
-        order four would be unstable, as with stiff servos, the first call takes four times as many
-        steps of the file's own integrator.
+        The first call raises the order to four, the second doubles the number of steps. With stiff
+        servos, steps of order four are stable only if they are shorter, so that the first call
+        takes up to four times as many. Where these would be unstable, too, it takes four times as
+        many of the file's own integrator, and the second call returns ``None``.
         """
-        if self.refinement > 1:
-            return None
         mujoco: Any = importlib.import_module("mujoco")
         rk4 = mujoco.mjtIntegrator.mjINT_RK4
-        engine_step = self.time_step / self.num_substeps(self.time_step)
+        is_fourth = self.model.opt.integrator == rk4
+        if self.is_finest or (self.unrefined is not None and not is_fourth):
+            return None
         changed = copy.copy(self)
         changed.prepared_models = {}
         changed.unrefined = self.unrefined or self
-        if fastest_damping(self.model, self.initial_positions) * engine_step > _MOST_DAMPED:
+        if is_fourth:
+            changed.refinement, changed.is_finest = _FINER * self.refinement, True
+            return changed
+        engine_step = self.time_step / self.num_substeps(self.time_step)
+        rate = fastest_damping(self.model, self.initial_positions) * engine_step
+        while rate > _MOST_DAMPED * changed.refinement <= _MOST_DAMPED * _FINER_IF_STIFF:
+            changed.refinement *= 2
+        if changed.refinement > _FINER_IF_STIFF:
             changed.refinement = _FINER_IF_STIFF
-        elif self.model.opt.integrator == rk4:
-            changed.refinement = _FINER
         else:
             changed.model = copy.copy(self.model)
             changed.model.opt.integrator = rk4
