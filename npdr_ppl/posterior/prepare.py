@@ -214,10 +214,12 @@ def prepare(
     )
     closest = searcher.fit_base(near=near, may_be_rough=True, progress=progress)
     step(None, "compare with finer integration steps")
-    closest = searcher.with_finer_steps(closest)
+    finer = searcher.with_finer_steps(closest, is_rough=True)
+    closest = searcher.converged(finer)
     base = BaseFit(searcher.base, closest, searcher.are_steps_coarse)
     step(None, "check the priors")
-    wider = searcher.with_wider_priors(closest)
+    wider = searcher.with_wider_priors(finer)
+    wider = closest if wider is finer else wider
     ends = ()
     if searcher.are_priors_widened:
         ends = beyond(base.hypothesis.segments.prior.distributions, wider)

@@ -252,22 +252,34 @@ def _in_span(columns: Tensor, residuals: Tensor) -> tuple[Tensor, Tensor]:
     size = columns.square().sum((0, 1)).sqrt().clamp_min(1e-150)  # parameters differ in size
     spanned = (columns / size).transpose(0, 1).flatten(1)  # (N, blocks · c)
     most = PERMUTATION_TEST.most_in_span
-    if 2 * most >= min(spanned.shape):
+    basis = None
+    if min(spanned.shape) > 2 * most:
+        basis = _sketched(spanned)
+    if basis is None and spanned.shape[1] < len(spanned):
         basis = torch.linalg.qr(spanned)[0]
-    else:  # a random sketch of the span (Halko, Martinsson & Tropp 2011)
-        generator = torch.Generator().manual_seed(0)
-        directions = torch.randn(spanned.shape[1], most, generator=generator, dtype=torch.float64)
-        basis = torch.linalg.qr(spanned @ directions)[0]
+    if basis is None:
+        return columns, residuals
+    return torch.einsum("bnc,nk->bkc", columns, basis), residuals @ basis
+
+
+def _sketched(spanned: Tensor) -> Tensor | None:
+    """Returns a basis of nearly all that columns span, ``None`` if it would have to be large.
+
+    It is found from a random sketch (Halko, Martinsson & Tropp 2011).
+
+    Args:
+        spanned: The columns, ``(N, n)``.
+    """
+    generator, most = torch.Generator().manual_seed(0), PERMUTATION_TEST.most_in_span
+    directions = torch.randn(spanned.shape[1], most, generator=generator, dtype=torch.float64)
+    basis = torch.linalg.qr(spanned @ directions)[0]
     inside = basis.mT @ spanned
     values, vectors = torch.linalg.eigh(inside @ inside.mT)
-    # Squares of all columns together, of which each has one.
+    # Squares of all columns together, of which each has at most one.
     outside = float(spanned.square().sum() - values.sum())
-    is_kept = outside + values.cumsum(0) > PERMUTATION_TEST.lost_in_span**2
-    if outside > PERMUTATION_TEST.lost_in_span**2 or int(is_kept.sum()) >= len(basis):
-        return columns, residuals
-    basis = basis @ vectors[:, is_kept]
-    turned = torch.einsum("bnc,nk->bkc", columns, basis)
-    return turned, residuals @ basis
+    if outside > PERMUTATION_TEST.lost_in_span**2:
+        return None
+    return basis @ vectors[:, outside + values.cumsum(0) > PERMUTATION_TEST.lost_in_span**2]
 
 
 def _derangements(draws: int, size: int, generator: torch.Generator) -> Tensor:

@@ -244,9 +244,11 @@ def in_finer_steps(
         (finer,) = trials.fits([replace(asked, is_trial=is_rough)], current.simulator)
         if finer is not None and not is_rough:
             finer = off_the_ends(finer)
-        if finer is not None and is_rough and _are_coarse_steps_likelier(current, finer):
-            finer = polished(finer)  # a rough fit would be at a disadvantage
-        if finer is None or _are_coarse_steps_likelier(current, finer):
+        coarse = current
+        if finer is not None and is_rough and not _are_likelier(finer, coarse):
+            # Rough fits do not show which is likelier.
+            coarse, finer = polished(coarse), polished(finer)
+        if finer is None or _are_likelier(coarse, finer):
             break
         report("the model's integration steps are too coarse for this recording; refining them")
         is_coarse, bases = True, bases[number:]
@@ -280,9 +282,9 @@ def _in_finer_steps(segments: SegmentModel) -> SegmentModel | None:
     return segments.with_model(with_finer_steps(segments.model))
 
 
-def _are_coarse_steps_likelier(coarse: Hypothesis, finer: Hypothesis) -> bool:
-    """Returns whether the recording itself seems to be simulated with coarse steps."""
-    return weigh([coarse, finer], [0.0, 0.0])[0] > BASE_FIT.coarse_probability
+def _are_likelier(one: Hypothesis, other: Hypothesis) -> bool:
+    """Returns whether the recording is clearly likelier with the steps of one hypothesis."""
+    return weigh([one, other], [0.0, 0.0])[0] > BASE_FIT.coarse_probability
 
 
 def _distance(current: Hypothesis, difference: Tensor) -> float:

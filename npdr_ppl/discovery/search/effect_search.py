@@ -88,7 +88,8 @@ class Searcher:
         self.are_steps_coarse = False
         self.are_priors_widened = False
         self._last: Round | None = None
-        # Where a fit in finer steps begins, if the last fit of the original model is rough.
+        # Whether the last fit of the original model is rough, and where one in finer steps begins.
+        self._is_rough = False
         self._finer_parameters: Mapping[str, Tensor] | None = None
         self._report = report
         self._progress = progress or Reporter()
@@ -119,12 +120,14 @@ class Searcher:
     ) -> Hypothesis:
         """Fits the original model; see :func:`~npdr_ppl.discovery.search.base_fit.fit_base`.
 
-        A rough fit is converged by :meth:`settled` or :meth:`with_finer_steps`.
+        A rough fit must be followed by :meth:`settled`, or by :meth:`with_finer_steps` and
+        :meth:`converged`.
         """
         self._report("fitting the original model")
         fitted, self._finer_parameters = fit_base(
             self.base, near=near, seed=self.seed, may_be_rough=may_be_rough, progress=progress
         )
+        self._is_rough = self._finer_parameters is not None
         return fitted
 
     def settled(self, given: Hypothesis) -> Hypothesis:
@@ -135,12 +138,17 @@ class Searcher:
         Args:
             given: The fitted original model.
         """
-        is_rough = self._finer_parameters is not None
         # Where a prior is too narrow, a precise fit takes many steps towards its end.
         finer = self.with_finer_steps(given, is_rough=True)
         wider = self.with_wider_priors(finer)
-        is_converged = wider is not finer or (finer is given and not is_rough)
-        return wider if is_converged else polished(finer)
+        return self.converged(finer) if wider is finer else wider
+
+    def converged(self, current: Hypothesis) -> Hypothesis:
+        """Returns the last fit of the original model, after precise steps if it is rough."""
+        if not self._is_rough:
+            return current
+        self._is_rough = False
+        return polished(current)
 
     def with_finer_steps(self, current: Hypothesis, *, is_rough: bool = False) -> Hypothesis:
         """Returns a hypothesis with finer steps if its own are too coarse; else unchanged.
@@ -156,9 +164,8 @@ class Searcher:
             current, self.base, near=near, is_rough=is_rough, report=self._report
         )
         self.base = found.segments
+        self._is_rough = is_rough and (self._is_rough or found.hypothesis is not current)
         self.are_steps_coarse = self.are_steps_coarse or found.are_steps_coarse
-        if near is not None and not is_rough and found.hypothesis is current:
-            return polished(current)
         return found.hypothesis
 
     def with_wider_priors(self, current: Hypothesis) -> Hypothesis:
