@@ -95,9 +95,8 @@ class SegmentFitSettings:
         least_gain: Steps end when no step can reduce the objective, in variances of the
             measurement noise and for independent measurements, by more than this. What a step can
             gain is computed from the derivatives, or tried where the misfit has local minima. The
-            default is a quarter of
-            a unit of log evidence. A model that is ten times as likely as another has 2.3 units
-            more.
+            default is a quarter of a unit of log evidence. A model that is ten times as likely as
+            another has 2.3 units more.
         outlier_misfit: Multiple of the median segment's misfit above which other initial states
             are tried.
         initial_state_restarts: Distances of these initial states, in standard deviations of the

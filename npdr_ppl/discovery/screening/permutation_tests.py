@@ -159,7 +159,7 @@ class LargestStatistic:
             columns = pulses.columns[: self._num_used].unflatten(0, (self._blocks, -1))
             standard = self._standard.unflatten(-1, columns.shape[1:3])
             parts = [_in_span(columns[:, j], standard[:, j]) for j in range(columns.shape[1])]
-            most = max(len(values.mT) for _, values in parts)
+            most = max(r.shape[1] for _, r in parts)
             turned = torch.stack([pad(c, (0, 0, 0, most - c.shape[1])) for c, _ in parts], 1)
             residuals = torch.stack([pad(r, (0, most - r.shape[1])) for _, r in parts], 1)
             self._bases[pulses] = _Along(turned.flatten(0, 1), residuals.flatten(1))
