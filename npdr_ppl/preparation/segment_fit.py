@@ -263,7 +263,8 @@ def _steps(
             model, now = segments.corrected(z, offsets, scale, is_rough=is_rough)
             if model is not segments:
                 # The squares of the last step had an earlier correction.
-                present_scale = _scale(segments, now.residual, scale)
+                square = now.residual.square().unflatten(-1, (-1, len(scale)))
+                present_scale = _scale(segments, square.sum((0, 1)), scale)
             now = replace(now, by_parameters=now.by_parameters * ~held)
             num_updates, num_linearised = 0, num_linearised + 1
         if not now.is_finite:
@@ -308,9 +309,7 @@ def _steps(
             dampings = (dampings * torch.tensor(factors).double()[place]).clamp(
                 *SEGMENT_FIT.damping_limits
             )
-            count = segments.num_measured.sum(0).clamp_min(1)
-            left = squares[best][place, every].sum(0) / count
-            present_scale = (scale * left.sqrt()).maximum(segments.least_scale)
+            present_scale = _scale(segments, squares[best][place, every].sum(0), scale)
             before = scale
             if is_rough:
                 scale = present_scale
@@ -340,9 +339,8 @@ def _steps(
     return z, offsets, present_scale
 
 
-def _scale(segments: SegmentModel, residual: Tensor, scale: Tensor) -> Tensor:
-    """Returns the scale of whitened residuals ``(S, N)`` in the channels' units, ``(C,)``."""
-    square = residual.square().unflatten(-1, (-1, len(scale))).sum((0, 1))
+def _scale(segments: SegmentModel, square: Tensor, scale: Tensor) -> Tensor:
+    """Returns the scale of residuals in their units from squares of whitened ones, ``(C,)``."""
     count = segments.num_measured.sum(0).clamp_min(1)
     return (scale * (square / count).sqrt()).maximum(segments.least_scale)
 
