@@ -283,9 +283,8 @@ def _drawn(arm: Arm, task: Task, rng: np.random.Generator) -> tuple[Hidden, ...]
         pairs = [
             pair
             for pair in itertools.combinations(kinds, 2)
-            # The catalogue has no entry for a gain, so that "unknown" would be the answer to both;
-            # and delays of a servo and of all are not two causes.
-            if "servo_gain" not in pair and set(pair) != set(LATE)
+            # Delays of a servo and of all are not two causes.
+            if set(pair) != set(LATE)
         ]
         kinds = list(pairs[int(rng.integers(len(pairs)))])
     joints = rng.permutation(len(arm.links)).tolist()

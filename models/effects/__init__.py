@@ -39,6 +39,7 @@ from npdr_ppl.models.effects.sensing import (
     Quantisation,
     SensorLowPass,
 )
+from npdr_ppl.models.effects.servos import ServoGain
 from npdr_ppl.models.effects.surroundings import Contact, Payload, Tilt
 from npdr_ppl.models.effects.timing import ClockSkew, SensorDelay
 from npdr_ppl.models.effects.transmission import Backlash, JointElasticity
@@ -71,6 +72,7 @@ __all__ = [
     "Saturation",
     "SensorDelay",
     "SensorLowPass",
+    "ServoGain",
     "Spring",
     "StribeckFriction",
     "SupplySag",

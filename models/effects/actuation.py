@@ -32,6 +32,7 @@ class InputDelay(ActionEffect):
     """
 
     id = "input_delay"
+    may_be_shared = True
     parameters = (Parameter("delay", "s", 0.0, "delay d"),)
     is_smooth = False
     law = "u(t − d)"
@@ -67,6 +68,7 @@ class ActuatorLag(ActionEffect):
     """τ̇ = (u − τ)/T: a first-order lag with time constant T; the mean over a step acts."""
 
     id = "actuator_lag"
+    may_be_shared = True
     parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
     law = "τ̇ = (u − τ)/T"
     equivalence = (FIRST_ORDER_LAG,)
@@ -105,6 +107,7 @@ class ActuatorGain(ActionEffect):
     """(1 + ε) u."""
 
     id = "actuator_gain"
+    port_kinds = ("action",)
     parameters = (Parameter("error", "1", 0.0, "relative gain error ε"),)
     law = "(1 + ε) u"
     equivalence = (OVERALL_SCALE,)
@@ -126,6 +129,7 @@ class SupplySag(ActionEffect):
     """(1 − a |u|/u_rated) u: a gain that falls with the load."""
 
     id = "supply_sag"
+    port_kinds = ("action",)
     parameters = (Parameter("sag", "1/({port})", 0.0, "relative loss of gain per command a"),)
     law = "(1 − a|u|) u"
     equivalence = (COMMAND_LIMIT,)
@@ -175,6 +179,7 @@ class DeadZone(ActionEffect):
     """sign(u) max(|u| − δ, 0)."""
 
     id = "dead_zone"
+    port_kinds = ("action",)
     parameters = (Parameter("width", "{port}", 0.0, "half width δ"),)
     is_smooth = False
     law = "sign(u) max(|u| − δ, 0)"

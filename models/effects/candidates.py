@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Port
 from npdr_ppl.language.effect_context import SensorSpan
-from npdr_ppl.language.effects import Effect, SensorEffect
+from npdr_ppl.language.effects import ActionEffect, Effect, SensorEffect
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.models.effects.registry import effects
 
@@ -19,7 +19,8 @@ def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
     """Returns each effect of the catalogue at each port to which it can attach.
 
     A sensor effect attaches to the channels that one device may affect; see
-    :class:`~npdr_ppl.language.effects.SensorEffect`. Drift applies to parameters that can change
+    :class:`~npdr_ppl.language.effects.SensorEffect`. A delay and a lag of commands also attach to
+    all commands of a kind together. Drift applies to parameters that can change
     during a rollout and are not nominally zero. Effects that the simulator already has, or that
     its engine cannot apply, are left out.
 
@@ -77,6 +78,11 @@ def _ports(simulator: Simulator, effect: type[Effect]) -> Iterator[str]:
         if any("{port}" in parameter.unit for parameter in effect.parameters):
             groups = [part for group in groups for part in _by_unit(simulator, group)]
         yield from dict.fromkeys(",".join(group) for group in groups)
+    if issubclass(effect, ActionEffect) and effect.may_be_shared:
+        for kind in effect.port_kinds:
+            group = [port.name for port in simulator.all_ports if port.kind == kind]
+            if len(group) > 1:
+                yield ",".join(group)
     lasting = {p.name for p in simulator.parameters if not _may_drift(p.unit, p.nominal)}
     for port in simulator.all_ports:
         if port.kind in kinds and not (port.kind == "parameter" and port.name in lasting):

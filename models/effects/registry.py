@@ -33,6 +33,7 @@ BUILT_IN = {
     "supply_sag": f"{_HOME}.actuation:SupplySag",
     "dead_zone": f"{_HOME}.actuation:DeadZone",
     "actuator_gain": f"{_HOME}.actuation:ActuatorGain",
+    "servo_gain": f"{_HOME}.servos:ServoGain",
     "bias": f"{_HOME}.forces:Bias",
     "cogging": f"{_HOME}.disturbances:Cogging",
     "spring": f"{_HOME}.forces:Spring",

@@ -9,7 +9,9 @@ from npdr_ppl.errors import ModelError
 
 __all__ = ["Channel", "Parameter", "Port", "PortKind"]
 
-PortKind = Literal["force", "action", "sensor", "environment", "clock", "parameter"]
+PortKind = Literal["force", "action", "servo", "sensor", "environment", "clock", "parameter"]
+
+_GROUPED = {"sensor", "action", "servo"}
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,13 @@ class Port:
     """A place in a simulator where effects attach.
 
     Attributes:
-        name: Name in sites and JSON. For a group of sensor channels that one device measures,
-            their names joined by commas: ``"arm_velocity,pole_velocity"``.
+        name: Name in sites and JSON. For a group of channels that one device measures, or whose
+            commands one device sends, their names joined by commas:
+            ``"arm_velocity,pole_velocity"``.
         kind: Quantity at the port: a generalised force at a joint, an action before it reaches
-            the dynamics, a measurement, a quantity of the environment, the clock that stamps all
-            measurements, or a domain parameter.
+            the dynamics, the position or velocity that a servo is to reach, a measurement, a
+            quantity of the environment, the clock that stamps all measurements, or a domain
+            parameter.
         unit: SI unit of the quantity.
         rated: Typical magnitude, in ``unit``; effects scale their priors by it.
         rated_speed: Typical speed of a joint that a force acts on, in its coordinate per second.
@@ -84,7 +88,9 @@ class Port:
 
 
 def find_port(ports: tuple[Port, ...], name: str, simulator_name: str) -> Port:
-    """Returns the port called ``name``; groups of sensor ports are formed on demand.
+    """Returns the port called ``name``; groups of ports of one kind are formed on demand.
+
+    Groups are formed of sensors, of actions, and of servos.
 
     Raises:
         ModelError: There is no such port, or the group mixes kinds.
@@ -93,8 +99,9 @@ def find_port(ports: tuple[Port, ...], name: str, simulator_name: str) -> Port:
     if name in by_name:
         return by_name[name]
     members = [by_name[part] for part in name.split(",") if part in by_name]
-    if len(members) == len(name.split(",")) and all(port.kind == "sensor" for port in members):
-        return Port(name, "sensor", members[0].unit, max(port.rated for port in members))
+    kinds = {port.kind for port in members}
+    if len(members) == len(name.split(",")) and len(kinds) == 1 and kinds < _GROUPED:
+        return Port(name, members[0].kind, members[0].unit, max(port.rated for port in members))
     close = get_close_matches(name, by_name, n=1)
     raise ModelError(
         f"{simulator_name} has no port {name!r}; "

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor
 
-__all__ = ["EquivalenceClass", "Excitation", "Joint", "SensorSpan", "Start"]
+__all__ = ["EquivalenceClass", "Excitation", "Joint", "SensorSpan", "Servo", "Start"]
 
 Excitation = Literal[
     "slow_ramp",
@@ -75,6 +75,16 @@ class Start(NamedTuple):
             value: The true value at the start.
         """
         return tuple(value + change for change in self.changes)
+
+
+class Servo(NamedTuple):
+    """The quantity at a servo's port: what an effect may change of the servo.
+
+    Attributes:
+        gain: Force per unit of error, of either a position or a velocity.
+    """
+
+    gain: Tensor
 
 
 class Joint(NamedTuple):

@@ -194,6 +194,11 @@ class Effect(ABC):
         return f"{self.port}.{self.id}"
 
     @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels, or of the one other place, that its port covers."""
+        return tuple(self.port.split(","))
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the sample sites: ``"<port>.<effect>.<parameter>"``."""
         return tuple(f"{self.name}.{parameter.name}" for parameter in self.parameters)
@@ -337,9 +342,15 @@ class Uneven(NamedTuple):
 
 
 class ActionEffect(Effect):
-    """An effect on a command before it reaches the dynamics."""
+    """An effect on a command before it reaches the dynamics.
 
-    port_kinds: ClassVar[tuple[PortKind, ...]] = ("action",)
+    Attributes:
+        may_be_shared: Whether all commands may have it with the same parameters, because one
+            device or bus sends them.
+    """
+
+    port_kinds: ClassVar[tuple[PortKind, ...]] = ("action", "servo")
+    may_be_shared: ClassVar[bool] = False
 
     def initial_memory(self, command: Tensor, start: Start) -> Any:
         """Returns the effect's own state after a long time with a constant ``command``.
@@ -427,7 +438,11 @@ class EnvironmentEffect(Effect):
 
     @abstractmethod
     def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
-        """Returns the changed quantity, e.g. the gravity vector (x, y, z) in m/s²."""
+        """Returns the changed quantity.
+
+        Examples are the gravity vector (x, y, z) in m/s², and the
+        :class:`~npdr_ppl.language.effect_context.Servo` at a servo's port.
+        """
 
 
 class ParameterEffect(Effect):

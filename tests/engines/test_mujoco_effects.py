@@ -18,6 +18,7 @@ from npdr_ppl.models.effects import (
     Payload,
     SensorDelay,
     SensorLowPass,
+    ServoGain,
     Tilt,
     ViscousFriction,
     candidate_effects,
@@ -197,3 +198,47 @@ def test_gains_may_exceed_the_control_range():
     gain = simulator.with_effects(ActuatorGain("motor"))
     out = gain.simulate({"motor.actuator_gain.error": value(0.25)}, inputs)
     torch.testing.assert_close(out, simulator.simulate({"gear": value(2.5)}, inputs))
+
+
+@pytest.mark.parametrize("servo", ['position kp="{:.17g}" kv="0.3"', 'velocity kv="{:.17g}"'])
+def test_a_servo_gain_is_that_of_the_file(servo):
+    def arm_with(gain):
+        text = f"""<mujoco><worldbody><body><joint name="j" axis="0 1 0" armature="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/></body></worldbody>
+        <actuator><{servo.format(gain)} name="servo" joint="j" gear="2"/></actuator></mujoco>"""
+        return MujocoSimulator(mujoco.MjModel.from_xml_string(text))
+
+    changed = arm_with(4.0).with_effects(ServoGain("servo"))
+    inputs = random_inputs(changed, num_steps=50)
+    given = {"servo.servo_gain.error": value([0.0, 0.25])}
+    out = changed.simulate(given, inputs)
+    assert torch.equal(out[0], arm_with(4.0).simulate({}, inputs))
+    torch.testing.assert_close(out[1], arm_with(5.0).simulate({}, inputs), atol=1e-12, rtol=0.0)
+
+
+def test_a_servo_gain_scales_a_gain_that_is_a_parameter():
+    base = arm(parameters={"kp": "actuator elbow_command kp"})
+    changed = base.with_effects(ServoGain("elbow_command"))
+    inputs = random_inputs(base)
+    scaled = changed.simulate(
+        {"kp": value(4.0), "elbow_command.servo_gain.error": value(0.5)}, inputs
+    )
+    torch.testing.assert_close(scaled, base.simulate({"kp": value(6.0)}, inputs))
+
+
+def test_a_shared_delay_is_the_same_delay_of_each_command():
+    text = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.1"/>
+    <body pos="0.2 0 0"><joint name="b" axis="0 1 0"/><geom size="0.1"/></body></body>
+    </worldbody><actuator><motor name="one" joint="a"/><motor name="two" joint="b"/></actuator>
+    </mujoco>"""
+    base = MujocoSimulator(mujoco.MjModel.from_xml_string(text))
+    inputs = random_inputs(base)
+    delay = value([0.0, 1.3e-3, 4.7e-3])
+    together = base.with_effects(InputDelay("one,two"))
+    each = base.with_effects(InputDelay("one"), InputDelay("two"))
+    torch.testing.assert_close(
+        together.simulate({"one,two.input_delay.delay": delay}, inputs),
+        each.simulate({"one.input_delay.delay": delay, "two.input_delay.delay": delay}, inputs),
+        atol=0.0,
+        rtol=0.0,
+    )

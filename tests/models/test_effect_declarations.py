@@ -5,8 +5,10 @@ from importlib import import_module
 from importlib.metadata import EntryPoint
 from typing import get_args
 
+import mujoco
 import pytest
 
+from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effect_context import Excitation
 from npdr_ppl.models.cart_pole import CartPole
@@ -28,7 +30,7 @@ from npdr_ppl.models.furuta import Furuta
 
 def test_the_catalogue_has_all_effects_with_what_discovery_needs():
     catalogue = effects()
-    assert len(catalogue) == 33
+    assert len(catalogue) == 34
     for name, effect in catalogue.items():
         assert effect.id == name
         assert effect.law and effect.reference
@@ -89,6 +91,23 @@ def test_candidates_are_where_they_make_sense():
     assert "hinge.unbalance" in on_rails and "rail.unbalance" not in on_rails
     attached = Furuta().with_effects(*candidate_effects(Furuta())[:3])
     assert len(candidate_effects(attached)) == len(names) - 3
+
+
+def test_servos_have_their_own_candidates():
+    text = """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size="0.1"/></body>
+    </worldbody><actuator><position name="goal" joint="j" kp="4"/>
+    <velocity name="speed" joint="j" kv="1"/><motor name="motor" joint="j"/></actuator></mujoco>"""
+    arm = MujocoSimulator(mujoco.MjModel.from_xml_string(text))
+    assert [arm.port(name).kind for name in ("goal", "speed", "motor")] == [
+        "servo",
+        "servo",
+        "action",
+    ]
+    names = {effect.name for effect in candidate_effects(arm)}
+    assert {"goal.servo_gain", "speed.servo_gain", "motor.dead_zone"} < names
+    assert not {"motor.servo_gain", "goal.dead_zone", "goal.actuator_gain"} & names
+    assert {"goal.input_delay", "speed.input_delay", "goal,speed.input_delay"} < names
+    assert "goal,speed,motor.input_delay" not in names
 
 
 def test_laws_that_make_no_sense_at_a_port_are_refused():

@@ -74,12 +74,14 @@ class EffectChain(ABC):
         simulator: The system and its effects.
         joints: Names of the force ports, in the order of the coordinates that they act on.
         time_step: Seconds per step.
-        histories: Number of past commands that each action effect may need, then of past values
-            that each sensor effect may need; see :func:`needed_histories`.
+        histories: Number of past commands that each action effect may need at each of its
+            channels, then of past values that each sensor effect may need; see
+            :func:`needed_histories`.
 
     Attributes:
         force_effects: Index in ``Tables.effects``, effect and joint of each force effect.
-        action_effects: Index, effect and action channel of each action effect.
+        action_effects: Index, effect and action channel of each action effect at each of its
+            channels.
         sensor_effects: Index, effect and sensor channels of each sensor effect.
         needs_joints: Whether a force effect needs a :class:`Joint` before every step.
     """
@@ -103,7 +105,8 @@ class EffectChain(ABC):
             if isinstance(effect, ForceEffect):
                 self.force_effects.append((place, effect, joints.index(effect.port)))
             elif isinstance(effect, ActionEffect):
-                self.action_effects.append((place, effect, actions.index(effect.port)))
+                for name in effect.channels:
+                    self.action_effects.append((place, effect, actions.index(name)))
             elif isinstance(effect, SensorEffect):
                 port = simulator.port(effect.port)
                 channels = sensors if port.kind == "clock" else port.channels
@@ -480,6 +483,8 @@ def needed_histories(
 ) -> tuple[int, ...]:
     """Returns how many past steps action effects, then sensor effects, need, rounded up.
 
+    An action effect at several channels has a number for each.
+
     Args:
         effects: The effects attached to a simulator.
         parameters: Parameters of each by short name.
@@ -490,6 +495,7 @@ def needed_histories(
         for kind in (ActionEffect, SensorEffect)
         for effect, values in zip(effects, parameters, strict=True)
         if isinstance(effect, kind)
+        for _ in (effect.channels if kind is ActionEffect else (effect.port,))
     ]
     return tuple(-(-number // _HISTORY_GRAIN) * _HISTORY_GRAIN for number in needed)
 

@@ -3,7 +3,6 @@
 The model is Python text, so that what runs is what a user can print and edit.
 """
 
-import importlib
 import re
 from dataclasses import dataclass
 from os import PathLike
@@ -13,7 +12,13 @@ from typing import Any
 from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
 from npdr_ppl.engines.mujoco.batches import quiet
 from npdr_ppl.engines.mujoco.dependent_fields import dependent_fields
-from npdr_ppl.engines.mujoco.fields import Field, actuator_names, element_names, find_field
+from npdr_ppl.engines.mujoco.fields import (
+    Field,
+    actuator_names,
+    element_names,
+    find_field,
+    servo_gains,
+)
 from npdr_ppl.errors import ModelError
 
 __all__ = ["DerivedModel", "DerivedParameter", "derive_model"]
@@ -203,22 +208,8 @@ def _servos(model: Any) -> list[_Choice]:
         ("actuator", name, word, GAIN_RANGE)
         for word in ("kp", "kv")
         for actuator, name in enumerate(names)
-        if word in _gains(model, actuator)
+        if word in servo_gains(model, actuator)
     ]
-
-
-def _gains(model: Any, actuator: int) -> tuple[str, ...]:
-    """Returns which gains an actuator has: kp and kv of position servos, kv of velocity servos."""
-    mujoco: Any = importlib.import_module("mujoco")
-    is_fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
-    is_affine = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
-    gain = float(model.actuator_gainprm[actuator, 0])
-    _, position, velocity = map(float, model.actuator_biasprm[actuator, :3])
-    if not (is_fixed and is_affine and gain > 0.0):
-        return ()
-    if position == -gain:
-        return ("kp", "kv") if velocity < 0.0 else ("kp",)
-    return ("kv",) if position == 0.0 and velocity == -gain else ()
 
 
 def _preference(field: Field) -> tuple[int, float]:

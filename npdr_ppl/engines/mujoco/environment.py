@@ -89,7 +89,7 @@ def with_environment(
         return result.get((array, place), torch.tensor(float(nominal), dtype=torch.float64))
 
     for effect, values in zip(effects, parameters, strict=True):
-        if not isinstance(effect, EnvironmentEffect):
+        if not isinstance(effect, EnvironmentEffect) or effect.port not in by_name:
             continue
         port = by_name[effect.port]
         if port.body is not None:

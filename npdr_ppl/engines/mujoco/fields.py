@@ -23,6 +23,7 @@ __all__ = [
     "element_names",
     "find_field",
     "joint_units",
+    "servo_gains",
 ]
 
 
@@ -224,6 +225,20 @@ def actuated_joint(model: Any, actuator: int) -> int | None:
     if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
         return None
     return int(model.actuator_trnid[actuator, 0])
+
+
+def servo_gains(model: Any, actuator: int) -> tuple[str, ...]:
+    """Returns which gains an actuator has: kp and kv of position servos, kv of velocity servos."""
+    mujoco: Any = importlib.import_module("mujoco")
+    is_fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+    is_affine = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+    gain = float(model.actuator_gainprm[actuator, 0])
+    _, position, velocity = map(float, model.actuator_biasprm[actuator, :3])
+    if not (is_fixed and is_affine and gain > 0.0):
+        return ()
+    if position == -gain:
+        return ("kp", "kv") if velocity < 0.0 else ("kp",)
+    return ("kv",) if position == 0.0 and velocity == -gain else ()
 
 
 def _joint_units_of(model: Any, kind: str, element: int) -> dict[str, str]:

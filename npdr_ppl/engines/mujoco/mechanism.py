@@ -31,6 +31,7 @@ from npdr_ppl.engines.mujoco.environment import environment_ports, with_environm
 from npdr_ppl.engines.mujoco.fields import element_names
 from npdr_ppl.engines.mujoco.parameters import Binding, Bindings, Derivation
 from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
+from npdr_ppl.engines.mujoco.servos import with_servos
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.effects import ForceEffect, ParameterEffect
@@ -159,6 +160,8 @@ class MujocoMechanism(ClosedLoopSimulator):
         assignments = with_environment(
             self.model, self._environment, self.effects, own, assignments
         )
+        commands = [action.name for action in self.actions]
+        assignments = with_servos(self.model, commands, self.effects, own, assignments)
         model = self._prepared(time_step / self.num_substeps(time_step), set(assignments))
         num_threads = self.num_threads or torch.get_num_threads()
         return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)

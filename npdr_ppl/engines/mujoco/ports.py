@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from npdr_ppl.engines.mujoco.channels import Component, Reading
 from npdr_ppl.engines.mujoco.fields import actuated_joint, element_names, joint_units
+from npdr_ppl.engines.mujoco.servos import is_servo
 from npdr_ppl.language.channels import Channel, Port
 
 __all__ = ["ForcePort", "actuator_moments", "derive_ports", "driven_dofs", "force_ports"]
@@ -93,10 +94,13 @@ def derive_ports(
     actions: Sequence[Channel],
     sensors: Sequence[Component | Reading],
 ) -> tuple[Port, ...]:
-    """Returns the ports of actions, joints and sensors."""
+    """Returns the ports of actions, joints and sensors; actions are those of all actuators."""
     by_position = {joint.position: joint for joint in joints}
     by_velocity = {joint.velocity: joint for joint in joints}
-    ports = [Port(a.name, "action", a.unit, _largest(a)) for a in actions]
+    ports = [
+        Port(a.name, "servo" if is_servo(model, i) else "action", a.unit, _largest(a))
+        for i, a in enumerate(actions)
+    ]
     ports += [joint.port for joint in joints]
     for sensor in sensors:
         rated = 1.0
