@@ -1,10 +1,10 @@
-"""The progress of long operations, on one line of a terminal; elsewhere nothing is shown."""
+"""The progress of long operations: one line on a terminal, elsewhere a line per minute."""
 
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,6 +20,10 @@ take is counted from the first report."""
 BAR_WIDTH = 10
 """Width of the bar in characters. On a terminal of 80, it leaves room for label, status and time,
 e.g. ``effect 1``, ``2 of 6 candidates fitted`` and ``at most 3.5 min left in this step``."""
+
+
+LOG_INTERVAL = 60.0
+"""Seconds between two lines where standard error is no terminal."""
 
 
 class TimeLeft:
@@ -123,41 +127,30 @@ class _Labelled(Reporter):
             yield step
 
 
-class _LineReporter(Reporter):
-    """Shows the present stage on one line: label, bar, status and time."""
+class _TimedReporter(Reporter):
+    """Keeps the time left of the present stage and of the outermost work of equal parts.
 
-    def __init__(
-        self, console: "Console | None" = None, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, ProgressColumn
-        from rich.table import Column
-        from rich.text import Text
+    Args:
+        clock: Returns the time in s.
+    """
 
-        class Words(ProgressColumn):
-            """Text that is made at every refresh; where there is no room, its end is left out."""
-
-            def __init__(self, words: Callable[[Any], str], is_kept: bool = False) -> None:
-                super().__init__(Column(no_wrap=is_kept, overflow="ellipsis"))
-                self.words = words
-
-            def render(self, task: Any) -> Text:
-                return Text(self.words(task), no_wrap=True, overflow="ellipsis")
-
+    def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._began = clock()
-        # The time left, and the words before and after it, of the stage that the line shows and of
-        # the outermost work of equal parts.
+        # The time left, and the words before and after it, of the stage that is shown and of the
+        # outermost work of equal parts.
         self._shown: tuple[TimeLeft, str, str] | None = None
         self._overall: tuple[TimeLeft, str, str] | None = None
-        self.bars = Progress(
-            Words(lambda task: task.description),
-            BarColumn(BAR_WIDTH),
-            Words(lambda task: task.fields["status"]),
-            Words(lambda task: self.time_words(), is_kept=True),
-            console=console or Console(stderr=True),
-            transient=True,
-        )
+
+    def show(self, label: str, fraction: float | None, status: str) -> None:
+        """Shows a report of a stage.
+
+        Args:
+            label: Name of the stage.
+            fraction: The fraction done, ``None`` if the total is not known.
+            status: A short status.
+        """
+        raise NotImplementedError
 
     def stage(self, label: str, *, may_end_early: bool = False) -> Step:
         left = TimeLeft(self._clock)
@@ -166,13 +159,7 @@ class _LineReporter(Reporter):
         def step(fraction: float | None, status: str) -> None:
             left.report(fraction)
             self._shown = times
-            # The line appears with the first step, because a stage may have nothing to do.
-            if not self.bars.tasks:
-                self.bars.add_task(label, total=1.0, status="")
-            (task,) = self.bars.tasks
-            task.total = None if fraction is None else 1.0
-            done = fraction or 0.0
-            self.bars.update(task.id, description=label, completed=done, status=status)
+            self.show(label, fraction, status)
 
         return step
 
@@ -194,18 +181,79 @@ class _LineReporter(Reporter):
         return f"{words_for(self._clock() - self._began)} so far"
 
 
+class _LineReporter(_TimedReporter):
+    """Shows the present stage on one line: label, bar, status and time."""
+
+    def __init__(
+        self, console: "Console | None" = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, ProgressColumn
+        from rich.table import Column
+        from rich.text import Text
+
+        class Words(ProgressColumn):
+            """Text that is made at every refresh; where there is no room, its end is left out."""
+
+            def __init__(self, words: Callable[[Any], str], is_kept: bool = False) -> None:
+                super().__init__(Column(no_wrap=is_kept, overflow="ellipsis"))
+                self.words = words
+
+            def render(self, task: Any) -> Text:
+                return Text(self.words(task), no_wrap=True, overflow="ellipsis")
+
+        super().__init__(clock)
+        self.bars = Progress(
+            Words(lambda task: task.description),
+            BarColumn(BAR_WIDTH),
+            Words(lambda task: task.fields["status"]),
+            Words(lambda task: self.time_words(), is_kept=True),
+            console=console or Console(stderr=True),
+            transient=True,
+        )
+
+    def show(self, label: str, fraction: float | None, status: str) -> None:
+        # The line appears with the first step, because a stage may have nothing to do.
+        if not self.bars.tasks:
+            self.bars.add_task(label, total=1.0, status="")
+        (task,) = self.bars.tasks
+        task.total = None if fraction is None else 1.0
+        done = fraction or 0.0
+        self.bars.update(task.id, description=label, completed=done, status=status)
+
+
+class _LogReporter(_TimedReporter):
+    """Writes a line per minute, for a log: label, status and time."""
+
+    def __init__(self, file: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(clock)
+        self._file = file
+        self._written = self._began
+
+    def show(self, label: str, fraction: float | None, status: str) -> None:
+        now = self._clock()
+        if now - self._written < LOG_INTERVAL:
+            return
+        self._written = now
+        when = time.strftime("%H:%M:%S")
+        print(f"npdr: {when} {label}: {status}, {self.time_words()}", file=self._file, flush=True)
+
+
 @contextmanager
 def reporter(show: bool | Reporter | None = None) -> Iterator[Reporter]:
     """Shows a line with the progress inside the block.
 
     Args:
-        show: Whether to show it; ``None`` shows it if standard error is a terminal. The reporter
-            of a larger workflow is used unchanged.
+        show: Whether to show it. ``None`` shows it if standard error is a terminal, and otherwise
+            writes a line to it every minute. The reporter of a larger workflow is used unchanged.
     """
     if isinstance(show, Reporter):
         yield show
         return
-    if not (sys.stderr.isatty() if show is None else show):
+    if show is None and not sys.stderr.isatty():
+        yield _LogReporter(sys.stderr)
+        return
+    if show is False:
         yield Reporter()
         return
     line = _LineReporter()

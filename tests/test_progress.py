@@ -1,4 +1,4 @@
-"""Progress: the estimate of the time left, the line that shows it, and silence elsewhere."""
+"""Progress: the estimate of the time left, the line that shows it, and lines in a log."""
 
 import io
 import itertools
@@ -13,7 +13,14 @@ from rich.console import Console
 import npdr_ppl as npdr
 from npdr_ppl.discovery.search_progress import SearchProgress
 from npdr_ppl.posterior.infer import infer
-from npdr_ppl.progress import Reporter, TimeLeft, _LineReporter, reporter, words_for
+from npdr_ppl.progress import (
+    Reporter,
+    TimeLeft,
+    _LineReporter,
+    _LogReporter,
+    reporter,
+    words_for,
+)
 
 
 class Clock:
@@ -182,17 +189,30 @@ def test_a_terminal_gets_one_line_that_is_removed_at_the_end():
     assert written.endswith("\x1b[1A\x1b[2K")
 
 
-def test_without_a_terminal_nothing_is_shown(capfd, monkeypatch):
+def test_short_work_without_a_terminal_shows_nothing(capfd, monkeypatch):
     for show, is_terminal in ((None, False), (False, True)):
         monkeypatch.setattr(sys.stderr, "isatty", lambda found=is_terminal: found)
         with reporter(show) as report:
-            assert type(report) is Reporter
+            assert type(report) is (Reporter if show is False else _LogReporter)
             step = report.stage("simulate", may_end_early=True)
             with report.under("iteration 1").overall("all rounds") as done:
                 for fraction in (0.0, 0.5, None, 1.0):
                     step(fraction, "status")
                     done(fraction, "")
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_log_gets_a_line_per_minute():
+    clock, file = Clock(), io.StringIO()
+    report = _LogReporter(file, clock)
+    step = report.stage("effect 1")
+    for number in range(13):
+        step(number / 12, f"{number} of 12 candidates fitted")
+        clock.now += 20.0
+    lines = file.getvalue().splitlines()
+    assert [line.split()[3] for line in lines] == ["1:"] * 4
+    assert "effect 1: 3 of 12 candidates fitted, about 3.0 min left in this step" in lines[0]
+    assert "12 of 12 candidates fitted, 4.0 min so far" in lines[-1]
 
 
 def test_a_search_uses_the_line_of_a_larger_workflow_and_else_one_of_its_own():
