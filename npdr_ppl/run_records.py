@@ -195,6 +195,7 @@ class DiscoveryRecord(TypedDict, total=False):
     stage: str
     verdict: str
     reason: str
+    has_stopped: bool
     data_problems: list[str]
     remarks: list[str]
     alarm: Alarm | None

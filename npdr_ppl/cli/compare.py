@@ -29,7 +29,7 @@ from npdr_ppl.cli.options import (
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
-    TimeLimit,
+    SimulationLimit,
     WorkersOption,
     chosen_workers,
 )
@@ -58,7 +58,7 @@ def compare(
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     address: Address = None,
-    time_limit: TimeLimit = None,
+    simulation_limit: SimulationLimit = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -91,7 +91,7 @@ def compare(
     with (
         resumable(f"the same command again continues the comparison in {out}."),
         reporter(False if quiet else None) as report,
-        chosen_workers(executor, workers, address, time_limit),
+        chosen_workers(executor, workers, address, simulation_limit),
     ):
         comparison = run_compare(
             chosen,

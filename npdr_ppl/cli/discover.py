@@ -29,7 +29,7 @@ from npdr_ppl.cli.options import (
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
-    TimeLimit,
+    SimulationLimit,
     WorkersOption,
     chosen_workers,
 )
@@ -81,6 +81,13 @@ def discover(
             help="Search both halves of the recording, too; name only what is found in both.",
         ),
     ] = False,
+    time_limit: Annotated[
+        float | None,
+        typer.Option(
+            help="Seconds after which nothing further is tried. The result is then the best so "
+            "far, and the same command continues."
+        ),
+    ] = None,
     stage: Annotated[
         LastStage, typer.Option(help="Stop after this stage and write the results so far.")
     ] = LastStage.PROVE,
@@ -88,7 +95,7 @@ def discover(
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     address: Address = None,
-    time_limit: TimeLimit = None,
+    simulation_limit: SimulationLimit = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -127,6 +134,7 @@ def discover(
         max_effects=max_effects,
         false_alarm_rate=false_alarm_rate,
         repeat=repeat,
+        time_limit=time_limit,
     )
     folder = DiscoveryFolder(out)
     with claimed(out):
@@ -136,7 +144,7 @@ def discover(
             with (
                 resumable(f"the same command again continues the search in {out}."),
                 folder.kept(),
-                chosen_workers(executor, workers, address, time_limit),
+                chosen_workers(executor, workers, address, simulation_limit),
             ):
                 with reporter(False if quiet else None) as report:
                     investigation = Investigation(

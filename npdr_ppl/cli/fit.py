@@ -31,7 +31,7 @@ from npdr_ppl.cli.options import (
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
-    TimeLimit,
+    SimulationLimit,
     WorkersOption,
     chosen_workers,
 )
@@ -63,7 +63,7 @@ def fit(
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     address: Address = None,
-    time_limit: TimeLimit = None,
+    simulation_limit: SimulationLimit = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -94,7 +94,7 @@ def fit(
     with (
         resumable(f"the same command again continues the run in {out}."),
         reporter(False if quiet else None) as report,
-        chosen_workers(executor, workers, address, time_limit),
+        chosen_workers(executor, workers, address, simulation_limit),
     ):
         posterior, result = run_fit(
             chosen,

@@ -29,7 +29,7 @@ from npdr_ppl.cli.options import (
 from npdr_ppl.cli.worker_options import (
     Address,
     ExecutorOption,
-    TimeLimit,
+    SimulationLimit,
     WorkersOption,
     chosen_workers,
 )
@@ -134,7 +134,7 @@ def train(
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     address: Address = None,
-    time_limit: TimeLimit = None,
+    simulation_limit: SimulationLimit = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
     as_json: AsJson = False,
@@ -200,7 +200,7 @@ def train(
     with resumable(f"the same command again continues the run in {out}."):
         with (
             reporter(False if quiet else None) as report,
-            chosen_workers(executor, workers, address, time_limit),
+            chosen_workers(executor, workers, address, simulation_limit),
         ):
             training = run_train(
                 chosen,

@@ -11,7 +11,7 @@ __all__ = [
     "Address",
     "ExecutorName",
     "ExecutorOption",
-    "TimeLimit",
+    "SimulationLimit",
     "WorkersOption",
     "chosen_workers",
 ]
@@ -43,10 +43,12 @@ Address = Annotated[
     str | None,
     typer.Option("--address", help="Address of a Dask or Ray cluster.", rich_help_panel=PANEL),
 ]
-TimeLimit = Annotated[
+SimulationLimit = Annotated[
     float | None,
     typer.Option(
-        "--time-limit", help="Limit per simulation in s; 60 by default.", rich_help_panel=PANEL
+        "--simulation-limit",
+        help="Seconds that one simulation may take; 60 by default.",
+        rich_help_panel=PANEL,
     ),
 ]
 
@@ -56,7 +58,7 @@ def chosen_workers(
     executor: ExecutorName | None,
     num_workers: int | None,
     address: str | None,
-    time_limit: float | None,
+    simulation_limit: float | None,
 ) -> Iterator[None]:
     """Runs simulations inside the block on the executor and workers that the options name.
 
@@ -65,14 +67,15 @@ def chosen_workers(
     """
     from npdr_ppl.engines.workers import workers
 
-    is_asked = any(value is not None for value in (executor, num_workers, address, time_limit))
+    given = executor, num_workers, address, simulation_limit
+    is_asked = any(value is not None for value in given)
     chosen = "loky" if executor is None else executor.value
-    limit = 60.0 if time_limit is None else time_limit
+    limit = 60.0 if simulation_limit is None else simulation_limit
     with workers(chosen, num_workers, address=address, time_limit=limit) as used:
         yield
     if is_asked and not used.is_used:
         typer.echo(
-            "npdr: note: --executor, --workers, --address and --time-limit had no effect, because "
-            "the model's engine simulates batches by itself.",
+            "npdr: note: --executor, --workers, --address and --simulation-limit had no effect, "
+            "because the model's engine simulates batches by itself.",
             err=True,
         )

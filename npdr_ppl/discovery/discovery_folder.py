@@ -1,7 +1,8 @@
 """The folder of a discovery: its settings, and the results once they are complete.
 
     run.json            model, options, seed, versions, a checksum of the recordings
-    discovery.json      the results; written last, so a folder with this file is complete
+    discovery.json      the results; written last. A folder with this file is complete, unless a
+                        time limit ended the search
     revised_model.py    the model with the effects that were missing
     fits/               the fits that an unfinished discovery has finished
 
@@ -72,7 +73,9 @@ class DiscoveryFolder:
         Raises:
             DataError: The folder holds another discovery.
         """
-        settings = dataclasses.asdict(search) | {
+        # A search that a time limit ended continues with another limit.
+        limitless = dataclasses.replace(search, time_limit=None)
+        settings = dataclasses.asdict(limitless) | {
             "effects": search.effects and [repr(effect) for effect in search.effects],
             "segment_length": options.segment_length,
             "precision": options.precision,
@@ -100,6 +103,8 @@ class DiscoveryFolder:
         if not file.exists():
             return None
         found = dict(read_json(file, DiscoveryRecord))
+        if found.get("has_stopped", False):
+            return None
         reached = found.get("stage", STAGES[0])
         if reached not in STAGES:
             raise DataError(f"{file} has an unknown stage.")
@@ -116,7 +121,8 @@ class DiscoveryFolder:
             with replacing(self.path / "revised_model.py") as temporary:
                 temporary.write_text(source, encoding="utf-8")
         write_json(self.path / "discovery.json", found)
-        if found["stage"] == STAGES[-1]:  # no later stage needs them
+        is_needed = found.get("has_stopped", False) or found["stage"] != STAGES[-1]
+        if not is_needed:
             shutil.rmtree(self.path / FITS, ignore_errors=True)
 
 

@@ -23,6 +23,10 @@ class DiscoveryOptions:
         confidence: Probability above which one cause is named.
         repeat: Whether both halves of the recording are searched, too. An effect that is not found
             in both is not named. This takes about twice as long.
+        time_limit: Seconds after which nothing further is tried; ``None`` for no limit. The
+            verdict is then ``unknown``, with the best explanation so far. The first test and the
+            step at which the time is over are finished, and the posterior and the held-out gap
+            follow.
     """
 
     effects: tuple[Effect, ...] | None = None
@@ -30,6 +34,7 @@ class DiscoveryOptions:
     false_alarm_rate: float = 0.01
     confidence: float = 0.9
     repeat: bool = False
+    time_limit: float | None = None
 
     def __post_init__(self) -> None:
         """Checks that the numbers are in range.
@@ -43,3 +48,5 @@ class DiscoveryOptions:
             value = getattr(self, name)
             if not 0.0 < value < 1.0:
                 raise DataError(f"{name} must lie between 0 and 1, got {value}.")
+        if self.time_limit is not None and not self.time_limit > 0.0:
+            raise DataError(f"time_limit is a number of seconds, got {self.time_limit}.")

@@ -103,6 +103,7 @@ class Discovery:
         return {
             "verdict": self.verdict,
             "reason": self.reason,
+            "has_stopped": self.search.has_stopped,
             "preparation": self.preparation.to_dict(),
             "data_problems": list(self.problems),
             "remarks": list(self.remarks),

@@ -26,6 +26,7 @@ from npdr_ppl.discovery.recording_repair import Repair, repair
 from npdr_ppl.discovery.screening.encoder_resolution import counts
 from npdr_ppl.discovery.screening.equivalents import equivalents
 from npdr_ppl.discovery.search.alternatives import Added
+from npdr_ppl.discovery.search.deadline import Deadline
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.halves import found_in_halves, search_halves
 from npdr_ppl.discovery.search.limits import limits
@@ -109,6 +110,7 @@ class Investigation:
         self.seconds: dict[str, float] = {}
         self.progress = SearchProgress(progress)
         self._data_options = segment_options(rollouts, options)
+        self._deadline = Deadline(self.settings.time_limit)
         self._drawn: list[tuple[Hypothesis, Draws]] = []
 
     @contextmanager
@@ -167,6 +169,7 @@ class Investigation:
             data_options=self._data_options,
             seed=self.seed,
             progress=self.progress,
+            deadline=self._deadline,
         )
 
     @cached_property
@@ -222,7 +225,8 @@ class Investigation:
     @cached_property
     def halves(self) -> dict[str, Search]:
         """The missing effects of each half of the recording; empty if that was not asked for."""
-        if not self.settings.repeat or not self.search.added:
+        is_asked = self.settings.repeat and self.search.added
+        if not is_asked or self.search.has_stopped:
             return {}
         first = self.search.rounds[0].hypothesis
         with self._stage("search halves"):
@@ -336,7 +340,8 @@ class Investigation:
         verdict, reason = judge(search, effects, unexplained, gap, self.settings)
         if self.narrow_priors:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
-        if self.settings.repeat and effects and len(self.halves) < len(HALVES):
+        is_short = len(self.halves) < len(HALVES) and not search.has_stopped
+        if self.settings.repeat and effects and is_short:
             reason = f"{reason} {NOT_REPEATED}"
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"

@@ -30,6 +30,8 @@ def judge(
         gap: Metrics on the held-out recording; empty without one.
         options: Settings of the search.
     """
+    if search.has_stopped:
+        return "unknown", _best_so_far(effects, options)
     if not effects:
         if not search.rounds[-1].alarm.fired:
             return "none", "This recording shows no missing effect."
@@ -85,6 +87,16 @@ def most_doubtful(effects: Sequence[Finding], options: DiscoveryOptions) -> Find
     return max(
         (f for f in effects if f.probability < options.confidence and f.can_be_named),
         key=lambda found: found.share,
+    )
+
+
+def _best_so_far(effects: Sequence[Finding], options: DiscoveryOptions) -> str:
+    """Returns the reason of a search that a time limit ended."""
+    limit = options.time_limit or 0.0
+    names = " and ".join(found.effect.name for found in effects) or "no effect"
+    return (
+        f"The time limit of {limit:.4g} s ended the search. The best explanation so far is "
+        f"{names}. The same command continues the search."
     )
 
 

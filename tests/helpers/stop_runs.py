@@ -80,7 +80,7 @@ def start(folder, executor):
     with (folder / "errors").open("w") as errors:
         return subprocess.Popen(
             [sys.executable, "-m", "npdr_ppl.cli", "fit", "own.py:model", "--data",
-             "recording.csv", "--simulations", "2000", "--time-limit", "5", "--quiet",
+             "recording.csv", "--simulations", "2000", "--simulation-limit", "5", "--quiet",
              "--executor", executor, *workers, "--out", "fit"],
             cwd=folder, env=environment, stderr=errors,
         )  # fmt: skip

@@ -26,6 +26,7 @@ from npdr_ppl.discovery.search.alternatives import (
     weigh_alternatives,
 )
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps, polished
+from npdr_ppl.discovery.search.deadline import Deadline
 from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.likelier_pair import likelier_pair
 from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
@@ -59,6 +60,7 @@ class Searcher:
         data_options: How the recording is cut into segments; discovery's defaults if ``None``.
         seed: Seed of all random numbers.
         progress: Where to show how many candidates are done.
+        deadline: When to end with the best answer so far.
 
     Attributes:
         rollouts: The recording.
@@ -79,7 +81,9 @@ class Searcher:
         data_options: DataOptions | None = None,
         seed: int = 0,
         progress: Reporter | None = None,
+        deadline: Deadline | None = None,
     ) -> None:
+        self._deadline = deadline or Deadline(options.time_limit)
         self._model = model
         self.rollouts = rollouts
         self.options = options
@@ -209,6 +213,8 @@ class Searcher:
         current, now = first.hypothesis, first
         rounds = [first]
         while len(current.effects) < max_effects and is_something_left(first, now):
+            if self._deadline.stops():
+                break
             best, weights, tried = self._extended(current, now)
             rounds[-1] = replace(now, weights=weights, trials=tried)
             single = current if best is None else tried[best]
@@ -243,6 +249,9 @@ class Searcher:
         added: list[Added] = []
         trials: dict[tuple[str, str], Hypothesis] = {}
         is_approximate = False
+        if current.effects and self._deadline.stops():
+            current, added, trials = self.with_rivals(current, rounds)
+            return Search(rounds, current, added, trials, has_stopped=True)
         for _ in range(SEARCH.most_revisions):
             current = repeated_effects(current, self.trials, self._report)
             # As long as something remains that no law explains, the laws are approximations.
@@ -257,13 +266,16 @@ class Searcher:
             current, added, trials = self.with_rivals(
                 current, rounds, is_approximate=is_approximate
             )
+            if current.effects and self._deadline.stops():
+                break
             kept = repeated_effects(current, self.trials, self._report)
             if kept is current:
                 break
             current = kept
             added = [each for each in added if each.effect.name in current.names]
         is_approximate = is_something_left(rounds[0], self._looked(current, rounds))
-        return Search(rounds, current, added, trials, is_approximate)
+        stopped = self._deadline.has_stopped
+        return Search(rounds, current, added, trials, is_approximate, stopped)
 
     def _looked(self, current: Hypothesis, rounds: list[Round]) -> Round:
         """Returns the last round, after one is added if it has other effects than a hypothesis."""
@@ -330,7 +342,9 @@ class Searcher:
         label = f"effect {len(current.effects) + 1}"
         # Candidates that are far behind the best one are skipped.
         step = self._progress.stage(label, may_end_early=True)
-        trials = fit_shortlist(self.trials, current, ranking, self._report, step)
+        trials = fit_shortlist(
+            self.trials, current, ranking, self._report, step, self._deadline.stops
+        )
         if not trials:
             return None, {}, {}
         progress = self._progress.stage(label)
@@ -378,6 +392,8 @@ class Searcher:
         new = set(after.names) - set(before.hypothesis.names)
         pairs = [pair for pair in before.pairs if not pair.names & new]
         if len(new) != 1 or len(before.hypothesis.effects) + 2 > max_effects:
+            return current
+        if not pairs or self._deadline.stops():
             return current
         found = likelier_pair(
             before.hypothesis,

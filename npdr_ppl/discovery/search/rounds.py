@@ -54,6 +54,7 @@ class Search:
         trials: The final model with each alternative in an effect's place, by the names of the
             effect and of the alternative.
         is_approximate: Whether something remains that no law of the catalogue explains.
+        has_stopped: Whether a time limit ended it before all was tried.
     """
 
     rounds: list[Round]
@@ -61,6 +62,7 @@ class Search:
     added: list[Added]
     trials: dict[tuple[str, str], Hypothesis]
     is_approximate: bool = False
+    has_stopped: bool = False
 
 
 def explained(first: Hypothesis, final: Hypothesis) -> float:

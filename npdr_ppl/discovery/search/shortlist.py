@@ -25,6 +25,7 @@ def fit_shortlist(
     ranking: Sequence[Screened],
     report: Callable[[str], None] = lambda _: None,
     progress: Step = lambda fraction, status: None,
+    stops: Callable[[], bool] = lambda: False,
 ) -> dict[str, Hypothesis]:
     """Fits the hypothesis with each candidate of the shortlist.
 
@@ -44,14 +45,15 @@ def fit_shortlist(
         ranking: The candidates, the best first.
         report: Called with a sentence about each candidate.
         progress: Called with the fraction of the shortlist that is fitted.
+        stops: Returns whether to leave out the candidates that are not fitted yet.
     """
     if ranking:
         num = _enough_segments(current, ranking[0].gain)
         if num < current.segments.inputs.num_segments:
             index = part_of(current.segments, num)
             few, along = Trials(trials.base.along(index)), current.along(index)
-            return _fit_each(few, along, ranking, report, progress)
-    return _fit_each(trials, current, ranking, report, progress)
+            return _fit_each(few, along, ranking, report, progress, stops)
+    return _fit_each(trials, current, ranking, report, progress, stops)
 
 
 def fit_contenders(
@@ -168,6 +170,7 @@ def _fit_each(
     ranking: Sequence[Screened],
     report: Callable[[str], None],
     progress: Step,
+    stops: Callable[[], bool],
 ) -> dict[str, Hypothesis]:
     """Fits the hypothesis with each candidate along its own segments."""
     tried: dict[str, Hypothesis] = {}
@@ -177,7 +180,7 @@ def _fit_each(
     def fitted(number: int) -> None:
         progress(number / planned, f"{number} of {planned} candidates fitted")
 
-    while waiting:
+    while waiting and not (tried and stops()):
         fitted(done)
         present, waiting = (
             waiting[: TRIALS.candidates_per_decision],
