@@ -72,6 +72,7 @@ EFFECTS = (
     "supply_sag",
     "dead_zone",
     "actuator_gain",
+    "servo_gain",
     "bias",
     "cogging",
     "spring",
