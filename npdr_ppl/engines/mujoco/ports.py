@@ -39,11 +39,11 @@ def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
     """Returns the force ports of all hinges and slides.
 
     A port has the name of its joint, or ``<joint>_torque`` (``_force`` for slides) if a channel
-    has that name. The rated force is the greatest force of the actuators at the joint; without
-    actuators, it is the weight that the joint carries in the file's pose. The rated speed is the
-    speed that the rated force would give the joint over a radian (half the range, or a metre), or
-    less if damping limits it. A joint is driven if an actuator moves it in the file's pose, also
-    through tendons and sites.
+    has that name. The rated force is the greatest force of the actuators at the joint; where the
+    file does not tell it, it is the weight that the joint carries in the file's pose. The rated
+    speed is the speed that the rated force would give the joint over a radian (half the range, or
+    a metre), or less if damping limits it. A joint is driven if an actuator moves it in the file's
+    pose, also through tendons and sites.
 
     Args:
         model: A ``mujoco.MjModel``.
@@ -166,7 +166,11 @@ def actuator_moments(model: Any, data: Any) -> Array:
 
 
 def _actuator_ratings(model: Any) -> dict[int, float]:
-    """Returns the greatest total actuator force at each joint that has actuators."""
+    """Returns the greatest total actuator force at each joint that has actuators.
+
+    Servos count only with a limit of their force: a gain times the range of positions is far more
+    than a servo has.
+    """
     ratings: dict[int, float] = {}
     for actuator in range(model.nu):
         joint = actuated_joint(model, actuator)
@@ -174,7 +178,7 @@ def _actuator_ratings(model: Any) -> dict[int, float]:
             continue
         if model.actuator_forcelimited[actuator]:
             force = float(np.abs(model.actuator_forcerange[actuator]).max())
-        elif model.actuator_ctrllimited[actuator]:
+        elif model.actuator_ctrllimited[actuator] and not is_servo(model, actuator):
             control = float(np.abs(model.actuator_ctrlrange[actuator]).max())
             force = abs(float(model.actuator_gainprm[actuator, 0])) * control
         else:
