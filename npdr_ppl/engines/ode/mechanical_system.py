@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from npdr_ppl.engines.common.compilation import CompileMode
 from npdr_ppl.engines.common.effect_chain import Tables, needed_histories
 from npdr_ppl.engines.common.integrators import Components, Integrator, integrator
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.effects import EnvironmentEffect
+from npdr_ppl.language.effects import Effect, EnvironmentEffect
 
 __all__ = ["Forces", "MechanicalSystem"]
 
@@ -81,12 +81,30 @@ class MechanicalSystem(ClosedLoopSimulator):
             constants: The result of :meth:`constants`.
         """
 
+    def with_effects(self, *effects: Effect) -> Self:
+        """Returns a copy with effects attached; see :meth:`Simulator.with_effects`.
+
+        Raises:
+            ModelError: An effect changes a quantity that :meth:`environment` does not return.
+        """
+        changed = super().with_effects(*effects)
+        asked = [effect for effect in effects if isinstance(effect, EnvironmentEffect)]
+        known = self.environment(self.nominal()) if asked else {}
+        for effect in asked:
+            if effect.port not in known:
+                raise ModelError(
+                    f"{effect.id} cannot attach to {effect.port!r} of {self.name}, because its "
+                    "environment() returns no such quantity."
+                )
+        return changed
+
     def environment(self, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
         """Returns the quantities of the environment ports, by port name.
 
         By default a port in m/s² is the vector (x, y, z) of gravity on a level base, with the
         magnitude of the parameter of that name, and a port in kg is a payload of zero. A component
-        that is the number 0.0 needs no computation.
+        that is the number 0.0 needs no computation. A model with a port of kind ``servo`` adds its
+        :class:`~npdr_ppl.language.effect_context.Servo`.
         """
         environment: dict[str, Any] = {}
         for port in self.ports:
