@@ -1,5 +1,6 @@
 """Residuals of a model's segments, and their derivatives at one point."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -8,7 +9,7 @@ from torch import Tensor
 from npdr_ppl.preparation.settings import LINEARISATION
 from npdr_ppl.preparation.solving import is_invertible, solve_or_zero
 
-__all__ = ["Linearisation"]
+__all__ = ["Linearisation", "difference_quotients"]
 
 
 @dataclass(frozen=True)
@@ -106,3 +107,52 @@ class Linearisation:
     def information(self) -> Tensor:
         """Returns the Fisher information Jᵀ C⁻¹ J of the parameters, ``(d, d)``."""
         return (self.by_parameters.mT @ self.weights()).sum(0)
+
+
+def difference_quotients(
+    residuals: Callable[[Tensor, Tensor], Tensor],
+    z: Tensor,
+    offsets: Tensor,
+    moves: Tensor,
+    check: Tensor,
+    *,
+    is_rough: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns derivatives by parameters and by offsets, and residuals, from one batch.
+
+    Args:
+        residuals: Returns residuals, ``(n, S, N)``, of parameters, ``(n, d)``, and offsets,
+            ``(n, S, m)`` or ``(n, 1, m)``.
+        z: Parameters, ``(d,)``.
+        offsets: Offsets of the initial states, ``(S, m)``.
+        moves: Differences of the offsets, ``(k, m)``.
+        check: Further differences, ``(c, m)``, with which residuals are returned.
+        is_rough: Whether one-sided differences will do.
+
+    Returns:
+        Derivatives by parameters, ``(d, S, N)``, and along the moves, ``(k, S, N)``, per length of
+        a move; and residuals, ``(1 + c, S, N)``, the first without any difference.
+    """
+    d, k, c = len(z), len(moves), len(check)
+    shifts = LINEARISATION.parameter_step * torch.eye(d, dtype=torch.float64)
+    signs = (1.0,) if is_rough else (1.0, -1.0)
+    num = len(signs)
+    points = torch.cat([sign * shifts for sign in signs])
+    starts = torch.cat([sign * moves for sign in signs] + [check])[:, None]
+    unmoved = torch.zeros(num * k + c + 1, d, dtype=torch.float64)
+    no_start = torch.zeros(1, 1, offsets.shape[-1], dtype=torch.float64)
+    found = residuals(
+        z + torch.cat((points, unmoved)),
+        offsets + torch.cat((no_start.expand(num * d, -1, -1), starts, no_start)),
+    )
+    by_z, by_start, checked, here = found.split((num * d, num * k, c, 1))
+    if is_rough:
+        down, right = here.expand_as(by_z), here.expand_as(by_start)
+        up, left = by_z, by_start
+    else:
+        up, down, left, right = by_z[:d], by_z[d:], by_start[:k], by_start[k:]
+    return (
+        (down - up) / (num * LINEARISATION.parameter_step),
+        (right - left) / (num * LINEARISATION.initial_state_step),
+        torch.cat((here, checked)),
+    )

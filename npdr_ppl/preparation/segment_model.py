@@ -10,7 +10,7 @@ states. The simulator stays a black box.
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -31,7 +31,7 @@ from npdr_ppl.preparation.initial_states import (
     estimate_starts,
     uncertain_components,
 )
-from npdr_ppl.preparation.linearisation import Linearisation
+from npdr_ppl.preparation.linearisation import Linearisation, difference_quotients
 from npdr_ppl.preparation.settings import LINEARISATION
 from npdr_ppl.rollouts import Rollouts
 
@@ -402,8 +402,9 @@ class SegmentModel:
         moves = step * eye[~idle]
         # One simulation shifts all the others at once, to confirm that they have no influence.
         check = step * idle.double()[None] if bool(idle.any()) else moves[:0]
-        by_z, by_start, (here, *checked) = self._moved_residuals(
-            z, offsets, scale, moves, check, is_rough=is_rough
+        residuals = partial(self.residuals, scale=scale)
+        by_z, by_start, (here, *checked) = difference_quotients(
+            residuals, z, offsets, moves, check, is_rough=is_rough
         )
         if checked and not torch.equal(checked[0].nan_to_num(), here.nan_to_num()):
             # The simulator uses them in another way, so that all are simulated from now on.
@@ -412,55 +413,6 @@ class SegmentModel:
         starts = here.new_zeros(len(eye), *here.shape)
         starts[~idle] = by_start
         return Linearisation(here, by_z.permute(1, 2, 0), starts.permute(1, 2, 0))
-
-    def _moved_residuals(
-        self,
-        z: Tensor,
-        offsets: Tensor,
-        scale: Tensor,
-        moves: Tensor,
-        check: Tensor,
-        *,
-        is_rough: bool,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns derivatives by parameters and by offsets, and residuals.
-
-        Args:
-            z: Parameters, ``(d,)``.
-            offsets: Offsets of the initial states, ``(S, m)``.
-            scale: Standard deviation of each channel's residuals, ``(C,)``.
-            moves: Differences of the offsets, ``(k, m)``.
-            check: Further differences, ``(c, m)``, with which residuals are returned.
-            is_rough: Whether one-sided differences will do.
-
-        Returns:
-            Derivatives by parameters, ``(d, S, N)``, and along the moves, ``(k, S, N)``, per
-            length of a move; and residuals, ``(1 + c, S, N)``, the first without any difference.
-        """
-        d, k, c = len(z), len(moves), len(check)
-        shifts = LINEARISATION.parameter_step * torch.eye(d, dtype=torch.float64)
-        signs = (1.0,) if is_rough else (1.0, -1.0)
-        num = len(signs)
-        points = torch.cat([sign * shifts for sign in signs])
-        starts = torch.cat([sign * moves for sign in signs] + [check])[:, None]
-        unmoved = torch.zeros(num * k + c + 1, d, dtype=torch.float64)
-        no_start = torch.zeros(1, 1, self.num_offsets, dtype=torch.float64)
-        residual = self.residuals(
-            z + torch.cat((points, unmoved)),
-            offsets + torch.cat((no_start.expand(num * d, -1, -1), starts, no_start)),
-            scale,
-        )
-        by_z, by_start, checked, here = residual.split((num * d, num * k, c, 1))
-        if is_rough:
-            down, right = here.expand_as(by_z), here.expand_as(by_start)
-            up, left = by_z, by_start
-        else:
-            up, down, left, right = by_z[:d], by_z[d:], by_start[:k], by_start[k:]
-        return (
-            (down - up) / (num * LINEARISATION.parameter_step),
-            (right - left) / (num * LINEARISATION.initial_state_step),
-            torch.cat((here, checked)),
-        )
 
     @cached_property
     def _without_influence(self) -> Tensor:

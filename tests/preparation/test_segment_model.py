@@ -60,9 +60,9 @@ def test_offsets_that_move_no_initial_state_are_not_simulated(
     rows = []
     residuals = SegmentModel.residuals
 
-    def counted(self, z, *others):
+    def counted(self, z, *others, **options):
         rows.append(len(z))
-        return residuals(self, z, *others)
+        return residuals(self, z, *others, **options)
 
     monkeypatch.setattr(SegmentModel, "residuals", counted)
     found = segments.linearise(z, offsets, scale, is_rough=is_rough).by_starts

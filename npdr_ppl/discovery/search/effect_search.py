@@ -10,13 +10,8 @@ from torch import Tensor
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.screening.alarm import sound_alarm
-from npdr_ppl.discovery.screening.latent_force import responses
-from npdr_ppl.discovery.screening.pairs import ranked_pairs
-from npdr_ppl.discovery.screening.projection import Projection, loss_without
-from npdr_ppl.discovery.screening.sensitivities import Variant
-from npdr_ppl.discovery.screening.separation import separation_matrix
-from npdr_ppl.discovery.screening.variants import candidates_at, variants_of
+from npdr_ppl.discovery.screening.projection import loss_without
+from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.alternatives import (
     Added,
     Alternatives,
@@ -29,6 +24,7 @@ from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps, polishe
 from npdr_ppl.discovery.search.deadline import Deadline
 from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.likelier_pair import likelier_pair
+from npdr_ppl.discovery.search.look import look
 from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
 from npdr_ppl.discovery.search.repeatability import repeated_effects
@@ -40,7 +36,6 @@ from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.model import Model
-from npdr_ppl.memory import release_freed_memory
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.progress import Reporter, Step
@@ -291,43 +286,15 @@ class Searcher:
             number: Number of parallel processes; by default that of the enclosing ``workers``
                 block. The result does not depend on it.
         """
-        if self._last is not None and self._last.hypothesis is hypothesis:
-            return self._last
-        release_freed_memory()
-        averaged = hypothesis.averaged()
-        projection = Projection(averaged)
-        step = self._progress.stage("screen candidates")
-        step(None, "responses to pulses of force")
-        found = responses(averaged)
-        candidates = candidates_at(hypothesis, self.options)
-        variants = variants_of(candidates, projection, found, number=number)
-        variants = _counted(variants, len(candidates), step)
-        sensors = hypothesis.simulator.sensors
-        looks = len(hypothesis.effects)
-        alarm, ranking = sound_alarm(
-            projection,
-            variants,
-            found,
-            sensors,
-            false_alarm_rate=self.options.false_alarm_rate,
-            seed=self.seed,
-            num_looks=looks,
-        )
-        separation = separation_matrix(projection, ranking[: SEARCH.num_leading])
-        pairs = ranked_pairs(projection, ranking[: SEARCH.num_paired])
-        ranking = [candidate.without_change() for candidate in ranking]
-        width = averaged.segments.steps_per_average
-        if width > 1:
-            fastest = 0.5 / (width * hypothesis.segments.inputs.time_step)
-            self._report(
-                f"long recording: averages of {width} steps were searched, so that effects above "
-                f"{fastest:.3g} Hz are not visible"
+        if self._last is None or self._last.hypothesis is not hypothesis:
+            self._last = look(
+                hypothesis,
+                self.options,
+                seed=self.seed,
+                number=number,
+                report=self._report,
+                progress=self._progress,
             )
-        best = ", ".join(s.name for s in ranking[:3]) or "none"
-        self._report(
-            f"p = {alarm.p_value:.2g} ({alarm.strongest}); the best candidates are {best}"
-        )
-        self._last = Round(hypothesis, averaged, alarm, ranking, separation, found, pairs)
         return self._last
 
     def _extended(
@@ -488,19 +455,6 @@ class Searcher:
         found = side_by_side(function, new, number if len(new) >= number else 1)
         for effect in effects:
             yield known[effect.name] or next(found)
-
-
-def _counted(variants: Iterator[Variant], num: int, step: Step) -> Iterator[Variant]:
-    """Yields the variants, and reports of how many of ``num`` candidates they are."""
-    seen: set[str] = set()
-    step(0.0, f"0 of {num} candidates")
-    for variant in variants:
-        if variant.effect.name not in seen:
-            # The variants of a candidate follow each other: those before it are done.
-            step(len(seen) / num, f"{len(seen)} of {num} candidates")
-            seen.add(variant.effect.name)
-        yield variant
-    step(None, "laws that are not in the catalogue")
 
 
 def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:
