@@ -96,6 +96,7 @@ class FitRecord(TypedDict):
     seconds: NotRequired[dict[str, Number] | None]
     units: NotRequired[dict[str, str] | None]
     faults: NotRequired[dict[str, int] | None]
+    finer_steps: NotRequired[int]
 
 
 class BackendRow(TypedDict, total=False):

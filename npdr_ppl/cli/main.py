@@ -7,7 +7,18 @@ from typing import Any
 
 import typer
 
-from npdr_ppl.cli import compare, demo, discover, fit, listings, logs, report, reproduce, train
+from npdr_ppl.cli import (
+    compare,
+    demo,
+    discover,
+    export,
+    fit,
+    listings,
+    logs,
+    report,
+    reproduce,
+    train,
+)
 from npdr_ppl.cli.manners import (
     INTERRUPTIONS,
     Commands,
@@ -42,6 +53,7 @@ app.command(rich_help_panel="Infer parameters")(compare.compare)
 app.command(rich_help_panel="Find what is missing")(discover.discover)
 app.command(rich_help_panel="Train policies")(train.train)
 app.command(rich_help_panel="Show results")(report.report)
+app.command(rich_help_panel="Show results")(export.export)
 app.command(rich_help_panel="See it work")(reproduce.reproduce)
 app.command("models", rich_help_panel="What there is")(listings.models)
 app.command("backends", rich_help_panel="What there is")(listings.backends)

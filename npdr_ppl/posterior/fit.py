@@ -13,6 +13,7 @@ import numpy as np
 from npdr_ppl.engines.workers import collect_faults
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.inference.registry import backend as backend_by_name
+from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.language.model import Model
 from npdr_ppl.model_identity import engine_settings
 from npdr_ppl.posterior.diagnostics import Decision, diagnose
@@ -134,6 +135,7 @@ def fit(
         },
         "noise": prepared.noise,
         "preparation": prepared.summary.to_dict(),
+        "finer_steps": num_finer_steps(prepared.plain_model),
         "checks": posterior.checks(),
         "seconds": {**posterior.provenance.seconds, "sample": sampled},
         "diagnosis": diagnosis.to_dict(),

@@ -29,12 +29,13 @@ from npdr_ppl.engines.mujoco.channels import (
 )
 from npdr_ppl.engines.mujoco.environment import environment_ports, with_environment
 from npdr_ppl.engines.mujoco.fields import element_names
-from npdr_ppl.engines.mujoco.parameters import Binding, Bindings, Derivation
+from npdr_ppl.engines.mujoco.native_laws import is_native, native_law
+from npdr_ppl.engines.mujoco.parameters import Assignments, Binding, Bindings, Derivation
 from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
 from npdr_ppl.engines.mujoco.servos import with_servos
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
-from npdr_ppl.language.effects import ForceEffect, ParameterEffect
+from npdr_ppl.language.effects import Effect, EnvironmentEffect, ForceEffect, ParameterEffect
 from npdr_ppl.registry import hint
 
 __all__ = ["MujocoMechanism"]
@@ -52,6 +53,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         components: Where MuJoCo stores each state.
         readings: Where MuJoCo stores each sensor's value.
         force_ports: The force ports with the coordinates they act on.
+        file: The MJCF or URDF file; ``None`` for a compiled model.
     """
 
     uses_threads = True
@@ -77,6 +79,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         with quiet(logger.warning):
             self.model: Any = load_mjcf(source)
         self._source = recorded_mjcf(source)
+        self.file = Path(source) if isinstance(source, str | PathLike) else None
         self.prepared_models: dict[tuple[float, tuple[int, ...], bool], Any] = {}
         is_path = isinstance(source, str | PathLike)
         self._label = Path(source).name if is_path else "a model"
@@ -151,6 +154,20 @@ class MujocoMechanism(ClosedLoopSimulator):
             time_step: Seconds per control step.
             time: Seconds from the start of the rollout to the middle of each segment.
         """
+        assignments, own = self.assignments(given, time)
+        model = self.prepared(time_step / self.num_substeps(time_step), set(assignments))
+        num_threads = self.num_threads or torch.get_num_threads()
+        return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)
+
+    def assignments(
+        self, given: Mapping[str, Tensor], time: Tensor
+    ) -> tuple[Assignments, tuple[dict[str, Tensor], ...]]:
+        """Returns what to write into the model, and the effects' parameters by short name.
+
+        Args:
+            given: Given parameters, ``(N,)`` or numbers, in float64.
+            time: Seconds from the start of the rollout to the middle of each segment.
+        """
         complete = self.complete(given, torch.float64, torch.device("cpu"))
         domain = self.changed(complete, time)
         drifting = {e.port for e in self.effects if isinstance(e, ParameterEffect)}
@@ -162,12 +179,27 @@ class MujocoMechanism(ClosedLoopSimulator):
         )
         commands = [action.name for action in self.actions]
         assignments = with_servos(self.model, commands, self.effects, own, assignments)
-        model = self._prepared(time_step / self.num_substeps(time_step), set(assignments))
-        num_threads = self.num_threads or torch.get_num_threads()
-        return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)
+        by_port = {port.port.name: port for port in self.force_ports}
+        for effect, values in zip(self.effects, own, strict=True):
+            if isinstance(effect, ForceEffect) and self.is_native(effect):
+                port = by_port[effect.port]
+                assignments |= native_law(self.model, port, effect, values, assignments)
+        return assignments, own
 
-    def _prepared(self, step: float, assigned: set[tuple[str, int]]) -> Any:
-        """Returns a model for batches, from a cache if possible."""
+    def is_native(self, effect: Effect) -> bool:
+        """Returns whether an effect is a number of the engine's model, and no force of its own."""
+        if isinstance(effect, EnvironmentEffect):
+            return True
+        port = next((p for p in self.force_ports if p.port.name == effect.port), None)
+        return port is not None and is_native(self.model, port, effect, self.bindings.places)
+
+    def prepared(self, step: float, assigned: set[tuple[str, int]]) -> Any:
+        """Returns a model for batches, from a cache if possible.
+
+        Args:
+            step: Seconds per engine step.
+            assigned: Arrays and places that parameters and effects set.
+        """
         dofs = {
             port.velocity
             for port in self.force_ports

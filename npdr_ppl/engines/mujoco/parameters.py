@@ -87,10 +87,15 @@ class Bindings:
         self._check_targets()
 
     @property
+    def places(self) -> set[tuple[str, int]]:
+        """Arrays and places of the numbers that the bindings set."""
+        groups = (*self._set.values(), *self._scaled.values(), tuple(self._derived))
+        return {(e.array, e.place) for fields in groups for field in fields for e in field.entries}
+
+    @property
     def arrays(self) -> set[str]:
         """Names of the model's arrays that the bindings change."""
-        groups = (*self._set.values(), *self._scaled.values(), tuple(self._derived))
-        return {entry.array for fields in groups for field in fields for entry in field.entries}
+        return {array for array, _ in self.places}
 
     def names_setting(self, arrays: set[str]) -> set[str]:
         """Returns the parameters that set a number in one of these arrays directly."""

@@ -24,9 +24,10 @@ ACCELERATION_STAGE = 3
 class MujocoStepper(EffectChain):
     """Advances a batch whose engine stores the physical state.
 
-    Forces of effects are generalised forces, evaluated at the start of an engine step and constant
-    during it. Dry friction is the engine's own friction loss; its bound is updated before every
-    engine step.
+    Viscous friction and springs are the engine's own; see
+    :mod:`npdr_ppl.engines.mujoco.native_laws`. Other forces of effects are generalised forces,
+    evaluated at the start of an engine step and constant during it. Dry friction is the engine's
+    own friction loss; its bound is updated before every engine step.
 
     Args:
         simulator: The system and its effects.
@@ -49,6 +50,7 @@ class MujocoStepper(EffectChain):
     ) -> None:
         super().__init__(simulator, simulator.joints, time_step, histories)
         self.simulator: MujocoMechanism = simulator
+        self.force_effects = [f for f in self.force_effects if not simulator.is_native(f[1])]
         self.substeps = simulator.num_substeps(time_step)
         self._engine_step = time_step / self.substeps
         self._batch = batch

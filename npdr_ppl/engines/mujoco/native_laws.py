@@ -1,0 +1,64 @@
+"""Laws of effects that MuJoCo has itself, as numbers of its model.
+
+The engine integrates them better than a force that is held for a step: damping implicitly, springs
+at every stage.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.mujoco.parameters import Assignments
+from npdr_ppl.engines.mujoco.ports import ForcePort
+from npdr_ppl.language.effects import Effect
+
+__all__ = ["is_native", "native_law", "present"]
+
+
+def is_native(model: Any, port: ForcePort, effect: Effect, bound: set[tuple[str, int]]) -> bool:
+    """Returns whether the engine has an effect's law at a joint.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        port: The joint.
+        effect: The effect at the joint.
+        bound: Arrays and places that parameters set.
+    """
+    if effect.id == "viscous_friction":
+        return True
+    # A joint has one spring with one rest position.
+    is_free = float(model.jnt_stiffness[port.joint]) == 0.0
+    return effect.id == "spring" and is_free and ("jnt_stiffness", port.joint) not in bound
+
+
+def native_law(
+    model: Any,
+    port: ForcePort,
+    effect: Effect,
+    values: Mapping[str, Tensor],
+    assignments: Assignments,
+) -> Assignments:
+    """Returns the numbers of a model that stand for an effect, see :func:`is_native`.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        port: The joint.
+        effect: The effect.
+        values: Its parameters by short name, in float64.
+        assignments: What else is written into the model.
+    """
+    if effect.id == "viscous_friction":
+        key = "dof_damping", port.velocity
+        return {key: present(model, *key, assignments) + values["damping"]}
+    return {
+        ("jnt_stiffness", port.joint): values["stiffness"],
+        ("qpos_spring", port.position): values["rest"],
+    }
+
+
+def present(model: Any, array: str, place: int, assignments: Assignments) -> Tensor:
+    """Returns a number of a model after assignments."""
+    nominal = float(getattr(model, array).reshape(-1)[place])
+    return assignments.get((array, place), torch.tensor(nominal, dtype=torch.float64))
