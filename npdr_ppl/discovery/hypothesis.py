@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from weakref import ref
 
 import torch
 from torch import Tensor
@@ -60,7 +61,9 @@ class Hypothesis:
 
     @cached_property
     def _linearised(self) -> Linearisation:
-        return self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
+        found = self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
+        _KEPT.add(self, found.num_bytes)
+        return found
 
     def averaged(self) -> "Hypothesis":
         """Returns the hypothesis with neighbouring measurements averaged if there are very many.
@@ -164,6 +167,33 @@ class Hypothesis:
         z = self.fit.z.clamp_min(HYPOTHESIS.least_penalised)
         num = sum(len(effect.parameters) for effect in self.effects)
         return 0.5 * float(z.square().sum()) + 0.5 * num * math.log(len(self.fit.offsets))
+
+
+class _KeptLinearisations:
+    """Bounds the memory of cached linearisations: the oldest are dropped, and computed again.
+
+    A search compares tens of fitted models. On a long recording of many channels, a linearisation
+    has hundreds of megabytes.
+    """
+
+    def __init__(self) -> None:
+        self._kept: list[tuple[ref[Hypothesis], int]] = []
+
+    def add(self, hypothesis: Hypothesis, num_bytes: int) -> None:
+        """Notes that a hypothesis keeps its linearisation, and drops others if there are too many.
+
+        Args:
+            hypothesis: The hypothesis.
+            num_bytes: Size of its linearisation.
+        """
+        alive = [(h, n) for h, n in self._kept if h() is not None and h() is not hypothesis]
+        self._kept = [*alive, (ref(hypothesis), num_bytes)]
+        while len(self._kept) > 1 and sum(n for _, n in self._kept) > HYPOTHESIS.kept_bytes:
+            (oldest, _), *self._kept = self._kept
+            vars(oldest()).pop("_linearised", None)
+
+
+_KEPT = _KeptLinearisations()
 
 
 def with_effects(model: Model, effects: Sequence[Effect]) -> Model:

@@ -73,17 +73,20 @@ class HypothesisSettings:
         least_averages: Fewest averages per segment: four for each of its ten pulses of force.
         implausible_coordinate: Absolute reference coordinate above which a value is implausible:
             three standard deviations of a normal prior.
+        kept_bytes: Bytes of derivatives that fitted models keep together. More are computed again
+            where they are needed.
     """
 
     least_penalised: float = -1.0
     most_measurements: int = 100_000
     least_averages: int = 40
     implausible_coordinate: float = 3.0
+    kept_bytes: int = 2**28
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, -10.0, 0.0, "least_penalised")
-        check_range(self, 1, math.inf, "most_measurements", "least_averages")
+        check_range(self, 1, math.inf, "most_measurements", "least_averages", "kept_bytes")
         check_range(self, 1.0, 10.0, "implausible_coordinate")
 
 

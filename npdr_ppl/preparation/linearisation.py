@@ -55,6 +55,12 @@ class Linearisation:
         return Linearisation(residual, by_parameters, by_starts)
 
     @property
+    def num_bytes(self) -> int:
+        """Bytes of memory that it takes."""
+        parts = self.residual, self.by_parameters, self.by_starts
+        return sum(part.numel() * part.element_size() for part in parts)
+
+    @property
     def is_finite(self) -> bool:
         """Whether residuals and derivatives are finite, and their squares, which are summed later.
 

@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
+from npdr_ppl.discovery import hypothesis
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.segment_options import segment_options
@@ -37,3 +39,16 @@ def test_a_fit_beside_which_a_segment_diverges_is_refused(quiet):
     vars(beside)["_linearised"] = replace(quiet.linearisation, by_starts=exploding)
     with pytest.raises(DataError, match="Simulations fail right beside the model's closest fit"):
         Projection(beside)
+
+
+def test_only_the_latest_large_linearisations_are_kept(quiet, monkeypatch):
+    size = quiet.linearisation.num_bytes
+    settings = replace(hypothesis.HYPOTHESIS, kept_bytes=int(2.5 * size))
+    monkeypatch.setattr(hypothesis, "HYPOTHESIS", settings)
+    monkeypatch.setattr(hypothesis, "_KEPT", hypothesis._KeptLinearisations())
+    fits = [replace(quiet) for _ in range(3)]
+    wanted = [fit.linearisation for fit in fits]
+    assert ["_linearised" in vars(fit) for fit in fits] == [False, True, True]
+    again = fits[0].linearisation  # computed again, with the same result
+    torch.testing.assert_close(again.by_parameters, wanted[0].by_parameters, rtol=0.0, atol=0.0)
+    assert ["_linearised" in vars(fit) for fit in fits] == [True, False, True]
