@@ -16,7 +16,7 @@ __all__ = ["export"]
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished fit or discovery.")],
+    run: Annotated[Path, typer.Argument(help="Folder that was passed as --out.")],
     model: ModelArgument,
     to: Annotated[Path, typer.Option(help="MJCF file to write, beside the robot's own file.")],
     as_json: AsJson = False,

@@ -1,0 +1,100 @@
+"""`npdr export`: a run's values in the robot's own file."""
+
+import json
+
+import mujoco
+import pytest
+
+from tests.cli.test_robot_files import write_arm
+from tests.helpers.command_line import run_for_module
+
+
+def write_fit(folder, parameters):
+    """A finished fit, of which only the parameters matter here."""
+    folder.mkdir()
+    intervals = {n: {"mean": v, "sd": 0.1, "hdi_94": [0.0, 1.0]} for n, v in parameters.items()}
+    found = {"backend": "snpe-c", "parameters": intervals, "finer_steps": 0}
+    (folder / "fit.json").write_text(json.dumps(found))
+    return folder
+
+
+MODEL = """
+import pyro, pyro.distributions as dist
+import npdr_ppl as npdr
+
+arm = npdr.MujocoSimulator("arm.xml", {"kp": "actuator servo kp"})
+
+def model(inputs):
+    return npdr.simulate("x", arm, {"kp": pyro.sample("kp", dist.Uniform(20.0, 30.0))}, inputs)
+"""
+
+
+@pytest.fixture
+def fitted(tmp_path):
+    """A robot's file, a model file beside it, and a fit with an effect."""
+    write_arm(tmp_path)
+    (tmp_path / "arm_model.py").write_text(MODEL)
+    values = {"kp": 44.0, "shoulder_torque.coulomb_friction.magnitude": 0.25}
+    return tmp_path, write_fit(tmp_path / "fit", values)
+
+
+def test_values_of_a_fit_are_in_the_file_beside_the_old_ones(fitted):
+    folder, fit = fitted
+    to = folder / "identified.xml"
+    code, text, err = run_for_module("export", fit, f"{folder / 'arm_model.py'}:model", "--to", to)
+    assert code == 0, err
+    assert "+++ identified.xml" in text and "kp 44 (was 40)" in text
+    found = mujoco.MjModel.from_xml_path(str(to))
+    assert found.actuator("servo").gainprm[0] == 44.0  # outside of its prior, as after widening
+    assert found.joint("shoulder").frictionloss[0] == 0.25
+    assert (
+        mujoco.MjModel.from_xml_path(str(folder / "arm.xml")).joint("shoulder").frictionloss == 0
+    )
+
+
+def test_what_the_file_cannot_hold_is_said(fitted):
+    folder, _ = fitted
+    values = {"kp": 44.0, "elbow.encoder_bias.offset": 0.01}
+    fit = write_fit(folder / "other", values)
+    words = "export", fit, f"{folder / 'arm_model.py'}:model", "--to", folder / "new.xml"
+    code, text, err = run_for_module(*words, "--json")
+    assert code == 0, err
+    left_out = json.loads(text)["left_out"]
+    assert "an error of the measurement" in left_out["elbow.encoder_bias"]
+
+
+def test_a_discovery_is_exported_with_its_effects(fitted):
+    folder, _ = fitted
+    run_folder = folder / "discovery"
+    run_folder.mkdir()
+    parameters = {
+        "kp": {"mean": 41.0, "sd": 1.0},
+        "shoulder_torque.viscous_friction.damping": {"mean": 0.3, "sd": 0.1},
+    }
+    found = {"stage": "prove", "verdict": "named", "parameters": parameters, "finer_steps": 1}
+    (run_folder / "discovery.json").write_text(json.dumps(found))
+    to = folder / "new.xml"
+    model = f"{folder / 'arm_model.py'}:model"
+    code, _, err = run_for_module("export", run_folder, model, "--to", to, "--quiet")
+    assert code == 0, err
+    loaded = mujoco.MjModel.from_xml_path(str(to))
+    assert loaded.joint("shoulder").damping[0] == 0.3
+    assert loaded.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("fit", "arm_model.py:model", "--to", "arm.xml"), "arm.xml exists already"),
+        (("fit", "arm_model.py:model", "--to", "arm.urdf"), "npdr export writes MJCF"),
+        (("parts", "arm_model.py:model", "--to", "new.xml"), "no folder of a finished"),
+        (("other", "arm_model.py:model", "--to", "new.xml"), "give the model of the run"),
+        (("fit", "pendulum", "--to", "new.xml"), "has no port 'shoulder_torque'"),
+    ],
+)
+def test_bad_input_gives_one_sentence(fitted, monkeypatch, words, sentence):
+    folder, _ = fitted
+    monkeypatch.chdir(folder)
+    write_fit(folder / "other", {"mass": 1.0})
+    code, _, err = run_for_module("export", *words)
+    assert code == 2 and err.count("\n") == 1 and sentence in err
