@@ -97,6 +97,7 @@ class FitRecord(TypedDict):
     units: NotRequired[dict[str, str] | None]
     faults: NotRequired[dict[str, int] | None]
     finer_steps: NotRequired[int]
+    preparation: NotRequired[dict[str, Any] | None]
 
 
 class BackendRow(TypedDict, total=False):
@@ -197,6 +198,7 @@ class DiscoveryRecord(TypedDict, total=False):
     verdict: str
     reason: str
     has_stopped: bool
+    preparation: dict[str, Any] | None
     data_problems: list[str]
     remarks: list[str]
     alarm: Alarm | None

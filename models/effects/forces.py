@@ -49,6 +49,7 @@ class Spring(LinearForceEffect):
     """−k (q − q₀): a spring, or a cable that moves with the joint."""
 
     id = "spring"
+    standard_law = "spring"
     parameters = (
         Parameter("stiffness", "{port}/{coordinate}", 0.0, "stiffness k"),
         Parameter("rest", "{coordinate}", 0.0, "position q₀ without force"),

@@ -26,6 +26,7 @@ class ViscousFriction(LinearForceEffect):
     """−b v with damping b; not distinguishable from a motor's back-EMF."""
 
     id = "viscous_friction"
+    standard_law = "damping"
     parameters = (Parameter("damping", "{port} s/{coordinate}", 0.0, "force per speed b"),)
     law = "−b v"
     equivalence = (VELOCITY_FEEDBACK,)

@@ -84,8 +84,8 @@ def discover(
     time_limit: Annotated[
         float | None,
         typer.Option(
-            help="Seconds after which nothing further is tried. The result is then the best so "
-            "far, and the same command continues."
+            help="Seconds after which no further effect is searched. The result is then the best "
+            "so far; the same command with a longer limit continues."
         ),
     ] = None,
     stage: Annotated[

@@ -18,16 +18,18 @@ __all__ = ["export"]
 def export(
     run: Annotated[Path, typer.Argument(help="Folder that was passed as --out.")],
     model: ModelArgument,
-    to: Annotated[Path, typer.Option(help="MJCF file to write, beside the robot's own file.")],
+    to: Annotated[
+        Path, typer.Option(help="New file; in the robot's folder if the robot has meshes.")
+    ],
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a run's parameters and effects into the robot's MJCF file.
+    """Write a copy of the robot's MJCF file with a run's parameters and effects.
 
-    The file keeps its text; changed elements get attributes and a comment with the value that
-    they had. Posterior means are written. Effects become what MuJoCo has itself: damping, friction
-    loss, springs, payloads, tilted gravity, gains of servos, limits of controls. The others are
-    listed and left out.
+    The copy has the same text. Changed elements have the posterior means, and a comment with the
+    values that they had. Effects become what MuJoCo has itself: damping, friction loss, springs,
+    payloads, tilted gravity, gains of servos, limits of controls. The others are listed and left
+    out.
 
     Example: npdr export fit arm.xml --to arm_identified.xml
     """
@@ -38,9 +40,8 @@ def export(
         raise DataError(f"{to} is no .xml file; npdr export writes MJCF.")
     if to.exists():
         raise DataError(f"{to} exists already; choose another name or remove it first.")
-    values, finer_steps = identified(run)
-    found = export_robot(resolve_model(model), values, finer_steps=finer_steps)
-    if found.needs_folder and to.absolute().parent != found.folder.absolute():
+    found = export_robot(resolve_model(model), identified(run))
+    if found.needs_folder and to.resolve().parent != found.folder.resolve():
         raise DataError(
             f"The robot's file refers to others, such as meshes; write the new one to "
             f"{found.folder}."

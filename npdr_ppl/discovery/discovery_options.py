@@ -23,10 +23,10 @@ class DiscoveryOptions:
         confidence: Probability above which one cause is named.
         repeat: Whether both halves of the recording are searched, too. An effect that is not found
             in both is not named. This takes about twice as long.
-        time_limit: Seconds after which nothing further is tried; ``None`` for no limit. The
-            verdict is then ``unknown``, with the best explanation so far. The first test and the
-            step at which the time is over are finished, and the posterior and the held-out gap
-            follow.
+        time_limit: Seconds after which no further effect is searched; ``None`` for no limit. The
+            running step is finished. Then the effects found so far are compared with their
+            alternatives, and the posterior and the held-out gap are computed. The verdict is
+            ``unknown``, with the best explanation so far.
     """
 
     effects: tuple[Effect, ...] | None = None

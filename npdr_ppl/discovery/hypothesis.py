@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 from weakref import ref
 
 import torch
@@ -42,6 +43,10 @@ class Hypothesis:
     effects: tuple[Effect, ...]
     segments: SegmentModel
     fit: SegmentFit
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out the linearisation, which the other process computes again if it needs it."""
+        return {name: value for name, value in vars(self).items() if name != "_linearised"}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -190,7 +195,8 @@ class _KeptLinearisations:
         self._kept = [*alive, (ref(hypothesis), num_bytes)]
         while len(self._kept) > 1 and sum(n for _, n in self._kept) > HYPOTHESIS.kept_bytes:
             (oldest, _), *self._kept = self._kept
-            vars(oldest()).pop("_linearised", None)
+            if (hypothesis_kept := oldest()) is not None:
+                vars(hypothesis_kept).pop("_linearised", None)
 
 
 _KEPT = _KeptLinearisations()

@@ -319,7 +319,9 @@ class Investigation:
 
     def conclude(self) -> Discovery:
         """Runs all stages and returns the result."""
-        search = self.search
+        search, halves = self.search, self.halves
+        if any(half.has_stopped for half in halves.values()):
+            search, halves = replace(search, has_stopped=True), {}
         final = search.final
         unexplained = _unexplained(search)
         every = estimates(final, self._draws(final), _units(final))
@@ -331,7 +333,7 @@ class Investigation:
                 every,
                 at_edge,
                 again.get(added.effect.name),
-                found_in_halves(added.effect, self.halves),
+                found_in_halves(added.effect, halves),
             )
             for added, at_edge in zip(search.added, self._at_edge, strict=True)
         ]
@@ -340,7 +342,7 @@ class Investigation:
         verdict, reason = judge(search, effects, unexplained, gap, self.settings)
         if self.narrow_priors:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
-        is_short = len(self.halves) < len(HALVES) and not search.has_stopped
+        is_short = len(halves) < len(HALVES) and not search.has_stopped
         if self.settings.repeat and effects and is_short:
             reason = f"{reason} {NOT_REPEATED}"
         if self._searcher.are_steps_coarse:
@@ -377,8 +379,7 @@ class Investigation:
             seed=self.seed,
             seconds=self.seconds,
             halves={
-                name: [added.effect.name for added in half.added]
-                for name, half in self.halves.items()
+                name: [added.effect.name for added in half.added] for name, half in halves.items()
             },
         )
 

@@ -194,6 +194,11 @@ class Effect(ABC):
         return f"{self.port}.{self.id}"
 
     @property
+    def may_cover_several(self) -> bool:
+        """Whether it may attach to a group of ports; see :class:`Port`."""
+        return False
+
+    @property
     def channels(self) -> tuple[str, ...]:
         """Names of the channels, or of the one other place, that its port covers."""
         return tuple(self.port.split(","))
@@ -223,10 +228,14 @@ class ForceEffect(Effect):
     Attributes:
         needs_joint: Whether :meth:`begin_step` is called, which costs the engine two evaluations
             of the accelerations per step.
+        standard_law: ``"damping"`` with the parameter ``damping``, or ``"spring"`` with
+            ``stiffness`` and ``rest``, if the law is one that engines have themselves; else empty.
+            A subclass with another law makes it empty.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("force",)
     needs_joint: ClassVar[bool] = False
+    standard_law: ClassVar[str] = ""
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Any:
         """Returns the effect's own state at a segment's start; ``None`` if it has none."""
@@ -352,6 +361,11 @@ class ActionEffect(Effect):
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("action", "servo")
     may_be_shared: ClassVar[bool] = False
 
+    @property
+    def may_cover_several(self) -> bool:
+        """Whether several commands may have it; see ``may_be_shared``."""
+        return self.may_be_shared
+
     def initial_memory(self, command: Tensor, start: Start) -> Any:
         """Returns the effect's own state after a long time with a constant ``command``.
 
@@ -381,6 +395,11 @@ class SensorEffect(Effect):
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
     needs_past: ClassVar[bool] = False
     spans: ClassVar[tuple[SensorSpan, ...]] = ("position", "rate", "positions", "rates")
+
+    @property
+    def may_cover_several(self) -> bool:
+        """Whether one device may affect several channels: always."""
+        return True
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
         """Returns the number of past true values that the memory holds."""

@@ -92,6 +92,10 @@ class Simulator(ABC):
                     f"but {port.name!r} of {self.name} is of kind {port.kind}; suitable are "
                     f"{', '.join(suitable) or 'none of its ports'}."
                 )
+            if len(port.channels) > 1 and not effect.may_cover_several:
+                raise ModelError(
+                    f"{effect.id} attaches to one port; attach it to each of {port.name}."
+                )
             if not effect.suits(port):
                 raise ModelError(
                     f"{effect.id} makes no sense at the port {port.name!r} of {self.name}, "

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from pyro import poutine
@@ -11,19 +11,39 @@ from torch import Tensor
 from npdr_ppl.engines.mujoco.export import ExportedMjcf, export_mjcf
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.errors import DataError, ModelError
-from npdr_ppl.language.handlers import SkipSimulation, add_effect, with_finer_steps
+from npdr_ppl.language.handlers import (
+    SkipSimulation,
+    add_effect,
+    num_finer_steps,
+    with_finer_steps,
+)
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.program_runs import alone, sample_sites, traced
 from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
 from npdr_ppl.models.effects import effect_class
+from npdr_ppl.posterior.run_folder import MAX_FINER_STEPS
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import DiscoveryRecord, FitRecord
 
-__all__ = ["export_robot", "identified"]
+__all__ = ["Identified", "export_robot", "identified"]
 
 
-def identified(run: Path) -> tuple[dict[str, float], int]:
-    """Returns posterior means by site, and how often steps were refined, of a finished run.
+class Identified(NamedTuple):
+    """What a finished run found.
+
+    Attributes:
+        values: Posterior means by site.
+        finer_steps: How often the simulator's steps were refined, those of the model included.
+        time_step: Seconds per step of the recording; ``None`` if the run does not say.
+    """
+
+    values: dict[str, float]
+    finer_steps: int
+    time_step: float | None
+
+
+def identified(run: Path) -> Identified:
+    """Returns what a finished run found.
 
     Args:
         run: Folder of a fit or a discovery.
@@ -44,47 +64,56 @@ def identified(run: Path) -> tuple[dict[str, float], int]:
         values[name] = float(interval["mean"])
     if not values:
         raise DataError(f"{run} has no parameters; let npdr discover run to its end.")
-    return values, int(found.get("finer_steps") or 0)
+    prepared = found.get("preparation") or {}
+    length, seconds = prepared.get("segment_length"), prepared.get("segment_seconds")
+    step = float(seconds) / float(length) if length and seconds else None
+    return Identified(values, int(found.get("finer_steps") or 0), step)
 
 
-def export_robot(
-    model: Callable[..., Any], values: Mapping[str, float], *, finer_steps: int = 0
-) -> ExportedMjcf:
-    """Writes values of a model's sites into the MJCF file of its simulator.
+def export_robot(model: Callable[..., Any], found: Identified) -> ExportedMjcf:
+    """Writes a run's values into the MJCF file of its model's simulator.
 
-    Effects that the values name, as ``<port>.<effect>.<parameter>``, are added to the model first.
+    Effects of the catalogue that the values name, as ``<port>.<effect>.<parameter>``, are added to
+    the model first.
 
     Args:
         model: A Pyro model with one simulator, a ``MujocoSimulator`` of a file.
-        values: Values by site.
-        finer_steps: How often the simulator's steps were refined.
+        found: What the run found.
 
     Raises:
         ModelError: The model has another simulator, or the file cannot hold a parameter.
     """
-    known = {effect.name for effect in _box(model, {}).simulator.effects}
-    for name in dict.fromkeys(site.rpartition(".")[0] for site in values if "." in site):
-        if name not in known:
-            port, _, effect = name.rpartition(".")
+    _, sites = _traced(model, {})
+    for name in dict.fromkeys(s.rpartition(".")[0] for s in found.values if s not in sites):
+        port, _, effect = name.rpartition(".")
+        if port:
             model = add_effect(model, effect_class(effect)(port))
-    for _ in range(finer_steps):
+    finer = found.finer_steps - num_finer_steps(model)
+    for _ in range(min(finer, MAX_FINER_STEPS)):
         model = with_finer_steps(model)
-    given = {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
-    box = _box(model, given)
+    given = {n: torch.tensor(value, dtype=torch.float64) for n, value in found.values.items()}
+    box, sites = _traced(model, given)
+    other = sorted(sites ^ given.keys())
+    if other:
+        raise ModelError(
+            f"{other[0]} is a parameter of only one of model and run; give the model of the run."
+        )
     if not isinstance(box.simulator, MujocoMechanism):
         raise ModelError(f"{box.simulator.name} has no MJCF file.")
-    return export_mjcf(box.simulator, box.parameters)
+    return export_mjcf(box.simulator, box.parameters, time_step=found.time_step)
 
 
-def _box(model: Callable[..., Any], values: Mapping[str, Tensor]) -> SimulatorBlackBox:
-    """Returns the simulator of a model, at given values of all sites.
+def _traced(
+    model: Callable[..., Any], values: Mapping[str, Tensor]
+) -> tuple[SimulatorBlackBox, set[str]]:
+    """Returns the simulator of a model at given values of its sites, and the sites' names.
 
     Args:
         model: The model.
-        values: Values by site; if there are none, they are drawn from the priors.
+        values: Values by site; those that are not given are drawn from the priors.
 
     Raises:
-        ModelError: There is not one simulator, or the sites are not those that are given.
+        ModelError: There is not one simulator.
     """
     with alone(), torch.random.fork_rng(devices=[]), SkipSimulation():
         trace = traced(poutine.condition(model, data=dict(values)), (_nothing(),))
@@ -93,12 +122,7 @@ def _box(model: Callable[..., Any], values: Mapping[str, Tensor]) -> SimulatorBl
     if len(boxes) != 1 or not isinstance(boxes[0], SimulatorBlackBox):
         raise ModelError("A robot's file is written for models with one simulator.")
     latent = {name for name, site in sites.items() if not isinstance(site["fn"], BlackBox)}
-    other = sorted(latent ^ values.keys()) if values else []
-    if other:
-        raise ModelError(
-            f"{other[0]} is a parameter of only one of model and run; give the model of the run."
-        )
-    return boxes[0]
+    return boxes[0], latent
 
 
 def _nothing() -> Inputs:

@@ -4,6 +4,7 @@ import re
 
 import mujoco
 import pytest
+import torch
 
 from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.engines.mujoco.export import export_mjcf
@@ -11,8 +12,10 @@ from npdr_ppl.engines.mujoco.mjcf_edits import MjcfText
 from npdr_ppl.errors import ModelError
 from npdr_ppl.models.effects import (
     Backlash,
+    Contact,
     CoulombFriction,
     EncoderBias,
+    InputDelay,
     Payload,
     Saturation,
     ServoGain,
@@ -199,7 +202,7 @@ def test_what_the_file_cannot_hold_is_listed(tmp_path):
         for n, number in e.probe(simulator.port(e.port)).items()
     }
     refused = export_mjcf(simulator, given).refused
-    assert refused["elbow_torque.backlash"] == "MuJoCo has no such law"
+    assert refused["elbow_torque.backlash"] == "npdr export does not write this law"
     assert "an error of the measurement" in refused["elbow.encoder_bias"]
     assert "has a spring already" in refused["elbow_torque.spring"]
 
@@ -220,7 +223,7 @@ def test_all_other_text_stays(tmp_path):
     [
         (' name="elbow" axis', " axis", "joint joint_1 damping", "no joint called 'joint_1'"),
         ("<compiler", '<compiler inertiafromgeom="true"', "body hand mass", "inertiafromgeom"),
-        ("", "", "actuator motor gain", "bind its gear"),
+        ("", "", "actuator motor gain", "make its gear"),
     ],
 )
 def test_what_cannot_be_written_is_refused(tmp_path, old, new, address, sentence):
@@ -232,6 +235,95 @@ def test_what_cannot_be_written_is_refused(tmp_path, old, new, address, sentence
     simulator = MujocoSimulator(path, {"it": address})
     with pytest.raises(ModelError, match=re.escape(sentence)):
         export_mjcf(simulator, {"it": value(1.5)})
+
+
+SETTINGS = """<mujoco><default><position kp="20" {default}/></default><worldbody>
+  <body name="b"><joint name="j" axis="0 1 0" {joint}/>
+    <geom name="g" type="sphere" size="0.1" mass="0.4"/></body>
+  {frame}</worldbody>
+  <actuator><position name="servo" joint="j" {servo}/></actuator></mujoco>"""
+
+
+def write_robot(folder, **settings):
+    path = folder / "robot.xml"
+    nothing = dict.fromkeys(("default", "joint", "frame", "servo"), "")
+    path.write_text(SETTINGS.format(**nothing | settings))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("settings", "address", "array"),
+    [
+        ({"default": 'dampratio="1"'}, "actuator servo kp", "biasprm"),
+        ({"joint": 'springdamper="0.1 1"'}, "body b mass_and_inertia", "stiffness"),
+        (
+            {"frame": '<frame pos="0 0 1"><body name="c"><geom size="0.1"/></body></frame>'},
+            "body c position x",
+            "body_pos",
+        ),
+    ],
+)
+def test_settings_that_replace_a_value_are_noticed(tmp_path, settings, address, array):
+    path = write_robot(tmp_path, **settings)
+    with pytest.raises(ModelError, match=f"{array} would differ"):
+        export_mjcf(MujocoSimulator(path, {"it": address}), {"it": value(0.3)})
+
+
+def test_a_damping_ratio_is_replaced_by_the_damping(tmp_path):
+    path = write_robot(tmp_path, servo='dampratio="1"')
+    simulator = MujocoSimulator(path, {"mass": "body b mass_and_inertia"})
+    difference, _ = largest_difference(simulator, {"mass": 0.7})
+    assert difference == 0.0
+
+
+def test_springs_and_dampers_of_higher_order_stay(tmp_path):
+    joint = 'stiffness="0 5" springref="20" damping="0.1 0.2"'
+    base = MujocoSimulator(write_robot(tmp_path, joint=joint))
+    inputs = random_inputs(base)
+    sprung = base.with_effects(Spring("j_torque"))
+    zero = {"j_torque.spring.stiffness": value(0.0), "j_torque.spring.rest": value(0.3)}
+    assert torch.equal(sprung.simulate(zero, inputs), base.simulate({}, inputs))
+    damped = base.with_effects(ViscousFriction("j_torque"))
+    difference, matters = largest_difference(damped, {"j_torque.viscous_friction.damping": 0.3})
+    assert difference == 0.0 and matters > 1e-3
+
+
+@pytest.mark.parametrize(("flag", "effect"), [("damper", ViscousFriction), ("spring", Spring)])
+def test_effects_act_where_the_engine_has_switched_its_own_law_off(tmp_path, flag, effect):
+    path = write_robot(tmp_path)
+    option = f'<option><flag {flag}="disable"/></option><default>'
+    path.write_text(path.read_text().replace("<default>", option))
+    base = MujocoSimulator(path)
+    attached = effect("j_torque")
+    changed = base.with_effects(attached)
+    inputs = random_inputs(base)
+    probe = attached.probe(base.port("j_torque"))
+    given = {f"{attached.name}.{name}": value(number) for name, number in probe.items()}
+    assert not torch.equal(changed.simulate(given, inputs), base.simulate({}, inputs))
+    assert attached.name in export_mjcf(changed, given).refused
+
+
+def test_an_effect_that_cannot_be_written_leaves_the_others(tmp_path):
+    path = write_arm(tmp_path)
+    path.write_text(path.read_text().replace(' contype="0" conaffinity="0"', ""))
+    simulator = MujocoSimulator(path).with_effects(Contact("contact"), Payload("payload"))
+    given = {"contact.contact.friction": value(0.2), "payload.payload.mass": value(0.1)}
+    found = export_mjcf(simulator, given)
+    assert list(found.refused) == ["contact.contact"]
+    assert "no geom called" in found.refused["contact.contact"]
+    assert "npdr: mass" in found.text
+
+
+def test_the_step_is_that_of_the_recording(tmp_path):
+    simulator = MujocoSimulator(write_arm(tmp_path))  # 2 ms
+    assert 'timestep="0.0015"' in export_mjcf(simulator, {}, time_step=0.003).text
+
+
+def test_an_effect_is_attached_to_one_servo(tmp_path):
+    simulator = MujocoSimulator(write_servos(tmp_path))
+    with pytest.raises(ModelError, match="attach it to each of one,two"):
+        simulator.with_effects(ServoGain("one,two"))
+    assert simulator.with_effects(InputDelay("one,two")).effects
 
 
 def test_a_compiled_model_has_no_file():

@@ -208,7 +208,8 @@ class Searcher:
         current, now = first.hypothesis, first
         rounds = [first]
         while len(current.effects) < max_effects and is_something_left(first, now):
-            if self._deadline.stops():
+            # At least the likeliest candidates are fitted, so that there is an answer.
+            if len(rounds) > 1 and self._deadline.stops():
                 break
             best, weights, tried = self._extended(current, now)
             rounds[-1] = replace(now, weights=weights, trials=tried)

@@ -187,11 +187,13 @@ class MujocoMechanism(ClosedLoopSimulator):
         return assignments, own
 
     def is_native(self, effect: Effect) -> bool:
-        """Returns whether an effect is a number of the engine's model, and no force of its own."""
+        """Returns whether the engine's model has the effect, so that no further force acts."""
         if isinstance(effect, EnvironmentEffect):
             return True
-        port = next((p for p in self.force_ports if p.port.name == effect.port), None)
-        return port is not None and is_native(self.model, port, effect, self.bindings.places)
+        ports = [p for p in self.force_ports if p.port.name == effect.port]
+        if not isinstance(effect, ForceEffect) or not ports:
+            return False
+        return is_native(self.model, ports[0], effect, self.bindings.places)
 
     def prepared(self, step: float, assigned: set[tuple[str, int]]) -> Any:
         """Returns a model for batches, from a cache if possible.

@@ -4,20 +4,24 @@ The engine integrates them better than a force that is held for a step: damping 
 at every stage.
 """
 
+import importlib
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from npdr_ppl.engines.mujoco.parameters import Assignments
 from npdr_ppl.engines.mujoco.ports import ForcePort
-from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.effects import ForceEffect
 
 __all__ = ["is_native", "native_law", "present"]
 
 
-def is_native(model: Any, port: ForcePort, effect: Effect, bound: set[tuple[str, int]]) -> bool:
+def is_native(
+    model: Any, port: ForcePort, effect: ForceEffect, bound: set[tuple[str, int]]
+) -> bool:
     """Returns whether the engine has an effect's law at a joint.
 
     Args:
@@ -26,17 +30,26 @@ def is_native(model: Any, port: ForcePort, effect: Effect, bound: set[tuple[str,
         effect: The effect at the joint.
         bound: Arrays and places that parameters set.
     """
-    if effect.id == "viscous_friction":
-        return True
+    mujoco: Any = importlib.import_module("mujoco")
+    off = int(model.opt.disableflags)
+    if effect.standard_law == "damping":
+        return not off & int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
+    if effect.standard_law != "spring" or off & int(mujoco.mjtDisableBit.mjDSBL_SPRING):
+        return False
     # A joint has one spring with one rest position.
-    is_free = float(model.jnt_stiffness[port.joint]) == 0.0
-    return effect.id == "spring" and is_free and ("jnt_stiffness", port.joint) not in bound
+    stiffness = [model.jnt_stiffness[port.joint], *np.atleast_1d(_poly(model)[port.joint])]
+    return not np.any(stiffness) and ("jnt_stiffness", port.joint) not in bound
+
+
+def _poly(model: Any) -> Any:
+    """Returns the higher coefficients of springs, which earlier versions do not have."""
+    return getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))
 
 
 def native_law(
     model: Any,
     port: ForcePort,
-    effect: Effect,
+    effect: ForceEffect,
     values: Mapping[str, Tensor],
     assignments: Assignments,
 ) -> Assignments:
@@ -49,7 +62,7 @@ def native_law(
         values: Its parameters by short name, in float64.
         assignments: What else is written into the model.
     """
-    if effect.id == "viscous_friction":
+    if effect.standard_law == "damping":
         key = "dof_damping", port.velocity
         return {key: present(model, *key, assignments) + values["damping"]}
     return {
