@@ -129,6 +129,7 @@ def sample_posterior(
     *,
     seed: int,
     reaches_ends: bool = True,
+    most_iterations: int | None = None,
 ) -> WeightedDraws:
     """Draws from the posterior of a recording by adaptive importance sampling.
 
@@ -141,6 +142,7 @@ def sample_posterior(
             posteriors that a backend has learnt.
         seed: Seed of the draws.
         reaches_ends: Whether draws move on to the ends of a ridge.
+        most_iterations: Greatest number of proposals; that of the settings by default.
     """
     prior = likelihood.segments.prior
     space = RidgeCoordinates.of(likelihood, seed=seed)
@@ -149,7 +151,7 @@ def sample_posterior(
     given = [_Proposal(density, settings.draws_of_given) for density in proposals]
     z, w, target, log_mixture = (torch.empty(0, dtype=torch.float64) for _ in range(4))
     result: WeightedDraws | None = None
-    for iteration in range(settings.most_iterations):
+    for iteration in range(most_iterations or settings.most_iterations):
         with seeded(seed, "importance", iteration):
             new_w = own[-1].density.sample(settings.draws_per_iteration).double()
             new_z, inside = space.to_reference(new_w)

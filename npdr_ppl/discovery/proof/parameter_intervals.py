@@ -71,7 +71,7 @@ class Draws:
         return self.z[systematic(self.weights.log(), num)]
 
 
-def posterior_draws(hypothesis: Hypothesis, *, seed: int, reaches_ends: bool = True) -> Draws:
+def posterior_draws(hypothesis: Hypothesis, *, seed: int, is_rough: bool = False) -> Draws:
     """Returns draws of the posterior, given the recording.
 
     They come from adaptive importance sampling; see
@@ -80,14 +80,19 @@ def posterior_draws(hypothesis: Hypothesis, *, seed: int, reaches_ends: bool = T
     Args:
         hypothesis: The fitted model.
         seed: Seed of the draws.
-        reaches_ends: Whether draws move on to the ends of ridges. Without, intervals along
-            them are up to a tenth too short, and half as many simulations suffice.
+        is_rough: Whether the draws are for predictions only: then they take at most
+            ``INTERVALS.rough_iterations`` proposals and do not move on to the ends of ridges.
 
     Raises:
         DataError: Simulations fail close to the fit.
     """
     own_seed = derived_seed(seed, "discovery", "posterior")
-    found = sample_posterior(hypothesis.likelihood, seed=own_seed, reaches_ends=reaches_ends)
+    found = sample_posterior(
+        hypothesis.likelihood,
+        seed=own_seed,
+        reaches_ends=not is_rough,
+        most_iterations=INTERVALS.rough_iterations if is_rough else None,
+    )
     counts = found.weights > 0.0  # without failed simulations, whose parameters can be anything
     return Draws(found.z[counts], found.weights[counts])
 

@@ -71,15 +71,18 @@ class IntervalSettings:
             interval of draws that are not smoothed would be where they happen to be dense.
         bandwidth: Spread of these draws, in standard deviations of the posterior.
         mass: Probability of the interval of highest density.
+        rough_iterations: Greatest number of proposals for draws of a model that lacks effects.
+            Their weights need not be reliable, because the model is wrong.
     """
 
     copies: int = 16
     bandwidth: float = 0.3
     mass: float = 0.94
+    rough_iterations: int = 2
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
-        check_range(self, 1, 1000, "copies")
+        check_range(self, 1, 1000, "copies", "rough_iterations")
         check_range(self, 0.0, 1.0, "bandwidth", "mass")
 
 
