@@ -19,6 +19,7 @@ from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.memory import release_freed_memory
 
 __all__ = [
     "Added",
@@ -97,10 +98,13 @@ def find_alternatives(
     without = trials.without(current, effect)
     if without is None:
         return None
+    release_freed_memory()
     candidates = tuple(e for e in candidates_at(without, options) if e.name != effect.name)
     averaged = without.averaged()
     projection = Projection(averaged)
     ranking = screen(projection, variants_of(candidates, projection, responses(averaged)))
+    ranking = [candidate.without_change() for candidate in ranking]
+    release_freed_memory()
     tried = fit_shortlist(trials, without, ranking)
     tried = fit_contenders(trials, tried, without, done={effect.name: current})
     others = {name: h for name, h in tried.items() if name != effect.name}
