@@ -59,9 +59,10 @@ def identified(run: Path) -> Identified:
         raise DataError(f"{run} is no folder of a finished npdr fit or npdr discover.")
     values = {}
     for name, interval in found.get("parameters", {}).items():
-        if not isinstance(interval["mean"], int | float):
+        mean = interval.get("mean")
+        if not isinstance(mean, int | float):
             raise DataError(f"{name} is not a single number, so no file can hold it.")
-        values[name] = float(interval["mean"])
+        values[name] = float(mean)
     if not values:
         raise DataError(f"{run} has no parameters; let npdr discover run to its end.")
     prepared = found.get("preparation") or {}
