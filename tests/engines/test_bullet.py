@@ -30,14 +30,14 @@ TIME_STEP = 0.02
 
 PORTS = {
     "force": "hinge", "action": "torque", "sensor": "angle", "environment": "gravity",
-    "clock": "clock", "parameter": "mass",
+    "clock": "clock", "parameter": "mass", "servo": "torque",
 }  # fmt: skip
 
 # What needs more of the joint or of rates than Bullet gives, and what needs a port that
 # a scene does not have.
 REFUSED = {
     "backlash", "clock_skew", "contact", "joint_elasticity", "load_dependent_friction", "payload",
-    "presliding_friction", "sensor_delay",
+    "presliding_friction", "sensor_delay", "servo_gain",
 }  # fmt: skip
 
 # Bullet works in float64 here and its Featherstone dynamics of one joint are the same formula.
