@@ -2,6 +2,7 @@
 
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TextIO
@@ -127,7 +128,7 @@ class _Labelled(Reporter):
             yield step
 
 
-class _TimedReporter(Reporter):
+class _TimedReporter(Reporter, ABC):
     """Keeps the time left of the present stage and of the outermost work of equal parts.
 
     Args:
@@ -142,6 +143,7 @@ class _TimedReporter(Reporter):
         self._shown: tuple[TimeLeft, str, str] | None = None
         self._overall: tuple[TimeLeft, str, str] | None = None
 
+    @abstractmethod
     def show(self, label: str, fraction: float | None, status: str) -> None:
         """Shows a report of a stage.
 
@@ -150,7 +152,6 @@ class _TimedReporter(Reporter):
             fraction: The fraction done, ``None`` if the total is not known.
             status: A short status.
         """
-        raise NotImplementedError
 
     def stage(self, label: str, *, may_end_early: bool = False) -> Step:
         left = TimeLeft(self._clock)

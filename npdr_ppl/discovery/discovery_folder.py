@@ -121,8 +121,8 @@ class DiscoveryFolder:
             with replacing(self.path / "revised_model.py") as temporary:
                 temporary.write_text(source, encoding="utf-8")
         write_json(self.path / "discovery.json", found)
-        is_needed = found.get("has_stopped", False) or found["stage"] != STAGES[-1]
-        if not is_needed:
+        if found["stage"] == STAGES[-1] and not found.get("has_stopped", False):
+            # No later run needs them.
             shutil.rmtree(self.path / FITS, ignore_errors=True)
 
 

@@ -8,7 +8,7 @@ import torch
 
 from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.engines.mujoco.export import export_mjcf
-from npdr_ppl.engines.mujoco.mjcf_edits import MjcfText
+from npdr_ppl.engines.mujoco.mjcf_text import MjcfText
 from npdr_ppl.errors import ModelError
 from npdr_ppl.models.effects import (
     Backlash,

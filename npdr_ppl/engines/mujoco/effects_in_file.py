@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
-from npdr_ppl.engines.mujoco.native_laws import present
-from npdr_ppl.engines.mujoco.parameters import Assignments
+from npdr_ppl.engines.mujoco.parameters import Assignments, present
 from npdr_ppl.language.effects import Effect
 
 __all__ = ["file_assignments", "why_not"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.engines.mujoco.fields import element_names
-from npdr_ppl.engines.mujoco.parameters import Assignments
+from npdr_ppl.engines.mujoco.parameters import Assignments, present
 from npdr_ppl.language.channels import Port
 from npdr_ppl.language.effects import Effect, EnvironmentEffect
 
@@ -85,18 +85,15 @@ def with_environment(
     by_name = {port.port.name: port for port in ports}
     result = dict(assignments)
 
-    def present(array: str, place: int, nominal: float) -> Tensor:
-        return result.get((array, place), torch.tensor(float(nominal), dtype=torch.float64))
-
     for effect, values in zip(effects, parameters, strict=True):
         if not isinstance(effect, EnvironmentEffect) or effect.port not in by_name:
             continue
         port = by_name[effect.port]
         if port.body is not None:
-            mass = present("body_mass", port.body, model.body_mass[port.body])
+            mass = present(model, "body_mass", port.body, result)
             result["body_mass", port.body] = effect.environment(mass, values)
         elif port.port.name == "gravity":
-            gravity = tuple(present("opt.gravity", i, g) for i, g in enumerate(model.opt.gravity))
+            gravity = tuple(present(model, "opt.gravity", i, result) for i in range(3))
             changed = effect.environment(gravity, values)
             result |= {("opt.gravity", i): g for i, g in enumerate(changed)}
         else:
@@ -110,7 +107,7 @@ def with_environment(
                         number = float(table[row, column])
                         # Negative values of solref are a stiffness, the inverse of compliance.
                         exponent = -1.0 if number < 0.0 and "solref" in array else power
-                        value = present(array, place, number)
+                        value = present(model, array, place, result)
                         result[array, place] = value * factors[name] ** exponent
     return result
 

@@ -1,193 +1,295 @@
-"""Changes attributes of elements in the text of an MJCF file, and leaves all the rest as it is."""
+"""Numbers of a MuJoCo model as attributes of elements in an MJCF file's text."""
 
-import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import importlib
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
-from xml.parsers import expat
 
-from npdr_ppl.engines.common.robot_files import RobotFiles
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.engines.mujoco.fields import element_names
+from npdr_ppl.engines.mujoco.mjcf_text import MjcfText
 from npdr_ppl.errors import ModelError
 
-__all__ = ["MjcfText", "Tag", "flattened"]
+__all__ = ["Edits", "array_of"]
+
+Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Tag:
-    """The start tag of an element.
-
-    Attributes:
-        name: The element's name.
-        attributes: Its attributes as they are written.
-        start: Place of its first byte.
-        end: Place behind its last byte.
-        parents: Names of the elements around it, the outermost first.
-        parent: Number of the tag of the element around it; -1 for the outermost.
-    """
-
-    name: str
-    attributes: Mapping[str, str]
-    start: int
-    end: int
-    parents: tuple[str, ...]
-    parent: int
+def array_of(model: Any, name: str) -> Array:
+    """Returns an array of a model by its name, ``"opt.…"`` for options."""
+    if name.startswith("opt."):
+        return np.atleast_1d(getattr(model.opt, name.removeprefix("opt.")))
+    return np.asarray(getattr(model, name))
 
 
-@dataclass
-class MjcfText:
-    """The text of an MJCF file, with changes to be made.
-
-    Attributes:
-        text: The text, in UTF-8.
-        tags: Its start tags, in the order of the text.
-    """
-
-    text: bytes
-    tags: list[Tag] = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Finds the tags."""
-        self.tags = _tags(self.text)
-        self._changed: dict[int, dict[str, str | None]] = {}
-        self._comments: dict[int, list[str]] = {}
-        self._inside: dict[int, str] = {}
-
-    def within(self, section: str) -> list[int]:
-        """Returns the numbers of the tags below elements of the outermost one.
-
-        Args:
-            section: Their name, e.g. ``"worldbody"``.
-        """
-        return [i for i, tag in enumerate(self.tags) if tag.parents[1:2] == (section,)]
-
-    def sections(self, name: str) -> list[int]:
-        """Returns the numbers of the elements with a name directly below the outermost one."""
-        return [i for i, t in enumerate(self.tags) if len(t.parents) == 1 and t.name == name]
-
-    def child(self, number: int, name: str) -> int | None:
-        """Returns the number of an element's first child with a name, ``None`` without one."""
-        found = (i for i, t in enumerate(self.tags) if t.parent == number and t.name == name)
-        return next(found, None)
-
-    def set(self, number: int, attributes: Mapping[str, str | None], comment: str = "") -> None:
-        """Changes attributes of an element.
-
-        Args:
-            number: Number of its tag.
-            attributes: New values; ``None`` to remove the attribute.
-            comment: What to write above it.
-        """
-        self._changed.setdefault(number, {}).update(attributes)
-        known = self._comments.setdefault(number, [])
-        if comment and comment not in known:
-            known.append(comment)
-
-    def insert(self, number: int, element: str) -> None:
-        """Puts an element behind a start tag, as the first child of its element."""
-        self._inside[number] = element
-
-    def result(self) -> str:
-        """Returns the text with all changes."""
-        text = self.text
-        for number in sorted({*self._changed, *self._comments, *self._inside}, reverse=True):
-            tag = self.tags[number]
-            written = text[tag.start : tag.end]
-            indent = _indent(text, tag.start)
-            for name, value in self._changed.get(number, {}).items():
-                written = _with_attribute(written, name, value)
-            if number in self._inside:
-                written = _opened(written, tag.name, self._inside[number], indent)
-            comments = self._comments.get(number, ())
-            before = b"".join(f"<!-- {text} -->".encode() + indent for text in comments)
-            text = text[: tag.start] + before + written + text[tag.end :]
-        return text.decode()
-
-
-def flattened(files: RobotFiles) -> bytes:
-    """Returns the text of a robot's first file, with the content of included files in their place.
+class Edits:
+    """Turns numbers of a model into attributes.
 
     Args:
-        files: The files.
-
-    Raises:
-        ModelError: An included file cannot be read.
+        text: The file's text.
+        before: The file's model.
+        model: The model with the new numbers.
     """
-    (first, text), *_ = files.texts.items()
-    return _included(files, first, text.encode(), frozenset({first}))
+
+    def __init__(self, text: MjcfText, before: Any, model: Any) -> None:
+        self.text = text
+        self.before = before
+        self.model = model
+        self._degrees = self._angles_are_degrees()
+        self._options: dict[str, tuple[str, str]] = {}  # of a file that has no such element
+
+    def write(self, array: str, places: Sequence[int]) -> None:
+        """Writes the numbers of an array at some places.
+
+        Args:
+            array: Its name.
+            places: Places in the flat array.
+        """
+        if array.startswith("opt."):
+            name = array.removeprefix("opt.")
+            old, new = (_words(array_of(model, array)) for model in (self.before, self.model))
+            self._option(name, new, old)
+            return
+        width = int(np.prod(array_of(self.model, array).shape[1:]))
+        if array not in _WRITERS:
+            raise ModelError(f"{array} cannot be written into an MJCF file.")
+        for row in sorted({place // width for place in places}):
+            _WRITERS[array](self, row)
+
+    def keep_damping(self) -> None:
+        """Writes the kv of servos for which the file gives a damping ratio, which would set it."""
+        for actuator in range(int(self.model.nu)):
+            try:
+                place = self.element("actuator", actuator)
+            except ModelError:  # it has no name, and nothing about it changes
+                continue
+            if "dampratio" in self.text.tags[place].attributes:
+                kv = -float(self.model.actuator_biasprm[actuator, 2])
+                self.text.set(place, {"dampratio": None, "kv": _words(kv)})
+
+    def write_options(self, step: float) -> None:
+        """Writes the step and the integrator, if they differ from the file's."""
+        old = float(self.before.opt.timestep)
+        if step != old:
+            self._option("timestep", repr(step), repr(old))
+        stated = [self.text.tags[i].attributes for i in self.text.sections("option")]
+        named = [attributes["integrator"] for attributes in stated if "integrator" in attributes]
+        was = (named or ["Euler"])[-1]
+        now = _INTEGRATORS[int(self.model.opt.integrator)]
+        if now != was:
+            self._option("integrator", now, was)
+
+    def _option(self, name: str, value: str, was: str) -> None:
+        note = f"npdr: {name} {value} (was {was})"
+        sections = self.text.sections("option")
+        if sections:
+            self.text.set(sections[-1], {name: value}, note)
+            return
+        self._options[name] = value, note
+        words = " ".join(f'{name}="{value}"' for name, (value, _) in self._options.items())
+        notes = " ".join(f"<!-- {note} -->" for _, note in self._options.values())
+        self.text.insert(0, f"{notes} <option {words}/>")
+
+    def element(self, kind: str, number: int) -> int:
+        """Returns the tag of an element of the world, an actuator or a tendon.
+
+        Args:
+            kind: ``"body"``, ``"joint"``, ``"geom"``, ``"site"``, ``"actuator"`` or ``"tendon"``.
+            number: Its number in the model.
+        """
+        section = "worldbody" if kind in ("body", "joint", "geom", "site") else kind
+        inside = self.text.within(section)
+        if kind == "actuator":
+            chosen = [i for i in inside if len(self.text.tags[i].parents) == 2]
+            if len(chosen) == int(self.model.nu):
+                return chosen[number]
+        name = element_names(self.model, kind)[number]
+        for i in inside:
+            tag = self.text.tags[i]
+            is_kind = tag.name == kind or kind in ("actuator", "tendon")
+            if is_kind and tag.attributes.get("name") == name:
+                return i
+        raise ModelError(
+            f"The file has no {kind} called {name!r}. Elements need a name, and those that "
+            "<replicate>, <attach> or <composite> make cannot be changed one by one."
+        )
+
+    def attribute(self, kind: str, number: int, values: Mapping[str, tuple[Any, Any]]) -> None:
+        """Sets attributes of an element that change, with a comment.
+
+        Args:
+            kind: See :meth:`element`.
+            number: Number of the element in the model.
+            values: By attribute, the value in the file's model and the new one.
+        """
+        changed = {n: v for n, v in values.items() if not np.array_equal(*v)}
+        if changed:
+            written = {name: _words(new) for name, (_, new) in changed.items()}
+            self.text.set(self.element(kind, number), written, _note(changed))
+
+    def angle(self, joint: int, value: Any) -> Any:
+        """Returns a position of a joint in the unit of the file's angles."""
+        mujoco: Any = importlib.import_module("mujoco")
+        turns = self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+        return np.rad2deg(value) if turns and self._degrees else value
+
+    def inertial(self, body: int) -> None:
+        """Writes the inertial element of a body."""
+        m, place = self.model, self.element("body", body)
+        values = {
+            "pos": m.body_ipos[body],
+            "quat": m.body_iquat[body],
+            "mass": m.body_mass[body],
+            "diaginertia": m.body_inertia[body],
+        }
+        written: dict[str, str | None] = {name: _words(value) for name, value in values.items()}
+        arrays = {"mass": "body_mass", "pos": "body_ipos", "diaginertia": "body_inertia"}
+        both = {n: tuple(getattr(x, a)[body] for x in (self.before, m)) for n, a in arrays.items()}
+        note = _note({name: pair for name, pair in both.items() if not np.array_equal(*pair)})
+        child = self.text.child(place, "inertial")
+        if child is None:
+            words = " ".join(f'{name}="{value}"' for name, value in written.items())
+            self.text.insert(place, f"<!-- {note} --> <inertial {words}/>")
+            return
+        others = ("fullinertia", "euler", "axisangle", "xyaxes", "zaxis")
+        present = self.text.tags[child].attributes
+        self.text.set(child, written | {name: None for name in others if name in present}, note)
+
+    def gains(self, actuator: int) -> None:
+        """Writes the gains of an actuator."""
+        place = self.element("actuator", actuator)
+        tag = self.text.tags[place]
+        (old, old_bias), (new, new_bias) = (
+            (m.actuator_gainprm[actuator], m.actuator_biasprm[actuator])
+            for m in (self.before, self.model)
+        )
+        if tag.name == "position" and new_bias[1] == -new[0]:
+            gains = {"kp": (old[0], new[0]), "kv": (-old_bias[2], -new_bias[2])}
+            self.attribute("actuator", actuator, gains)
+        elif tag.name == "velocity" and new_bias[2] == -new[0]:
+            self.attribute("actuator", actuator, {"kv": (old[0], new[0])})
+        elif tag.name == "general":
+            gains = {"gainprm": (old[:3], new[:3]), "biasprm": (old_bias[:3], new_bias[:3])}
+            self.attribute("actuator", actuator, gains)
+        else:
+            raise ModelError(
+                f"The gain of a <{tag.name}> actuator cannot be written; make its gear a "
+                "parameter instead."
+            )
+
+    def _angles_are_degrees(self) -> bool:
+        """Returns whether the file's angles are degrees, as they are if it does not say."""
+        stated = [
+            self.text.tags[i].attributes.get("angle") for i in self.text.sections("compiler")
+        ]
+        return ([s for s in stated if s] or ["degree"])[-1] == "degree"
 
 
-def _included(files: RobotFiles, name: str, text: bytes, inside: frozenset[str]) -> bytes:
-    for tag in reversed(_tags(text)):
-        if tag.name != "include":
-            continue
-        other = tag.attributes.get("file", "")
-        if other not in files.texts or other in inside:
-            raise ModelError(f"{name} includes {other!r}, which cannot be read.")
-        content = files.texts[other].encode()
-        content = _included(files, other, content, inside | {other})
-        root = _tags(content)[0]
-        inner = content[root.end : content.rindex(b"</")] if b"</" in content else b""
-        end = tag.end
-        if not text[tag.start : tag.end].rstrip().endswith(b"/>"):
-            end = text.index(b">", text.index(b"</", tag.end)) + 1
-        text = text[: tag.start] + inner.strip() + text[end:]
-    return text
+_INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
+"""Names of the engine's integrators in a file, by number."""
 
 
-def _tags(text: bytes) -> list[Tag]:
-    """Returns all start tags of a text that is well-formed."""
-    found: list[Tag] = []
-    open_tags: list[int] = []
-    parser = expat.ParserCreate()
-
-    def begin(name: str, attributes: dict[str, Any]) -> None:
-        start = parser.CurrentByteIndex
-        parents = tuple(found[i].name for i in open_tags)
-        parent = open_tags[-1] if open_tags else -1
-        open_tags.append(len(found))
-        found.append(Tag(name, dict(attributes), start, _end(text, start), parents, parent))
-
-    parser.StartElementHandler = begin
-    parser.EndElementHandler = lambda name: open_tags.pop() and None
-    parser.Parse(text, True)
-    return found
+def _words(value: Any) -> str:
+    """Returns numbers as the shortest text that is read as the same numbers."""
+    return " ".join(repr(float(number)) for number in np.atleast_1d(value))
 
 
-def _end(text: bytes, start: int) -> int:
-    """Returns the place behind a start tag; values may contain its last character."""
-    quote = None
-    for place in range(start, len(text)):
-        character = text[place : place + 1]
-        if quote is None and character in (b'"', b"'"):
-            quote = character
-        elif character == quote:
-            quote = None
-        elif quote is None and character == b">":
-            return place + 1
-    return len(text)
+def _note(changed: Mapping[str, tuple[Any, Any]]) -> str:
+    """Returns a comment on changed values."""
+    parts = [f"{name} {_short(new)} (was {_short(old)})" for name, (old, new) in changed.items()]
+    return f"npdr: {', '.join(parts)}"
 
 
-def _indent(text: bytes, start: int) -> bytes:
-    """Returns the line break and the blanks before a tag; a blank if it does not begin a line."""
-    line = text[text.rfind(b"\n", 0, start) + 1 : start]
-    return b"\n" + line if not line.strip() else b" "
+def _short(value: Any) -> str:
+    return " ".join(f"{float(number):.6g}" for number in np.atleast_1d(value))
 
 
-def _with_attribute(tag: bytes, name: str, value: str | None) -> bytes:
-    """Returns a start tag with an attribute set, or removed."""
-    pattern = re.compile(rb"\s" + re.escape(name.encode()) + rb"\s*=\s*(\"[^\"]*\"|'[^']*')")
-    new = b"" if value is None else f' {name}="{value}"'.encode()
-    if pattern.search(tag):
-        return pattern.sub(lambda _: new, tag, count=1)
-    if value is None:
-        return tag
-    closing = b"/>" if tag.endswith(b"/>") else b">"
-    return tag[: -len(closing)].rstrip() + new + closing
+def _of_dof(name: str) -> Callable[[Edits, int], None]:
+    def write(edits: Edits, dof: int) -> None:
+        def both(array: str) -> tuple[Any, Any]:
+            return tuple(getattr(m, f"dof_{array}")[dof] for m in (edits.before, edits.model))
+
+        higher = getattr(edits.model, f"dof_{name}poly", None)
+        values = {name: _with_higher(*both(name), higher, dof)}
+        if name == "frictionloss":
+            # As hard as in the package's simulations, where the friction is an effect.
+            values |= {"solreffriction": both("solref"), "solimpfriction": both("solimp")}
+        edits.attribute("joint", int(edits.model.dof_jntid[dof]), values)
+
+    return write
 
 
-def _opened(tag: bytes, name: str, element: str, indent: bytes) -> bytes:
-    """Returns a start tag followed by a first child."""
-    inner = (indent + b"  " if indent != b" " else b"") + element.encode()
-    if not tag.endswith(b"/>"):
-        return tag + inner
-    return tag[:-2].rstrip() + b">" + inner + indent.rstrip(b" ") + f"</{name}>".encode()
+def _stiffness(edits: Edits, joint: int) -> None:
+    old, new = (model.jnt_stiffness[joint] for model in (edits.before, edits.model))
+    higher = getattr(edits.model, "jnt_stiffnesspoly", None)
+    edits.attribute("joint", joint, {"stiffness": _with_higher(old, new, higher, joint)})
+
+
+def _with_higher(old: Any, new: Any, higher: Any, row: int) -> tuple[Any, Any]:
+    """Returns both values with the coefficients of higher order, if the file has some."""
+    if higher is None or not np.any(higher[row]):
+        return old, new
+    return np.array([old, *higher[row]]), np.array([new, *higher[row]])
+
+
+def _of(kind: str, array: str, name: str) -> Callable[[Edits, int], None]:
+    def write(edits: Edits, number: int) -> None:
+        old, new = (getattr(model, array)[number] for model in (edits.before, edits.model))
+        edits.attribute(kind, number, {name: (old, new)})
+
+    return write
+
+
+def _rest(edits: Edits, place: int) -> None:
+    (joint,) = map(int, np.flatnonzero(np.asarray(edits.model.jnt_qposadr) == place))
+    old, new = (edits.angle(joint, m.qpos_spring[place]) for m in (edits.before, edits.model))
+    edits.attribute("joint", joint, {"springref": (old, new)})
+
+
+def _range(edits: Edits, joint: int) -> None:
+    old, new = (edits.angle(joint, m.jnt_range[joint]) for m in (edits.before, edits.model))
+    edits.attribute("joint", joint, {"range": (old, new)})
+
+
+def _limits(array: str, name: str) -> Callable[[Edits, int], None]:
+    def write(edits: Edits, actuator: int) -> None:
+        old, new = (getattr(model, array)[actuator] for model in (edits.before, edits.model))
+        edits.attribute("actuator", actuator, {f"{name}range": (old, new)})
+        place = edits.element("actuator", actuator)
+        edits.text.set(place, {f"{name}limited": "true"})
+        if "inheritrange" in edits.text.tags[place].attributes:
+            edits.text.set(place, {"inheritrange": None})
+
+    return write
+
+
+_WRITERS: dict[str, Callable[[Edits, int], None]] = {
+    "dof_damping": _of_dof("damping"),
+    "dof_frictionloss": _of_dof("frictionloss"),
+    "dof_armature": _of_dof("armature"),
+    "jnt_stiffness": _stiffness,
+    "jnt_pos": _of("joint", "jnt_pos", "pos"),
+    "jnt_range": _range,
+    "qpos_spring": _rest,
+    "body_mass": Edits.inertial,
+    "body_inertia": Edits.inertial,
+    "body_ipos": Edits.inertial,
+    "body_pos": _of("body", "body_pos", "pos"),
+    "body_gravcomp": _of("body", "body_gravcomp", "gravcomp"),
+    "geom_friction": _of("geom", "geom_friction", "friction"),
+    "geom_size": _of("geom", "geom_size", "size"),
+    "geom_pos": _of("geom", "geom_pos", "pos"),
+    "geom_solref": _of("geom", "geom_solref", "solref"),
+    "site_pos": _of("site", "site_pos", "pos"),
+    "actuator_gainprm": Edits.gains,
+    "actuator_biasprm": Edits.gains,
+    "actuator_gear": _of("actuator", "actuator_gear", "gear"),
+    "actuator_forcerange": _limits("actuator_forcerange", "force"),
+    "actuator_ctrlrange": _limits("actuator_ctrlrange", "ctrl"),
+    "tendon_stiffness": _of("tendon", "tendon_stiffness", "stiffness"),
+    "tendon_damping": _of("tendon", "tendon_damping", "damping"),
+    "tendon_frictionloss": _of("tendon", "tendon_frictionloss", "frictionloss"),
+    "tendon_armature": _of("tendon", "tendon_armature", "armature"),
+}
+"""What writes a row of each array of a model."""

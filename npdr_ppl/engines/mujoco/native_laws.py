@@ -9,14 +9,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from npdr_ppl.engines.mujoco.parameters import Assignments
+from npdr_ppl.engines.mujoco.parameters import Assignments, present
 from npdr_ppl.engines.mujoco.ports import ForcePort
 from npdr_ppl.language.effects import ForceEffect
 
-__all__ = ["is_native", "native_law", "present"]
+__all__ = ["is_native", "native_law"]
 
 
 def is_native(
@@ -69,9 +68,3 @@ def native_law(
         ("jnt_stiffness", port.joint): values["stiffness"],
         ("qpos_spring", port.position): values["rest"],
     }
-
-
-def present(model: Any, array: str, place: int, assignments: Assignments) -> Tensor:
-    """Returns a number of a model after assignments."""
-    nominal = float(getattr(model, array).reshape(-1)[place])
-    return assignments.get((array, place), torch.tensor(nominal, dtype=torch.float64))

@@ -12,13 +12,29 @@ from npdr_ppl.errors import ModelError, ShapeError
 from npdr_ppl.language.channels import Parameter
 from npdr_ppl.registry import hint
 
-__all__ = ["Assignments", "Binding", "Bindings", "Derivation", "Scale"]
+__all__ = ["Assignments", "Binding", "Bindings", "Derivation", "Scale", "present"]
 
 Derivation = Callable[[Mapping[str, Tensor]], Tensor]
 """Maps all parameters by name, each of the batch shape or a number, to a field's value."""
 
 Assignments = dict[tuple[str, int], Tensor]
 """Values by array and place in it, each ``(N,)`` or a number."""
+
+
+def present(model: Any, array: str, place: int, assignments: Assignments) -> Tensor:
+    """Returns a number of a model after assignments.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        array: Name of its array, ``"opt.…"`` for options.
+        place: Its index in the flat array.
+        assignments: What is written into the model.
+    """
+    if (array, place) in assignments:
+        return assignments[array, place]
+    option = array.removeprefix("opt.")
+    values = getattr(model if array == option else model.opt, option)
+    return torch.tensor(float(values.reshape(-1)[place]), dtype=torch.float64)
 
 
 @dataclass(frozen=True, init=False)

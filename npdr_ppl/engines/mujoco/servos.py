@@ -3,11 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from npdr_ppl.engines.mujoco.fields import servo_gains
-from npdr_ppl.engines.mujoco.parameters import Assignments
+from npdr_ppl.engines.mujoco.parameters import Assignments, present
 from npdr_ppl.language.effect_context import Servo
 from npdr_ppl.language.effects import Effect, EnvironmentEffect
 
@@ -45,7 +44,6 @@ def with_servos(
         column = 1 if "kp" in servo_gains(model, actuator) else 2
         gain = "actuator_gainprm", actuator * model.actuator_gainprm.shape[1]
         bias = "actuator_biasprm", actuator * model.actuator_biasprm.shape[1] + column
-        nominal = torch.tensor(float(model.actuator_gainprm[actuator, 0]), dtype=torch.float64)
-        changed = effect.environment(Servo(result.get(gain, nominal)), values)
+        changed = effect.environment(Servo(present(model, *gain, result)), values)
         result |= {gain: changed.gain, bias: -changed.gain}
     return result
