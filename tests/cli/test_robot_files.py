@@ -88,6 +88,14 @@ def test_a_fit_needs_only_the_file_and_a_log(folder, tmp_path, monkeypatch, caps
         # Beyond 4 standard deviations once in 4000 seeds.
         assert abs(found[name]["mean"] - value) < 4.0 * found[name]["sd"], name
         assert found[name]["sd"] < 0.02 * value, name
+    to = tmp_path / "identified.xml"
+    code, _, err = run(
+        monkeypatch, capsys, "export", tmp_path / "fit", folder / "arm.xml", "--to", to
+    )
+    assert code == 0, err
+    arm = mujoco.MjModel.from_xml_path(str(to))
+    assert arm.actuator("servo").gainprm[0] == found["servo_kp"]["mean"]
+    assert arm.body("hand").mass[0] == found["hand_mass"]["mean"]
 
 
 def test_inspect_prints_and_writes_the_model(folder, tmp_path, monkeypatch, capsys):
