@@ -39,7 +39,14 @@ from npdr_ppl.models.effects.sensing import (
     Quantisation,
     SensorLowPass,
 )
-from npdr_ppl.models.effects.servos import ServoGain
+from npdr_ppl.models.effects.servos import (
+    GoalAccelerationLimit,
+    GoalResolution,
+    GoalSpeedLimit,
+    ServoDeadBand,
+    ServoForceLimit,
+    ServoGain,
+)
 from npdr_ppl.models.effects.surroundings import Contact, Payload, Tilt
 from npdr_ppl.models.effects.timing import ClockSkew, SensorDelay
 from npdr_ppl.models.effects.transmission import Backlash, JointElasticity
@@ -59,6 +66,9 @@ __all__ = [
     "EncoderBias",
     "EncoderScale",
     "FrictionDrift",
+    "GoalAccelerationLimit",
+    "GoalResolution",
+    "GoalSpeedLimit",
     "HardeningSpring",
     "InputDelay",
     "JointElasticity",
@@ -72,6 +82,8 @@ __all__ = [
     "Saturation",
     "SensorDelay",
     "SensorLowPass",
+    "ServoDeadBand",
+    "ServoForceLimit",
     "ServoGain",
     "Spring",
     "StribeckFriction",

@@ -69,6 +69,7 @@ class ActuatorLag(ActionEffect):
 
     id = "actuator_lag"
     may_be_shared = True
+    memory_time = 0.5  # ten of the longest time constants
     parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
     law = "τ̇ = (u − τ)/T"
     equivalence = (FIRST_ORDER_LAG,)
@@ -166,6 +167,10 @@ class Saturation(ActionEffect):
     def probe(self, port: Port) -> dict[str, float]:
         """Returns 80 % of the rated command."""
         return {"limit": 0.8 * port.rated}
+
+    def peaks(self, commands: Tensor, time_step: float) -> dict[str, float]:
+        """Returns the greatest magnitude of the commands."""
+        return {"limit": float(commands.abs().max())}
 
     def act(
         self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float

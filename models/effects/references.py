@@ -4,6 +4,7 @@ __all__ = [
     "ARMSTRONG_1994",
     "BITTENCOURT_2012",
     "CANUDAS_1995",
+    "DYNAMIXEL",
     "JANOT_2019",
     "LJUNG_1999",
     "MUJOCO",
@@ -37,4 +38,5 @@ TAO_1996 = (
     "nonlinearities, 1996"
 )
 LJUNG_1999 = "L. Ljung, System identification: theory for the user, second edition, 1999"
+DYNAMIXEL = "Robotis, e-Manual of the X series: profiles and control of the goal"
 MUJOCO = "MuJoCo's documentation, computation and modeling chapters"

@@ -1,17 +1,36 @@
 """Effects at a servo, which follows a position or a velocity."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import pyro.distributions as dist
+import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
-from npdr_ppl.language.effects import EnvironmentEffect
-from npdr_ppl.models.effects.references import MUJOCO
+from npdr_ppl.language.effect_context import Start
+from npdr_ppl.language.effects import ActionEffect, Commands, EnvironmentEffect, ServoEffect
+from npdr_ppl.models.effects.references import DYNAMIXEL, MUJOCO, TAO_1996
 
-__all__ = ["ServoGain"]
+__all__ = [
+    "GoalAccelerationLimit",
+    "GoalResolution",
+    "GoalSpeedLimit",
+    "ServoDeadBand",
+    "ServoForceLimit",
+    "ServoGain",
+]
+
+# A limit may be anything between tight and unnoticeable. This is the standard deviation of its
+# logarithm: a factor of e either way.
+_SPREAD = 1.0
+
+
+def _follows_position(port: Port) -> bool:
+    """Returns whether a servo's goal is a position of its joint."""
+    return port.unit == port.coordinate
 
 
 class ServoGain(EnvironmentEffect):
@@ -34,3 +53,160 @@ class ServoGain(EnvironmentEffect):
     def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
         """Returns the servo with the changed gain."""
         return value._replace(gain=(1.0 + parameters["error"]) * value.gain)
+
+
+class ServoForceLimit(EnvironmentEffect):
+    """clip(f, ±f_max): the servo's force has a limit, that of its current or its supply."""
+
+    id = "servo_force_limit"
+    port_kinds = ("servo",)
+    parameters = (Parameter("limit", "{force}", math.inf, "greatest force f_max"),)
+    is_smooth = False
+    law = "clip(f, ±f_max)"
+    excitation = "wide_range"
+    reference = MUJOCO
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Log-normal about the rated force."""
+        return {"limit": dist.LogNormal(math.log(port.rated_force), _SPREAD)}
+
+    def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
+        """Returns the servo with the lower one of both limits."""
+        return value._replace(limit=torch.minimum(value.limit, parameters["limit"]))
+
+
+class ServoDeadBand(ServoEffect):
+    """K sign(e) max(|e| − δ, 0): the servo does not act on errors up to δ."""
+
+    id = "servo_dead_band"
+    parameters = (Parameter("width", "{coordinate}", 0.0, "half width δ"),)
+    is_smooth = False
+    law = "K sign(e) max(|e| − δ, 0), e = u − q"
+    excitation = "slow_ramp"
+    reference = TAO_1996
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal; 1 % of the rated excursion."""
+        return {"width": dist.HalfNormal(0.01 * port.rated_position)}
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the servo follows its joint's position."""
+        return _follows_position(port)
+
+    def change(self, error: Tensor, gain: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns −K clip(e, ±δ), which turns K e into the law."""
+        width = parameters["width"]
+        return -gain * error.clamp(-width, width)
+
+
+class GoalSpeedLimit(ActionEffect):
+    """|ġ| ≤ v: the servo follows a goal g that approaches the commanded one at a limited speed."""
+
+    id = "goal_speed_limit"
+    port_kinds = ("servo",)
+    parameters = (Parameter("limit", "{port}/s", math.inf, "greatest speed v"),)
+    is_smooth = False
+    memory_time = math.inf  # a slow goal may be behind for any time
+    law = "|ġ| ≤ v"
+    excitation = "steps"
+    reference = DYNAMIXEL
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Log-normal; about the rated excursion per second."""
+        return {"limit": dist.LogNormal(math.log(port.rated_position), _SPREAD)}
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the servo follows its joint's position."""
+        return _follows_position(port)
+
+    def initial_memory(self, command: Tensor, start: Start) -> Tensor:
+        """Returns the command, which the goal has reached."""
+        return command
+
+    def act(
+        self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns the goal after the step."""
+        furthest = parameters["limit"] * time_step
+        command = commands.now()
+        step = (command - memory).clamp(-furthest, furthest)
+        goal = torch.where(step == command - memory, command, memory + step)
+        return goal, goal
+
+
+class GoalAccelerationLimit(ActionEffect):
+    """|g̈| ≤ a: the servo follows a goal g that speeds up and brakes at a limited rate.
+
+    The goal moves as fast as it can and still stop at the command, as the profile generators of
+    servos do. Where a step of length h brakes from the speed v, v − a h and so on, it travels
+    v²/(2 a) + v h/2, which gives the greatest speed at a distance.
+    """
+
+    id = "goal_acceleration_limit"
+    port_kinds = ("servo",)
+    parameters = (
+        Parameter("limit", "{port}/s²", math.inf, "greatest acceleration a"),
+    )
+    is_smooth = False
+    memory_time = math.inf
+    law = "|g̈| ≤ a"
+    excitation = "steps"
+    reference = DYNAMIXEL
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Log-normal; about ten rated excursions per square second."""
+        return {"limit": dist.LogNormal(math.log(10.0 * port.rated_position), _SPREAD)}
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the servo follows its joint's position."""
+        return _follows_position(port)
+
+    def initial_memory(self, command: Tensor, start: Start) -> tuple[Tensor, Tensor]:
+        """Returns the command, which the goal has reached, and its speed, zero."""
+        return command, torch.zeros_like(command)
+
+    def act(
+        self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns the goal after the step."""
+        goal, speed = memory
+        command = commands.now()
+        distance = command - goal
+        change = parameters["limit"] * time_step
+        braking = 4.0 * distance.abs() / time_step
+        # (−c + sqrt(c² + 2 c b)) / 2, without a difference of large numbers.
+        fastest = braking / (1.0 + torch.sqrt(1.0 + 2.0 * braking / change))
+        wanted = distance.sign() * torch.minimum(fastest, distance.abs() / time_step)
+        reached = torch.maximum(torch.minimum(wanted, speed + change), speed - change)
+        arrives = reached == distance / time_step
+        goal = torch.where(arrives, command, goal + time_step * reached)
+        return goal, (goal, reached)
+
+
+class GoalResolution(ActionEffect):
+    """Δ round(u/Δ): the servo's goal has steps of Δ."""
+
+    id = "goal_resolution"
+    port_kinds = ("servo",)
+    parameters = (Parameter("step", "{port}", 0.0, "step Δ"),)
+    is_smooth = False
+    has_local_minima = True
+    law = "Δ round(u/Δ)"
+    excitation = "slow_ramp"
+    reference = DYNAMIXEL
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Uniform; up to 1 % of the rated excursion."""
+        return {"step": dist.Uniform(0.0, 0.01 * port.rated_position)}
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the servo follows its joint's position."""
+        return _follows_position(port)
+
+    def act(
+        self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns the goal."""
+        command, step = commands.now(), parameters["step"]
+        size = torch.where(step > 0.0, step, 1.0)
+        return torch.where(step > 0.0, size * torch.round(command / size), command), memory

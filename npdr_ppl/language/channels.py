@@ -65,10 +65,12 @@ class Port:
             parameter.
         unit: SI unit of the quantity.
         rated: Typical magnitude, in ``unit``; effects scale their priors by it.
-        rated_speed: Typical speed of a joint that a force acts on, in its coordinate per second.
+        rated_speed: Typical speed of a joint that a force or a servo acts on, in its coordinate
+            per second.
         rated_position: Typical excursion of such a joint, in its coordinate.
-        coordinate: Unit of the position of a joint that a force acts on: ``"rad"`` for a revolute,
-            ``"m"`` for a prismatic joint.
+        coordinate: Unit of the position of a joint that a force or a servo acts on: ``"rad"`` for
+            a revolute, ``"m"`` for a prismatic joint.
+        rated_force: Typical force of a servo, in :attr:`force_unit`.
         is_driven: Whether an actuator drives the joint that a force acts on.
     """
 
@@ -80,6 +82,12 @@ class Port:
     rated_position: float = 1.0
     coordinate: str = "rad"
     is_driven: bool = True
+    rated_force: float = 1.0
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of the force at a joint: N m or N."""
+        return "N m" if self.coordinate == "rad" else "N"
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -82,9 +82,11 @@ class Servo(NamedTuple):
 
     Attributes:
         gain: Force per unit of error, of either a position or a velocity.
+        limit: Its greatest force; infinite if there is no limit.
     """
 
     gain: Tensor
+    limit: Tensor
 
 
 class Joint(NamedTuple):

@@ -34,6 +34,7 @@ __all__ = [
     "LinearForceEffect",
     "ParameterEffect",
     "SensorEffect",
+    "ServoEffect",
     "Uneven",
 ]
 
@@ -63,7 +64,8 @@ class Effect(ABC):
         id: Name in code and JSON, e.g. ``"coulomb_friction"``.
         port_kinds: Kinds of port the effect can attach to.
         parameters: Its parameters; ``{port}`` in a unit stands for the port's unit,
-            ``{coordinate}`` for that of the joint's position.
+            ``{coordinate}`` for that of the joint's position, ``{force}`` for that of the joint's
+            force.
         strength: Names of the parameters that scale the effect from zero; the others set its
             shape, and their nominal values are those of a typical device. Empty for all.
         is_smooth: Whether trajectories are differentiable in the strengths at zero. If not,
@@ -159,14 +161,16 @@ class Effect(ABC):
         """Returns a typical value of every parameter, with the effect switched on.
 
         The distance of strengths from zero strength is the root mean square under the priors;
-        shape parameters are nominal.
+        limits have their mean under the priors, and shape parameters are nominal.
         """
         priors = self.default_priors(port)
         result = {}
         for parameter in self.parameters:
+            prior = priors[parameter.name]
             result[parameter.name] = parameter.nominal
-            if parameter in self.strengths:
-                prior = priors[parameter.name]
+            if math.isinf(parameter.nominal):
+                result[parameter.name] = float(prior.mean)
+            elif parameter in self.strengths:
                 offset = prior.mean - parameter.nominal
                 result[parameter.name] += float((prior.variance + offset**2).sqrt())
         return result
@@ -177,10 +181,8 @@ class Effect(ABC):
 
     def units(self, port: Port) -> dict[str, str]:
         """Returns the unit of each parameter at a port."""
-        return {
-            p.name: p.unit.format(port=port.unit, coordinate=port.coordinate)
-            for p in self.parameters
-        }
+        own = {"port": port.unit, "coordinate": port.coordinate, "force": port.force_unit}
+        return {p.name: p.unit.format(**own) for p in self.parameters}
 
     @property
     def strengths(self) -> tuple[Parameter, ...]:
@@ -356,10 +358,14 @@ class ActionEffect(Effect):
     Attributes:
         may_be_shared: Whether all commands may have it with the same parameters, because one
             device or bus sends them.
+        memory_time: For how many seconds past commands influence the effect's own state. At the
+            start of a segment, it is computed from commands of that time, as far as they are
+            recorded.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("action", "servo")
     may_be_shared: ClassVar[bool] = False
+    memory_time: ClassVar[float] = 0.0
 
     @property
     def may_cover_several(self) -> bool:
@@ -377,11 +383,41 @@ class ActionEffect(Effect):
         """Returns the number of past commands that :meth:`act` may request."""
         return 0
 
+    def peaks(self, commands: Tensor, time_step: float) -> dict[str, float]:
+        """Returns the greatest values in a recording of what its parameters limit, by parameter.
+
+        Searches begin below them. For limits that are not in the result, they try several values
+        of the prior.
+
+        Args:
+            commands: Recorded commands, time last.
+            time_step: Seconds per step.
+        """
+        return {}
+
     @abstractmethod
     def act(
         self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
     ) -> "tuple[Tensor | Uneven, Any]":
         """Returns the command that reaches the dynamics in this step, and the next memory."""
+
+
+class ServoEffect(Effect):
+    """An effect inside a servo: its force depends on the error otherwise than declared."""
+
+    port_kinds: ClassVar[tuple[PortKind, ...]] = ("servo",)
+
+    @abstractmethod
+    def change(self, error: Tensor, gain: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns the force that is added to the declared one, gain times error.
+
+        It is evaluated in every step of the engine.
+
+        Args:
+            error: Goal minus position, or minus velocity, ``(N,)``.
+            gain: Force per unit of error.
+            parameters: The effect's parameters by short name.
+        """
 
 
 class SensorEffect(Effect):

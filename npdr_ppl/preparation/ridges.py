@@ -3,11 +3,11 @@
 If a motion determines fewer combinations than there are parameters, the posterior is a thin sheet.
 Across it are stiff directions, in which it is a thousand times narrower than the prior; along it
 are weak ones, in which it is hardly narrower. If the sheet is curved even slightly, a normal
-approximation fails. Let a be the weak and b the stiff coordinates of the prior-whitened
-information; if more than six are weak, at most the six count along which the posterior is curved
-most. The ridge b = g(a) is traced by Newton steps with the Jacobian of the closest fit (the chord
-method), fitted by a polynomial, and subtracted. The shear (a, b) → (a, b − g(a)) preserves
-volumes, so densities need no correction for it.
+approximation fails. Let a be the weak coordinates of the prior-whitened information along which
+the posterior is curved, the six most curved ones if there are more, and b all others. The ridge b
+= g(a) is traced by Newton steps with the Jacobian of the closest fit (the chord method), fitted by
+a polynomial, and subtracted. The shear (a, b) → (a, b − g(a)) preserves volumes, so densities need
+no correction for it.
 
 The curvature at the closest fit makes a curved ridge look shorter than it is. Its length is
 therefore found from the traced points. They are weighted by the ratio of their posterior density
@@ -74,7 +74,7 @@ class RidgeCoordinates:
         straight = cls._straight(space, space.from_reference(z[None])[0], basis, information, 0)
         is_weak = torch.zeros(len(z), dtype=torch.bool)
         is_weak[:can_be_weak] = True
-        if RIDGE.most_weak < can_be_weak < len(z):
+        if 0 < can_be_weak < len(z):
             is_weak[:can_be_weak] = straight._most_curved(likelihood, can_be_weak)
         order = torch.cat((is_weak.nonzero()[:, 0], (~is_weak).nonzero()[:, 0]))
         num_weak = int(is_weak.sum())

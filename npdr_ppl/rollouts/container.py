@@ -335,7 +335,7 @@ class Rollouts(Recording):
         segment_length: int | None = None,
         initial_state: segments.InitialState = "estimated",
         *,
-        history: int = segments.DEFAULT_HISTORY,
+        history: int | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> Inputs:
         """Returns the inputs with which a simulator replays these rollouts.
@@ -346,7 +346,8 @@ class Rollouts(Recording):
             initial_state: ``"estimated"`` smooths and differentiates the measurements around each
                 segment's start; ``"recorded"`` takes the measurements as exact; ``"uncertain"``
                 draws the initial state of every simulation from the estimate and its error.
-            history: Steps of commands before each segment to include, for delays.
+            history: Steps of commands before each segment to include, for delays, lags and goals
+                of servos; by default those of two seconds.
             dtype: Floating-point type of the tensors.
 
         Raises:
@@ -356,7 +357,7 @@ class Rollouts(Recording):
             self,
             segment_length=segment_length,
             initial_state=initial_state,
-            history=history,
+            history=segments.default_history(self.time_step) if history is None else history,
             dtype=dtype,
         )
 

@@ -17,10 +17,10 @@ from npdr_ppl.rollouts.sampling import NEAREST
 from npdr_ppl.rollouts.states import StateEstimate, estimate_states
 
 __all__ = [
-    "DEFAULT_HISTORY",
     "InitialState",
     "columns_of",
     "cut",
+    "default_history",
     "inputs",
     "layout_of",
     "motion",
@@ -33,9 +33,22 @@ InitialState = Literal["estimated", "recorded", "uncertain"]
 differentiated. ``recorded``: the measurements are taken as exact. ``uncertain``: every simulation
 draws its initial state from the estimate and its error."""
 
-DEFAULT_HISTORY = 64
-"""Default number of past commands per segment, in steps: 64 ms at 1 kHz. This is longer than any
-input delay of a working control loop and small compared with a segment."""
+_HISTORY_SECONDS = 2.0
+_HISTORY_STEPS = 64, 1000
+
+
+def default_history(time_step: float) -> int:
+    """Returns the default number of past commands per segment.
+
+    They last for two seconds, in which a servo's profile generator reaches most goals. There are
+    at least 64, which is longer than any input delay of a working control loop, and at most 1000,
+    which take less memory than the measurements of long recordings.
+
+    Args:
+        time_step: Seconds per step.
+    """
+    least, most = _HISTORY_STEPS
+    return min(max(least, round(_HISTORY_SECONDS / time_step)), most)
 
 
 def columns_of(wanted: Sequence[str], names: Sequence[str]) -> list[int]:

@@ -138,7 +138,11 @@ def test_a_ridge_is_traced_inside_the_support(monkeypatch):
         simulated.append(len(z))
         return scores(self, z)
 
+    def all_curved(self, likelihood, num):
+        return torch.ones(num, dtype=torch.bool)
+
     monkeypatch.setattr(RidgeCoordinates, "to_reference", leaving)
+    monkeypatch.setattr(RidgeCoordinates, "_most_curved", all_curved)
     monkeypatch.setattr(SegmentLikelihood, "scores", seen)
     space = RidgeCoordinates.of(hypothesis.likelihood, seed=0)
     assert simulated[1] == (simulated[0] + 1) // 2

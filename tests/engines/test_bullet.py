@@ -37,7 +37,8 @@ PORTS = {
 # a scene does not have.
 REFUSED = {
     "backlash", "clock_skew", "contact", "joint_elasticity", "load_dependent_friction", "payload",
-    "presliding_friction", "sensor_delay", "servo_gain",
+    "presliding_friction", "sensor_delay", "servo_gain", "servo_force_limit", "servo_dead_band",
+    "goal_speed_limit", "goal_acceleration_limit", "goal_resolution",
 }  # fmt: skip
 
 # Bullet works in float64 here and its Featherstone dynamics of one joint are the same formula.

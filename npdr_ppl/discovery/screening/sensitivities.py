@@ -8,8 +8,8 @@ in their strength at several sizes.
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.settings import SENSITIVITY
 from npdr_ppl.engines.pooled.pool_simulator import PooledSimulator
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.effects import ActionEffect, Effect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.preparation.segment_model import SegmentModel
@@ -93,16 +93,63 @@ def sensitivities(
         )
     largest = float(segments.whitened(base, fit.scale).abs().max())
     rounding = SENSITIVITY.rounding_errors * torch.finfo(base.dtype).eps * largest
-    for group in _groups(probes, box.simulator, segments):
+
+    def changed(group: list[_Probe]) -> list[Tensor]:
         differences = _differences(hypothesis, segments, base, group)
         if segments is not own and not bool(differences.isfinite().all()):
             # Coarser steps can be unstable where the model's own are not.
             there = own.black_box(fit.z[None])
             start = own.run(there.simulator, there.parameters, fit.offsets[None])[0]
             differences = _differences(hypothesis, own, start, group)
-        sizes = [len(probe.runs) for probe in group]
-        for probe, rows in zip(group, differences.split(sizes), strict=True):
+        return list(differences.split([len(probe.runs) for probe in group]))
+
+    for group in _groups(probes, box.simulator, segments):
+        if group[0].effect.is_resonant:
+            group, parts = _at_telling_sizes(group, changed)
+        else:
+            parts = changed(group)
+        for probe, rows in zip(group, parts, strict=True):
             yield from _variants(probe, rows, rounding)
+
+
+def _at_telling_sizes(
+    group: "list[_Probe]", changed: "Callable[[list[_Probe]], list[Tensor]]"
+) -> "tuple[list[_Probe], list[Tensor]]":
+    """Returns the probes with as many of their sizes as differ, and their changes.
+
+    Far from the frequencies of the motion, neighbouring resonances change it alike. Between two
+    sizes that do not, the one in the middle is tried, and so on.
+
+    Args:
+        group: Probes of resonances with all their sizes, which ascend.
+        changed: Returns the changes of the whitened measurements by each run of probes.
+    """
+    num = len(group[0].cases)
+    found: list[dict[int, Tensor]] = [{} for _ in group]
+    waiting = [sorted({*range(0, num, SENSITIVITY.resonance_stride), num - 1}) for _ in group]
+    while any(waiting):
+        asked = [probe.at(cases) for probe, cases in zip(group, waiting, strict=True) if cases]
+        rows = iter(changed(asked))
+        for probe, cases, known in zip(group, waiting, found, strict=True):
+            if cases:
+                known |= dict(zip(cases, next(rows).split(len(probe.strengths)), strict=True))
+        waiting = [_between_unlike(known) for known in found]
+    chosen = [sorted(known) for known in found]
+    return (
+        [probe.at(cases) for probe, cases in zip(group, chosen, strict=True)],
+        [torch.cat([known[k] for k in cases]) for known, cases in zip(found, chosen, strict=True)],
+    )
+
+
+def _between_unlike(known: Mapping[int, Tensor]) -> list[int]:
+    """Returns the middles between neighbouring sizes whose changes are not proportional."""
+    middles = []
+    for one, other in itertools.pairwise(sorted(known)):
+        a, b = known[one].flatten(), known[other].flatten()
+        likeness = (a @ b) / (a.norm() * b.norm()).clamp_min(1e-300)
+        if other - one > 1 and not float(likeness) >= SENSITIVITY.alike:
+            middles.append((one + other) // 2)
+    return middles
 
 
 def _differences(
@@ -138,7 +185,7 @@ class _Probe:
         priors: Its priors, by parameter.
         cases: Values of its parameters at size one, whether they are hinted, and the size.
         strengths: Names of the parameters that scale it.
-        nominal: Their values at zero strength; for a limit, the largest command.
+        nominal: Their values at zero strength in each case; for a limit, the largest command.
         runs: Parameters of each simulation: one per case and strength, the others at zero
             strength.
     """
@@ -147,8 +194,18 @@ class _Probe:
     priors: Mapping[str, Distribution]
     cases: list[tuple[dict[str, float], bool, float]]
     strengths: tuple[str, ...]
-    nominal: Tensor
+    nominal: list[Tensor]
     runs: list[dict[str, float]]
+
+    def at(self, cases: Sequence[int]) -> "_Probe":
+        """Returns the probe with some of its cases only."""
+        width = len(self.strengths)
+        return replace(
+            self,
+            cases=[self.cases[k] for k in cases],
+            nominal=[self.nominal[k] for k in cases],
+            runs=[run for k in cases for run in self.runs[k * width : (k + 1) * width]],
+        )
 
 
 def _probe(
@@ -159,22 +216,29 @@ def _probe(
     probe = effect.probe(port)
     strengths = tuple(p.name for p in effect.strengths)
     resting = {p.name: p.nominal for p in effect.parameters}
-    if effect.port in inputs.action_names:
-        probe = _within_reach(effect, probe, inputs)
+    peaks = _peaks(effect, inputs)
+    probe |= {name: SENSITIVITY.first_limit * peak for name, peak in peaks.items()}
     shapes = [(shape, False) for shape in _shapes(effect, priors, strengths)]
     if hint:
         shapes.append(({**shapes[0][0], **hint}, True))
     sizes = SENSITIVITY.sizes if _needs_size(effect, strengths) else (SENSITIVITY.smooth_size,)
     if effect.is_resonant:
         shapes, sizes = shapes[:1], SENSITIVITY.resonant_sizes
+    limits = [n for n in strengths if math.isinf(resting[n]) and n not in peaks]
+    if limits:
+        # How much of a motion a limit cuts off is not known, so several values are tried.
+        shapes, sizes = _limit_shapes(shapes[0][0], limits, priors), (1.0,)
     cases = [
         ({**probe, **shape}, is_hinted, size)
         for (shape, is_hinted), size in itertools.product(shapes, sizes)
     ]
-    nominal = torch.tensor([_resting(resting[n], probe[n]) for n in strengths]).double()
+    nominal = [
+        torch.tensor([_resting(resting[n], values[n]) for n in strengths]).double()
+        for values, _, _ in cases
+    ]
     runs = [
-        _switched_on(values, size, on, nominal[k], resting, strengths)
-        for values, _, size in cases
+        _switched_on(values, size, on, zero[k], resting, strengths)
+        for (values, _, size), zero in zip(cases, nominal, strict=True)
         for k, on in enumerate(strengths)
     ]
     return _Probe(effect, priors, cases, strengths, nominal, runs)
@@ -195,7 +259,8 @@ def _groups(
     kinds: dict[object, list[_Probe]] = {}
     for probe in probes:
         effect = probe.effect
-        kind = (simulator.port(effect.port).kind, getattr(effect, "needs_joint", False))
+        port = simulator.port(effect.port)
+        kind = port.kind, getattr(effect, "needs_joint", False), effect.is_resonant
         kinds.setdefault(kind, []).append(probe)
     for members in kinds.values():
         group: list[_Probe] = []
@@ -226,20 +291,24 @@ def _variants(probe: _Probe, rows: Tensor, rounding: float) -> list[Variant]:
 
     Changes up to a rounding error are left out.
     """
-    strengths, nominal = probe.strengths, probe.nominal
+    strengths = probe.strengths
     result = []
     parts = rows.split(len(strengths))
-    for (values, is_hinted, size), part in zip(probe.cases, parts, strict=True):
+    tried = [size for _, _, size in probe.cases]
+    ratio = SENSITIVITY.resonance_ratio
+    # Each size stands for those up to its neighbours.
+    least = [tried[0] / ratio, *tried[:-1]]
+    most = [*tried[1:], tried[-1] * ratio]
+    for (values, is_hinted, size), nominal, part, low, high in zip(
+        probe.cases, probe.nominal, parts, least, most, strict=True
+    ):
         if not bool(part.isfinite().all()) or float(part.abs().max()) <= rounding:
             continue
         difference = part / size
         full = torch.tensor([values[n] for n in strengths], dtype=torch.float64)
         lower, upper, deviation = _limits(probe.priors, strengths, nominal, full)
         if probe.effect.is_resonant:
-            lower, upper = (
-                lower.clamp_min(size / SENSITIVITY.resonance_ratio),
-                upper.clamp_max(size * SENSITIVITY.resonance_ratio),
-            )
+            lower, upper = lower.clamp_min(low), upper.clamp_max(high)
         change = difference.permute(1, 2, 0)
         result.append(
             Variant(
@@ -294,14 +363,22 @@ def _needs_size(effect: Effect, strengths: tuple[str, ...]) -> bool:
     return not effect.is_smooth or any(units[name] == "s" for name in strengths)
 
 
-def _within_reach(effect: Effect, probe: dict[str, float], inputs: Inputs) -> dict[str, float]:
-    """Returns the probe with limits that the commands of the recording reach."""
-    k = inputs.action_names.index(effect.port)
-    peak = float(inputs.actions[..., k].abs().max())
-    return {
-        p.name: probe[p.name] if math.isfinite(p.nominal) else SENSITIVITY.first_limit * peak
-        for p in effect.parameters
-    }
+def _peaks(effect: Effect, inputs: Inputs) -> dict[str, float]:
+    """Returns the greatest recorded values of what an effect on one command limits."""
+    if not isinstance(effect, ActionEffect) or effect.port not in inputs.action_names:
+        return {}
+    commands = inputs.actions[..., inputs.action_names.index(effect.port)]
+    return effect.peaks(commands, inputs.time_step)
+
+
+def _limit_shapes(
+    values: Mapping[str, float], limits: list[str], priors: Mapping[str, Distribution]
+) -> list[tuple[dict[str, float], bool]]:
+    """Returns values of limits at several quantiles of their priors."""
+    return [
+        ({**values, **{n: float(priors[n].icdf(torch.tensor(q))) for n in limits}}, False)
+        for q in SENSITIVITY.limit_quantiles
+    ]
 
 
 def _resting(nominal: float, probe: float) -> float:

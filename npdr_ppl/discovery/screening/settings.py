@@ -205,6 +205,26 @@ class RepetitionSettings:
 
 
 @dataclass(frozen=True)
+class GroupSettings:
+    """The same law at several joints.
+
+    Attributes:
+        fewest: Least number of joints. Two are found as a pair.
+        least_evidence: Least gain of a member in log density, given the others: what makes it
+            e⁶ = 400 times as likely as not, so that it outweighs the number of joints and its own
+            prior.
+    """
+
+    fewest: int = 3
+    least_evidence: float = 6.0
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 2, 1000, "fewest")
+        check_range(self, 0.0, 1000.0, "least_evidence")
+
+
+@dataclass(frozen=True)
 class SensitivitySettings:
     """Changes of a simulation by candidate effects.
 
@@ -214,8 +234,13 @@ class SensitivitySettings:
         sizes: Sizes of an effect that is not smooth, as multiples of its probe.
         resonant_sizes: Sizes of a resonance, as multiples of its probe: up to about twice its
             size, with ``resonance_ratio`` between neighbours.
+        resonance_stride: Every how many of them is tried first.
+        alike: Cosine of the changes by two sizes from which those between them are not tried. The
+            linear gain of a size between them is then known to 0.5 %.
         first_limit: First value tried for a limit of commands, as a fraction of the largest
             command.
+        limit_quantiles: Quantiles of its prior at which a limit is tried if the recorded commands
+            do not tell what it would cut off.
         rounding_errors: A change below this many rounding errors of the largest measurement is
             treated as zero. Effects without influence leave such errors: an encoder's bias, where
             no force depends on its position.
@@ -231,7 +256,10 @@ class SensitivitySettings:
     resonance_ratio: float = 1.1
     sizes: tuple[float, ...] = (1.0, 0.25)
     resonant_sizes: tuple[float, ...] = tuple(0.05 * 1.1**k for k in range(40))
+    resonance_stride: int = 4
+    alike: float = 0.99
     first_limit: float = 0.7
+    limit_quantiles: tuple[float, ...] = (0.9, 0.7, 0.5, 0.3, 0.1)
     rounding_errors: float = 100.0
     smooth_size: float = 0.05
     shape_quantiles: tuple[float, ...] = (0.5, 0.15, 0.85)
@@ -251,13 +279,15 @@ class SensitivitySettings:
             "smooth_size",
         )
         check_range(self, 1.0, math.inf, "rounding_errors")
-        check_range(self, 0.0, 1.0, "shape_quantiles")
-        check_range(self, 1, math.inf, "most_shapes", "segments_per_part")
+        check_range(self, 0.0, 1.0, "shape_quantiles", "limit_quantiles")
+        check_range(self, 1, math.inf, "most_shapes", "segments_per_part", "resonance_stride")
+        check_range(self, 0.0, 1.0, "alike")
 
 
 ALARM = AlarmSettings()
 ENCODER = EncoderSettings()
 GENERIC_LAWS = GenericLawSettings()
+GROUPS = GroupSettings()
 LATENT_FORCE = LatentForceSettings()
 MOMENT_TEST = MomentTestSettings()
 PERMUTATION_TEST = PermutationTestSettings()

@@ -23,12 +23,18 @@ from npdr_ppl.discovery.search.alternatives import (
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps, polished
 from npdr_ppl.discovery.search.deadline import Deadline
 from npdr_ppl.discovery.search.evidence import weigh
-from npdr_ppl.discovery.search.likelier_pair import likelier_pair
+from npdr_ppl.discovery.search.likelier_group import likelier_group
 from npdr_ppl.discovery.search.look import look
 from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
 from npdr_ppl.discovery.search.repeatability import repeated_effects
-from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
+from npdr_ppl.discovery.search.rounds import (
+    Round,
+    Search,
+    is_negligible,
+    is_something_left,
+    num_counted,
+)
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
 from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
@@ -207,7 +213,7 @@ class Searcher:
         """
         current, now = first.hypothesis, first
         rounds = [first]
-        while len(current.effects) < max_effects and is_something_left(first, now):
+        while num_counted(current.effects) < max_effects and is_something_left(first, now):
             # At least the likeliest candidates are fitted, so that there is an answer.
             if len(rounds) > 1 and self._deadline.stops():
                 break
@@ -216,22 +222,42 @@ class Searcher:
             single = current if best is None else tried[best]
             if is_negligible(first.hypothesis, current, single):
                 single = current
+            single = self._with_law_at_several(rounds[-1], single)
             extended = self._with_likelier_pair(rounds, single, max_effects)
             if is_negligible(first.hypothesis, current, extended):
                 break
             tested = best if extended is single else None
             current = self.trials.with_own_starts(self._pruned(extended, tested))
             if self.with_finer_steps(current) is not current:
-                # The missing effect had hidden that the steps are too coarse: restart the search.
-                current = self.fit_base()
-                first = now = self.look(current)
-                rounds = [first]
+                # The missing effect had hidden that the steps are too coarse.
+                first = now = self._in_present_steps(rounds[0])
+                current, rounds = first.hypothesis, [first]
                 continue
             if any(set(current.names) == set(r.hypothesis.names) for r in rounds):
                 break
             now = self.look(current)
             rounds.append(now)
         return self._revised(current, rounds, max_effects)
+
+    def _in_present_steps(self, first: Round) -> Round:
+        """Returns the first round with the original model in the present integration steps.
+
+        The order of the candidates stays, because they are compared in coarse steps anyway. Those
+        whose fit was hopeless in coarse steps are not fitted again.
+
+        Args:
+            first: The round in coarser steps.
+        """
+        fitted = self.fit_base(near=first.hypothesis.parameters)
+        hopeless = {name for name, w in first.weights.items() if w < SEARCH.hopeless}
+        return replace(
+            first,
+            hypothesis=fitted,
+            averaged=fitted.averaged(),
+            hopeless=first.hopeless | hopeless,
+            weights={},
+            trials={},
+        )
 
     def _revised(self, current: Hypothesis, rounds: list[Round], max_effects: int) -> Search:
         """Returns the effects that are found again, in their simplest form, and alternatives.
@@ -310,8 +336,9 @@ class Searcher:
         label = f"effect {len(current.effects) + 1}"
         # Candidates that are far behind the best one are skipped.
         step = self._progress.stage(label, may_end_early=True)
+        hopeful = [c for c in ranking[: TRIALS.shortlist] if c.name not in now.hopeless]
         trials = fit_shortlist(
-            self.trials, current, ranking, self._report, step, self._deadline.stops
+            self.trials, current, hopeful, self._report, step, self._deadline.stops
         )
         if not trials:
             return None, {}, {}
@@ -341,6 +368,28 @@ class Searcher:
         self._report(f"adding {best}")
         return best, weights, trials
 
+    def _with_law_at_several(self, now: Round, current: Hypothesis) -> Hypothesis:
+        """Returns the model with one law at several joints, if that is likelier.
+
+        Args:
+            now: The results before the last addition.
+            current: The model after it, if there was one.
+        """
+        if current is now.hypothesis or not now.laws or self._deadline.stops():
+            return current
+        found = likelier_group(
+            now.hypothesis,
+            now.laws,
+            current,
+            self.trials,
+            num_new=1,
+            num_candidates=len(now.ranking),
+            confidence=self.options.confidence,
+            report=self._report,
+            progress=self._progress.stage("laws at several joints", may_end_early=True),
+        )
+        return found or current
+
     def _with_likelier_pair(
         self, rounds: list[Round], current: Hypothesis, max_effects: int
     ) -> Hypothesis:
@@ -359,15 +408,16 @@ class Searcher:
         before, after = rounds[-2], rounds[-1].hypothesis
         new = set(after.names) - set(before.hypothesis.names)
         pairs = [pair for pair in before.pairs if not pair.names & new]
-        if len(new) != 1 or len(before.hypothesis.effects) + 2 > max_effects:
+        if len(new) != 1 or num_counted(before.hypothesis.effects) + 2 > max_effects:
             return current
         if not pairs or self._deadline.stops():
             return current
-        found = likelier_pair(
+        found = likelier_group(
             before.hypothesis,
             pairs,
             current,
             self.trials,
+            num_new=2,
             num_candidates=len(before.ranking),
             confidence=self.options.confidence,
             report=self._report,

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.alarm import sound_alarm
+from npdr_ppl.discovery.screening.groups import ranked_laws, ranked_pairs
 from npdr_ppl.discovery.screening.latent_force import responses
-from npdr_ppl.discovery.screening.pairs import ranked_pairs
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.sensitivities import Variant
 from npdr_ppl.discovery.screening.separation import separation_matrix
@@ -59,6 +59,7 @@ def look(
     )
     separation = separation_matrix(projection, ranking[: SEARCH.num_leading])
     pairs = ranked_pairs(projection, ranking[: SEARCH.num_paired])
+    laws = ranked_laws(projection, ranking)
     ranking = [candidate.without_change() for candidate in ranking]
     width = averaged.segments.steps_per_average
     if width > 1:
@@ -69,7 +70,7 @@ def look(
         )
     best = ", ".join(s.name for s in ranking[:3]) or "none"
     report(f"p = {alarm.p_value:.2g} ({alarm.strongest}); the best candidates are {best}")
-    return Round(hypothesis, averaged, alarm, ranking, separation, found, pairs)
+    return Round(hypothesis, averaged, alarm, ranking, separation, found, pairs, laws)
 
 
 def _counted(variants: Iterator[Variant], num: int, step: Step) -> Iterator[Variant]:

@@ -1,19 +1,23 @@
 """The rounds of a search and its result."""
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.alarm import Alarm
+from npdr_ppl.discovery.screening.groups import Group
 from npdr_ppl.discovery.screening.latent_force import Responses
-from npdr_ppl.discovery.screening.pairs import Pair
 from npdr_ppl.discovery.screening.screening import Screened
+from npdr_ppl.discovery.screening.settings import GROUPS
 from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.evidence import closest
 from npdr_ppl.discovery.search.settings import SEARCH
+from npdr_ppl.language.effects import Effect
 
-__all__ = ["Round", "Search", "explained", "is_negligible", "is_something_left"]
+__all__ = ["Round", "Search", "explained", "is_negligible", "is_something_left", "num_counted"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,8 @@ class Round:
         separation: Distances between the best candidates; see :mod:`separation`.
         responses: Changes of the measurements by pulses of force at the joints.
         pairs: Pairs of the best candidates by joint linear gain.
+        laws: Groups of the same law at several joints by joint linear gain.
+        hopeless: Candidates that need not be fitted in full, by name.
         weights: Probability of each candidate fitted in full, by name; ``""`` for no effect.
         trials: The model with each of these candidates, by name.
     """
@@ -38,7 +44,9 @@ class Round:
     ranking: list[Screened]
     separation: Tensor
     responses: Responses
-    pairs: list[Pair] = field(default_factory=list)
+    pairs: list[Group] = field(default_factory=list)
+    laws: list[Group] = field(default_factory=list)
+    hopeless: frozenset[str] = frozenset()
     weights: dict[str, float] = field(default_factory=dict)
     trials: dict[str, Hypothesis] = field(default_factory=dict)
 
@@ -63,6 +71,12 @@ class Search:
     trials: dict[tuple[str, str], Hypothesis]
     is_approximate: bool = False
     has_stopped: bool = False
+
+
+def num_counted(effects: Iterable[Effect]) -> int:
+    """Returns the number of effects, of which the same law at several joints counts as one."""
+    numbers = Counter(effect.id for effect in effects)
+    return sum(1 if number >= GROUPS.fewest else number for number in numbers.values())
 
 
 def explained(first: Hypothesis, final: Hypothesis) -> float:

@@ -57,6 +57,9 @@ class SearchSettings:
     """The rounds of the search.
 
     Attributes:
+        hopeless: Probability in coarse steps below which a candidate is not fitted again in finer
+            ones. An error of the steps of 10 standard deviations changes a log evidence of 230 by
+            up to 10 √(2 · 230), less than itself.
         least_unexplained: Stop when the unexplained misfit is below this fraction of the explained
             misfit. If a large effect was missing, differences between integrators and in details
             of the laws are this large.
@@ -68,6 +71,7 @@ class SearchSettings:
             parts of the recording.
     """
 
+    hopeless: float = 1e-100
     least_unexplained: float = 1e-4
     num_leading: int = 10
     num_paired: int = 20
@@ -76,7 +80,7 @@ class SearchSettings:
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
-        check_range(self, 0.0, 1.0, "least_unexplained", "prior_of_any")
+        check_range(self, 0.0, 1.0, "hopeless", "least_unexplained", "prior_of_any")
         check_range(self, 2, 1000, "num_leading", "num_paired")
         check_range(self, 1, 100, "most_revisions")
 

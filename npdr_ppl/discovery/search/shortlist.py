@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.screening.pairs import Pair
+from npdr_ppl.discovery.screening.groups import Group
 from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.search.evidence import closest, evidence
 from npdr_ppl.discovery.search.settings import TRIALS
@@ -16,7 +16,7 @@ from npdr_ppl.preparation.closest_fit import part_of
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.progress import Step
 
-__all__ = ["fit_contenders", "fit_pairs", "fit_shortlist"]
+__all__ = ["fit_contenders", "fit_groups", "fit_shortlist"]
 
 
 def fit_shortlist(
@@ -131,36 +131,38 @@ def fit_contenders(
     return result
 
 
-def fit_pairs(
+def fit_groups(
     trials: Trials,
     current: Hypothesis,
-    pairs: Sequence[Pair],
+    groups: Sequence[Group],
     starts: InitialStates | None,
     report: Callable[[str], None] = lambda _: None,
     progress: Step = lambda fraction, status: None,
 ) -> dict[str, Hypothesis]:
-    """Fits the hypothesis with each of several pairs of candidates, from linear estimates.
+    """Fits the hypothesis with each of several groups of candidates, from linear estimates.
 
     Args:
         trials: Fits the model.
         current: The hypothesis.
-        pairs: The pairs.
+        groups: The groups.
         starts: Initial states of the segments.
-        report: Called with a sentence about each pair.
-        progress: Called with the fraction of the pairs that is fitted.
+        report: Called with a sentence about each group.
+        progress: Called with the fraction of the groups that is fitted.
 
     Returns:
-        The model with each pair, by the names of both; pairs that cannot be simulated are left
-        out.
+        The model with each group, by the names of its members; groups that cannot be simulated
+        are left out.
     """
-    asked = [trials.extension(current, pair.effects, pair.parameters, starts) for pair in pairs]
+    asked = [
+        trials.extension(current, group.effects, group.parameters, starts) for group in groups
+    ]
     tried: dict[str, Hypothesis] = {}
     fits = trials.fits(asked, current.simulator)
-    for number, (pair, found) in enumerate(zip(pairs, fits, strict=True), 1):
+    for number, (group, found) in enumerate(zip(groups, fits, strict=True), 1):
         if found is not None:
-            tried[pair.name] = found
-            report(f"tried {pair.name}: {_shown(found)}")
-        progress(number / len(pairs), f"{number} of {len(pairs)} pairs fitted")
+            tried[group.name] = found
+            report(f"tried {group.name}: {_shown(found)}")
+        progress(number / len(groups), f"{number} of {len(groups)} groups fitted")
     return tried
 
 

@@ -15,8 +15,8 @@ __all__ = ["CommandRecord", "RecentCommands", "RecordedCommands", "commands_at"]
 class CommandRecord:
     """All commands of one action channel in a batch of segments, including past ones.
 
-    Commands before the oldest recorded one are zero if the segment is the first of its rollout.
-    Otherwise they are unknown and assumed equal to the oldest one.
+    Commands before a rollout are zero, but a servo already holds the first goal. Commands before
+    the oldest one that is included of a running rollout are assumed equal to it.
 
     Args:
         inputs: The segments; their actions may carry batch dimensions.
@@ -24,6 +24,7 @@ class CommandRecord:
         batch_shape: The batch shape including the segments, of numel N.
         limits: Least and greatest command that the device accepts.
         dtype: Floating type of the simulation.
+        is_goal: Whether the channel is the goal of a servo.
     """
 
     def __init__(
@@ -33,10 +34,18 @@ class CommandRecord:
         batch_shape: torch.Size,
         limits: tuple[float, float],
         dtype: torch.dtype,
+        *,
+        is_goal: bool = False,
     ) -> None:
         known = torch.cat((inputs.past_actions, inputs.actions), dim=-2)[..., column]
         known = known.to(dtype).clamp(*limits)
         before = torch.where(inputs.start == 0, torch.zeros_like(known[..., 0]), known[..., 0])
+        if is_goal:
+            first = (inputs.past_actions.shape[-2] - inputs.start).clamp_min(0)[..., None]
+            goal = known.gather(-1, first.expand(*known.shape[:-1], 1))
+            is_before = torch.arange(known.shape[-1], device=known.device) < first
+            known = torch.where(is_before, goal, known)
+            before = known[..., 0]
         # Time is the first axis, so that the commands of one step are contiguous in memory.
         self._table = torch.cat((before[..., None], known), dim=-1).movedim(-1, 0).contiguous()
         self._batch_shape: torch.Size | None = batch_shape

@@ -1,5 +1,6 @@
 """Applies effects before, during and after a step, for every engine."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -23,6 +24,10 @@ from npdr_ppl.language.effects import (
 from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["EffectChain", "Moments", "State", "Tables", "needed_histories"]
+
+# Steps of past commands from which the memory of action effects at a segment's start is computed,
+# if no effect asks for more: longer than the delays of working control loops.
+_PAST_STEPS = 64
 
 # Lengths of histories are rounded up to multiples of this number of steps, so that different draws
 # of a delay share a compiled kernel.
@@ -118,6 +123,20 @@ class EffectChain(ABC):
     def force_step(self) -> float:
         """Seconds between two evaluations of the force effects."""
         return self.time_step
+
+    def num_past_steps(self, recorded: int) -> int:
+        """Returns from how many steps of past commands a segment's start is computed.
+
+        Args:
+            recorded: Number of past steps that are included in the inputs.
+        """
+        if not self.action_effects:
+            return 0
+        times = [0.0] * len(self.simulator.actions)
+        for _, effect, channel in self.action_effects:
+            times[channel] += effect.memory_time
+        steps = math.ceil(min(max(times) / self.time_step, recorded))
+        return min(recorded, max(_PAST_STEPS, steps))
 
     @property
     def signature(self) -> Hashable:

@@ -114,7 +114,7 @@ class Signals:
             shape = len(self.start_times), self._inputs.num_steps, 0
             return torch.zeros(shape, dtype=torch.float64)
         chain, tables = self._action_chain, Tables(None, self._action_parameters)
-        past = self._inputs.past_actions.shape[-2]
+        past = chain.num_past_steps(self._inputs.past_actions.shape[-2])
         settled = commands_at(self._records, -1 - past)
         state = chain.start((), (), tables, settled, (), self.start_times, num_past=past)
         state = with_past_commands(chain, state, tables, self._records, past)

@@ -98,7 +98,12 @@ def has_constraints(model: Any) -> bool:
 
 
 def prepared_copy(
-    model: Any, step: float, crisp: tuple[int, ...], *, keeps_solver: bool = True
+    model: Any,
+    step: float,
+    crisp: tuple[int, ...],
+    limited: tuple[int, ...] = (),
+    *,
+    keeps_solver: bool = True,
 ) -> Any:
     """Returns a copy of a model, ready for a batch.
 
@@ -111,6 +116,7 @@ def prepared_copy(
         crisp: Degrees of freedom whose dry friction is made as hard as the engine allows. This
             changes nothing while the friction is zero, so an effect of zero strength has no
             influence.
+        limited: Actuators whose force is unlimited and gets a limit, infinite for now.
         keeps_solver: Whether the constraint solver is called even if the model has no
             constraints, because parameters or effects may add some.
     """
@@ -121,6 +127,9 @@ def prepared_copy(
         # The same values in 7 % less time.
         own.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     own.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+    for actuator in limited:
+        own.actuator_forcelimited[actuator] = True
+        own.actuator_forcerange[actuator] = -np.inf, np.inf
     for dof in crisp:
         own.dof_solref[dof] = _CRISP_STEPS * step, 1.0
         own.dof_solimp[dof] = _CRISP_IMPEDANCE

@@ -32,10 +32,16 @@ from npdr_ppl.engines.mujoco.fields import element_names
 from npdr_ppl.engines.mujoco.native_laws import is_native, native_law
 from npdr_ppl.engines.mujoco.parameters import Assignments, Binding, Bindings, Derivation
 from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
-from npdr_ppl.engines.mujoco.servos import with_servos
+from npdr_ppl.engines.mujoco.servos import servo_gain, with_servos
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
-from npdr_ppl.language.effects import Effect, EnvironmentEffect, ForceEffect, ParameterEffect
+from npdr_ppl.language.effects import (
+    Effect,
+    EnvironmentEffect,
+    ForceEffect,
+    ParameterEffect,
+    ServoEffect,
+)
 from npdr_ppl.registry import hint
 
 __all__ = ["MujocoMechanism"]
@@ -80,7 +86,7 @@ class MujocoMechanism(ClosedLoopSimulator):
             self.model: Any = load_mjcf(source)
         self._source = recorded_mjcf(source)
         self.file = Path(source) if isinstance(source, str | PathLike) else None
-        self.prepared_models: dict[tuple[float, tuple[int, ...], bool], Any] = {}
+        self.prepared_models: dict[tuple[object, ...], Any] = {}
         is_path = isinstance(source, str | PathLike)
         self._label = Path(source).name if is_path else "a model"
         self.substeps, self.num_threads = substeps, num_threads
@@ -146,7 +152,7 @@ class MujocoMechanism(ClosedLoopSimulator):
     def make_batch(
         self, given: Mapping[str, Tensor], num_simulations: int, time_step: float, time: Tensor
     ) -> tuple[Any, Tables]:
-        """Returns a batch with its parameters set, and the effects' parameters.
+        """Returns a batch with its parameters set, and the effects' parameters and servos' gains.
 
         Args:
             given: Given parameters, ``(N,)`` or numbers, in float64.
@@ -157,7 +163,19 @@ class MujocoMechanism(ClosedLoopSimulator):
         assignments, own = self.assignments(given, time)
         model = self.prepared(time_step / self.num_substeps(time_step), set(assignments))
         num_threads = self.num_threads or torch.get_num_threads()
-        return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)
+        servos = {actuator for _, _, actuator in self.servo_effects}
+        gains = {a: servo_gain(self.model, a, assignments) for a in servos}
+        return make_batch(model, assignments, num_simulations, num_threads), Tables(gains, own)
+
+    @property
+    def servo_effects(self) -> list[tuple[int, ServoEffect, int]]:
+        """Index among the effects, effect and number of the actuator of each servo effect."""
+        names = [action.name for action in self.actions]
+        return [
+            (place, effect, names.index(effect.port))
+            for place, effect in enumerate(self.effects)
+            if isinstance(effect, ServoEffect)
+        ]
 
     def assignments(
         self, given: Mapping[str, Tensor], time: Tensor
@@ -216,10 +234,12 @@ class MujocoMechanism(ClosedLoopSimulator):
             and ("dof_frictionloss", dof) not in assigned
         )
         may_add = bool(crisp) or any(array.endswith("frictionloss") for array, _ in assigned)
-        key = step, crisp, may_add
+        limits = {place // 2 for array, place in assigned if array == "actuator_forcerange"}
+        unlimited = tuple(a for a in sorted(limits) if not self.model.actuator_forcelimited[a])
+        key = step, crisp, may_add, unlimited
         if key not in self.prepared_models:
             self.prepared_models[key] = prepared_copy(
-                self.model, step, crisp, keeps_solver=may_add
+                self.model, step, crisp, unlimited, keeps_solver=may_add
             )
         return self.prepared_models[key]
 

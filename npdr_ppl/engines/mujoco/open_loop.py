@@ -92,7 +92,6 @@ class _Replay:
         self.limits = [(a.lower, a.upper) for a in simulator.actions]
         self.commands, self.rows = self._commands(shape)
         self.start = recorded_start(simulator, inputs, shape)
-        self.past = inputs.past_actions.shape[-2]
         self.histories = simulator.histories(given, inputs.time_step)
 
     @property
@@ -118,20 +117,21 @@ class _Replay:
             chain = MujocoStepper(self.simulator, batch, step, self.histories)
             records = self._records(chain, first, last)
             components = true_start(chain, tables, recorded, records)
+            past = chain.num_past_steps(self.inputs.past_actions.shape[-2])
             chain.place(components)
             chain.begin()
             state = chain.start(
                 components[: chain.num_positions],
                 components[chain.num_positions :],
                 tables,
-                commands_at(records, -1 - self.past),
+                commands_at(records, -1 - past),
                 recorded.readings,
                 recorded.time,
                 commands_before=partial(commands_at, records),
-                num_past=self.past if chain.action_effects else 0,
+                num_past=past,
             )
             controls = self._controls(chain, state, tables, records, first, last)
-            if chain.force_effects:
+            if chain.has_forces:
                 return self._step_by_step(chain, state, tables, controls)
             true = run_all_steps(batch, controls, chain.substeps, self.simulator.readings)
         readings = torch.from_numpy(true)
@@ -161,8 +161,15 @@ class _Replay:
         if not (chain.action_effects or chain.sensor_effects):
             return ()
         return tuple(
-            CommandRecord(self.inputs, column, self.shape, limits, torch.float64).part(first, last)
-            for column, limits in zip(self.columns, self.limits, strict=True)
+            CommandRecord(
+                self.inputs,
+                column,
+                self.shape,
+                (action.lower, action.upper),
+                torch.float64,
+                is_goal=self.simulator.port(action.name).kind == "servo",
+            ).part(first, last)
+            for column, action in zip(self.columns, self.simulator.actions, strict=True)
         )
 
     def _controls(
@@ -182,7 +189,8 @@ class _Replay:
         if not chain.action_effects:
             return controls
         controls = np.repeat(controls, chain.substeps, axis=2)
-        state = with_past_commands(chain, state, tables, records, self.past)
+        past = chain.num_past_steps(self.inputs.past_actions.shape[-2])
+        state = with_past_commands(chain, state, tables, records, past)
         for k in range(self.inputs.num_steps):
             commands = commands_at(records, k)
             views = tuple(record.view(k) for record in records)

@@ -3,6 +3,7 @@
 import importlib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -97,10 +98,7 @@ def derive_ports(
     """Returns the ports of actions, joints and sensors; actions are those of all actuators."""
     by_position = {joint.position: joint for joint in joints}
     by_velocity = {joint.velocity: joint for joint in joints}
-    ports = [
-        Port(a.name, "servo" if is_servo(model, i) else "action", a.unit, _largest(a))
-        for i, a in enumerate(actions)
-    ]
+    ports = [_command_port(model, i, a, joints) for i, a in enumerate(actions)]
     ports += [joint.port for joint in joints]
     for sensor in sensors:
         rated = 1.0
@@ -113,6 +111,25 @@ def derive_ports(
             rated = 9.81
         ports.append(Port(sensor.channel.name, "sensor", sensor.channel.unit, rated))
     return tuple(ports)
+
+
+def _command_port(
+    model: Any, actuator: int, channel: Channel, joints: Sequence[ForcePort]
+) -> Port:
+    """Returns the port of an actuator's command; a servo's has the ratings of its joint."""
+    if not is_servo(model, actuator):
+        return Port(channel.name, "action", channel.unit, _largest(channel))
+    port = Port(channel.name, "servo", channel.unit, _largest(channel))
+    moved = actuated_joint(model, actuator)
+    for joint in (j.port for j in joints if j.joint == moved):
+        port = replace(
+            port,
+            rated_speed=joint.rated_speed,
+            rated_position=joint.rated_position,
+            coordinate=joint.coordinate,
+            rated_force=joint.rated,
+        )
+    return port
 
 
 def _largest(channel: Channel) -> float:

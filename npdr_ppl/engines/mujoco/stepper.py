@@ -14,6 +14,7 @@ from npdr_ppl.engines.mujoco.batches import state_view
 from npdr_ppl.engines.mujoco.channels import Component, Reading
 from npdr_ppl.engines.mujoco.joints import JointStates
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
+from npdr_ppl.engines.mujoco.servos import ServoForces
 
 __all__ = ["ACCELERATION_STAGE", "MujocoStepper", "lost_simulations"]
 
@@ -38,6 +39,7 @@ class MujocoStepper(EffectChain):
             that each sensor effect may need.
 
     Attributes:
+        has_forces: Whether effects have to be evaluated before every engine step.
         is_lost: Simulations about which the engine warned, ``(N,)``; they report NaN.
     """
 
@@ -51,6 +53,9 @@ class MujocoStepper(EffectChain):
         super().__init__(simulator, simulator.joints, time_step, histories)
         self.simulator: MujocoMechanism = simulator
         self.force_effects = [f for f in self.force_effects if not simulator.is_native(f[1])]
+        servo_effects = simulator.servo_effects
+        self._has_servo_effects = bool(servo_effects)
+        self.has_forces = self._has_servo_effects or bool(self.force_effects)
         self.substeps = simulator.num_substeps(time_step)
         self._engine_step = time_step / self.substeps
         self._batch = batch
@@ -63,7 +68,8 @@ class MujocoStepper(EffectChain):
         # computed again. Acceleration sensors report the values of the last engine step.
         self._stage = max(stages - {ACCELERATION_STAGE}, default=0)
         self._has_accelerations = ACCELERATION_STAGE in stages
-        self._applied = state_view(batch, "qfrc_applied") if self.force_effects else None
+        self._applied = state_view(batch, "qfrc_applied") if self.has_forces else None
+        self._servos = ServoForces(simulator.model, servo_effects, self._ctrl, self._qpos)
         # The bounds of dry friction that the engine reads, and the bounds without effects.
         self._friction: tuple[np.ndarray, np.ndarray] | None = None
         self._joints = JointStates(batch, simulator.force_ports) if self.needs_joints else None
@@ -159,7 +165,7 @@ class MujocoStepper(EffectChain):
             actions: Actions after all effects, for each engine step or one for all of them.
             tables: Constants of the simulation.
         """
-        if len(actions) == 1 and not self.force_effects:
+        if len(actions) == 1 and not self.has_forces:
             self._command(actions[0])
             self._guarded(self._batch.step, nstep=self.substeps, stage=self._stage)
         else:
@@ -172,7 +178,7 @@ class MujocoStepper(EffectChain):
 
     def _move_once(self, state: State, tables: Tables, stage: int) -> State:
         """Advances all simulations by one engine step under the force effects."""
-        if not self.force_effects:
+        if not self.has_forces:
             self._guarded(self._batch.step, stage=stage)
             return state
         positions, velocities = self.at_joints((), ())
@@ -196,12 +202,14 @@ class MujocoStepper(EffectChain):
         forces = self.applied_forces(
             state.positions, state.velocities, state, tables, before_step=before_step
         )
-        if before_step:
-            # Removes the previous step's forces of effects that need their joint's state first.
+        if before_step or self._has_servo_effects:
+            # Removes the previous step's forces of effects that need their joint's state first,
+            # or that are added.
             self._applied[:] = 0.0
         for port, force in zip(ports, forces, strict=True):
             if force is not None:
                 self._applied[:, port.velocity] = force.numpy()
+        self._servos.add_to(self._applied, tables)
         if before_step:
             if self._friction is not None:
                 present, own = self._friction

@@ -199,7 +199,7 @@ def _start(
             f"{simulator.name} has {num_joints} joints, so it should declare {2 * num_joints} "
             f"states, got {len(recorded.states)}."
         )
-    past = inputs.past_actions.shape[-2]
+    past = stepper.num_past_steps(inputs.past_actions.shape[-2])
     components = true_start(stepper, tables, recorded, records)
     state = stepper.start(
         components[:num_joints],
@@ -209,6 +209,6 @@ def _start(
         recorded.readings,
         recorded.time,
         commands_before=partial(commands_at, records),
-        num_past=past if stepper.action_effects else 0,
+        num_past=past,
     )
     return with_past_commands(stepper, state, tables, records, past)

@@ -5,12 +5,12 @@ import torch
 from hidden_rigs import make_case
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.screening.pairs import ranked_pairs
+from npdr_ppl.discovery.screening.groups import ranked_pairs
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.screening import Screening
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_pairs, fit_shortlist
+from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_groups, fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.models.effects import (
     ActuatorLag,
@@ -113,7 +113,7 @@ def test_a_pair_that_cannot_be_simulated_is_left_out(rubbed, monkeypatch):
 
     monkeypatch.setattr(Trials, "with_effects", without_drag)
     starts = first.hypothesis.segments.starts
-    found = fit_pairs(searcher.trials, first.hypothesis, first.pairs[:3], starts)
+    found = fit_groups(searcher.trials, first.hypothesis, first.pairs[:3], starts)
     kept = {pair.name for pair in first.pairs[:3] if "hinge.quadratic_drag" not in pair.names}
     assert set(found) == kept
 

@@ -1,0 +1,192 @@
+"""Effects inside servos in MuJoCo, against the engine's own numbers and loops written out here."""
+
+import math
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from npdr_ppl.engines.mujoco import MujocoSimulator
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.effects import (
+    GoalAccelerationLimit,
+    GoalResolution,
+    GoalSpeedLimit,
+    InputDelay,
+    ServoDeadBand,
+    ServoForceLimit,
+    candidate_effects,
+)
+from tests.helpers.mujoco_files import random_inputs, value
+
+STEP, GAIN, DAMPING = 0.002, 20.0, 1.0
+
+SERVO = '<position name="goal" joint="hinge" kp="{kp}" kv="{kv}" {more}/>'
+
+
+def joint(actuator=SERVO, more=""):
+    actuator = actuator.format(kp=GAIN, kv=DAMPING, more=more)
+    text = f"""<mujoco><option timestep="{STEP}"/><worldbody>
+    <body><joint name="hinge" axis="0 1 0" armature="0.02" range="-120 120"/>
+    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/></body></worldbody>
+    <actuator>{actuator}</actuator></mujoco>"""
+    return MujocoSimulator(mujoco.MjModel.from_xml_string(text))
+
+
+def goals(commands, first=0.0):
+    """Inputs with commands from rest at the first position."""
+    commands = torch.as_tensor(np.asarray(commands), dtype=torch.float64)
+    return Inputs.single(
+        commands[:, None],
+        value([first, 0.0]),
+        action_names=("goal",),
+        state_names=("hinge", "hinge_velocity"),
+        time_step=STEP,
+    )
+
+
+def written_out(law, commands, position=0.0):
+    """Positions of a joint whose servo is a law, one engine step after another."""
+    model = joint('<motor name="goal" joint="hinge"/>').model
+    data = mujoco.MjData(model)
+    data.qpos[0] = position
+    result = []
+    for command in commands:
+        mujoco.mj_forward(model, data)
+        data.qfrc_applied[0] = law(command - data.qpos[0]) - DAMPING * data.qvel[0]
+        mujoco.mj_step(model, data)
+        result.append(float(data.qpos[0]))
+    return torch.tensor(result, dtype=torch.float64)
+
+
+def test_a_dead_band_takes_the_force_of_small_errors():
+    inputs = random_inputs(joint(), num_steps=150)
+    base = joint().simulate({}, inputs)
+    width = 0.05
+    effect = ServoDeadBand("goal")
+    out = (
+        joint().with_effects(effect).simulate({f"{effect.name}.width": value([0, width])}, inputs)
+    )
+    assert torch.equal(out[0], base)
+    commands = 0.4 * np.sin(np.linspace(0.0, 9.0, 300))
+    given = {f"{effect.name}.width": value(width)}
+    (reached,) = joint().with_effects(effect).simulate(given, goals(commands))
+
+    def law(error):
+        return GAIN * math.copysign(max(abs(error) - width, 0.0), error)
+
+    # The engine treats the servo's damping implicitly, the loop does not.
+    expected = written_out(law, commands)
+    without = written_out(lambda error: GAIN * error, commands)
+    error = float((reached[:, 0] - expected).abs().max())
+    assert error < 0.02 * float((without - expected).abs().max())
+
+
+def test_a_force_limit_is_that_of_the_file():
+    limited = joint(more='forcerange="-0.7 0.7"')
+    inputs = random_inputs(joint(), num_steps=150)
+    name = "goal.servo_force_limit.limit"
+    changed = joint().with_effects(ServoForceLimit("goal"))
+    out = changed.simulate({name: value([math.inf, 0.7])}, inputs)
+    assert torch.equal(out[0], joint().simulate({}, inputs))
+    assert torch.equal(out[1], limited.simulate({}, inputs))
+    assert float((out[0] - out[1]).abs().max()) > 0.01
+    # The lower one of both limits acts.
+    both = limited.with_effects(ServoForceLimit("goal")).simulate(
+        {name: value([0.4, 2.0])}, inputs
+    )
+    assert torch.equal(both[1], out[1])
+    assert float((both[0] - out[1]).abs().max()) > 0.01
+
+
+@pytest.mark.parametrize("effect", [GoalSpeedLimit("goal"), GoalAccelerationLimit("goal")])
+def test_an_infinite_limit_changes_nothing(effect):
+    inputs = random_inputs(joint(), num_steps=100)
+    out = joint().with_effects(effect).simulate({f"{effect.name}.limit": value(math.inf)}, inputs)
+    assert torch.equal(out, joint().simulate({}, inputs))
+    assert torch.equal(joint().with_effects(effect).simulate({}, inputs), out)
+
+
+def test_a_goal_with_limited_speed_is_a_ramp():
+    speed, step = 2.0, 0.3
+    ramp = np.minimum(step, speed * STEP * np.arange(1, 201))
+    limited = joint().with_effects(GoalSpeedLimit("goal"))
+    inputs = goals(np.r_[np.zeros(10), np.full(200, step)])
+    out = limited.simulate({"goal.goal_speed_limit.limit": value(speed)}, inputs)
+    expected = joint().simulate({}, goals(np.r_[np.zeros(10), ramp]))
+    torch.testing.assert_close(out, expected, atol=1e-12, rtol=0.0)
+
+
+def test_a_goal_with_limited_acceleration_arrives_in_the_shortest_time():
+    acceleration, step, first = 4.0, 0.25, 10
+    law = GoalAccelerationLimit("goal")
+    memory, path = law.initial_memory(value([0.0]), None), []
+
+    class Now:
+        def __init__(self, command):
+            self.command = value([command])
+
+        def now(self):
+            return self.command
+
+    for command in np.r_[np.zeros(first), np.full(400, step)]:
+        goal, memory = law.act(Now(command), {"limit": value(acceleration)}, memory, STEP)
+        path.append(float(goal))
+    speeds = np.diff(path) / STEP
+    assert np.abs(np.diff(speeds)).max() <= acceleration * STEP * (1.0 + 1e-9)
+    assert max(path) == step == path[-1]
+    arrival = STEP * (int(np.argmax(np.asarray(path) == step)) + 1 - first)
+    assert arrival == pytest.approx(2.0 * math.sqrt(step / acceleration), abs=4 * STEP)
+
+
+def test_the_goal_of_a_running_rollout_is_known_from_the_past():
+    """A segment that begins while a slow goal is under way continues it."""
+    commands = np.r_[np.zeros(20), np.full(600, 0.5)]
+    limited = joint().with_effects(GoalSpeedLimit("goal"))
+    given = {"goal.goal_speed_limit.limit": value(0.6)}
+    (whole,) = limited.simulate(given, goals(commands))
+    first = 200
+    begun = goals(commands[first:])
+    later = replace(
+        begun,
+        initial_readings=whole[first - 1][None],
+        initial_values=whole[first - 1][None],
+        past_actions=torch.tensor(commands)[None, :first, None],
+        start=torch.tensor([first]),
+    )
+    (part,) = limited.simulate(given, later)
+    torch.testing.assert_close(part, whole[first:], atol=1e-12, rtol=0.0)
+
+
+def test_a_servo_holds_its_first_goal_before_the_rollout():
+    commands = np.full(100, 0.4)
+    late = joint().with_effects(InputDelay("goal"))
+    out = late.simulate({"goal.input_delay.delay": value([0.0, 0.02])}, goals(commands, 0.4))
+    assert torch.equal(out[0], out[1])
+
+
+def test_a_coarse_goal_is_a_multiple_of_its_step():
+    commands = np.linspace(-0.5, 0.5, 100)
+    coarse = joint().with_effects(GoalResolution("goal"))
+    given = {"goal.goal_resolution.step": value([0.0, 0.07])}
+    out = coarse.simulate(given, goals(commands))
+    assert torch.equal(out[0], joint().simulate({}, goals(commands)))
+    rounded = 0.07 * np.round(commands / 0.07)
+    torch.testing.assert_close(out[1], joint().simulate({}, goals(rounded)))
+
+
+def test_laws_of_goals_need_a_servo_that_follows_its_joint():
+    names = {effect.name for effect in candidate_effects(joint())}
+    assert {"goal.servo_dead_band", "goal.servo_force_limit", "goal.goal_speed_limit"} < names
+    geared = joint(more='gear="3"')
+    names = {effect.name for effect in candidate_effects(geared)}
+    assert "goal.servo_force_limit" in names
+    assert "goal.servo_dead_band" not in names
+    with pytest.raises(ModelError, match="makes no sense"):
+        geared.with_effects(ServoDeadBand("goal"))
+    port = joint().port("goal")
+    assert port.force_unit == "N m"
+    assert ServoForceLimit("goal").units(port) == {"limit": "N m"}
