@@ -144,9 +144,7 @@ class GoalAccelerationLimit(ActionEffect):
 
     id = "goal_acceleration_limit"
     port_kinds = ("servo",)
-    parameters = (
-        Parameter("limit", "{port}/s²", math.inf, "greatest acceleration a"),
-    )
+    parameters = (Parameter("limit", "{port}/s²", math.inf, "greatest acceleration a"),)
     is_smooth = False
     memory_time = math.inf
     law = "|g̈| ≤ a"
