@@ -117,7 +117,7 @@ class RidgeCoordinates:
         """
         axes = torch.eye(num, dtype=torch.float64)
         missed = self._missed(likelihood, axes)
-        straight = (missed <= RIDGE.close_gain).nonzero()[:, 0]
+        straight = (missed <= RIDGE.straight_gain).nonzero()[:, 0]
         if num - len(straight) < RIDGE.most_weak and len(straight) > 1:
             # A ridge can be curved between two coordinates along each of which it is straight.
             first, second = straight[torch.triu_indices(len(straight), len(straight), 1)]
@@ -126,13 +126,13 @@ class RidgeCoordinates:
                 missed = missed.scatter_reduce(0, members, between, "amax")
         is_curved = torch.zeros(num, dtype=torch.bool)
         is_curved[missed.argsort(descending=True)[: RIDGE.most_weak]] = True
-        return is_curved & (missed > RIDGE.close_gain)
+        return is_curved & (missed > RIDGE.straight_gain)
 
     def _missed(self, likelihood: SegmentLikelihood, directions: Tensor) -> Tensor:
         """Returns by how much a normal posterior is wrong at two standard deviations, ``(n,)``.
 
         It is the difference of log densities, the mean of both sides, because a slope is no
-        curvature. It is zero where a side is outside the prior's support.
+        curvature. It is infinite where both sides are outside the prior's support.
 
         Args:
             likelihood: The recording's likelihood.
@@ -152,8 +152,8 @@ class RidgeCoordinates:
             - self.log_jacobian(at)
         )
         normal = -0.5 * away.square().sum(-1)
-        missed = (density[1:] - density[0] - normal).unflatten(0, (2, -1)).mean(0)
-        return missed.abs().nan_to_num(0.0, torch.inf)
+        missed = (density[1:] - density[0] - normal).unflatten(0, (2, -1)).nanmean(0)
+        return missed.abs().nan_to_num(torch.inf, torch.inf, torch.inf)
 
     def tensors(self) -> dict[str, Tensor]:
         """Returns the tensors from which, with the prior, the coordinates can be rebuilt."""

@@ -8,6 +8,7 @@ import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.search import shortlist
 from npdr_ppl.discovery.search.effect_search import Searcher
+from npdr_ppl.discovery.search.rivals import with_rivals
 from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
 from npdr_ppl.models.effects import (
     Bias,
@@ -53,7 +54,7 @@ def test_every_effect_gets_its_own_alternatives(dragged):
     # The last one's were tried when it was added.
     tried = {"hinge.bias": all_three, "hinge.cogging": ripple}
     rounds = [searcher.look(searcher.fit_base()), replace(searcher.look(two), trials=tried)]
-    _, added, trials = searcher.with_rivals(all_three, rounds)
+    _, added, trials = with_rivals(all_three, rounds, searcher.trials, searcher.options)
     assert [each.place for each in added] == [effect.name for effect in three]
     for effect in three:
         others = {other.name for other in three} - {effect.name}

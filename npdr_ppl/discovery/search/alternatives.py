@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
@@ -15,11 +15,16 @@ from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.parsimony import overlap
 from npdr_ppl.discovery.search.repeatability import repetitions
 from npdr_ppl.discovery.search.settings import EVIDENCE
-from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
+from npdr_ppl.discovery.search.shortlist import (
+    enough_segments,
+    fit_contenders,
+    fit_shortlist,
+)
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.memory import release_freed_memory
+from npdr_ppl.preparation.closest_fit import part_of
 
 __all__ = [
     "Added",
@@ -86,6 +91,8 @@ def find_alternatives(
 ) -> Alternatives | None:
     """Fits the model with other effects in an effect's place.
 
+    Where the effect explains very much, a part of the segments shows what could take its place.
+
     Args:
         current: The model with the effect.
         effect: The effect.
@@ -100,10 +107,19 @@ def find_alternatives(
         return None
     release_freed_memory()
     candidates = tuple(e for e in candidates_at(without, options) if e.name != effect.name)
-    averaged = without.averaged()
+    scale, num_segments = current.fit.scale, without.segments.inputs.num_segments
+    explained = float((without.losses(scale) - current.losses(scale)).sum())
+    num = enough_segments(without, current.share * explained)
+    part = without
+    if num < num_segments:
+        part = without.along(part_of(without.segments, num))
+    averaged = part.averaged()
     projection = Projection(averaged)
     ranking = screen(projection, variants_of(candidates, projection, responses(averaged)))
-    ranking = [candidate.without_change() for candidate in ranking]
+    ranking = [
+        replace(candidate.without_change(), gain=candidate.gain * num_segments / num)
+        for candidate in ranking
+    ]
     release_freed_memory()
     tried = fit_shortlist(trials, without, ranking)
     tried = fit_contenders(trials, tried, without, done={effect.name: current})

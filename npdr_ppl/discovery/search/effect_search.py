@@ -2,9 +2,9 @@
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 
 from torch import Tensor
 
@@ -12,14 +12,7 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.projection import loss_without
 from npdr_ppl.discovery.screening.variants import candidates_at
-from npdr_ppl.discovery.search.alternatives import (
-    Added,
-    Alternatives,
-    find_alternatives,
-    log_prior,
-    tried_before,
-    weigh_alternatives,
-)
+from npdr_ppl.discovery.search.alternatives import Added, log_prior
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps, polished
 from npdr_ppl.discovery.search.deadline import Deadline
 from npdr_ppl.discovery.search.evidence import weigh
@@ -28,6 +21,7 @@ from npdr_ppl.discovery.search.look import look
 from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
 from npdr_ppl.discovery.search.repeatability import repeated_effects
+from npdr_ppl.discovery.search.rivals import with_rivals
 from npdr_ppl.discovery.search.rounds import (
     Round,
     Search,
@@ -39,8 +33,6 @@ from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
 from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.segment_options import segment_options
-from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
-from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
@@ -272,7 +264,7 @@ class Searcher:
         trials: dict[tuple[str, str], Hypothesis] = {}
         is_approximate = False
         if current.effects and self._deadline.stops():
-            current, added, trials = self.with_rivals(current, rounds)
+            current, added, trials = self._with_rivals(current, rounds)
             return Search(rounds, current, added, trials, has_stopped=True)
         for _ in range(SEARCH.most_revisions):
             current = repeated_effects(current, self.trials, self._report)
@@ -285,7 +277,7 @@ class Searcher:
                 current = plausible_laws(
                     current, candidates, self.trials, self._report, most=max_effects
                 )
-            current, added, trials = self.with_rivals(
+            current, added, trials = self._with_rivals(
                 current, rounds, is_approximate=is_approximate
             )
             if current.effects and self._deadline.stops():
@@ -298,6 +290,20 @@ class Searcher:
         is_approximate = is_something_left(rounds[0], self._looked(current, rounds))
         stopped = self._deadline.has_stopped
         return Search(rounds, current, added, trials, is_approximate, stopped)
+
+    def _with_rivals(
+        self, current: Hypothesis, rounds: list[Round], *, is_approximate: bool = False
+    ) -> tuple[Hypothesis, list[Added], dict[tuple[str, str], Hypothesis]]:
+        """Compares each effect with its alternatives; see :func:`with_rivals`."""
+        return with_rivals(
+            current,
+            rounds,
+            self.trials,
+            self.options,
+            is_approximate=is_approximate,
+            report=self._report,
+            progress=self._progress.stage("compare with alternatives"),
+        )
 
     def _looked(self, current: Hypothesis, rounds: list[Round]) -> Round:
         """Returns the last round, after one is added if it has other effects than a hypothesis."""
@@ -444,68 +450,6 @@ class Searcher:
                 self._report(f"removing {effect.name}")
                 current = without
         return current
-
-    def with_rivals(
-        self, current: Hypothesis, rounds: list[Round], *, is_approximate: bool = False
-    ) -> tuple[Hypothesis, list[Added], dict[tuple[str, str], Hypothesis]]:
-        """Compares each effect with its alternatives, and replaces it if one is likelier.
-
-        Args:
-            current: The fitted model with all effects.
-            rounds: The results of the search so far.
-            is_approximate: Whether something remains that no law of the catalogue explains.
-
-        Returns:
-            The final model, its effects, and the models with each alternative; see
-            :class:`Search`.
-        """
-        added: list[Added] = []
-        trials: dict[tuple[str, str], Hypothesis] = {}
-        waiting = current.effects
-        num = len(waiting)
-        step = self._progress.stage("compare with alternatives")
-        while waiting:
-            asked = current
-            compared = num - len(waiting)
-            step(compared / num, f"{compared} of {num} effects compared")
-            for effect, alternatives in zip(
-                waiting, self._alternatives(asked, waiting, rounds), strict=True
-            ):
-                waiting = waiting[1:]
-                current, found = weigh_alternatives(
-                    rounds[0].hypothesis,
-                    asked,
-                    effect,
-                    alternatives,
-                    is_approximate=is_approximate,
-                )
-                probability = found.alternatives[effect.name]
-                self._report(f"{effect.name}: probability {probability:.2f}")
-                added.append(found)
-                tried = {effect.name: asked} | (
-                    {} if alternatives is None else alternatives.others
-                )
-                trials |= {(effect.name, name): trial for name, trial in tried.items()}
-                compared = num - len(waiting)
-                step(compared / num, f"{compared} of {num} effects compared")
-                if current is not asked:
-                    current = self.trials.with_own_starts(current)
-                    break  # the other effects are compared together with the new one
-        return current, added, trials
-
-    def _alternatives(
-        self, current: Hypothesis, effects: Sequence[Effect], rounds: list[Round]
-    ) -> Iterator[Alternatives | None]:
-        """Yields the alternatives of each effect, in the order of the effects."""
-        seen = [(r.hypothesis, r.trials) for r in rounds]
-        known = {effect.name: tried_before(current, effect, seen) for effect in effects}
-        new = [effect for effect in effects if known[effect.name] is None]
-        function = partial(find_alternatives, current, trials=self.trials, options=self.options)
-        number = num_processes(current.simulator)
-        # With fewer effects than processes, it is faster if each search uses all processes.
-        found = side_by_side(function, new, number if len(new) >= number else 1)
-        for effect in effects:
-            yield known[effect.name] or next(found)
 
 
 def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:

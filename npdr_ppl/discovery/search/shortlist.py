@@ -16,7 +16,7 @@ from npdr_ppl.preparation.closest_fit import part_of
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.progress import Step
 
-__all__ = ["fit_contenders", "fit_groups", "fit_shortlist"]
+__all__ = ["enough_segments", "fit_contenders", "fit_groups", "fit_shortlist"]
 
 
 def fit_shortlist(
@@ -48,7 +48,7 @@ def fit_shortlist(
         stops: Returns whether to leave out the candidates that are not fitted yet.
     """
     if ranking:
-        num = _enough_segments(current, ranking[0].gain)
+        num = enough_segments(current, 0.5 * current.share * ranking[0].gain)
         if num < current.segments.inputs.num_segments:
             index = part_of(current.segments, num)
             few, along = Trials(trials.base.along(index)), current.along(index)
@@ -212,15 +212,14 @@ def _fit_each(
     return tried
 
 
-def _enough_segments(current: Hypothesis, gain: float) -> int:
+def enough_segments(current: Hypothesis, evidence_of_all: float) -> int:
     """Returns how many segments show which candidates explain most.
 
     Args:
         current: The hypothesis.
-        gain: Linear gain of the best candidate along all segments.
+        evidence_of_all: Log evidence for the best candidate along all segments.
     """
     num = current.segments.inputs.num_segments
-    evidence_of_all = 0.5 * current.share * gain
     if evidence_of_all <= TRIALS.enough_evidence:
         return num
     return min(
