@@ -11,7 +11,13 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Start
-from npdr_ppl.language.effects import ActionEffect, Commands, EnvironmentEffect, ServoEffect
+from npdr_ppl.language.effects import (
+    ActionEffect,
+    Commands,
+    EnvironmentEffect,
+    ServoEffect,
+    Uneven,
+)
 from npdr_ppl.models.effects.references import DYNAMIXEL, MUJOCO, TAO_1996
 
 __all__ = [
@@ -125,21 +131,27 @@ class GoalSpeedLimit(ActionEffect):
 
     def act(
         self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
-    ) -> tuple[Tensor, Any]:
-        """Returns the goal after the step."""
+    ) -> tuple[Uneven, Any]:
+        """Returns the goal during the step, and at its end."""
         furthest = parameters["limit"] * time_step
         command = commands.now()
-        step = (command - memory).clamp(-furthest, furthest)
-        goal = torch.where(step == command - memory, command, memory + step)
-        return goal, goal
+        distance = command - memory
+        arrives = distance.abs() <= furthest
+        # The share of the step in which it moves.
+        share = torch.where(arrives, distance.abs() / furthest, 1.0)
+        travel = torch.where(arrives, distance, furthest * distance.sign())
+        goal = torch.where(arrives, command, memory + travel)
+        late = 0.5 * share * travel
+        return Uneven(goal - late, share * travel * time_step**2 / 12.0), goal
 
 
 class GoalAccelerationLimit(ActionEffect):
     """|g̈| ≤ a: the servo follows a goal g that speeds up and brakes at a limited rate.
 
     The goal moves as fast as it can and still stop at the command, as the profile generators of
-    servos do. Where a step of length h brakes from the speed v, v − a h and so on, it travels
-    v²/(2 a) + v h/2, which gives the greatest speed at a distance.
+    servos do. With a constant acceleration in a step of length h, it travels h (w + w')/2 from the
+    speed w to w'. From there it can stop within the rest of the distance d if
+    w'² = 2 a (d − h (w + w')/2), which gives w'.
     """
 
     id = "goal_acceleration_limit"
@@ -165,20 +177,25 @@ class GoalAccelerationLimit(ActionEffect):
 
     def act(
         self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float
-    ) -> tuple[Tensor, Any]:
-        """Returns the goal after the step."""
+    ) -> tuple[Uneven, Any]:
+        """Returns the goal during the step, and goal and speed at its end."""
         goal, speed = memory
-        command = commands.now()
+        h, command = time_step, commands.now()
         distance = command - goal
-        change = parameters["limit"] * time_step
-        braking = 4.0 * distance.abs() / time_step
-        # (−c + sqrt(c² + 2 c b)) / 2, without a difference of large numbers.
-        fastest = braking / (1.0 + torch.sqrt(1.0 + 2.0 * braking / change))
-        wanted = distance.sign() * torch.minimum(fastest, distance.abs() / time_step)
+        change = parameters["limit"] * h
+        furthest = 0.5 * change * h
+        arrives = (distance.abs() <= furthest) & (speed.abs() <= change)
+        direction = distance.sign()
+        ahead = (2.0 * distance.abs() / h - direction * speed).clamp_min(0.0)
+        wanted = direction * 2.0 * ahead / (1.0 + torch.sqrt(1.0 + 4.0 * ahead / change))
         reached = torch.maximum(torch.minimum(wanted, speed + change), speed - change)
-        arrives = reached == distance / time_step
-        goal = torch.where(arrives, command, goal + time_step * reached)
-        return goal, (goal, reached)
+        reached = torch.where(arrives, 0.0, reached)
+        # A goal that arrives brakes over the part of the step that it needs.
+        share = torch.where(arrives, distance.abs() / furthest, 1.0)
+        travel = torch.where(arrives, distance, 0.5 * h * (speed + reached))
+        end = torch.where(arrives, command, goal + travel)
+        late = torch.where(arrives, share * distance / 3.0, h * (speed + 2.0 * reached) / 6.0)
+        return Uneven(end - late, share * travel * h**2 / 12.0), (end, reached)
 
 
 class GoalResolution(ActionEffect):

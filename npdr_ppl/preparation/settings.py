@@ -232,9 +232,8 @@ class RidgeSettings:
             ends.
         most_rounds: Greatest number of rounds.
         straight_gain: Log density by which the posterior of a straight coordinate differs at most
-            from a normal one at two standard deviations. A normal one with a standard deviation 5 %
-            greater differs by this. With 1.0, posteriors of Furuta pendulums (hidden rigs, seed
-            300) kept a fifth of their width.
+            from a normal one at two standard deviations. A normal one with a standard deviation
+            5 % greater differs by this.
         close_gain: Tracing can end when the median point gains less log density than this by its
             chord steps. The polynomial is then within the posterior's own width.
         most_degree: Greatest degree of the polynomial.

@@ -347,7 +347,7 @@ class Rollouts(Recording):
                 segment's start; ``"recorded"`` takes the measurements as exact; ``"uncertain"``
                 draws the initial state of every simulation from the estimate and its error.
             history: Steps of commands before each segment to include, for delays, lags and goals
-                of servos; by default those of two seconds.
+                of servos; by default those of five seconds, if they take little memory.
             dtype: Floating-point type of the tensors.
 
         Raises:
@@ -357,7 +357,7 @@ class Rollouts(Recording):
             self,
             segment_length=segment_length,
             initial_state=initial_state,
-            history=segments.default_history(self.time_step) if history is None else history,
+            history=history,
             dtype=dtype,
         )
 

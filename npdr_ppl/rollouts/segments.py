@@ -33,22 +33,25 @@ InitialState = Literal["estimated", "recorded", "uncertain"]
 differentiated. ``recorded``: the measurements are taken as exact. ``uncertain``: every simulation
 draws its initial state from the estimate and its error."""
 
-_HISTORY_SECONDS = 2.0
-_HISTORY_STEPS = 64, 1000
+_HISTORY_SECONDS = 5.0
+_LEAST_HISTORY = 64
+_MOST_PAST_COMMANDS = 1 << 22
 
 
-def default_history(time_step: float) -> int:
+def default_history(time_step: float, num_segments: int, num_actions: int) -> int:
     """Returns the default number of past commands per segment.
 
-    They last for two seconds, in which a servo's profile generator reaches most goals. There are
-    at least 64, which is longer than any input delay of a working control loop, and at most 1000,
-    which take less memory than the measurements of long recordings.
+    They last for five seconds, in which a servo's profile generator reaches its goals, or shorter
+    if they would take more than 32 MiB. There are at least 64, which is longer than any input
+    delay of a working control loop.
 
     Args:
         time_step: Seconds per step.
+        num_segments: Number of segments.
+        num_actions: Number of commands.
     """
-    least, most = _HISTORY_STEPS
-    return min(max(least, round(_HISTORY_SECONDS / time_step)), most)
+    most = _MOST_PAST_COMMANDS // max(1, num_segments * num_actions)
+    return max(_LEAST_HISTORY, min(round(_HISTORY_SECONDS / time_step), most))
 
 
 def columns_of(wanted: Sequence[str], names: Sequence[str]) -> list[int]:
@@ -70,16 +73,18 @@ def inputs(
     *,
     segment_length: int | None,
     initial_state: InitialState,
-    history: int,
+    history: int | None,
     dtype: torch.dtype,
 ) -> Inputs:
     """Cuts rollouts into segments; see :meth:`Rollouts.inputs`."""
     if initial_state not in get_args(InitialState):
         known = ", ".join(repr(name) for name in get_args(InitialState))
         raise DataError(f"initial_state is one of {known}, not {initial_state!r}.")
-    if history < 0:
+    if history is not None and history < 0:
         raise DataError(f"a history cannot be negative, but {history=}.")
     layout = layout_of(rollouts, segment_length)
+    if history is None:
+        history = default_history(rollouts.time_step, len(layout), len(rollouts.action_names))
     return cut(rollouts, layout, initial_state=initial_state, history=history, dtype=dtype)
 
 
