@@ -62,12 +62,19 @@ class Hypothesis:
     def difference(self) -> Tensor:
         """Measurement minus simulation at the fit, ``(S, K, C)``."""
         simulated = self.segments.simulate(self.fit.z[None], self.fit.offsets[None])[0]
-        return self.segments.observed - simulated
+        difference = self.segments.observed - simulated
+        _KEPT.add(self, "difference", difference.nbytes)
+        return difference
+
+    def keep_difference(self, difference: Tensor) -> None:
+        """Sets :attr:`difference`, which is known, so that it is not simulated again."""
+        self.__dict__["difference"] = difference
+        _KEPT.add(self, "difference", difference.nbytes)
 
     @cached_property
     def _linearised(self) -> Linearisation:
         found = self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
-        _KEPT.add(self, found.num_bytes)
+        _KEPT.add(self, "_linearised", found.num_bytes)
         return found
 
     def averaged(self) -> "Hypothesis":
@@ -174,32 +181,37 @@ class Hypothesis:
         return 0.5 * float(z.square().sum()) + 0.5 * num * math.log(len(self.fit.offsets))
 
 
-class _KeptLinearisations:
-    """Bounds the memory of cached linearisations: the oldest are dropped, and computed again.
+class _Kept:
+    """Bounds the memory of what fitted models cache: the oldest is dropped, and computed again.
 
     A search compares tens of fitted models. On a long recording of many channels, a linearisation
     has hundreds of megabytes.
     """
 
     def __init__(self) -> None:
-        self._kept: list[tuple[ref[Hypothesis], int]] = []
+        self._kept: list[tuple[ref[Hypothesis], str, int]] = []
 
-    def add(self, hypothesis: Hypothesis, num_bytes: int) -> None:
-        """Notes that a hypothesis keeps its linearisation, and drops others if there are too many.
+    def add(self, hypothesis: Hypothesis, name: str, num_bytes: int) -> None:
+        """Notes that a hypothesis caches something, and drops others if they are too large.
 
         Args:
             hypothesis: The hypothesis.
-            num_bytes: Size of its linearisation.
+            name: Name of the cached attribute.
+            num_bytes: Its size.
         """
-        alive = [(h, n) for h, n in self._kept if h() is not None and h() is not hypothesis]
-        self._kept = [*alive, (ref(hypothesis), num_bytes)]
-        while len(self._kept) > 1 and sum(n for _, n in self._kept) > HYPOTHESIS.kept_bytes:
-            (oldest, _), *self._kept = self._kept
-            if (hypothesis_kept := oldest()) is not None:
-                vars(hypothesis_kept).pop("_linearised", None)
+        alive = [
+            (owner, other, size)
+            for owner, other, size in self._kept
+            if owner() is not None and (owner() is not hypothesis or other != name)
+        ]
+        self._kept = [*alive, (ref(hypothesis), name, num_bytes)]
+        while len(self._kept) > 1 and sum(n for _, _, n in self._kept) > HYPOTHESIS.kept_bytes:
+            (oldest, dropped, _), *self._kept = self._kept
+            if (owner_now := oldest()) is not None:
+                vars(owner_now).pop(dropped, None)
 
 
-_KEPT = _KeptLinearisations()
+_KEPT = _Kept()
 
 
 def with_effects(model: Model, effects: Sequence[Effect]) -> Model:

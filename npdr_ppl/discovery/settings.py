@@ -73,8 +73,8 @@ class HypothesisSettings:
         least_averages: Fewest averages per segment: four for each of its ten pulses of force.
         implausible_coordinate: Absolute reference coordinate above which a value is implausible:
             three standard deviations of a normal prior.
-        kept_bytes: Bytes of derivatives that fitted models keep together. Older ones are dropped,
-            and computed again when they are needed.
+        kept_bytes: Bytes of derivatives and differences from the recording that fitted models keep
+            together. Older ones are dropped, and computed again when they are needed.
     """
 
     least_penalised: float = -1.0

@@ -45,7 +45,7 @@ def test_only_the_latest_large_linearisations_are_kept(quiet, monkeypatch):
     size = quiet.linearisation.num_bytes
     settings = replace(hypothesis.HYPOTHESIS, kept_bytes=int(2.5 * size))
     monkeypatch.setattr(hypothesis, "HYPOTHESIS", settings)
-    monkeypatch.setattr(hypothesis, "_KEPT", hypothesis._KeptLinearisations())
+    monkeypatch.setattr(hypothesis, "_KEPT", hypothesis._Kept())
     fits = [replace(quiet) for _ in range(3)]
     wanted = [fit.linearisation for fit in fits]
     assert ["_linearised" in vars(fit) for fit in fits] == [False, True, True]

@@ -70,7 +70,7 @@ def look(
         )
     best = ", ".join(s.name for s in ranking[:3]) or "none"
     report(f"p = {alarm.p_value:.2g} ({alarm.strongest}); the best candidates are {best}")
-    return Round(hypothesis, averaged, alarm, ranking, separation, found, pairs, laws)
+    return Round(hypothesis, averaged, alarm, ranking, separation, pairs, laws)
 
 
 def _counted(variants: Iterator[Variant], num: int, step: Step) -> Iterator[Variant]:

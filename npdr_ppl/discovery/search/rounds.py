@@ -9,7 +9,6 @@ from torch import Tensor
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.alarm import Alarm
 from npdr_ppl.discovery.screening.groups import Group
-from npdr_ppl.discovery.screening.latent_force import Responses
 from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.screening.settings import GROUPS
 from npdr_ppl.discovery.search.alternatives import Added
@@ -30,7 +29,6 @@ class Round:
         alarm: Result of the test whether another effect is missing.
         ranking: The candidates by linear gain.
         separation: Distances between the best candidates; see :mod:`separation`.
-        responses: Changes of the measurements by pulses of force at the joints.
         pairs: Pairs of the best candidates by joint linear gain.
         laws: Groups of the same law at several joints by joint linear gain.
         hopeless: Candidates that need not be fitted in full, by name.
@@ -43,7 +41,6 @@ class Round:
     alarm: Alarm
     ranking: list[Screened]
     separation: Tensor
-    responses: Responses
     pairs: list[Group] = field(default_factory=list)
     laws: list[Group] = field(default_factory=list)
     hopeless: frozenset[str] = frozenset()

@@ -222,7 +222,7 @@ class Trials:
                 yield None
                 continue
             hypothesis = Hypothesis(fit.segments.model, fit.effects, fit.segments, result[0])
-            hypothesis.__dict__["difference"] = result[1]  # else it would be simulated again
+            hypothesis.keep_difference(result[1])
             yield hypothesis
 
 

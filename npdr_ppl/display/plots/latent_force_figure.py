@@ -7,7 +7,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from npdr_ppl.discovery.screening.latent_force import LatentForce, latent_force
+from npdr_ppl.discovery.screening.latent_force import (
+    LatentForce,
+    Responses,
+    latent_force,
+    responses,
+)
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.search.rounds import Round
 from npdr_ppl.display.plots.marginals import add_legend
@@ -54,11 +59,12 @@ def plot_latent_force(
     rounds = {BEFORE: first}
     if last is not None and last.hypothesis is not first.hypothesis:
         rounds[AFTER] = last
-    forces = {title: _forces(now) for title, now in rounds.items()}
+    pushed = {title: responses(now.averaged) for title, now in rounds.items()}
+    forces = {title: _forces(now, pushed[title]) for title, now in rounds.items()}
     ports = list(forces[BEFORE])
     if not ports:
         return None
-    against = {title: _axes_of(now) for title, now in rounds.items()}
+    against = {title: _axes_of(found) for title, found in pushed.items()}
     names = list(against[BEFORE])
     with theme():
         size = (1.75 * len(names) + 0.6, 1.7 * len(ports) + 0.5)
@@ -120,12 +126,12 @@ def _binned(x: Array, y: Array, weight: Array) -> tuple[Array, Array, Array]:
     return centre, mean, error
 
 
-def _forces(now: Round) -> dict[str, LatentForce]:
-    found = latent_force(Projection(now.averaged), now.responses)
+def _forces(now: Round, pushed: Responses) -> dict[str, LatentForce]:
+    found = latent_force(Projection(now.averaged), pushed)
     return {force.port: force for force in found}
 
 
-def _axes_of(now: Round) -> dict[str, Array]:
+def _axes_of(pushed: Responses) -> dict[str, Array]:
     """Returns channels, commands and time in the order of the flattened forces."""
-    values = {name: v.numpy().ravel() for name, v in now.responses.channels.items()}
-    return values | {"time": now.responses.time.numpy().ravel()}
+    values = {name: v.numpy().ravel() for name, v in pushed.channels.items()}
+    return values | {"time": pushed.time.numpy().ravel()}
