@@ -6,10 +6,18 @@ import torch
 from hidden_rigs import make_case
 
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.screening import screen
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.screening.settings import SENSITIVITY
 from npdr_ppl.discovery.segment_options import segment_options
-from npdr_ppl.models.effects import CoulombFriction, EncoderBias, QuadraticDrag, candidate_effects
+from npdr_ppl.models.effects import (
+    CoulombFriction,
+    EncoderBias,
+    JointElasticity,
+    QuadraticDrag,
+    candidate_effects,
+)
 
 
 def test_sensitivities_equal_finite_differences(quiet):
@@ -45,3 +53,18 @@ def test_effects_simulated_in_one_batch_have_the_sensitivities_of_each_alone(qui
     assert len(together) == len(alone)
     for variant in together:
         assert torch.equal(variant.change, by_name[variant.effect.name].pop(0))
+
+
+def test_sizes_of_a_resonance_that_change_the_motion_alike_are_left_out(quiet, monkeypatch):
+    effects = (JointElasticity("hinge"),)
+    few = list(sensitivities(quiet, effects))
+    every = replace(SENSITIVITY, resonance_stride=1)
+    monkeypatch.setattr("npdr_ppl.discovery.screening.sensitivities.SENSITIVITY", every)
+    all_sizes = list(sensitivities(quiet, effects))
+    assert len(few) < len(all_sizes) == len(SENSITIVITY.resonant_sizes)
+    projection = Projection(quiet)
+    (best,), (best_of_all,) = screen(projection, few), screen(projection, all_sizes)
+    assert best.gain > 0.95 * best_of_all.gain
+    # Each size stands for those up to the next ones that were tried, so none is excluded.
+    ends = [(float(v.lower), float(v.upper)) for v in few]
+    assert all(one[1] >= other[0] for one, other in zip(ends, ends[1:], strict=False))

@@ -236,7 +236,7 @@ class SensitivitySettings:
             size, with ``resonance_ratio`` between neighbours.
         resonance_stride: Every how many of them is tried first.
         alike: Cosine of the changes by two sizes from which those between them are not tried. The
-            linear gain of a size between them is then known to 0.5 %.
+            linear gain of a size between them is then known to 3 %.
         first_limit: First value tried for a limit of commands, as a fraction of the largest
             command.
         limit_quantiles: Quantiles of its prior at which a limit is tried if the recorded commands
@@ -257,7 +257,7 @@ class SensitivitySettings:
     sizes: tuple[float, ...] = (1.0, 0.25)
     resonant_sizes: tuple[float, ...] = tuple(0.05 * 1.1**k for k in range(40))
     resonance_stride: int = 4
-    alike: float = 0.99
+    alike: float = 0.95
     first_limit: float = 0.7
     limit_quantiles: tuple[float, ...] = (0.9, 0.7, 0.5, 0.3, 0.1)
     rounding_errors: float = 100.0
