@@ -20,6 +20,7 @@ from npdr_ppl.models.effects import (
     ServoForceLimit,
     candidate_effects,
 )
+from npdr_ppl.policies.playback import Playback
 from tests.helpers.mujoco_files import random_inputs, value
 
 STEP, GAIN, DAMPING = 0.002, 20.0, 1.0
@@ -192,3 +193,14 @@ def test_laws_of_goals_need_a_servo_that_follows_its_joint():
     port = joint().port("goal")
     assert port.force_unit == "N m"
     assert ServoForceLimit("goal").units(port) == {"limit": "N m"}
+
+
+def test_an_episode_begins_with_the_goal_where_the_joint_is():
+    """A policy that holds the joint keeps it at rest under a slow goal."""
+    slow = joint().with_effects(GoalSpeedLimit("goal"))
+    policy = Playback(value([[0.6]]), ("goal",), STEP)
+    episodes = slow.roll_out(
+        {"goal.goal_speed_limit.limit": value(0.1)}, policy, value([0.6, 0.0]), 50, record=True
+    )
+    free = joint().roll_out({}, policy, value([0.6, 0.0]), 50, record=True)
+    torch.testing.assert_close(episodes.readings, free.readings, atol=1e-12, rtol=0.0)

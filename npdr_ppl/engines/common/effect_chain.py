@@ -148,6 +148,14 @@ class EffectChain(ABC):
         """Number of the simulator's states that are positions; the others are velocities."""
         return len(self.simulator.states) // 2
 
+    def commands_at_rest(self, positions: Components) -> Components:
+        """Returns the commands before an episode: zero; a servo holds its joint where it is.
+
+        Args:
+            positions: Positions among the states, ``(N,)`` each; there is at least one.
+        """
+        return (torch.zeros_like(positions[0]),) * len(self.simulator.actions)
+
     @abstractmethod
     def true_readings(
         self, positions: Components, velocities: Components, tables: Tables

@@ -98,7 +98,7 @@ class EpisodeRequest:
     def believed(self, domain: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Returns the parameters that the policy's own model assumes in a domain."""
         given = self.internal_model or {}
-        like = next(iter(domain.values()))
+        like = next(iter(domain.values()), self.initial_states)
         return {**domain, **{name: like.new_tensor(value) for name, value in given.items()}}
 
     def check(self, simulator: Simulator) -> None:

@@ -113,14 +113,13 @@ class LoopBody:
 
 
 def begin(body: LoopBody, states: Components, tables: Tables) -> PolicyLoop:
-    """Returns the loop before its first step, with zero commands in the past."""
+    """Returns the loop before its first step, with commands in the past that keep it at rest."""
     zero = torch.zeros_like(states[0])
     simulator, num_positions = body.stepper.simulator, body.stepper.num_positions
     positions, velocities = states[:num_positions], states[num_positions:]
     no_readings = (None,) * len(simulator.sensors)
-    state = body.stepper.start(
-        positions, velocities, tables, (zero,) * len(simulator.actions), no_readings, zero
-    )
+    before = body.stepper.commands_at_rest(positions)
+    state = body.stepper.start(positions, velocities, tables, before, no_readings, zero)
     readings = body.stepper.true_readings(positions, velocities, tables)
     memory = body.policy.initial_memory(tuple(readings[i] for i in body.observed))
     return PolicyLoop(state, readings, memory, torch.ones_like(zero, dtype=torch.bool), zero, zero)

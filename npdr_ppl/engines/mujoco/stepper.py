@@ -12,6 +12,7 @@ from npdr_ppl.engines.common.effect_chain import EffectChain, Moments, State, Ta
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.mujoco.batches import state_view
 from npdr_ppl.engines.mujoco.channels import Component, Reading
+from npdr_ppl.engines.mujoco.fields import actuated_joint
 from npdr_ppl.engines.mujoco.joints import JointStates
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.servos import ServoForces
@@ -84,6 +85,20 @@ class MujocoStepper(EffectChain):
     def num_positions(self) -> int:
         """Number of the simulator's states that are positions."""
         return sum(not component.is_velocity for component in self.simulator.components)
+
+    def commands_at_rest(self, positions: Components) -> Components:
+        """Returns zero, and the present position of the joint for a servo that follows it."""
+        components = [c for c in self.simulator.components if not c.is_velocity]
+        held = {c.address: value for c, value in zip(components, positions, strict=True)}
+        commands = list(super().commands_at_rest(positions))
+        for actuator, action in enumerate(self.simulator.actions):
+            port = self.simulator.port(action.name)
+            joint = actuated_joint(self.simulator.model, actuator)
+            # Its goal is a position if both have the same unit.
+            if port.kind == "servo" and port.unit == port.coordinate and joint is not None:
+                address = int(self.simulator.model.jnt_qposadr[joint])
+                commands[actuator] = held.get(address, commands[actuator])
+        return tuple(commands)
 
     def place(self, components: tuple[Tensor, ...]) -> None:
         """Sets the simulations' states, ``(N,)`` per component of the simulator's state."""
