@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Start
-from npdr_ppl.language.effects import ActionEffect, Commands, Uneven
+from npdr_ppl.language.effects import ActionEffect, Commands, Uneven, upper_end
 from npdr_ppl.models.effects.equivalence import (
     COMMAND_LIMIT,
     FIRST_ORDER_LAG,
@@ -48,6 +48,11 @@ class InputDelay(ActionEffect):
         """Returns the number of steps in the longest delay."""
         return math.floor(float(parameters["delay"].detach().max()) / time_step) + 1
 
+    @property
+    def memory_time(self) -> float:
+        """Nothing beside the commands that it requests: n and f do not change."""
+        return 0.0
+
     def initial_memory(self, command: Tensor, start: Start) -> tuple[Tensor, Tensor]:
         """Returns n and f."""
         steps = start.parameters["delay"] / start.time_step
@@ -69,7 +74,6 @@ class ActuatorLag(ActionEffect):
 
     id = "actuator_lag"
     may_be_shared = True
-    memory_time = 0.5  # ten of the longest time constants
     parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
     law = "τ̇ = (u − τ)/T"
     equivalence = (FIRST_ORDER_LAG,)
@@ -79,6 +83,12 @@ class ActuatorLag(ActionEffect):
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Uniform up to 50 ms."""
         return {"time_constant": dist.Uniform(0.0, 0.05)}
+
+    @property
+    def memory_time(self) -> float:
+        """Ten of the longest time constants that the prior allows."""
+        given = self.given_priors.get("time_constant")
+        return 10.0 * (0.05 if given is None else upper_end(given))
 
     def initial_memory(self, command: Tensor, start: Start) -> Any:
         """Returns the settled output, and its relative errors in the next step.

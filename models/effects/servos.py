@@ -32,6 +32,11 @@ __all__ = [
 # A limit may be anything between tight and unnoticeable. This is the standard deviation of its
 # logarithm: a factor of e either way.
 _SPREAD = 1.0
+# A force limit is not declared where it matters: a factor of 4 either way.
+_FORCE_SPREAD = 1.5
+
+# Least divisor, so that a limit of zero gives no NaN.
+_LEAST = 1e-300
 
 
 def _follows_position(port: Port) -> bool:
@@ -66,7 +71,9 @@ class ServoForceLimit(EnvironmentEffect):
 
     id = "servo_force_limit"
     port_kinds = ("servo",)
-    parameters = (Parameter("limit", "{force}", math.inf, "greatest force f_max"),)
+    parameters = (
+        Parameter("limit", "{force}", math.inf, "greatest force f_max, before the gear"),
+    )
     is_smooth = False
     law = "clip(f, ±f_max)"
     excitation = "wide_range"
@@ -74,7 +81,7 @@ class ServoForceLimit(EnvironmentEffect):
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Log-normal about the rated force."""
-        return {"limit": dist.LogNormal(math.log(port.rated_force), _SPREAD)}
+        return {"limit": dist.LogNormal(math.log(port.rated_force), _FORCE_SPREAD)}
 
     def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
         """Returns the servo with the lower one of both limits."""
@@ -99,10 +106,10 @@ class ServoDeadBand(ServoEffect):
         """Returns whether the servo follows its joint's position."""
         return _follows_position(port)
 
-    def change(self, error: Tensor, gain: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Returns −K clip(e, ±δ), which turns K e into the law."""
+    def act(self, error: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns e − clip(e, ±δ), an equal expression."""
         width = parameters["width"]
-        return -gain * error.clamp(-width, width)
+        return error - error.clamp(-width, width)
 
 
 class GoalSpeedLimit(ActionEffect):
@@ -112,7 +119,6 @@ class GoalSpeedLimit(ActionEffect):
     port_kinds = ("servo",)
     parameters = (Parameter("limit", "{port}/s", math.inf, "greatest speed v"),)
     is_smooth = False
-    memory_time = math.inf  # a slow goal may be behind for any time
     law = "|ġ| ≤ v"
     excitation = "steps"
     reference = DYNAMIXEL
@@ -138,11 +144,12 @@ class GoalSpeedLimit(ActionEffect):
         distance = command - memory
         arrives = distance.abs() <= furthest
         # The share of the step in which it moves.
-        share = torch.where(arrives, distance.abs() / furthest, 1.0)
+        share = torch.where(arrives, distance.abs() / furthest.clamp_min(_LEAST), 1.0)
         travel = torch.where(arrives, distance, furthest * distance.sign())
         goal = torch.where(arrives, command, memory + travel)
         late = 0.5 * share * travel
-        return Uneven(goal - late, share * travel * time_step**2 / 12.0), goal
+        moment = share * travel * time_step**2 * (0.25 - share / 6.0)
+        return Uneven(goal - late, moment), goal
 
 
 class GoalAccelerationLimit(ActionEffect):
@@ -158,7 +165,6 @@ class GoalAccelerationLimit(ActionEffect):
     port_kinds = ("servo",)
     parameters = (Parameter("limit", "{port}/s²", math.inf, "greatest acceleration a"),)
     is_smooth = False
-    memory_time = math.inf
     law = "|g̈| ≤ a"
     excitation = "steps"
     reference = DYNAMIXEL
@@ -191,11 +197,12 @@ class GoalAccelerationLimit(ActionEffect):
         reached = torch.maximum(torch.minimum(wanted, speed + change), speed - change)
         reached = torch.where(arrives, 0.0, reached)
         # A goal that arrives brakes over the part of the step that it needs.
-        share = torch.where(arrives, distance.abs() / furthest, 1.0)
+        share = torch.where(arrives, distance.abs() / furthest.clamp_min(_LEAST), 1.0)
         travel = torch.where(arrives, distance, 0.5 * h * (speed + reached))
         end = torch.where(arrives, command, goal + travel)
         late = torch.where(arrives, share * distance / 3.0, h * (speed + 2.0 * reached) / 6.0)
-        return Uneven(end - late, share * travel * h**2 / 12.0), (end, reached)
+        moment = share * travel * h**2 * (2.0 - share) / 12.0
+        return Uneven(end - late, moment), (end, reached)
 
 
 class GoalResolution(ActionEffect):

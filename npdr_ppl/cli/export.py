@@ -28,8 +28,8 @@ def export(
 
     The copy has the same text. Changed elements have the posterior means, and a comment with the
     values that they had. Effects become what MuJoCo has itself: damping, friction loss, springs,
-    payloads, tilted gravity, gains of servos, limits of controls. The others are listed and left
-    out.
+    payloads, tilted gravity, gains and limits of servos and controls. The others are listed and
+    left out.
 
     Example: npdr export fit arm.xml --to arm_identified.xml
     """

@@ -18,7 +18,7 @@ class DiscoveryOptions:
     Attributes:
         effects: The effects to search; ``None`` for every effect of the catalogue at every port
             where it makes sense.
-        max_effects: Greatest number of effects to add.
+        max_effects: Greatest number of effects to add; one law at three joints or more is one.
         false_alarm_rate: Probability that an alarm fires although nothing is missing.
         confidence: Probability above which one cause is named.
         repeat: Whether both halves of the recording are searched, too. An effect that is not found

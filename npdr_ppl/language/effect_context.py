@@ -1,9 +1,11 @@
 """Data that an engine passes to effects, and types for the declarations of effects."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+import torch
 from torch import Tensor
 
 __all__ = ["EquivalenceClass", "Excitation", "Joint", "SensorSpan", "Servo", "Start"]
@@ -82,11 +84,11 @@ class Servo(NamedTuple):
 
     Attributes:
         gain: Force per unit of error, of either a position or a velocity.
-        limit: Its greatest force; infinite if there is no limit.
+        limit: Its greatest force, beside the limits that the model has; infinite without one.
     """
 
     gain: Tensor
-    limit: Tensor
+    limit: Tensor = torch.tensor(math.inf, dtype=torch.float64)
 
 
 class Joint(NamedTuple):

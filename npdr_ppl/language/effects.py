@@ -36,6 +36,7 @@ __all__ = [
     "SensorEffect",
     "ServoEffect",
     "Uneven",
+    "upper_end",
 ]
 
 
@@ -43,7 +44,7 @@ LONGEST_TIME = 3.0
 """Default priors of delays and lags reach at least this many time steps."""
 
 
-def _upper_end(prior: Distribution) -> float:
+def upper_end(prior: Distribution) -> float:
     """Returns the upper end of a range that begins at zero; infinity for other priors."""
     if isinstance(prior, Uniform) and float(prior.low) == 0.0:
         return float(prior.high)
@@ -149,7 +150,7 @@ class Effect(ABC):
             for parameter in self.parameters
             if parameter.unit == "s"
             and parameter.name not in self._priors
-            and _upper_end(self.priors(port)[parameter.name]) < longest
+            and upper_end(self.priors(port)[parameter.name]) < longest
         }
         if not wider:
             return self
@@ -358,14 +359,10 @@ class ActionEffect(Effect):
     Attributes:
         may_be_shared: Whether all commands may have it with the same parameters, because one
             device or bus sends them.
-        memory_time: For how many seconds past commands influence the effect's own state. At the
-            start of a segment, it is computed from commands of that time, as far as they are
-            recorded.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("action", "servo")
     may_be_shared: ClassVar[bool] = False
-    memory_time: ClassVar[float] = 0.0
 
     @property
     def may_cover_several(self) -> bool:
@@ -382,6 +379,16 @@ class ActionEffect(Effect):
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
         """Returns the number of past commands that :meth:`act` may request."""
         return 0
+
+    @property
+    def memory_time(self) -> float:
+        """For how many seconds past commands influence the effect's own state.
+
+        At the start of a segment, the state is computed from commands of that time, and of those
+        that :meth:`history` counts, as far as they are included in the inputs.
+        """
+        has_state = type(self).initial_memory is not ActionEffect.initial_memory
+        return math.inf if has_state else 0.0
 
     def peaks(self, commands: Tensor, time_step: float) -> dict[str, float]:
         """Returns the greatest values in a recording of what its parameters limit, by parameter.
@@ -403,19 +410,16 @@ class ActionEffect(Effect):
 
 
 class ServoEffect(Effect):
-    """An effect inside a servo: its force depends on the error otherwise than declared."""
+    """An effect inside a position servo, which acts on another error than goal minus position."""
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("servo",)
 
     @abstractmethod
-    def change(self, error: Tensor, gain: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Returns the force that is added to the declared one, gain times error.
-
-        It is evaluated in every step of the engine.
+    def act(self, error: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Returns the error on which the servo acts; evaluated in every step of the engine.
 
         Args:
-            error: Goal minus position, or minus velocity, ``(N,)``.
-            gain: Force per unit of error.
+            error: Goal minus position, ``(N,)``.
             parameters: The effect's parameters by short name.
         """
 

@@ -88,7 +88,7 @@ class _Quantile(ReferenceMap):
     def __call__(self, z: Tensor) -> Tensor:
         # In float32, Φ(5.4) is already 1, where many quantiles are infinite.
         probability = torch.special.ndtr(z.double().clamp(-_MAX_Z, _MAX_Z))
-        return _icdf(self.distribution, probability).to(z.dtype)
+        return quantile(self.distribution, probability).to(z.dtype)
 
     def inverse(self, value: Tensor) -> Tensor:
         probability = _cdf(self.distribution, value.double())
@@ -211,7 +211,7 @@ def _has_quantiles(distribution: distributions.Distribution) -> bool:
     return True
 
 
-def _icdf(distribution: distributions.Distribution, probability: Tensor) -> Tensor:
+def quantile(distribution: distributions.Distribution, probability: Tensor) -> Tensor:
     """Returns quantiles; torch lacks those of the gamma and beta distributions."""
     if isinstance(distribution, distributions.Gamma):
         unit = special.gammaincinv(

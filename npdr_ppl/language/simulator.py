@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port, find_port
-from npdr_ppl.language.effects import Effect, ParameterEffect
+from npdr_ppl.language.effects import Effect, ParameterEffect, ServoEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.linear_dynamics import InverseDynamics
 
@@ -39,6 +39,7 @@ class Simulator(ABC):
         is_differentiable: Whether gradients flow from trajectories to parameters.
         uses_threads: Whether a batch is simulated on several threads, so that further processes
             would save no time.
+        takes_servo_effects: Whether effects inside servos can be attached.
         effects: The effects attached, in the order of attachment.
         inverse_dynamics: The equations of motion in the form for linear regression; ``None`` if
             not declared.
@@ -53,6 +54,7 @@ class Simulator(ABC):
     is_deterministic: bool = True
     is_differentiable: bool = False
     uses_threads: bool = False
+    takes_servo_effects: bool = False
     effects: tuple[Effect, ...] = ()
     inverse_dynamics: InverseDynamics | None = None
 
@@ -96,6 +98,10 @@ class Simulator(ABC):
                 raise ModelError(
                     f"{effect.id} attaches to one port; attach it to each of {port.name}."
                 )
+            if isinstance(effect, ServoEffect) and not self.takes_servo_effects:
+                raise ModelError(
+                    f"{self.name} cannot apply {effect.id}, an effect inside a servo."
+                )
             if not effect.suits(port):
                 raise ModelError(
                     f"{effect.id} makes no sense at the port {port.name!r} of {self.name}, "
@@ -105,6 +111,10 @@ class Simulator(ABC):
                 raise ModelError(f"{effect.name} is attached to {self.name} already.")
             changed.effects = (*changed.effects, effect)
         return changed
+
+    def is_goal(self, action: str) -> bool:
+        """Returns whether an action is the goal of a servo."""
+        return any(port.name == action and port.kind == "servo" for port in self.ports)
 
     @property
     def rate_lag(self) -> float:

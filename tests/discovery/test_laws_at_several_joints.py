@@ -5,11 +5,10 @@ import numpy as np
 import pyro
 import pyro.distributions as dist
 import pytest
-import torch
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery.screening.groups import num_counted
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.search.rounds import num_counted
 from npdr_ppl.models.effects import Bias, CoulombFriction, ViscousFriction
 
 JOINTS = ("shoulder", "elbow", "wrist", "finger")
@@ -115,5 +114,4 @@ def test_one_joint_with_friction_makes_no_group():
     searcher = Searcher(model, recorded({"elbow": 0.15}), options, seed=0)
     first = searcher.look(searcher.fit_base())
     assert first.ranking[0].name == "elbow_torque.coulomb_friction"
-    assert all(len(law.members) < len(JOINTS) for law in first.laws)
-    assert torch.isfinite(torch.tensor([law.gain for law in first.laws])).all()
+    assert not any("coulomb" in law.name for law in first.laws)

@@ -57,7 +57,7 @@ def written_out(law, commands, position=0.0):
     result = []
     for command in commands:
         mujoco.mj_forward(model, data)
-        data.qfrc_applied[0] = law(command - data.qpos[0]) - DAMPING * data.qvel[0]
+        data.qfrc_applied[0] = law(command - data.qpos[0], data.qvel[0])
         mujoco.mj_step(model, data)
         result.append(float(data.qpos[0]))
     return torch.tensor(result, dtype=torch.float64)
@@ -76,14 +76,26 @@ def test_a_dead_band_takes_the_force_of_small_errors():
     given = {f"{effect.name}.width": value(width)}
     (reached,) = joint().with_effects(effect).simulate(given, goals(commands))
 
-    def law(error):
-        return GAIN * math.copysign(max(abs(error) - width, 0.0), error)
+    def law(error, velocity):
+        acted = math.copysign(max(abs(error) - width, 0.0), error)
+        return GAIN * acted - DAMPING * velocity
 
-    # The engine treats the servo's damping implicitly, the loop does not.
+    torch.testing.assert_close(reached[:, 0], written_out(law, commands), atol=1e-12, rtol=0.0)
+
+
+def test_a_saturated_servo_loses_nothing_by_a_dead_band():
+    effects = ServoDeadBand("goal"), ServoForceLimit("goal")
+    limit, width, commands = 1.0, 0.04, np.full(200, 2.0)
+    given = {"goal.servo_dead_band.width": value(width)}
+    given["goal.servo_force_limit.limit"] = value(limit)
+    (reached,) = joint().with_effects(*effects).simulate(given, goals(commands))
+
+    def law(error, velocity):
+        acted = math.copysign(max(abs(error) - width, 0.0), error)
+        return min(max(GAIN * acted - DAMPING * velocity, -limit), limit)
+
     expected = written_out(law, commands)
-    without = written_out(lambda error: GAIN * error, commands)
-    error = float((reached[:, 0] - expected).abs().max())
-    assert error < 0.02 * float((without - expected).abs().max())
+    torch.testing.assert_close(reached[:, 0], expected, atol=1e-12, rtol=0.0)
 
 
 def test_a_force_limit_is_that_of_the_file():
@@ -95,6 +107,10 @@ def test_a_force_limit_is_that_of_the_file():
     assert torch.equal(out[0], joint().simulate({}, inputs))
     assert torch.equal(out[1], limited.simulate({}, inputs))
     assert float((out[0] - out[1]).abs().max()) > 0.01
+    asymmetric = joint(more='forcerange="-0.3 2"')
+    inputs_of_it = random_inputs(asymmetric, num_steps=150)
+    kept = asymmetric.with_effects(ServoForceLimit("goal")).simulate({}, inputs_of_it)
+    assert torch.equal(kept, asymmetric.simulate({}, inputs_of_it))
     # The lower one of both limits acts.
     both = limited.with_effects(ServoForceLimit("goal")).simulate(
         {name: value([0.4, 2.0])}, inputs
@@ -195,12 +211,17 @@ def test_laws_of_goals_need_a_servo_that_follows_its_joint():
     assert ServoForceLimit("goal").units(port) == {"limit": "N m"}
 
 
-def test_an_episode_begins_with_the_goal_where_the_joint_is():
-    """A policy that holds the joint keeps it at rest under a slow goal."""
+def test_an_episode_and_the_replay_of_its_commands_are_the_same():
     slow = joint().with_effects(GoalSpeedLimit("goal"))
-    policy = Playback(value([[0.6]]), ("goal",), STEP)
-    episodes = slow.roll_out(
-        {"goal.goal_speed_limit.limit": value(0.1)}, policy, value([0.6, 0.0]), 50, record=True
-    )
-    free = joint().roll_out({}, policy, value([0.6, 0.0]), 50, record=True)
-    torch.testing.assert_close(episodes.readings, free.readings, atol=1e-12, rtol=0.0)
+    given = {"goal.goal_speed_limit.limit": value(1.0)}
+    commands = np.r_[np.full(40, 0.5), np.full(60, -0.2)]
+    policy = Playback(value(commands[:, None]), ("goal",), STEP)
+    episodes = slow.roll_out(given, policy, value([0.1, 0.0]), len(commands), record=True)
+    (replayed,) = slow.simulate(given, goals(commands, 0.1))
+    torch.testing.assert_close(episodes.readings[1:], replayed, atol=1e-12, rtol=0.0)
+
+
+def test_a_filtered_servo_has_no_dead_band():
+    filtered = joint(more='timeconst="0.1"')
+    with pytest.raises(ModelError, match="without a filter"):
+        filtered.with_effects(ServoDeadBand("goal"))

@@ -7,7 +7,8 @@ all members are fitted together with all parameters and the initial states.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from npdr_ppl.discovery.screening.screening import Screened, within_limits
 from npdr_ppl.discovery.screening.settings import GROUPS
 from npdr_ppl.language.effects import Effect
 
-__all__ = ["Group", "ranked_laws", "ranked_pairs"]
+__all__ = ["Group", "num_counted", "ranked_laws", "ranked_pairs"]
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,12 @@ class Group:
             for member, own in zip(self.members, self.sizes, strict=True)
             for name, value in member.variant.parameters(own).items()
         }
+
+
+def num_counted(effects: Iterable[Effect]) -> int:
+    """Returns the number of effects, of which the same law at several joints counts as one."""
+    numbers = Counter(effect.id for effect in effects)
+    return sum(1 if number >= GROUPS.fewest else number for number in numbers.values())
 
 
 def ranked_pairs(projection: Projection, candidates: Sequence[Screened]) -> list[Group]:

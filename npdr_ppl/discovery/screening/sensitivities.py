@@ -21,6 +21,7 @@ from npdr_ppl.engines.pooled.pool_simulator import PooledSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import ActionEffect, Effect
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.reference import quantile
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.preparation.segment_model import SegmentModel
 
@@ -348,8 +349,8 @@ def _shapes(
     varied = [p for p in effect.parameters if p.name not in strengths]
     shapes: list[dict[str, float]] = [{p.name: p.nominal for p in varied}]
     for parameter in varied:
-        for quantile in SENSITIVITY.shape_quantiles[1:]:
-            value = float(priors[parameter.name].icdf(torch.tensor(quantile)))
+        for share in SENSITIVITY.shape_quantiles[1:]:
+            value = float(quantile(priors[parameter.name], torch.tensor(share)))
             shapes.append({**shapes[0], parameter.name: value})
     return shapes[: SENSITIVITY.most_shapes]
 
@@ -376,7 +377,7 @@ def _limit_shapes(
 ) -> list[tuple[dict[str, float], bool]]:
     """Returns values of limits at several quantiles of their priors."""
     return [
-        ({**values, **{n: float(priors[n].icdf(torch.tensor(q))) for n in limits}}, False)
+        ({**values, **{n: float(quantile(priors[n], torch.tensor(q))) for n in limits}}, False)
         for q in SENSITIVITY.limit_quantiles
     ]
 

@@ -259,7 +259,7 @@ class SensitivitySettings:
     resonance_stride: int = 4
     alike: float = 0.95
     first_limit: float = 0.7
-    limit_quantiles: tuple[float, ...] = (0.9, 0.7, 0.5, 0.3, 0.1)
+    limit_quantiles: tuple[float, ...] = (0.95, 0.75, 0.5, 0.25, 0.05)
     rounding_errors: float = 100.0
     smooth_size: float = 0.05
     shape_quantiles: tuple[float, ...] = (0.5, 0.15, 0.85)

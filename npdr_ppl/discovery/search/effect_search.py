@@ -10,6 +10,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.groups import num_counted
 from npdr_ppl.discovery.screening.projection import loss_without
 from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.alternatives import Added, log_prior
@@ -22,13 +23,7 @@ from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
 from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
 from npdr_ppl.discovery.search.repeatability import repeated_effects
 from npdr_ppl.discovery.search.rivals import with_rivals
-from npdr_ppl.discovery.search.rounds import (
-    Round,
-    Search,
-    is_negligible,
-    is_something_left,
-    num_counted,
-)
+from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
 from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
@@ -214,8 +209,8 @@ class Searcher:
             single = current if best is None else tried[best]
             if is_negligible(first.hypothesis, current, single):
                 single = current
-            single = self._with_law_at_several(rounds[-1], single)
-            extended = self._with_likelier_pair(rounds, single, max_effects)
+            likelier = self._with_law_at_several(rounds[-1], single)
+            extended = self._with_likelier_pair(rounds, likelier, max_effects)
             if is_negligible(first.hypothesis, current, extended):
                 break
             tested = best if extended is single else None
@@ -234,22 +229,14 @@ class Searcher:
     def _in_present_steps(self, first: Round) -> Round:
         """Returns the first round with the original model in the present integration steps.
 
-        The order of the candidates stays, because they are compared in coarse steps anyway. Those
-        whose fit was hopeless in coarse steps are not fitted again.
+        Candidates whose fit was hopeless in coarse steps are not fitted again.
 
         Args:
             first: The round in coarser steps.
         """
         fitted = self.fit_base(near=first.hypothesis.parameters)
         hopeless = {name for name, w in first.weights.items() if w < SEARCH.hopeless}
-        return replace(
-            first,
-            hypothesis=fitted,
-            averaged=fitted.averaged(),
-            hopeless=first.hopeless | hopeless,
-            weights={},
-            trials={},
-        )
+        return replace(self.look(fitted), hopeless=first.hopeless | hopeless)
 
     def _revised(self, current: Hypothesis, rounds: list[Round], max_effects: int) -> Search:
         """Returns the effects that are found again, in their simplest form, and alternatives.
@@ -377,11 +364,13 @@ class Searcher:
     def _with_law_at_several(self, now: Round, current: Hypothesis) -> Hypothesis:
         """Returns the model with one law at several joints, if that is likelier.
 
+        Each joint alone may explain too little to be added.
+
         Args:
             now: The results before the last addition.
             current: The model after it, if there was one.
         """
-        if current is now.hypothesis or not now.laws or self._deadline.stops():
+        if not now.laws or self._deadline.stops():
             return current
         found = likelier_group(
             now.hypothesis,

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.screening.groups import Group
+from npdr_ppl.discovery.screening.groups import Group, num_counted
 from npdr_ppl.discovery.search.alternatives import log_prior
 from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.settings import SEARCH, TRIALS
@@ -49,17 +49,19 @@ def likelier_group(
     starts = current.segments.starts
     tried = fit_groups(trials, before, groups[: TRIALS.pairs], starts, report, progress)
     if tried:
-        known = len(before.effects)
         tried = {
             name: trial
             for name, trial in fit_contenders(trials, tried, before).items()
-            if trials.apart_from_waves_in_step({name: trial}, len(trial.effects) - known)
+            if trials.apart_from_waves_in_step(
+                {name: trial}, len(trial.effects) - len(before.effects)
+            )
         }
     if not tried:
         return None
     each = math.log(SEARCH.prior_of_any / max(1, num_candidates))
     hypotheses = [current, *tried.values()]
-    counted = [len(current.effects), *[len(before.effects) + num_new for _ in tried]]
+    known = num_counted(before.effects)
+    counted = [num_counted(current.effects), *[known + num_new for _ in tried]]
     prior = [each * n + log_prior(h) for n, h in zip(counted, hypotheses, strict=True)]
     weights = dict(zip(("", *tried), weigh(hypotheses, prior), strict=True))
     best = max(weights, key=lambda name: weights[name])

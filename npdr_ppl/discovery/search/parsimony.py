@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.groups import num_counted
 from npdr_ppl.discovery.screening.projection import loss_without
 from npdr_ppl.discovery.search.settings import EVIDENCE, PARSIMONY, TRIALS
 from npdr_ppl.discovery.search.trials import Trials
@@ -101,7 +102,7 @@ def plausible_laws(
             beside = _new_laws(effect, effect.beside, current, candidates)
             options += [(effect, law) for law in beside]
         others = tuple(e for e in current.effects if e.name != effect.name)
-        options = [laws for laws in options if len(others) + len(laws) <= most]
+        options = [laws for laws in options if num_counted((*others, *laws)) <= most]
         found = trials.each_refitted(current, [(*others, *laws) for laws in options])
         # The fewest laws come first.
         for laws, trial in zip(options, found, strict=True):

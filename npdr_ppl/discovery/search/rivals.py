@@ -54,8 +54,8 @@ def with_rivals(
         asked = current
         compared = num - len(waiting)
         progress(compared / num, f"{compared} of {num} effects compared")
-        known = _alternatives(asked, waiting, rounds, trials, options)
-        for effect, alternatives in zip(waiting, known, strict=True):
+        of_each = _alternatives(asked, waiting, rounds, trials, options)
+        for effect, alternatives in zip(waiting, of_each, strict=True):
             waiting = waiting[1:]
             current, found = weigh_alternatives(
                 rounds[0].hypothesis,

@@ -1,7 +1,5 @@
 """The rounds of a search and its result."""
 
-from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from torch import Tensor
@@ -10,13 +8,11 @@ from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.alarm import Alarm
 from npdr_ppl.discovery.screening.groups import Group
 from npdr_ppl.discovery.screening.screening import Screened
-from npdr_ppl.discovery.screening.settings import GROUPS
 from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.evidence import closest
 from npdr_ppl.discovery.search.settings import SEARCH
-from npdr_ppl.language.effects import Effect
 
-__all__ = ["Round", "Search", "explained", "is_negligible", "is_something_left", "num_counted"]
+__all__ = ["Round", "Search", "explained", "is_negligible", "is_something_left"]
 
 
 @dataclass(frozen=True)
@@ -68,12 +64,6 @@ class Search:
     trials: dict[tuple[str, str], Hypothesis]
     is_approximate: bool = False
     has_stopped: bool = False
-
-
-def num_counted(effects: Iterable[Effect]) -> int:
-    """Returns the number of effects, of which the same law at several joints counts as one."""
-    numbers = Counter(effect.id for effect in effects)
-    return sum(1 if number >= GROUPS.fewest else number for number in numbers.values())
 
 
 def explained(first: Hypothesis, final: Hypothesis) -> float:

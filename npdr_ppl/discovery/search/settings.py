@@ -58,8 +58,8 @@ class SearchSettings:
 
     Attributes:
         hopeless: Probability in coarse steps below which a candidate is not fitted again in finer
-            ones. An error of the steps of 10 standard deviations changes a log evidence of 230 by
-            up to 10 √(2 · 230), less than itself.
+            ones: a log evidence of −230. An error of the steps of 10 standard deviations, of which
+            the parameters absorb most, changes it by up to 10 √(2 · 230), less than itself.
         least_unexplained: Stop when the unexplained misfit is below this fraction of the explained
             misfit. If a large effect was missing, differences between integrators and in details
             of the laws are this large.

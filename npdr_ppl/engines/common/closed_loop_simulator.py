@@ -34,7 +34,7 @@ class ClosedLoopSimulator(Simulator):
         The three broadcast to the batch shape B: keep policies on one axis, domains on another and
         states on a third. Commands are limited to the channels' bounds and then pass the action
         effects. Policies receive measurements; the first measurement has no errors. Commands
-        before the start are zero, but servos hold their joints where they are.
+        before the start are zero, but servos hold their first goals.
 
         Args:
             parameters: Domain and effect parameters; missing ones are nominal.

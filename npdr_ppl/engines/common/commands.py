@@ -8,8 +8,15 @@ from torch import Tensor
 
 from npdr_ppl.language.effects import Commands
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.simulator import Simulator
 
-__all__ = ["CommandRecord", "RecentCommands", "RecordedCommands", "commands_at"]
+__all__ = [
+    "CommandRecord",
+    "RecentCommands",
+    "RecordedCommands",
+    "command_records",
+    "commands_at",
+]
 
 
 class CommandRecord:
@@ -37,7 +44,7 @@ class CommandRecord:
         *,
         is_goal: bool = False,
     ) -> None:
-        known = torch.cat((inputs.past_actions, inputs.actions), dim=-2)[..., column]
+        known = torch.cat((inputs.past_actions[..., column], inputs.actions[..., column]), dim=-1)
         known = known.to(dtype).clamp(*limits)
         before = torch.where(inputs.start == 0, torch.zeros_like(known[..., 0]), known[..., 0])
         if is_goal:
@@ -83,6 +90,24 @@ class CommandRecord:
         part.rows = self.rows[first:last]
         part._batch_shape = None
         return part
+
+
+def command_records(
+    simulator: Simulator, inputs: Inputs, batch_shape: torch.Size, dtype: torch.dtype
+) -> tuple[CommandRecord, ...]:
+    """Returns the commands of each action channel of a simulator; see :class:`CommandRecord`."""
+    columns = {name: i for i, name in enumerate(inputs.action_names)}
+    return tuple(
+        CommandRecord(
+            inputs,
+            columns[action.name],
+            batch_shape,
+            (action.lower, action.upper),
+            dtype,
+            is_goal=simulator.is_goal(action.name),
+        )
+        for action in simulator.actions
+    )
 
 
 def commands_at(records: Sequence[CommandRecord], step: int) -> tuple[Tensor, ...]:

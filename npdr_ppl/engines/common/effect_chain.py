@@ -132,11 +132,12 @@ class EffectChain(ABC):
         """
         if not self.action_effects:
             return 0
-        times = [0.0] * len(self.simulator.actions)
-        for _, effect, channel in self.action_effects:
-            times[channel] += effect.memory_time
-        steps = math.ceil(min(max(times) / self.time_step, recorded))
-        return min(recorded, max(_PAST_STEPS, steps))
+        steps = [0.0] * len(self.simulator.actions)
+        for (_, effect, channel), history in zip(
+            self.action_effects, self.histories, strict=False
+        ):
+            steps[channel] += effect.memory_time / self.time_step + history
+        return min(recorded, max(_PAST_STEPS, math.ceil(min(max(steps), recorded))))
 
     @property
     def signature(self) -> Hashable:
@@ -147,14 +148,6 @@ class EffectChain(ABC):
     def num_positions(self) -> int:
         """Number of the simulator's states that are positions; the others are velocities."""
         return len(self.simulator.states) // 2
-
-    def commands_at_rest(self, positions: Components) -> Components:
-        """Returns the commands before an episode: zero; a servo holds its joint where it is.
-
-        Args:
-            positions: Positions among the states, ``(N,)`` each; there is at least one.
-        """
-        return (torch.zeros_like(positions[0]),) * len(self.simulator.actions)
 
     @abstractmethod
     def true_readings(

@@ -112,16 +112,32 @@ class LoopBody:
         return loop
 
 
-def begin(body: LoopBody, states: Components, tables: Tables) -> PolicyLoop:
-    """Returns the loop before its first step, with commands in the past that keep it at rest."""
+def begin(body: LoopBody, states: Components, tables: Tables, constants: Any) -> PolicyLoop:
+    """Returns the loop before its first step.
+
+    Commands in the past are zero, but servos hold their first goals, as in recordings.
+
+    Args:
+        body: The loop's body.
+        states: Initial states, ``(N,)`` each.
+        tables: Constants of the simulation.
+        constants: Constants of the policy.
+    """
     zero = torch.zeros_like(states[0])
     simulator, num_positions = body.stepper.simulator, body.stepper.num_positions
     positions, velocities = states[:num_positions], states[num_positions:]
     no_readings = (None,) * len(simulator.sensors)
-    before = body.stepper.commands_at_rest(positions)
-    state = body.stepper.start(positions, velocities, tables, before, no_readings, zero)
     readings = body.stepper.true_readings(positions, velocities, tables)
-    memory = body.policy.initial_memory(tuple(readings[i] for i in body.observed))
+    observed = tuple(readings[i] for i in body.observed)
+    memory = body.policy.initial_memory(observed)
+    before = [zero] * len(simulator.actions)
+    goals = [k for k, action in enumerate(simulator.actions) if simulator.is_goal(action.name)]
+    if goals:
+        chosen, _ = body.policy.act(observed, 0.0, memory, constants)
+        for k in goals:
+            lower, upper = body.limits[k]
+            before[k] = chosen[body.order[k]].clamp(lower, upper).expand_as(zero)
+    state = body.stepper.start(positions, velocities, tables, tuple(before), no_readings, zero)
     return PolicyLoop(state, readings, memory, torch.ones_like(zero, dtype=torch.bool), zero, zero)
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.common.batching import flatten
-from npdr_ppl.engines.common.commands import CommandRecord, commands_at
+from npdr_ppl.engines.common.commands import command_records, commands_at
 from npdr_ppl.engines.common.effect_chain import (
     EffectChain,
     Moments,
@@ -86,11 +86,7 @@ class Signals:
         # All commands are known before the engine runs, and measurements only afterwards.
         self._action_chain, self._action_parameters = chain(ActionEffect)
         self._sensor_chain, self._sensor_parameters = chain(SensorEffect)
-        columns = {name: i for i, name in enumerate(inputs.action_names)}
-        self._records = tuple(
-            CommandRecord(inputs, columns[a.name], shape, (a.lower, a.upper), torch.float64)
-            for a in simulator.actions
-        )
+        self._records = command_records(simulator, inputs, shape, torch.float64)
 
     @property
     def has_action_effects(self) -> bool:

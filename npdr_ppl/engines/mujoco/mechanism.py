@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from npdr_ppl.engines.mujoco.fields import element_names
 from npdr_ppl.engines.mujoco.native_laws import is_native, native_law
 from npdr_ppl.engines.mujoco.parameters import Assignments, Binding, Bindings, Derivation
 from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
-from npdr_ppl.engines.mujoco.servos import servo_gain, with_servos
+from npdr_ppl.engines.mujoco.servos import check_servo, with_servos
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.effects import (
@@ -63,6 +63,7 @@ class MujocoMechanism(ClosedLoopSimulator):
     """
 
     uses_threads = True
+    takes_servo_effects = True
 
     def __init__(
         self,
@@ -152,7 +153,7 @@ class MujocoMechanism(ClosedLoopSimulator):
     def make_batch(
         self, given: Mapping[str, Tensor], num_simulations: int, time_step: float, time: Tensor
     ) -> tuple[Any, Tables]:
-        """Returns a batch with its parameters set, and the effects' parameters and servos' gains.
+        """Returns a batch with its parameters set, and the effects' parameters.
 
         Args:
             given: Given parameters, ``(N,)`` or numbers, in float64.
@@ -163,9 +164,14 @@ class MujocoMechanism(ClosedLoopSimulator):
         assignments, own = self.assignments(given, time)
         model = self.prepared(time_step / self.num_substeps(time_step), set(assignments))
         num_threads = self.num_threads or torch.get_num_threads()
-        servos = {actuator for _, _, actuator in self.servo_effects}
-        gains = {a: servo_gain(self.model, a, assignments) for a in servos}
-        return make_batch(model, assignments, num_simulations, num_threads), Tables(gains, own)
+        return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)
+
+    def with_effects(self, *effects: Effect) -> Self:
+        """Returns a copy with effects attached after the present ones; see the base class."""
+        changed = super().with_effects(*effects)
+        for _, effect, actuator in changed.servo_effects:
+            check_servo(self.model, actuator, effect.id)
+        return changed
 
     @property
     def servo_effects(self) -> list[tuple[int, ServoEffect, int]]:
@@ -234,8 +240,12 @@ class MujocoMechanism(ClosedLoopSimulator):
             and ("dof_frictionloss", dof) not in assigned
         )
         may_add = bool(crisp) or any(array.endswith("frictionloss") for array, _ in assigned)
+        names = [action.name for action in self.actions]
+        changed = {names.index(e.port) for e in self.effects if e.port in names}
         limits = {place // 2 for array, place in assigned if array == "actuator_forcerange"}
-        unlimited = tuple(a for a in sorted(limits) if not self.model.actuator_forcelimited[a])
+        unlimited = tuple(
+            a for a in sorted(limits & changed) if not self.model.actuator_forcelimited[a]
+        )
         key = step, crisp, may_add, unlimited
         if key not in self.prepared_models:
             self.prepared_models[key] = prepared_copy(

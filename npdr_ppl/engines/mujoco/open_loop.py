@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.engines.common.batching import flatten
-from npdr_ppl.engines.common.commands import CommandRecord, commands_at
+from npdr_ppl.engines.common.commands import CommandRecord, command_records, commands_at
 from npdr_ppl.engines.common.effect_chain import State, Tables
 from npdr_ppl.engines.common.segment_start import recorded_start, true_start, with_past_commands
 from npdr_ppl.engines.mujoco.batches import quiet
@@ -160,17 +160,8 @@ class _Replay:
         """Returns the commands of each action channel, if an effect needs them."""
         if not (chain.action_effects or chain.sensor_effects):
             return ()
-        return tuple(
-            CommandRecord(
-                self.inputs,
-                column,
-                self.shape,
-                (action.lower, action.upper),
-                torch.float64,
-                is_goal=self.simulator.port(action.name).kind == "servo",
-            ).part(first, last)
-            for column, action in zip(self.columns, self.simulator.actions, strict=True)
-        )
+        records = command_records(self.simulator, self.inputs, self.shape, torch.float64)
+        return tuple(record.part(first, last) for record in records)
 
     def _controls(
         self,

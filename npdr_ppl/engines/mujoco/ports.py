@@ -18,6 +18,9 @@ __all__ = ["ForcePort", "actuator_moments", "derive_ports", "driven_dofs", "forc
 
 Array = NDArray[np.float64]
 
+# A servo's error in a fast motion, as a share of the joint's rated excursion.
+_LARGE_ERROR = 0.05
+
 
 class ForcePort:
     """A hinge or slide on which forces of effects act.
@@ -116,18 +119,24 @@ def derive_ports(
 def _command_port(
     model: Any, actuator: int, channel: Channel, joints: Sequence[ForcePort]
 ) -> Port:
-    """Returns the port of an actuator's command; a servo's has the ratings of its joint."""
+    """Returns the port of an actuator's command; a servo's has the ratings of its joint.
+
+    The rated force of a servo is that of the joint, or that at an error of ``_LARGE_ERROR`` of the
+    rated excursion if it is greater: a joint may carry no weight. It is the force before the gear.
+    """
     if not is_servo(model, actuator):
         return Port(channel.name, "action", channel.unit, _largest(channel))
     port = Port(channel.name, "servo", channel.unit, _largest(channel))
     moved = actuated_joint(model, actuator)
+    gear = abs(float(model.actuator_gear[actuator, 0])) or 1.0
+    gain = float(model.actuator_gainprm[actuator, 0])
     for joint in (j.port for j in joints if j.joint == moved):
         port = replace(
             port,
             rated_speed=joint.rated_speed,
             rated_position=joint.rated_position,
             coordinate=joint.coordinate,
-            rated_force=joint.rated,
+            rated_force=max(joint.rated / gear, gain * _LARGE_ERROR * gear * joint.rated_position),
         )
     return port
 

@@ -1,6 +1,5 @@
 """Servos of a MuJoCo model: actuators whose force is a gain times an error, and their effects."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,10 +11,11 @@ from torch import Tensor
 from npdr_ppl.engines.common.effect_chain import Tables
 from npdr_ppl.engines.mujoco.fields import actuated_joint, servo_gains
 from npdr_ppl.engines.mujoco.parameters import Assignments, present
+from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effect_context import Servo
 from npdr_ppl.language.effects import Effect, EnvironmentEffect, ServoEffect
 
-__all__ = ["ServoForces", "is_servo", "servo_gain", "with_servos"]
+__all__ = ["ServoErrors", "check_servo", "is_servo", "with_servos"]
 
 
 def is_servo(model: Any, actuator: int) -> bool:
@@ -47,38 +47,47 @@ def with_servos(
         # A servo's error is taken from its position, the second number of the bias, or its
         # velocity, the third.
         column = 1 if "kp" in servo_gains(model, actuator) else 2
-        gain = _gain_place(model, actuator)
+        gain = "actuator_gainprm", actuator * model.actuator_gainprm.shape[1]
         bias = "actuator_biasprm", actuator * model.actuator_biasprm.shape[1] + column
-        lower, upper = (("actuator_forcerange", 2 * actuator + i) for i in range(2))
-        limit = torch.tensor(math.inf, dtype=torch.float64)
-        if model.actuator_forcelimited[actuator]:
-            limit = present(model, *upper, result)
-        old = Servo(present(model, *gain, result), limit)
+        old = Servo(present(model, *gain, result))
         new = effect.environment(old, values)
         if new.gain is not old.gain:
             result |= {gain: new.gain, bias: -new.gain}
         if new.limit is not old.limit:
-            result |= {lower: -new.limit, upper: new.limit}
+            result |= _limited(model, actuator, new.limit, result)
     return result
 
 
-def servo_gain(model: Any, actuator: int, assignments: Assignments) -> Tensor:
-    """Returns a servo's force per unit of error, a number or ``(N,)``.
+def _limited(model: Any, actuator: int, limit: Tensor, assignments: Assignments) -> Assignments:
+    """Returns a servo's range of forces with a further limit, a number or ``(N,)``."""
+    lower, upper = (("actuator_forcerange", 2 * actuator + i) for i in range(2))
+    if not model.actuator_forcelimited[actuator]:
+        return {lower: -limit, upper: limit}
+    least, most = (present(model, *place, assignments) for place in (lower, upper))
+    return {lower: torch.maximum(least, -limit), upper: torch.minimum(most, limit)}
+
+
+def check_servo(model: Any, actuator: int, effect: str) -> None:
+    """Raises a ModelError if the error of an actuator is not its goal minus its joint's position.
 
     Args:
         model: A ``mujoco.MjModel``.
-        actuator: The servo's number.
-        assignments: What is written into the model.
+        actuator: Number of the actuator.
+        effect: Name of the effect that needs the error.
     """
-    return present(model, *_gain_place(model, actuator), assignments)
+    has_state = int(model.actuator_dyntype[actuator]) != 0
+    if (
+        has_state
+        or actuated_joint(model, actuator) is None
+        or "kp" not in servo_gains(model, actuator)
+    ):
+        raise ModelError(
+            f"{effect} needs a position servo that acts on a joint without a filter of its own."
+        )
 
 
-def _gain_place(model: Any, actuator: int) -> tuple[str, int]:
-    return "actuator_gainprm", actuator * model.actuator_gainprm.shape[1]
-
-
-class ServoForces:
-    """Forces that effects inside position servos add to those of the engine.
+class ServoErrors:
+    """Changes the goals of position servos so that they act on the errors that effects give.
 
     The servos act on a joint directly, with a gear of one.
 
@@ -100,17 +109,15 @@ class ServoForces:
         self._goals, self._positions = goals, positions
         joints = {actuator: actuated_joint(model, actuator) for _, _, actuator in effects}
         self._address = {a: int(model.jnt_qposadr[joint]) for a, joint in joints.items()}
-        self._dof = {a: int(model.jnt_dofadr[joint]) for a, joint in joints.items()}
 
-    def add_to(self, applied: NDArray[np.float64], tables: Tables) -> None:
-        """Adds the forces in the present state.
+    def apply(self, tables: Tables) -> None:
+        """Changes the goals in the present state.
 
         Args:
-            applied: Generalised forces, ``(N, nv)``.
-            tables: Parameters of the effects; its constants are the gains, by actuator.
+            tables: Parameters of the effects.
         """
         for place, effect, actuator in self._effects:
-            error = self._goals[:, actuator] - self._positions[:, self._address[actuator]]
-            gain = tables.constants[actuator]
-            force = effect.change(torch.from_numpy(error), gain, tables.effects[place])
-            applied[:, self._dof[actuator]] += force.numpy()
+            position = self._positions[:, self._address[actuator]]
+            error = torch.from_numpy(self._goals[:, actuator] - position)
+            changed = effect.act(error, tables.effects[place])
+            self._goals[:, actuator] += (changed - error).numpy()

@@ -153,5 +153,5 @@ class MujocoSimulator(MujocoMechanism):
             stepper.place(states)
             stepper.begin()
             body = LoopBody(stepper, policy, request.reward)
-            loop = begin(body, states, tables)
+            loop = begin(body, states, tables, constants)
             return run_eagerly(body, loop, tables, constants, num_steps, shape, request.record)

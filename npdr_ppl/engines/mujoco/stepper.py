@@ -12,10 +12,9 @@ from npdr_ppl.engines.common.effect_chain import EffectChain, Moments, State, Ta
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.mujoco.batches import state_view
 from npdr_ppl.engines.mujoco.channels import Component, Reading
-from npdr_ppl.engines.mujoco.fields import actuated_joint
 from npdr_ppl.engines.mujoco.joints import JointStates
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
-from npdr_ppl.engines.mujoco.servos import ServoForces
+from npdr_ppl.engines.mujoco.servos import ServoErrors
 
 __all__ = ["ACCELERATION_STAGE", "MujocoStepper", "lost_simulations"]
 
@@ -55,8 +54,7 @@ class MujocoStepper(EffectChain):
         self.simulator: MujocoMechanism = simulator
         self.force_effects = [f for f in self.force_effects if not simulator.is_native(f[1])]
         servo_effects = simulator.servo_effects
-        self._has_servo_effects = bool(servo_effects)
-        self.has_forces = self._has_servo_effects or bool(self.force_effects)
+        self.has_forces = bool(servo_effects or self.force_effects)
         self.substeps = simulator.num_substeps(time_step)
         self._engine_step = time_step / self.substeps
         self._batch = batch
@@ -69,8 +67,8 @@ class MujocoStepper(EffectChain):
         # computed again. Acceleration sensors report the values of the last engine step.
         self._stage = max(stages - {ACCELERATION_STAGE}, default=0)
         self._has_accelerations = ACCELERATION_STAGE in stages
-        self._applied = state_view(batch, "qfrc_applied") if self.has_forces else None
-        self._servos = ServoForces(simulator.model, servo_effects, self._ctrl, self._qpos)
+        self._applied = state_view(batch, "qfrc_applied") if self.force_effects else None
+        self._servos = ServoErrors(simulator.model, servo_effects, self._ctrl, self._qpos)
         # The bounds of dry friction that the engine reads, and the bounds without effects.
         self._friction: tuple[np.ndarray, np.ndarray] | None = None
         self._joints = JointStates(batch, simulator.force_ports) if self.needs_joints else None
@@ -85,20 +83,6 @@ class MujocoStepper(EffectChain):
     def num_positions(self) -> int:
         """Number of the simulator's states that are positions."""
         return sum(not component.is_velocity for component in self.simulator.components)
-
-    def commands_at_rest(self, positions: Components) -> Components:
-        """Returns zero, and the present position of the joint for a servo that follows it."""
-        components = [c for c in self.simulator.components if not c.is_velocity]
-        held = {c.address: value for c, value in zip(components, positions, strict=True)}
-        commands = list(super().commands_at_rest(positions))
-        for actuator, action in enumerate(self.simulator.actions):
-            port = self.simulator.port(action.name)
-            joint = actuated_joint(self.simulator.model, actuator)
-            # Its goal is a position if both have the same unit.
-            if port.kind == "servo" and port.unit == port.coordinate and joint is not None:
-                address = int(self.simulator.model.jnt_qposadr[joint])
-                commands[actuator] = held.get(address, commands[actuator])
-        return tuple(commands)
 
     def place(self, components: tuple[Tensor, ...]) -> None:
         """Sets the simulations' states, ``(N,)`` per component of the simulator's state."""
@@ -193,7 +177,8 @@ class MujocoStepper(EffectChain):
 
     def _move_once(self, state: State, tables: Tables, stage: int) -> State:
         """Advances all simulations by one engine step under the force effects."""
-        if not self.has_forces:
+        self._servos.apply(tables)
+        if not self.force_effects:
             self._guarded(self._batch.step, stage=stage)
             return state
         positions, velocities = self.at_joints((), ())
@@ -217,14 +202,12 @@ class MujocoStepper(EffectChain):
         forces = self.applied_forces(
             state.positions, state.velocities, state, tables, before_step=before_step
         )
-        if before_step or self._has_servo_effects:
-            # Removes the previous step's forces of effects that need their joint's state first,
-            # or that are added.
+        if before_step:
+            # Removes the previous step's forces of effects that need their joint's state first.
             self._applied[:] = 0.0
         for port, force in zip(ports, forces, strict=True):
             if force is not None:
                 self._applied[:, port.velocity] = force.numpy()
-        self._servos.add_to(self._applied, tables)
         if before_step:
             if self._friction is not None:
                 present, own = self._friction

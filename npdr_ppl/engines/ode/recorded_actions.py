@@ -8,7 +8,12 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.common.batching import flatten
-from npdr_ppl.engines.common.commands import CommandRecord, RecordedCommands, commands_at
+from npdr_ppl.engines.common.commands import (
+    CommandRecord,
+    RecordedCommands,
+    command_records,
+    commands_at,
+)
 from npdr_ppl.engines.common.compilation import (
     compiled,
     is_worthwhile,
@@ -69,11 +74,7 @@ def _replay(
     """Returns all trajectories, ``shape + (steps, sensors)``, including padded steps."""
     tables, histories = simulator.tables(domain, shape, inputs.time_step, expand=is_compiled)
     body = _Body(Stepper(simulator, inputs.time_step, histories))
-    columns = {name: i for i, name in enumerate(inputs.action_names)}
-    records = tuple(
-        CommandRecord(inputs, columns[action.name], shape, (action.lower, action.upper), dtype)
-        for action in simulator.actions
-    )
+    records = command_records(simulator, inputs, shape, dtype)
     readings: list[Tensor] = []
     given = tables, [vars(part) for part in (inputs, *records)]
     has_gradient = any(

@@ -71,7 +71,7 @@ class ODESimulator(MechanicalSystem):
             stepper = Stepper(self, step, histories)
             body = LoopBody(stepper, policy, reward, steps_per_call(**size))
             states = flatten(initial_states.to(dtype).unbind(-1), shape, expand=True)
-            loop = begin(body, states, tables)
+            loop = begin(body, states, tables, constants)
             if not is_compiled:
                 return run_eagerly(body, loop, tables, constants, num_steps, shape, request.record)
             return run_compiled(body, loop, tables, constants, num_steps, shape)

@@ -170,7 +170,7 @@ class _RunEpisode(Task):
         policy.parameters = torch.from_numpy(one.policy)
         constants = flatten(policy.constants(request.believed(domain)), _ONE)
         body = LoopBody(stepper, policy, request.reward)
-        loop = begin(body, stepper.states(), stepper.tables)
+        loop = begin(body, stepper.states(), stepper.tables, constants)
         readings, commands = [loop.readings], []
         for step in range(num_steps):
             loop, chosen = body.step(loop, stepper.tables, constants, step * time_step)
