@@ -178,8 +178,8 @@ def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remed
     best, least = _best(remedies(sensors, rollouts, suspects if present else None), ratio)
     if best is not None and isinstance(best.apply, Shift):
         best, least = _refined(best.apply, ratio)
-    if least < REPAIR.remedy_factor:
-        return best
+    if best is not None and least < REPAIR.remedy_factor:
+        return best if least < REPAIR.remedy_factor * trials.ratio_without(best) else None
     # A channel is given up only if nothing else helps.
     best, least = _best(without_one(sensors), ratio)
     return best if least < REPAIR.remedy_factor else None
@@ -198,6 +198,8 @@ class _Trials:
         """Misfit of the recording as it was read, by channel."""
         self._shifted: dict[str | None, dict[float, Mapping[str, Tensor]]] = {}
         """Fitted parameters by channel and number of steps."""
+        self._parameters: dict[str, Mapping[str, Tensor]] = {}
+        """Fitted parameters by the sentence of a remedy."""
 
     def ratio(self, remedy: Remedy) -> float:
         """Returns the misfit with a remedy, relative to that of the same channels without it."""
@@ -219,7 +221,21 @@ class _Trials:
             return math.inf
         if isinstance(shift, Shift):
             known[shift.steps] = tried.parameters
-        found = _misfits(tried)
+        self._parameters[remedy.sentence] = tried.parameters
+        return self._relative(_misfits(tried))
+
+    def ratio_without(self, remedy: Remedy) -> float:
+        """Returns the relative misfit without a remedy, fitted from where it was fitted with it.
+
+        It is at most 1. If it is about as small as with the remedy, the parameters explain the
+        recording and not the remedy: a servo that hardly acts predicts slow motions from their
+        speed alone, whatever the commands.
+        """
+        start = self._parameters[remedy.sentence]
+        again = _fitted(self._model, self._rollouts, self._options, start)
+        return 1.0 if again is None else min(1.0, self._relative(_misfits(again)))
+
+    def _relative(self, found: Mapping[str, float]) -> float:
         before = {name: self.present[name] for name in found if name in self.present}
         return _rms(found) / (_rms(before) if before else 1.0)
 

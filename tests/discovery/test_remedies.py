@@ -193,6 +193,28 @@ def test_the_fit_of_a_shift_begins_at_that_of_the_nearest_shift(monkeypatch):
     assert begun[id(sign)] is None
 
 
+def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is(monkeypatch):
+    """A fit that got stuck is no fault of the data."""
+    rollouts, options = swinging(steps=240), npdr.DataOptions(None, 30)
+    fitted = recording_repair._fitted
+
+    def stuck(model, recording, options, start=None):
+        found = fitted(model, recording, options, start)
+        if recording is rollouts and start is None:
+            away = dataclasses.replace(found.fit, z=found.fit.z + 2.0)
+            return dataclasses.replace(found, fit=away)
+        return found
+
+    monkeypatch.setattr(recording_repair, "_fitted", stuck)
+    monkeypatch.setattr(recording_repair, "_searched", lambda segments: None)
+    as_read = stuck(pendulum, rollouts, options)
+    trials = recording_repair._Trials(pendulum, rollouts, options, as_read)
+    shift = Shift(None, 1).remedy
+    assert trials.ratio(shift) < recording_repair.REPAIR.remedy_factor
+    assert trials.ratio_without(shift) < trials.ratio(shift)
+    assert recording_repair._remedy_for(pendulum, rollouts, options) is None
+
+
 def _swapped(time):
     time[[200, 201]] = time[[201, 200]]
 
