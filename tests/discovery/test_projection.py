@@ -52,3 +52,15 @@ def test_only_the_latest_large_linearisations_are_kept(quiet, monkeypatch):
     again = fits[0].linearisation  # computed again, with the same result
     torch.testing.assert_close(again.by_parameters, wanted[0].by_parameters, rtol=0.0, atol=0.0)
     assert ["_linearised" in vars(fit) for fit in fits] == [True, False, True]
+
+
+def test_only_the_latest_differences_are_kept(quiet, monkeypatch):
+    settings = replace(hypothesis.HYPOTHESIS, kept_bytes=int(2.5 * quiet.difference.nbytes))
+    monkeypatch.setattr(hypothesis, "HYPOTHESIS", settings)
+    monkeypatch.setattr(hypothesis, "_KEPT", hypothesis._Kept())
+    fits = [replace(quiet) for _ in range(3)]
+    wanted = [fit.difference for fit in fits]
+    assert ["difference" in vars(fit) for fit in fits] == [False, True, True]
+    assert torch.equal(fits[0].difference, wanted[0])
+    fits[1].keep_difference(wanted[1])
+    assert ["difference" in vars(fit) for fit in fits] == [True, True, False]

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from npdr_ppl.discovery.screening.sensitivities import _probe
+from npdr_ppl.discovery.screening.settings import SENSITIVITY
 from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
@@ -16,6 +18,7 @@ from npdr_ppl.models.effects import (
     GoalResolution,
     GoalSpeedLimit,
     InputDelay,
+    Saturation,
     ServoDeadBand,
     ServoForceLimit,
     candidate_effects,
@@ -225,3 +228,18 @@ def test_a_filtered_servo_has_no_dead_band():
     filtered = joint(more='timeconst="0.1"')
     with pytest.raises(ModelError, match="without a filter"):
         filtered.with_effects(ServoDeadBand("goal"))
+
+
+def test_limits_are_tried_below_what_they_would_cut_off():
+    simulator = joint()
+    inputs = goals(0.5 * np.sin(np.linspace(0.0, 9.0, 100)))
+    force = _probe(ServoForceLimit("goal"), inputs, simulator, None)
+    limits = [values["limit"] for values, _, _ in force.cases]
+    assert limits == sorted(limits, reverse=True)
+    assert len(limits) == len(SENSITIVITY.limit_quantiles)
+    assert [float(zero) * SENSITIVITY.first_limit for zero in force.nominal] == pytest.approx(
+        limits
+    )
+    clipped = _probe(Saturation("goal"), inputs, simulator, None)
+    peak = float(inputs.actions.abs().max())
+    assert {values["limit"] for values, _, _ in clipped.cases} == {SENSITIVITY.first_limit * peak}

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from npdr_ppl.errors import DataError, ShapeError
 from npdr_ppl.rollouts import Rollouts, stitch
+from npdr_ppl.rollouts.segments import default_history
 
 torch.set_num_threads(1)
 
@@ -126,3 +127,19 @@ def test_estimated_states_come_with_rates():
     recorded = rollouts.inputs(50, "recorded")
     assert recorded.initial_rates is None
     assert torch.equal(recorded.initial_values, recorded.initial_readings)
+
+
+@pytest.mark.parametrize(
+    ("time_step", "num_segments", "num_actions", "wanted"),
+    [
+        (0.002, 100, 1, 2500),  # five seconds
+        (0.02, 100, 6, 250),
+        (0.001, 600, 7, (1 << 22) // 4200),  # what fits into 32 MiB
+        (1.0, 3, 1, 64),
+        (0.001, 1_000_000, 7, 64),
+    ],
+)
+def test_past_commands_last_five_seconds_or_take_little_memory(
+    time_step, num_segments, num_actions, wanted
+):
+    assert default_history(time_step, num_segments, num_actions) == wanted
