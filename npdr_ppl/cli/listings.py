@@ -177,7 +177,7 @@ def searches(
 
 def _unit(template: str) -> str:
     """Returns an effect's unit in words where it depends on the port."""
-    return template.format(port="port", coordinate="coordinate")
+    return template.format(port="port", coordinate="coordinate", force="force")
 
 
 def _first_line(documented: object) -> str:
