@@ -31,6 +31,7 @@ class CommandRecord:
         batch_shape: The batch shape including the segments, of numel N.
         limits: Least and greatest command that the device accepts.
         dtype: Floating type of the simulation.
+        num_past: Number of past commands to keep.
         is_goal: Whether the channel is the goal of a servo.
     """
 
@@ -42,13 +43,16 @@ class CommandRecord:
         limits: tuple[float, float],
         dtype: torch.dtype,
         *,
+        num_past: int,
         is_goal: bool = False,
     ) -> None:
-        known = torch.cat((inputs.past_actions[..., column], inputs.actions[..., column]), dim=-1)
+        left_out = inputs.past_actions.shape[-2] - num_past
+        past = inputs.past_actions[..., left_out:, column]
+        known = torch.cat((past, inputs.actions[..., column]), dim=-1)
         known = known.to(dtype).clamp(*limits)
         before = torch.where(inputs.start == 0, torch.zeros_like(known[..., 0]), known[..., 0])
         if is_goal:
-            first = (inputs.past_actions.shape[-2] - inputs.start).clamp_min(0)[..., None]
+            first = (num_past - inputs.start).clamp_min(0)[..., None]
             goal = known.gather(-1, first.expand(*known.shape[:-1], 1))
             is_before = torch.arange(known.shape[-1], device=known.device) < first
             known = torch.where(is_before, goal, known)
@@ -59,7 +63,7 @@ class CommandRecord:
         segments = self._table.shape[1:]
         row = torch.arange(segments.numel(), device=known.device).reshape(segments)
         self.rows = row.expand(batch_shape).reshape(-1)
-        self.first = 1 + inputs.past_actions.shape[-2]
+        self.first = 1 + num_past
 
     @property
     def table(self) -> Tensor:
@@ -93,7 +97,11 @@ class CommandRecord:
 
 
 def command_records(
-    simulator: Simulator, inputs: Inputs, batch_shape: torch.Size, dtype: torch.dtype
+    simulator: Simulator,
+    inputs: Inputs,
+    batch_shape: torch.Size,
+    dtype: torch.dtype,
+    num_past: int,
 ) -> tuple[CommandRecord, ...]:
     """Returns the commands of each action channel of a simulator; see :class:`CommandRecord`."""
     columns = {name: i for i, name in enumerate(inputs.action_names)}
@@ -104,6 +112,7 @@ def command_records(
             batch_shape,
             (action.lower, action.upper),
             dtype,
+            num_past=num_past,
             is_goal=simulator.is_goal(action.name),
         )
         for action in simulator.actions

@@ -139,6 +139,10 @@ class EffectChain(ABC):
             steps[channel] += effect.memory_time / self.time_step + history
         return min(recorded, max(_PAST_STEPS, math.ceil(min(max(steps), recorded))))
 
+    def num_kept_steps(self, recorded: int) -> int:
+        """Returns how many of the recorded past steps an effect may look at."""
+        return min(recorded, max(_PAST_STEPS, self.num_past_steps(recorded)))
+
     @property
     def signature(self) -> Hashable:
         """Equal for chains that compile to the same code."""

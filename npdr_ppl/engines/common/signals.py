@@ -86,7 +86,8 @@ class Signals:
         # All commands are known before the engine runs, and measurements only afterwards.
         self._action_chain, self._action_parameters = chain(ActionEffect)
         self._sensor_chain, self._sensor_parameters = chain(SensorEffect)
-        self._records = command_records(simulator, inputs, shape, torch.float64)
+        kept = self._action_chain.num_kept_steps(inputs.past_actions.shape[-2])
+        self._records = command_records(simulator, inputs, shape, torch.float64, kept)
 
     @property
     def has_action_effects(self) -> bool:

@@ -160,7 +160,8 @@ class _Replay:
         """Returns the commands of each action channel, if an effect needs them."""
         if not (chain.action_effects or chain.sensor_effects):
             return ()
-        records = command_records(self.simulator, self.inputs, self.shape, torch.float64)
+        kept = chain.num_kept_steps(self.inputs.past_actions.shape[-2])
+        records = command_records(self.simulator, self.inputs, self.shape, torch.float64, kept)
         return tuple(record.part(first, last) for record in records)
 
     def _controls(

@@ -74,7 +74,8 @@ def _replay(
     """Returns all trajectories, ``shape + (steps, sensors)``, including padded steps."""
     tables, histories = simulator.tables(domain, shape, inputs.time_step, expand=is_compiled)
     body = _Body(Stepper(simulator, inputs.time_step, histories))
-    records = command_records(simulator, inputs, shape, dtype)
+    kept = body.stepper.num_kept_steps(inputs.past_actions.shape[-2])
+    records = command_records(simulator, inputs, shape, dtype, kept)
     readings: list[Tensor] = []
     given = tables, [vars(part) for part in (inputs, *records)]
     has_gradient = any(
