@@ -39,11 +39,6 @@ _FORCE_SPREAD = 1.5
 _LEAST = 1e-300
 
 
-def _follows_position(port: Port) -> bool:
-    """Returns whether a servo's goal is a position of its joint."""
-    return port.unit == port.coordinate
-
-
 class ServoGain(EnvironmentEffect):
     """K (1 + ε): a servo's force per unit of error differs from the declared one.
 
@@ -102,34 +97,35 @@ class ServoDeadBand(ServoEffect):
         """Half-normal; 1 % of the rated excursion."""
         return {"width": dist.HalfNormal(0.01 * port.rated_position)}
 
-    def suits(self, port: Port) -> bool:
-        """Returns whether the servo follows its joint's position."""
-        return _follows_position(port)
-
     def act(self, error: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
         """Returns e − clip(e, ±δ), an equal expression."""
         width = parameters["width"]
         return error - error.clamp(-width, width)
 
 
-class GoalSpeedLimit(ActionEffect):
+class _GoalEffect(ActionEffect):
+    """An effect on the goal of a servo that follows its joint's position."""
+
+    port_kinds = ("servo",)
+    is_smooth = False
+    reference = DYNAMIXEL
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the servo follows its joint's position."""
+        return port.follows_position
+
+
+class GoalSpeedLimit(_GoalEffect):
     """|ġ| ≤ v: the servo follows a goal g that approaches the commanded one at a limited speed."""
 
     id = "goal_speed_limit"
-    port_kinds = ("servo",)
     parameters = (Parameter("limit", "{port}/s", math.inf, "greatest speed v"),)
-    is_smooth = False
     law = "|ġ| ≤ v"
     excitation = "steps"
-    reference = DYNAMIXEL
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Log-normal; about the rated excursion per second."""
         return {"limit": dist.LogNormal(math.log(port.rated_position), _SPREAD)}
-
-    def suits(self, port: Port) -> bool:
-        """Returns whether the servo follows its joint's position."""
-        return _follows_position(port)
 
     def initial_memory(self, command: Tensor, start: Start) -> Tensor:
         """Returns the command, which the goal has reached."""
@@ -152,7 +148,7 @@ class GoalSpeedLimit(ActionEffect):
         return Uneven(goal - late, moment), goal
 
 
-class GoalAccelerationLimit(ActionEffect):
+class GoalAccelerationLimit(_GoalEffect):
     """|g̈| ≤ a: the servo follows a goal g that speeds up and brakes at a limited rate.
 
     The goal moves as fast as it can and still stop at the command, as the profile generators of
@@ -162,20 +158,13 @@ class GoalAccelerationLimit(ActionEffect):
     """
 
     id = "goal_acceleration_limit"
-    port_kinds = ("servo",)
     parameters = (Parameter("limit", "{port}/s²", math.inf, "greatest acceleration a"),)
-    is_smooth = False
     law = "|g̈| ≤ a"
     excitation = "steps"
-    reference = DYNAMIXEL
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Log-normal; about ten rated excursions per square second."""
         return {"limit": dist.LogNormal(math.log(10.0 * port.rated_position), _SPREAD)}
-
-    def suits(self, port: Port) -> bool:
-        """Returns whether the servo follows its joint's position."""
-        return _follows_position(port)
 
     def initial_memory(self, command: Tensor, start: Start) -> tuple[Tensor, Tensor]:
         """Returns the command, which the goal has reached, and its speed, zero."""
@@ -205,25 +194,18 @@ class GoalAccelerationLimit(ActionEffect):
         return Uneven(end - late, moment), (end, reached)
 
 
-class GoalResolution(ActionEffect):
+class GoalResolution(_GoalEffect):
     """Δ round(u/Δ): the servo's goal has steps of Δ."""
 
     id = "goal_resolution"
-    port_kinds = ("servo",)
     parameters = (Parameter("step", "{port}", 0.0, "step Δ"),)
-    is_smooth = False
     has_local_minima = True
     law = "Δ round(u/Δ)"
     excitation = "slow_ramp"
-    reference = DYNAMIXEL
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Uniform; up to 1 % of the rated excursion."""
         return {"step": dist.Uniform(0.0, 0.01 * port.rated_position)}
-
-    def suits(self, port: Port) -> bool:
-        """Returns whether the servo follows its joint's position."""
-        return _follows_position(port)
 
     def act(
         self, commands: Commands, parameters: Mapping[str, Tensor], memory: Any, time_step: float

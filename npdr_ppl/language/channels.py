@@ -85,6 +85,11 @@ class Port:
     rated_force: float = 1.0
 
     @property
+    def follows_position(self) -> bool:
+        """Whether the goal of a servo is the position of its joint."""
+        return self.kind == "servo" and self.unit == self.coordinate
+
+    @property
     def force_unit(self) -> str:
         """Unit of the force at a joint: N m or N."""
         return "N m" if self.coordinate == "rad" else "N"

@@ -414,6 +414,10 @@ class ServoEffect(Effect):
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("servo",)
 
+    def suits(self, port: Port) -> bool:
+        """Returns whether the servo follows its joint's position."""
+        return port.follows_position
+
     @abstractmethod
     def act(self, error: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
         """Returns the error on which the servo acts; evaluated in every step of the engine.
