@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.screening.groups import num_counted
+from npdr_ppl.discovery.screening.groups import Group, num_counted
 from npdr_ppl.discovery.screening.projection import loss_without
 from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.alternatives import Added, log_prior
@@ -372,18 +372,7 @@ class Searcher:
         """
         if not now.laws or self._deadline.stops():
             return current
-        found = likelier_group(
-            now.hypothesis,
-            now.laws,
-            current,
-            self.trials,
-            num_new=1,
-            num_candidates=len(now.ranking),
-            confidence=self.options.confidence,
-            report=self._report,
-            progress=self._progress.stage("laws at several joints", may_end_early=True),
-        )
-        return found or current
+        return self._likelier(now, now.laws, current, "laws at several joints", num_new=1)
 
     def _with_likelier_pair(
         self, rounds: list[Round], current: Hypothesis, max_effects: int
@@ -407,16 +396,36 @@ class Searcher:
             return current
         if not pairs or self._deadline.stops():
             return current
+        return self._likelier(before, pairs, current, "pairs of effects", num_new=2)
+
+    def _likelier(
+        self,
+        before: Round,
+        groups: Sequence[Group],
+        current: Hypothesis,
+        stage: str,
+        *,
+        num_new: int,
+    ) -> Hypothesis:
+        """Returns the model of a round with the likeliest group, or the current one.
+
+        Args:
+            before: The round to whose model a group is added.
+            groups: The groups.
+            current: The model to compare with.
+            stage: What the progress says.
+            num_new: As how many effects a group counts.
+        """
         found = likelier_group(
             before.hypothesis,
-            pairs,
+            groups,
             current,
             self.trials,
-            num_new=2,
+            num_new=num_new,
             num_candidates=len(before.ranking),
             confidence=self.options.confidence,
             report=self._report,
-            progress=self._progress.stage("pairs of effects", may_end_early=True),
+            progress=self._progress.stage(stage, may_end_early=True),
         )
         return found or current
 
