@@ -31,6 +31,7 @@ import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.search.effect_search import Searcher
+from npdr_ppl.discovery.search.look import look
 from npdr_ppl.models.effects import candidate_effects
 
 JOINTS = (1, 2, 4, 6, 7, 12)
@@ -121,10 +122,8 @@ def measured(number: int, seconds: float) -> dict[str, Any]:
     row: dict[str, Any] = {"joints": number, "fit_seconds": time.process_time() - begun}
     everything = candidate_effects(fitted.simulator)
     for name, effects in (("all", everything), ("fourth", everything[::4])):
-        searcher.options = npdr.DiscoveryOptions(effects=effects)
-        searcher._last = None
         begun = time.process_time()
-        searcher.look(fitted)
+        look(fitted, npdr.DiscoveryOptions(effects=effects))
         row[f"candidates_{name}"] = len(effects)
         row[f"screening_seconds_{name}"] = time.process_time() - begun
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
