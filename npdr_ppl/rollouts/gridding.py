@@ -22,6 +22,7 @@ from npdr_ppl.rollouts.sampling import (
     common,
     placed,
     spans_without_gaps,
+    split,
 )
 from npdr_ppl.rollouts.tracks import Track, clock_notes
 
@@ -36,6 +37,13 @@ JITTER = 0.1
 PHASE_SHARE = 0.1
 """Weight of the newest stamp in the running mean of a clock's phase, about the mean of 20 stamps:
 it follows a clock that drifts, and has a quarter of the jitter of one stamp."""
+
+JUMP = 5.0
+"""Change of a command across lost ones, in median changes nearby, above which a straight line does
+not tell when it changed. A smooth command changes less, and one that is piecewise constant more."""
+
+NEARBY = 10
+"""Number of commands before, and after, a gap that tell how much the command usually changes."""
 
 MOST_LOST = 0.9
 """Share of the steps with a measurement below which a channel is reported as a slower one."""
@@ -52,6 +60,7 @@ class Gridded:
         sampling: The measurements as they were taken.
         num_unused: Number of measurements of each channel that share a row with another one and
             are not used, ``(C,)``.
+        is_unknown: Whether a command was lost when it jumped, ``(T,)``.
     """
 
     time: Array
@@ -59,9 +68,17 @@ class Gridded:
     actions: Array
     sampling: Sampling
     num_unused: NDArray[np.int64]
+    is_unknown: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, channels: Sequence[Track], time: Array, actions: Array, step: float) -> "Gridded":
+    def of(
+        cls,
+        channels: Sequence[Track],
+        time: Array,
+        actions: Array,
+        step: float,
+        is_unknown: NDArray[np.bool_] | None = None,
+    ) -> "Gridded":
         """Puts measurements on a grid that is known.
 
         The readings follow from the measurements on the grid alone. A file that keeps these gives
@@ -72,6 +89,7 @@ class Gridded:
             time: Times of the rows in s on the clock of the channels, ``(T + 1,)``.
             actions: Mean commands of the steps, ``(T, A)``.
             step: Seconds between the rows.
+            is_unknown: As the attribute; ``None`` if no command was lost.
         """
         shape = (len(time), len(channels))
         readings, lateness = np.zeros(shape), np.zeros(shape)
@@ -87,11 +105,19 @@ class Gridded:
             values[:, k] = np.where(found.is_read, found.values, readings[:, k])
             lateness[:, k], is_read[:, k] = found.lateness, found.is_read
             num_unused[k] = found.num_unused
-        return cls(time, readings, actions, Sampling(values, lateness, is_read), num_unused)
+        if is_unknown is None:
+            is_unknown = np.zeros(len(actions), dtype=bool)
+        sampling = Sampling(values, lateness, is_read)
+        return cls(time, readings, actions, sampling, num_unused, is_unknown)
 
     @cached_property
     def spans(self) -> Spans:
-        """The stretches without long gaps."""
+        """The stretches without long gaps, in which all commands are known."""
+        return split(self.spans_measured, np.flatnonzero(self.is_unknown).tolist())
+
+    @cached_property
+    def spans_measured(self) -> Spans:
+        """The stretches without long gaps between measurements."""
         return spans_without_gaps(self.sampling.is_read)
 
 
@@ -122,12 +148,19 @@ def grid_of(channels: Sequence[Track], actions: Sequence[Track], step: float) ->
     if count * len(tracks) > LIMITS.numbers:
         raise DataError(f"{count} steps of {step:.6g} s are more than are read.")
     rows = step * np.arange(count + 1, dtype=np.float64)
-    commands = [_mean_held(_bridged(track), begin + rows) for track in actions]
+    is_unknown = np.zeros(count, dtype=bool)
+    commands = []
+    for track in actions:
+        bridged, jumps = _bridged(track)
+        commands.append(_mean_held(bridged, begin + rows))
+        for first, end in (jumps - begin) / step:
+            is_unknown[max(0, math.floor(first)) : max(0, math.ceil(end))] = True
     return Gridded.of(
         [Track(track.time - begin, track.values) for track in channels],
         rows,
         np.stack(commands, axis=1) if commands else np.zeros((count, 0)),
         step,
+        is_unknown,
     )
 
 
@@ -147,26 +180,37 @@ def _interpolated(at: Array, values: Array, num_rows: int) -> Array:
     return np.asarray(Akima1DInterpolator(at, values)(inside), dtype=np.float64)
 
 
-def _bridged(track: Track) -> Track:
-    """Returns a regular stream of commands with its short gaps filled by straight lines.
+def _bridged(track: Track) -> tuple[Track, Array]:
+    """Fills the short gaps in a regular stream of commands by straight lines.
 
     Commands that were written only when they changed are left as they are.
+
+    Returns:
+        The commands, and the times in s between which they jumped and were lost, ``(N, 2)``.
     """
     usual, steps = track.rate, np.diff(track.time)
     if usual is None or not (steps > 1.5 * usual).any():
-        return track
+        return track, np.zeros((0, 2))
     mean = track.step
     # The median step differs from the mean one if a clock of whole milliseconds rounds.
     count = np.diff(_slots(track.time, mean if abs(mean - usual) < 0.5 * usual else usual))
     short = np.flatnonzero((count > 1) & (count <= MOST_BRIDGED))
     if not len(short):
-        return track
+        return track, np.zeros((0, 2))
     time = [track.time[k] + steps[k] * np.arange(1, int(count[k])) / count[k] for k in short]
     added = np.concatenate(time)
     every = np.concatenate((track.time, added))
     order = np.argsort(every, kind="stable")
     values = np.concatenate((track.values, np.interp(added, track.time, track.values)))
-    return Track(every[order], values[order])
+    jumps = [(track.time[k], track.time[k + 1]) for k in short if _jumps(track.values, int(k))]
+    return Track(every[order], values[order]), np.reshape(jumps, (-1, 2))
+
+
+def _jumps(values: Array, index: int) -> bool:
+    """Returns whether a command and the next one differ by much more than those around them."""
+    changes = np.abs(np.diff(values[max(0, index - NEARBY) : index + 2 + NEARBY]))
+    change = changes[min(index, NEARBY)]
+    return bool(change > JUMP * np.median(changes))
 
 
 def _slots(time: Array, usual: float) -> NDArray[np.int64]:
@@ -371,8 +415,17 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str]) -> list[str]:
     ]
     if slow:
         notes.append(Remark(f"Not measured at every step: {', '.join(slow)}."))
-    cut = sum(len(part.actions) - sum(b - a for a, b in part.spans) for part in parts)
-    if cut:
-        total = sum(len(part.actions) for part in parts)
-        notes.append(f"Gaps: {cut} of {total} steps have no measurements nearby and are left out.")
+    total = sum(len(part.actions) for part in parts)
+    measured = sum(end - first for part in parts for first, end in part.spans_measured)
+    kept = sum(end - first for part in parts for first, end in part.spans)
+    if measured < total:
+        notes.append(
+            f"Gaps: {total - measured} of {total} steps have no measurements nearby and are left "
+            "out."
+        )
+    if kept < measured:
+        notes.append(
+            f"Lost commands: {measured - kept} of {total} steps in which a command jumped are left "
+            "out."
+        )
     return notes

@@ -129,6 +129,27 @@ def test_commands_that_a_log_has_lost_are_filled_by_straight_lines():
     assert np.allclose(rollouts.actions[0][[50, 120, 121], 0], STEP * np.array([50, 120, 121]))
 
 
+def test_steps_in_which_a_jumping_command_was_lost_are_left_out():
+    def triangle_and_steps(time):
+        return np.abs(time % 2.0 - 1.0) + 2.0 * np.sign(np.sin(np.pi * time))
+
+    kept = np.delete(STEP * np.arange(200), [20, 50, 120])
+    # It jumps at 1 s, where tick 50 is lost; at the lost ticks 20 and 120 it changes smoothly.
+    command = Track(kept, triangle_and_steps(kept))
+    rollouts = made([track(STEP * np.arange(200))], [command])
+    (before, after) = rollouts.spans[0]
+    assert before[1] in (49, 50) and after[0] in (51, 52)
+    assert any("Lost commands: " in note for note in rollouts.notes)
+
+
+@pytest.mark.parametrize("period", [1, 2])
+def test_commands_that_always_jump_are_kept_where_some_were_lost(period):
+    kept = np.delete(STEP * np.arange(200), [50, 120])
+    command = Track(kept, np.where(np.arange(len(kept)) // period % 2, 1.0, -1.0))
+    rollouts = made([track(STEP * np.arange(200))], [command])
+    assert len(rollouts.spans[0]) == 1
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_late_commands_are_not_taken_for_lost_ones(seed):
     # Every second step or so is longer than 1.5 usual ones, but no command is missing.
