@@ -39,8 +39,9 @@ PHASE_SHARE = 0.1
 it follows a clock that drifts, and has a quarter of the jitter of one stamp."""
 
 JUMP = 5.0
-"""Change of a command across lost ones, in median changes nearby, above which a straight line does
-not tell when it changed. A smooth command changes less, and one that is piecewise constant more."""
+"""Change of a command across lost ones, in median changes nearby, above which a straight line
+does not tell when it changed. Smooth commands change less. Of steps and reversals of a command, the
+change is much larger."""
 
 NEARBY = 10
 """Number of commands before, and after, a gap that tell how much the command usually changes."""
@@ -425,7 +426,7 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str]) -> list[str]:
         )
     if kept < measured:
         notes.append(
-            f"Lost commands: {measured - kept} of {total} steps in which a command jumped are left "
-            "out."
+            f"Lost commands: {measured - kept} of {total} steps in which a command jumped are "
+            "left out."
         )
     return notes
