@@ -40,8 +40,7 @@ it follows a clock that drifts, and has a quarter of the jitter of one stamp."""
 
 JUMP = 5.0
 """Change of a command across lost ones, in median changes nearby, above which a straight line
-does not tell when it changed. Smooth commands change less. Of steps and reversals of a command, the
-change is much larger."""
+does not tell when it changed. Smooth commands change less; steps and reversals are larger."""
 
 NEARBY = 10
 """Number of commands before, and after, a gap that tell how much the command usually changes."""
