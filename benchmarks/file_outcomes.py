@@ -32,7 +32,8 @@ def read(kind: str, path: Path) -> None:
         Mapping.of(path)
     elif kind in LOGS:
         from npdr_ppl.rollouts.logs import read_log
-        from npdr_ppl.rollouts.logs.inspection import described, mapping_to_start_from
+        from npdr_ppl.rollouts.logs.inspection import described
+        from npdr_ppl.rollouts.logs.mapping_template import mapping_to_start_from
 
         mapping_to_start_from(described(read_log(path)))
     elif kind == "pickle":

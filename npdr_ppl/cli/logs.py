@@ -14,7 +14,9 @@ import typer
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.cli.manners import AsJson
 from npdr_ppl.cli.model_files import is_robot
+from npdr_ppl.cli.names import complete_model
 from npdr_ppl.cli.options import MappingOption, OutOption
+from npdr_ppl.cli.resolve import columns_of_model
 from npdr_ppl.cli.robots import inspect_robot
 from npdr_ppl.errors import DataError
 
@@ -44,6 +46,13 @@ def inspect(
         Path | None,
         typer.Option(help="Write a mapping (TOML), or a robot's model (Python), to start from."),
     ] = None,
+    model: Annotated[
+        str,
+        typer.Option(
+            help="Model or robot file whose sensors and actions the written mapping names.",
+            autocompletion=complete_model,
+        ),
+    ] = "",
     time: Annotated[str, typer.Option(help="Name of the column with the time stamps.")] = "",
     time_step: Annotated[
         float | None,
@@ -56,22 +65,28 @@ def inspect(
     Of a robot's MJCF or URDF file it shows the parameters of the model that is derived from it,
     the columns that a log needs, and the ports of effects.
 
-    Example: npdr inspect bag_folder --write mapping.toml
+    Example: npdr inspect bag_folder --model robot.xml --write mapping.toml
     """
     import msgspec
 
     from npdr_ppl.rollouts import Rollouts
-    from npdr_ppl.rollouts.logs.inspection import described, mapping_to_start_from
+    from npdr_ppl.rollouts.logs.inspection import described
     from npdr_ppl.rollouts.logs.mapping import Mapping
+    from npdr_ppl.rollouts.logs.mapping_template import mapping_to_start_from
     from npdr_ppl.rollouts.logs.read import read_log
 
     if write is not None and write.exists():
         raise DataError(f"{write} exists already; choose another name or remove it first.")
     if is_robot(str(log)):
-        if mapping is not None or time or time_step is not None:
-            raise DataError(f"--mapping, --time and --time-step are for logs; {log} is a robot.")
+        if mapping is not None or model or time or time_step is not None:
+            raise DataError(
+                f"--mapping, --model, --time and --time-step are for logs; {log} is a robot."
+            )
         inspect_robot(log, write, as_json)
         return
+    if model and write is None:
+        raise DataError("--model is for the mapping that --write writes; name its file.")
+    columns = columns_of_model(model) if model else ()
     chosen = Mapping() if mapping is None else Mapping.of(mapping)
     stated = {"time": time or chosen.log.time, "time_step": time_step or chosen.log.time_step}
     settings = msgspec.structs.replace(chosen.log, **stated)
@@ -95,11 +110,13 @@ def inspect(
         typer.echo(f"\n{mapping} has no channels, so no rollouts are made.")
     if write is not None:
         with replacing(write) as temporary:
-            temporary.write_text(mapping_to_start_from(found, settings), encoding="utf-8")
+            text = mapping_to_start_from(found, settings, model=model, columns=columns)
+            temporary.write_text(text, encoding="utf-8")
         if not as_json:
             typer.echo(f"\nWrote {write}. Check its names and units, then:")
-            typer.echo(f"    npdr fit MODEL --data {log} --mapping {write} --out fit")
-            _print_lack_of_actions(found)
+            typer.echo(f"    npdr fit {model or 'MODEL'} --data {log} --mapping {write} --out fit")
+            if not model:
+                _print_lack_of_actions(found)
 
 
 def convert(
@@ -142,7 +159,7 @@ def _print_rollouts(rollouts: "Rollouts", known: Sequence[str] = ()) -> None:
 
 def _print_lack_of_actions(found: "Description") -> None:
     """Prints that a written mapping has no actions, and which signals may be some."""
-    from npdr_ppl.rollouts.logs.inspection import possible_actions, proposed_actions
+    from npdr_ppl.rollouts.logs.mapping_template import possible_actions, proposed_actions
 
     if proposed_actions(found):
         return

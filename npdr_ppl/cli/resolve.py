@@ -17,9 +17,11 @@ if TYPE_CHECKING:
     from npdr_ppl.loop.control_task import ControlTask
     from npdr_ppl.policies.policy_search import PolicySearch
     from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.rollouts.logs.matching import Column
     from npdr_ppl.targets.base import TargetDomain
 
 __all__ = [
+    "columns_of_model",
     "load_all",
     "named_effects",
     "resolve_backend",
@@ -72,6 +74,34 @@ def resolve_model(word: str) -> Callable[..., Any]:
         )
     path, _, function = word.rpartition(":")
     return load_function(Path(path), function)
+
+
+def columns_of_model(word: str) -> "list[Column]":
+    """Returns the columns that the model that ``MODEL`` names reads from recordings.
+
+    Raises:
+        ModelError: There is no such model, or it takes no recordings of a simulator's sensors.
+    """
+    import numpy as np
+
+    from npdr_ppl.engines.mujoco import MujocoSimulator
+    from npdr_ppl.language.prior import Prior
+    from npdr_ppl.language.sites import SimulatorBlackBox
+    from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.rollouts.logs.matching import columns_of
+
+    if is_robot(word):
+        robot = MujocoSimulator(Path(word))
+        return columns_of(robot.sensors, robot.actions)
+    # The program is run without simulating, so that any recording serves.
+    shortest = Rollouts([np.zeros((2, 1))], [np.zeros((1, 0))], ["any"], [], time_step=1.0)
+    boxes = Prior(resolve_model(word), (shortest.inputs(None, "recorded"),)).black_boxes.values()
+    simulators = [box.simulator for box in boxes if isinstance(box, SimulatorBlackBox)]
+    if len(simulators) != 1:
+        raise ModelError(
+            f"{word} has {len(simulators)} sites with a simulator; --model takes one."
+        )
+    return columns_of(simulators[0].sensors, simulators[0].actions)
 
 
 def resolve_effects(model: Model, words: Sequence[str]) -> Callable[..., Any]:

@@ -120,7 +120,9 @@ def _lines(found: dict[str, Any]) -> list[str]:
     lines += ["", *_table(rows)]
     if not any(c["role"] == "command" for c in columns):
         lines.append("  No actuators: the motion is taken as free.")
-    lines.append("  Other names in a log: npdr inspect LOG --write mapping.toml, then --mapping.")
+    lines.append(
+        "  Other names in a log: npdr inspect LOG --model FILE --write MAPPING, then --mapping."
+    )
     lines += ["", "Ports, where effects attach (npdr effects):"]
     for kind in dict.fromkeys(port["kind"] for port in found["ports"]):
         names = [port["name"] for port in found["ports"] if port["kind"] == kind]

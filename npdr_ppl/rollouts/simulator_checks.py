@@ -81,8 +81,8 @@ def check_channels(
     if missing:
         raise DataError(
             f"the column {', '.join(missing)} is missing; the data have {found}. If a log has "
-            "other names, --mapping gives it the model's; npdr inspect LOG --write mapping.toml "
-            "writes one to start from."
+            "other names, --mapping gives it the model's; npdr inspect LOG --model MODEL --write "
+            "mapping.toml writes one to start from."
         )
     expected_actions = {action.name for action in actions}
     extra = [name for name in recording.action_names if name not in expected_actions]

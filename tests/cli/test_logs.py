@@ -52,6 +52,24 @@ def test_inspect_as_json(monkeypatch, capsys, log):
     assert code == 0 and content["timings"][0]["largest"] == pytest.approx(0.12, abs=1e-5)
 
 
+def test_a_mapping_for_a_model_names_its_columns(monkeypatch, capsys, tmp_path):
+    time = 0.02 * np.arange(100)
+    frame = pd.DataFrame({"time": time, "q_measured": np.sin(time), "dq_measured": np.cos(time)})
+    frame["torque_command"], frame["temperature"] = np.sin(3 * time), 20 + time
+    log, toml = tmp_path / "log.csv", tmp_path / "mapping.toml"
+    frame.to_csv(log, index=False)
+    words = ["inspect", log, "--model", "pendulum"]
+    code, _, err = run(monkeypatch, capsys, *words)
+    assert code == 2 and "--write" in err
+    code, out, _ = run(monkeypatch, capsys, *words, "--write", toml)
+    assert code == 0 and f"npdr fit pendulum --data {log} --mapping {toml}" in out
+    assert "#   temperature" in toml.read_text()
+    rollouts = load_all([log], toml)
+    assert rollouts.channel_names == ("angle", "velocity")
+    assert rollouts.action_names == ("torque",)
+    assert rollouts.channel_units == ("rad", "rad/s")
+
+
 def test_the_mapping_that_is_written_converts_the_log(monkeypatch, capsys, log, tmp_path):
     toml = tmp_path / "mapping.toml"
     code, out, _ = run(monkeypatch, capsys, "inspect", log, "--write", toml)

@@ -151,7 +151,7 @@ def test_a_path_may_also_be_relative_to_the_working_directory(folder, tmp_path, 
             "other.xml",
             "the column motor, j, j_velocity is missing; the data have",
         ),
-        ("compare", "other.xml", "npdr inspect LOG --write mapping.toml"),
+        ("compare", "other.xml", "npdr inspect LOG --model MODEL --write"),
     ],
 )
 def test_a_mistake_gets_one_sentence(

@@ -8,22 +8,12 @@ from numpy.typing import NDArray
 
 from npdr_ppl.rollouts.clock_jumps import without_jumps
 from npdr_ppl.rollouts.logs.log import Log, Signal
-from npdr_ppl.rollouts.logs.log_settings import LogSettings
-from npdr_ppl.rollouts.logs.mapping import settings_lines, toml_text
-from npdr_ppl.rollouts.logs.signal_names import Role, plain_names, role_of
+from npdr_ppl.rollouts.logs.signal_names import Role, role_of
 from npdr_ppl.rollouts.logs.unit_remarks import rates_without_unit
 from npdr_ppl.rollouts.logs.units import is_known
 from npdr_ppl.rollouts.tracks import LARGEST, usual_step
 
-__all__ = [
-    "Description",
-    "SignalSummary",
-    "Timing",
-    "described",
-    "mapping_to_start_from",
-    "possible_actions",
-    "proposed_actions",
-]
+__all__ = ["Description", "SignalSummary", "Timing", "described"]
 
 Array = NDArray[np.float64]
 
@@ -181,92 +171,3 @@ def _unit_in(name: str) -> str:
         return in_brackets[1].strip()
     words = re.findall(r"[a-z]+", end.lower())
     return _UNITS_IN_NAMES.get(words[-1], "") if words else ""
-
-
-# -- A mapping to start from -------------------------------------------------------------------
-
-_HEAD = """\
-# Which signals of the log {source} are channels and actions of the rollouts.
-# Rename the tables as your model names its sensors and actions, state the units, and delete what
-# you do not need. A value is sign * scale * (signal in SI units) + offset, the offset in SI units.
-"""
-
-_UNCLEAR = {
-    "other": "meaning not clear from its name",
-    "effort": "a command or a measurement; remove the # if it is the command",
-}
-"""Why a signal is commented out, by role."""
-
-_SECTIONS = {"command": "actions", "effort": "actions"}
-"""Tables of a mapping by role; all others are channels."""
-
-_UNIT_HINTS = {
-    "position": '"rad", "deg", "m", "mm", ...',
-    "velocity": '"rad/s", "deg/s", "rpm", "m/s", ...',
-    "command": '"V", "A", "N m", "rad", "percent", ...',
-    "effort": '"N m", "N", "A", "percent", ...',
-}
-
-
-def mapping_to_start_from(description: Description, settings: LogSettings | None = None) -> str:
-    """Returns a mapping in TOML; signals whose meaning is not clear are commented out.
-
-    Args:
-        description: The log.
-        settings: How the log was read; the mapping states the same.
-    """
-    lines = _HEAD.format(source=toml_text(description.source)).splitlines()
-    lines += ["", *(_comment(note) for note in description.notes)]
-    lines += ["[log]"]
-    stated = settings_lines(settings or LogSettings())
-    lines += stated.values()
-    if "episodes" not in stated:
-        lines.append(
-            f"episodes = {toml_text(description.episodes)}"
-            if description.episodes
-            else '# episodes = "..."      # a signal whose every change begins a new rollout'
-        )
-    if "time_step" not in stated:
-        lines.append("# time_step = 0.01      # s between the steps of the rollouts")
-    lines.append("")
-    if not proposed_actions(description):
-        lines += ["# There are no actions yet, so the motion is taken as free.", ""]
-    signals = [s for timing in description.timings for s in timing.signals]
-    signals = [s for s in signals if s.name != description.episodes]
-    names = plain_names([s.name for s in signals])
-    unclear = []
-    for signal, name in zip(signals, names, strict=True):
-        entry = _entry(signal, name)
-        if signal.role in _UNCLEAR or signal.is_constant:
-            why = "does not change" if signal.is_constant else _UNCLEAR[signal.role]
-            unclear += [f"# {why}:", *(_comment(line) for line in entry), ""]
-        else:
-            lines += [*entry, ""]
-    return "\n".join([*lines, *unclear]).rstrip() + "\n"
-
-
-def proposed_actions(description: Description) -> list[str]:
-    """Returns the names of the signals that a mapping to start from has as actions."""
-    signals = [s for timing in description.timings for s in timing.signals]
-    return [s.name for s in signals if s.role == "command" and not s.is_constant]
-
-
-def possible_actions(description: Description) -> list[str]:
-    """Returns the names of the signals that are either actions or measurements."""
-    signals = [s for timing in description.timings for s in timing.signals]
-    return [s.name for s in signals if s.role == "effort" and not s.is_constant]
-
-
-def _entry(signal: SignalSummary, name: str) -> list[str]:
-    """Returns the lines of a channel or an action."""
-    lines = [f"[{_SECTIONS.get(signal.role, 'channels')}.{name}]"]
-    lines.append(f"signal = {toml_text(signal.name)}")
-    if signal.unit:
-        lines.append(f"unit = {toml_text(signal.unit)}")
-    else:
-        lines.append(f"# unit = {_UNIT_HINTS.get(signal.role, '...')}")
-    return lines
-
-
-def _comment(text: str) -> str:
-    return f"# {''.join(c if c.isprintable() else ' ' for c in text)}"
