@@ -1,6 +1,7 @@
 """The progress of long operations: one line on a terminal, elsewhere a line per minute."""
 
 import sys
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -224,20 +225,48 @@ class _LineReporter(_TimedReporter):
 
 
 class _LogReporter(_TimedReporter):
-    """Writes a line per minute, for a log: label, status and time."""
+    """Writes a line per minute, for a log: label, status and time.
+
+    If a step takes longer than a minute, its last report is written again with the new time.
+    """
 
     def __init__(self, file: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(clock)
         self._file = file
         self._written = self._began
+        self._latest = "working"
+        self._lock = threading.Lock()
 
     def show(self, label: str, fraction: float | None, status: str) -> None:
-        now = self._clock()
-        if now - self._written < LOG_INTERVAL:
-            return
-        self._written = now
-        when = time.strftime("%H:%M:%S")
-        print(f"npdr: {when} {label}: {status}, {self.time_words()}", file=self._file, flush=True)
+        self._latest = f"{label}: {status}" if status else label
+        self.write_if_due()
+
+    def write_if_due(self) -> None:
+        """Writes the latest report, if the last line is a minute old."""
+        with self._lock:
+            now = self._clock()
+            if now - self._written < LOG_INTERVAL:
+                return
+            self._written = now
+            when = time.strftime("%H:%M:%S")
+            print(f"npdr: {when} {self._latest}, {self.time_words()}", file=self._file, flush=True)
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Writes lines inside the block, also if nothing is reported."""
+        is_over = threading.Event()
+
+        def watch() -> None:
+            while not is_over.wait(LOG_INTERVAL / 10):
+                self.write_if_due()
+
+        thread = threading.Thread(target=watch, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            is_over.set()
+            thread.join()
 
 
 @contextmanager
@@ -252,7 +281,9 @@ def reporter(show: bool | Reporter | None = None) -> Iterator[Reporter]:
         yield show
         return
     if show is None and not sys.stderr.isatty():
-        yield _LogReporter(sys.stderr)
+        log = _LogReporter(sys.stderr)
+        with log.watched():
+            yield log
         return
     if show is False:
         yield Reporter()

@@ -3,6 +3,7 @@
 import io
 import itertools
 import sys
+import time
 
 import pyro
 import pyro.distributions as dist
@@ -213,6 +214,22 @@ def test_a_log_gets_a_line_per_minute():
     assert [line.split()[3] for line in lines] == ["1:"] * 4
     assert "effect 1: 3 of 12 candidates fitted, about 3.0 min left in this step" in lines[0]
     assert "12 of 12 candidates fitted, 4.0 min so far" in lines[-1]
+
+
+def test_a_log_gets_lines_while_a_step_is_long(monkeypatch):
+    monkeypatch.setattr("npdr_ppl.progress.LOG_INTERVAL", 0.02)
+    file = io.StringIO()
+    report = _LogReporter(file)
+    with report.watched():
+        report.stage("fit")(0.0, "searching")
+        for _ in range(500):
+            time.sleep(0.01)
+            if file.getvalue().count("fit: searching, ") >= 2:
+                break
+    written = file.getvalue()
+    assert written.count("fit: searching, ") >= 2
+    time.sleep(0.05)
+    assert file.getvalue() == written
 
 
 def test_a_search_uses_the_line_of_a_larger_workflow_and_else_one_of_its_own():
