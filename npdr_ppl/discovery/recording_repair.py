@@ -15,9 +15,11 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis, fit_segment_model
+from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
 from npdr_ppl.discovery.remedies import Remedy, Shift, remedies, without_one
-from npdr_ppl.discovery.search.base_fit import fit_base
+from npdr_ppl.discovery.search.base_fit import first_guesses
+from npdr_ppl.discovery.search.evidence import closest
+from npdr_ppl.discovery.search.prior_ends import with_widest_priors
 from npdr_ppl.discovery.settings import REPAIR
 from npdr_ppl.errors import DataError, NpdrError
 from npdr_ppl.language.handlers import with_noise
@@ -25,13 +27,14 @@ from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
-from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.data_options import DataOptions, one_of_each_part
 from npdr_ppl.preparation.segment_model import SegmentModel, has_closest_fit
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.collection import with_commands, without_duplicates
 from npdr_ppl.rollouts.faults import without_faults
 from npdr_ppl.rollouts.notes import faults_among
+from npdr_ppl.rollouts.segments import motion
 from npdr_ppl.rollouts.simulator_checks import limited_commands
 
 __all__ = ["Repair", "repair"]
@@ -160,10 +163,9 @@ def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remed
     """Returns the remedy that explains a recording best, if the recording is not explained."""
     as_read = _fitted(model, rollouts, options)
     if as_read is not None and _rms(_misfits(as_read)) >= REPAIR.large_residual:
-        # Before data are blamed, the parameters are searched for as thoroughly as for a fit.
-        searched = _searched(as_read.segments)
-        if searched is not None and _rms(_misfits(searched)) < _rms(_misfits(as_read)):
-            as_read = searched
+        # Before data are blamed, the parameters are searched for, also with wider priors.
+        as_read = min(_searched(as_read), key=lambda found: _rms(_misfits(found)))
+        model = as_read.model
     if as_read is not None and _rms(_misfits(as_read)) < REPAIR.large_residual:
         return None
     trials = _Trials(model, rollouts, options, as_read)
@@ -175,13 +177,16 @@ def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remed
     )
     # A channel that the simulation explains has no fault.
     suspects = {name for name, value in present.items() if value >= REPAIR.large_residual}
-    best, least = _best(remedies(sensors, rollouts, suspects if present else None), ratio)
+    joints = {s.rate_of or s.name for s in sensors if s.name in suspects}
+    singly = len(joints) <= REPAIR.most_suspects
+    possible = remedies(sensors, rollouts, suspects if present else None, singly=singly)
+    best, least = _best(possible, ratio)
     if best is not None and isinstance(best.apply, Shift):
         best, least = _refined(best.apply, ratio)
     if best is not None and least < REPAIR.remedy_factor:
         return best if least < REPAIR.remedy_factor * trials.ratio_without(best) else None
     # A channel is given up only if nothing else helps.
-    best, least = _best(without_one(sensors), ratio)
+    best, least = _best(without_one(sensors) if singly else (), ratio)
     return best if least < REPAIR.remedy_factor else None
 
 
@@ -279,18 +284,35 @@ def _fitted(
 ) -> Hypothesis | None:
     """Returns a rough fit from the smoother's initial states; ``None`` if simulations fail."""
     try:
-        return fit_hypothesis(model, rollouts, options, start=start, max_steps=6, is_rough=True)
+        segments = _part_along(model, rollouts, options)
+        return fit_segment_model(segments, start=start, max_steps=6, is_rough=True)
     except DataError:
         return None
 
 
-def _searched(segments: SegmentModel) -> Hypothesis | None:
-    """Returns a rough fit that begins at the result of a search; ``None`` if simulations fail."""
+def _part_along(model: Model, rollouts: Rollouts, options: DataOptions) -> SegmentModel:
+    """Returns a model along the segments with which remedies are tried."""
+    segments = SegmentModel(model, rollouts, options)
+    num = segments.inputs.num_segments
+    if num <= REPAIR.most_segments:
+        return segments
+    weights = motion(rollouts, options.steps(rollouts))[options.used_segments(rollouts)]
+    index = one_of_each_part(REPAIR.most_segments, num, seed=0, weights=weights)
+    return segments.along(index)
+
+
+def _searched(as_read: Hypothesis) -> list[Hypothesis]:
+    """Returns rough fits: the given one, one that begins at a search, one with wider priors."""
+    found = [as_read]
     try:
-        found, _ = fit_base(segments)
-        return fit_segment_model(segments, start=found.parameters, max_steps=6, is_rough=True)
-    except DataError:
-        return None
+        (_, searched) = first_guesses(as_read.segments)
+        found.append(
+            fit_segment_model(as_read.segments, start=searched, max_steps=6, is_rough=True)
+        )
+    except DataError:  # no parameters of the prior can be simulated along all segments
+        pass
+    widest, names = with_widest_priors(closest(found), is_rough=True)
+    return [*found, widest] if names else found
 
 
 def _misfits(hypothesis: Hypothesis) -> dict[str, float]:

@@ -40,7 +40,11 @@ class Remedy:
 
 
 def remedies(
-    sensors: Sequence[Channel], rollouts: Rollouts, suspects: Collection[str] | None = None
+    sensors: Sequence[Channel],
+    rollouts: Rollouts,
+    suspects: Collection[str] | None = None,
+    *,
+    singly: bool = True,
 ) -> Iterator[Remedy]:
     """Yields the remedies that can be tried on a recording.
 
@@ -48,17 +52,19 @@ def remedies(
         sensors: The channels of the model that were measured.
         rollouts: The recording.
         suspects: Names of those that may have a fault; all if ``None``.
+        singly: Whether single channels may have a fault, besides the whole recording.
     """
     measured = {sensor.name for sensor in sensors}
     suspects = measured if suspects is None else suspects
     units = {s.name: s.unit.removesuffix("/s") for s in sensors if s.name in suspects}
     pairs = [[s.rate_of, s.name] for s in sensors if s.name in units and s.rate_of in units]
-    for group in [[name] for name in units] + pairs:
+    for group in ([[name] for name in units] + pairs) if singly else []:
         text = f"The sign of {' and '.join(group)} looks inverted; changed."
         yield Remedy(text, _Scaled(group, -1.0))
     for si, (other, factor) in OTHER_UNITS.items():
         chosen = [name for name, unit in units.items() if unit == si]
-        for group in [[name] for name in chosen] + ([chosen] if len(chosen) > 1 else []):
+        single = [[name] for name in chosen if singly]
+        for group in [*single, *([chosen] if len(chosen) > 1 else [])]:
             looks = "look" if len(group) > 1 else "looks"
             names = " and ".join(group)
             text = f"{names} {looks} recorded in {other}, not in SI units; converted."
@@ -73,7 +79,7 @@ def remedies(
     if any(np.ptp(actions, axis=0).any() for actions in rollouts.actions if len(actions)):
         for steps in (*shifts, *(-steps for steps in long)):
             yield Shift(None, steps).remedy
-    for sensor in (sensor for sensor in sensors if sensor.name in suspects):
+    for sensor in (sensor for sensor in sensors if singly and sensor.name in suspects):
         column = rollouts.channel_names.index(sensor.name)
         values = np.concatenate(rollouts.measurements(column))
         if len(values) and values.min() >= 0.0 and values.max() > 0.0:

@@ -27,6 +27,11 @@ class RepairSettings:
             begin at an impact and have a wrong initial state.
         remedy_factor: A remedy is applied if it reduces the residual to less than this fraction.
         most_remedies: Greatest number of remedies of one recording.
+        most_segments: Greatest number of segments along which remedies are tried. A unit, a sign
+            or a clock is wrong in the whole recording. With the default length they last 20 s.
+        most_suspects: Greatest number of joints, unexplained as the recording is, of which single
+            channels are suspected. If one channel is wrong, its joint and those that it moves are
+            not explained. If more joints are not, the model lacks something in each of them.
         shifts: Shifts of the commands, and of one channel, that are tried first, in steps.
         longest_delay: Longest time in seconds that a device takes to answer a command. Early time
             stamps of commands look the same, so only larger shifts are tried for them.
@@ -39,6 +44,8 @@ class RepairSettings:
     disregarded_share: float = 0.2
     remedy_factor: float = 0.5
     most_remedies: int = 3
+    most_segments: int = 50
+    most_suspects: int = 3
     shifts: tuple[int, ...] = (1, 2, 4, 7, 10, 13, 16, 19)
     longest_delay: float = 0.04
     long_shifts: tuple[float, ...] = (1.25, 1.5, 1.75, 2.0, 2.25)
@@ -56,7 +63,8 @@ class RepairSettings:
             "longest_delay",
         )
         check_range(self, 1.0, 100.0, "long_shifts")
-        check_range(self, 1, 1000, "most_remedies", "shifts", "fewest_clipped")
+        check_range(self, 1, 1000, "most_remedies", "most_segments", "most_suspects")
+        check_range(self, 1, 1000, "shifts", "fewest_clipped")
 
 
 @dataclass(frozen=True)

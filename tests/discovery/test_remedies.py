@@ -193,6 +193,13 @@ def test_the_fit_of_a_shift_begins_at_that_of_the_nearest_shift(monkeypatch):
     assert begun[id(sign)] is None
 
 
+def test_remedies_of_the_whole_recording_are_fewer():
+    every = {r.sentence for r in remedies(Pendulum.sensors, recording(SWING))}
+    whole = {r.sentence for r in remedies(Pendulum.sensors, recording(SWING), singly=False)}
+    assert whole < every
+    assert all("time stamps of the commands" in s or "torque" in s or " and " in s for s in whole)
+
+
 def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is(monkeypatch):
     """A fit that got stuck is no fault of the data."""
     rollouts, options = swinging(steps=240), npdr.DataOptions(None, 30)
@@ -206,7 +213,7 @@ def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is
         return found
 
     monkeypatch.setattr(recording_repair, "_fitted", stuck)
-    monkeypatch.setattr(recording_repair, "_searched", lambda segments: None)
+    monkeypatch.setattr(recording_repair, "_searched", lambda as_read: [as_read])
     as_read = stuck(pendulum, rollouts, options)
     trials = recording_repair._Trials(pendulum, rollouts, options, as_read)
     shift = Shift(None, 1).remedy

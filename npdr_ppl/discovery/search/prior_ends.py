@@ -22,7 +22,7 @@ from npdr_ppl.language.wider_priors import described_prior, widened, with_wider_
 from npdr_ppl.preparation.closest_fit import part_of
 from npdr_ppl.preparation.segment_model import SegmentModel
 
-__all__ = ["PriorEnd", "Widened", "beyond", "widen_where_it_helps"]
+__all__ = ["PriorEnd", "Widened", "beyond", "widen_where_it_helps", "with_widest_priors"]
 
 
 @dataclass(frozen=True)
@@ -76,22 +76,12 @@ def widen_where_it_helps(base: SegmentModel, current: Hypothesis) -> Widened | N
     priors, num = current.segments.prior.distributions, current.segments.inputs.num_segments
     # A part of the segments shows how far to widen.
     index = part_of(current.segments)
-    model, ratio = base.model, num / len(index)
     # Parameters that are free to fit the part fit it better than those of the whole recording.
-    widest = _refitted(current.along(index), model) or current.along(index)
-    names: set[str] = set()
-    for _ in range(PRIOR_ENDS.most_widenings):
-        own = _at_end(widest)
-        if not own:
-            break
-        wider = with_wider_priors(model, own)
-        fitted = _refitted(widest, wider)
-        if fitted is None or ratio * _gain(widest, fitted) < _threshold(own):
-            break
-        model, widest = wider, fitted
-        names.update(own)
+    begun = _refitted(current.along(index), base.model) or current.along(index)
+    widest, names = with_widest_priors(begun, ratio=num / len(index))
     if not names:
         return None
+    model = widest.segments.model
     fitted = _refitted(current, model, widest.parameters)
     if fitted is None or _gain(current, fitted) < _threshold(names):
         return None
@@ -101,8 +91,39 @@ def widen_where_it_helps(base: SegmentModel, current: Hypothesis) -> Widened | N
     return Widened(wider_base, found, ends) if ends else None
 
 
+def with_widest_priors(
+    current: Hypothesis, *, ratio: float = 1.0, is_rough: bool = False
+) -> tuple[Hypothesis, frozenset[str]]:
+    """Widens the priors that have a fit at an end, as long as the model then fits better.
+
+    Args:
+        current: The closest fit of a model without added effects.
+        ratio: How many times as many segments the recording has.
+        is_rough: Whether rough fits are enough.
+
+    Returns:
+        The fit with the widest priors that help, and the sites that they belong to.
+    """
+    names: set[str] = set()
+    for _ in range(PRIOR_ENDS.most_widenings):
+        own = _at_end(current)
+        if not own:
+            break
+        wider = with_wider_priors(current.segments.model, own)
+        fitted = _refitted(current, wider, is_rough=is_rough)
+        if fitted is None or ratio * _gain(current, fitted) < _threshold(own):
+            break
+        current = fitted
+        names.update(own)
+    return current, frozenset(names)
+
+
 def _refitted(
-    current: Hypothesis, model: Model, start: Mapping[str, Tensor] | None = None
+    current: Hypothesis,
+    model: Model,
+    start: Mapping[str, Tensor] | None = None,
+    *,
+    is_rough: bool = False,
 ) -> Hypothesis | None:
     """Fits another model along a hypothesis's segments; ``None`` if it cannot be simulated.
 
@@ -110,12 +131,14 @@ def _refitted(
         current: The hypothesis, from whose parameters the fit begins by default.
         model: The other model.
         start: Parameters from which the fit begins instead.
+        is_rough: Whether a rough fit is enough.
     """
     try:
         return fit_segment_model(
             current.segments.with_model(model),
             start=start or current.parameters,
             offsets=current.fit.offsets,
+            is_rough=is_rough,
         )
     except NpdrError:
         return None
