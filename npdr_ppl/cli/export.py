@@ -14,6 +14,12 @@ from npdr_ppl.errors import DataError
 
 __all__ = ["export"]
 
+DOUBTS = {
+    "ambiguous": "the recording cannot tell its effects from others.",
+    "unknown": "its effects explain the recording best, but more is missing.",
+}
+"""What a verdict says of the effects that are written, where it does not name them."""
+
 
 def export(
     run: Annotated[Path, typer.Argument(help="Folder that was passed as --out.")],
@@ -40,7 +46,8 @@ def export(
         raise DataError(f"{to} is no .xml file; npdr export writes MJCF.")
     if to.exists():
         raise DataError(f"{to} exists already; choose another name or remove it first.")
-    found = export_robot(resolve_model(model), identified(run))
+    run_result = identified(run)
+    found = export_robot(resolve_model(model), run_result)
     if found.needs_folder and to.resolve().parent != found.folder.resolve():
         raise DataError(
             f"The robot's file refers to others, such as meshes; write the new one to "
@@ -49,11 +56,16 @@ def export(
     with replacing(to) as temporary:
         temporary.write_text(found.text, encoding="utf-8")
     if as_json:
-        typer.echo(json.dumps({"file": str(to), "left_out": found.refused}, ensure_ascii=False))
+        told = {"file": str(to), "left_out": found.refused, "verdict": run_result.verdict or None}
+        typer.echo(json.dumps(told, ensure_ascii=False))
     elif not quiet:
         before, after = found.before.splitlines(), found.text.splitlines()
         for line in difflib.unified_diff(before, after, found.name, to.name, lineterm="", n=0):
             typer.echo(line)
         for name, reason in found.refused.items():
             typer.echo(f"\nnot written: {name}, because {reason}.")
+        if run_result.verdict in DOUBTS:
+            typer.echo(
+                f"\nThe verdict of {run} is {run_result.verdict}: {DOUBTS[run_result.verdict]}"
+            )
         typer.echo(f"\nThe robot's file with the identified values is {to}")

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from npdr_ppl.embeddings import Embedding
     from npdr_ppl.inference.base import Backend
     from npdr_ppl.language.effects import Effect
+    from npdr_ppl.language.simulator import Simulator
     from npdr_ppl.loop.control_task import ControlTask
     from npdr_ppl.policies.policy_search import PolicySearch
     from npdr_ppl.rollouts import Rollouts
@@ -80,28 +81,17 @@ def columns_of_model(word: str) -> "list[Column]":
     """Returns the columns that the model that ``MODEL`` names reads from recordings.
 
     Raises:
-        ModelError: There is no such model, or it takes no recordings of a simulator's sensors.
+        ModelError: There is no such model, or it has not one simulator.
     """
-    import numpy as np
-
     from npdr_ppl.engines.mujoco import MujocoSimulator
-    from npdr_ppl.language.prior import Prior
-    from npdr_ppl.language.sites import SimulatorBlackBox
-    from npdr_ppl.rollouts import Rollouts
+    from npdr_ppl.language.only_simulator import only_simulator
     from npdr_ppl.rollouts.logs.matching import columns_of
 
-    if is_robot(word):
-        robot = MujocoSimulator(Path(word))
-        return columns_of(robot.sensors, robot.actions)
-    # The program is run without simulating, so that any recording serves.
-    shortest = Rollouts([np.zeros((2, 1))], [np.zeros((1, 0))], ["any"], [], time_step=1.0)
-    boxes = Prior(resolve_model(word), (shortest.inputs(None, "recorded"),)).black_boxes.values()
-    simulators = [box.simulator for box in boxes if isinstance(box, SimulatorBlackBox)]
-    if len(simulators) != 1:
-        raise ModelError(
-            f"{word} has {len(simulators)} sites with a simulator; --model takes one."
-        )
-    return columns_of(simulators[0].sensors, simulators[0].actions)
+    if is_robot(word):  # whose parameters do not matter here
+        simulator: Simulator = MujocoSimulator(Path(word))
+    else:
+        simulator = only_simulator(resolve_model(word))[0].simulator
+    return columns_of(simulator.sensors, simulator.actions)
 
 
 def resolve_effects(model: Model, words: Sequence[str]) -> Callable[..., Any]:

@@ -5,21 +5,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from pyro import poutine
-from torch import Tensor
 
 from npdr_ppl.engines.mujoco.export import ExportedMjcf, export_mjcf
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.errors import DataError, ModelError
-from npdr_ppl.language.handlers import (
-    SkipSimulation,
-    add_effect,
-    num_finer_steps,
-    with_finer_steps,
-)
-from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.language.program_runs import alone, sample_sites, traced
-from npdr_ppl.language.sites import BlackBox, SimulatorBlackBox
+from npdr_ppl.language.handlers import add_effect, num_finer_steps, with_finer_steps
+from npdr_ppl.language.only_simulator import only_simulator
 from npdr_ppl.models.effects import effect_class
 from npdr_ppl.posterior.run_folder import MAX_FINER_STEPS
 from npdr_ppl.run_files import read_json
@@ -35,11 +26,13 @@ class Identified(NamedTuple):
         values: Posterior means by site.
         finer_steps: How often the simulator's steps were refined, those of the model included.
         time_step: Seconds per step of the recording; ``None`` if the run does not say.
+        verdict: The verdict of a discovery, ``""`` of a fit.
     """
 
     values: dict[str, float]
     finer_steps: int
     time_step: float | None
+    verdict: str = ""
 
 
 def identified(run: Path) -> Identified:
@@ -68,7 +61,8 @@ def identified(run: Path) -> Identified:
     prepared = found.get("preparation") or {}
     length, seconds = prepared.get("segment_length"), prepared.get("segment_seconds")
     step = float(seconds) / float(length) if length and seconds else None
-    return Identified(values, int(found.get("finer_steps") or 0), step)
+    verdict = str(found.get("verdict") or "")
+    return Identified(values, int(found.get("finer_steps") or 0), step, verdict)
 
 
 def export_robot(model: Callable[..., Any], found: Identified) -> ExportedMjcf:
@@ -84,7 +78,7 @@ def export_robot(model: Callable[..., Any], found: Identified) -> ExportedMjcf:
     Raises:
         ModelError: The model has another simulator, or the file cannot hold a parameter.
     """
-    _, sites = _traced(model, {})
+    _, sites = only_simulator(model)
     for name in dict.fromkeys(s.rpartition(".")[0] for s in found.values if s not in sites):
         port, _, effect = name.rpartition(".")
         if port:
@@ -93,7 +87,7 @@ def export_robot(model: Callable[..., Any], found: Identified) -> ExportedMjcf:
     for _ in range(min(finer, MAX_FINER_STEPS)):
         model = with_finer_steps(model)
     given = {n: torch.tensor(value, dtype=torch.float64) for n, value in found.values.items()}
-    box, sites = _traced(model, given)
+    box, sites = only_simulator(model, given)
     other = sorted(sites ^ given.keys())
     if other:
         raise ModelError(
@@ -102,32 +96,3 @@ def export_robot(model: Callable[..., Any], found: Identified) -> ExportedMjcf:
     if not isinstance(box.simulator, MujocoMechanism):
         raise ModelError(f"{box.simulator.name} has no MJCF file.")
     return export_mjcf(box.simulator, box.parameters, time_step=found.time_step)
-
-
-def _traced(
-    model: Callable[..., Any], values: Mapping[str, Tensor]
-) -> tuple[SimulatorBlackBox, set[str]]:
-    """Returns the simulator of a model at given values of its sites, and the sites' names.
-
-    Args:
-        model: The model.
-        values: Values by site; those that are not given are drawn from the priors.
-
-    Raises:
-        ModelError: There is not one simulator.
-    """
-    with alone(), torch.random.fork_rng(devices=[]), SkipSimulation():
-        trace = traced(poutine.condition(model, data=dict(values)), (_nothing(),))
-    sites = dict(sample_sites(trace))
-    boxes = [site["fn"] for site in sites.values() if isinstance(site["fn"], BlackBox)]
-    if len(boxes) != 1 or not isinstance(boxes[0], SimulatorBlackBox):
-        raise ModelError("A robot's file is written for models with one simulator.")
-    latent = {name for name, site in sites.items() if not isinstance(site["fn"], BlackBox)}
-    return boxes[0], latent
-
-
-def _nothing() -> Inputs:
-    """Returns inputs without channels: the model's program runs, and nothing is simulated."""
-    return Inputs.single(
-        torch.zeros(1, 0), torch.zeros(0), action_names=(), state_names=(), time_step=1.0
-    )
