@@ -14,12 +14,6 @@ from npdr_ppl.errors import DataError
 
 __all__ = ["export"]
 
-DOUBTS = {
-    "ambiguous": "the recording cannot tell its effects from others.",
-    "unknown": "its effects explain the recording best, but more is missing.",
-}
-"""What a verdict says of the effects that are written, where it does not name them."""
-
 
 def export(
     run: Annotated[Path, typer.Argument(help="Folder that was passed as --out.")],
@@ -64,8 +58,6 @@ def export(
             typer.echo(line)
         for name, reason in found.refused.items():
             typer.echo(f"\nnot written: {name}, because {reason}.")
-        if run_result.verdict in DOUBTS:
-            typer.echo(
-                f"\nThe verdict of {run} is {run_result.verdict}: {DOUBTS[run_result.verdict]}"
-            )
+        if run_result.verdict in ("ambiguous", "unknown"):
+            typer.echo(f"\nThe verdict of {run} is {run_result.verdict}: {run_result.reason}")
         typer.echo(f"\nThe robot's file with the identified values is {to}")

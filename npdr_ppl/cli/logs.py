@@ -72,7 +72,7 @@ def inspect(
     from npdr_ppl.rollouts import Rollouts
     from npdr_ppl.rollouts.logs.inspection import described
     from npdr_ppl.rollouts.logs.mapping import Mapping
-    from npdr_ppl.rollouts.logs.mapping_template import mapping_to_start_from
+    from npdr_ppl.rollouts.logs.mapping_template import mapping_to_start_from, without_signal
     from npdr_ppl.rollouts.logs.read import read_log
 
     if write is not None and write.exists():
@@ -115,7 +115,11 @@ def inspect(
         if not as_json:
             typer.echo(f"\nWrote {write}. Check its names and units, then:")
             typer.echo(f"    npdr fit {model or 'MODEL'} --data {log} --mapping {write} --out fit")
-            if not model:
+            if model:
+                missing = without_signal(found, columns)
+                if missing:
+                    typer.echo(_wrapped(f"No signal was found for {', '.join(missing)}."))
+            else:
                 _print_lack_of_actions(found)
 
 
@@ -139,6 +143,13 @@ def convert(
     rollouts: Rollouts = load_all(logs, mapping)
     getattr(rollouts, writer)(out)
     _print_rollouts(rollouts)
+    if not rollouts.is_whole and writer in ("to_csv", "to_parquet"):
+        typer.echo(
+            _wrapped(
+                f"{out.suffix} files hold gaps, but no other steps that are left out; "
+                ".npz and .nc files do."
+            )
+        )
     typer.echo(f"Wrote {out}.")
 
 

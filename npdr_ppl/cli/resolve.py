@@ -5,7 +5,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from npdr_ppl.cli.model_files import ROBOTS, derived_model, is_robot, load_function
+from npdr_ppl.cli.model_files import ROBOTS, check_exists, derived_model, is_robot, load_function
 from npdr_ppl.engines.common.robot_files import relative_to
 from npdr_ppl.errors import BackendError, DataError, ModelError, NpdrError
 from npdr_ppl.language.model import Model
@@ -88,6 +88,7 @@ def columns_of_model(word: str) -> "list[Column]":
     from npdr_ppl.rollouts.logs.matching import columns_of
 
     if is_robot(word):  # whose parameters do not matter here
+        check_exists(Path(word), "*.*")
         simulator: Simulator = MujocoSimulator(Path(word))
     else:
         simulator = only_simulator(resolve_model(word))[0].simulator

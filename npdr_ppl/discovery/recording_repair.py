@@ -13,12 +13,12 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
 from npdr_ppl.discovery.remedies import Remedy, Shift, remedies, without_one
 from npdr_ppl.discovery.search.base_fit import first_guesses
-from npdr_ppl.discovery.search.evidence import closest
 from npdr_ppl.discovery.search.prior_ends import with_widest_priors
 from npdr_ppl.discovery.settings import REPAIR
 from npdr_ppl.errors import DataError, NpdrError
@@ -34,7 +34,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.collection import with_commands, without_duplicates
 from npdr_ppl.rollouts.faults import without_faults
 from npdr_ppl.rollouts.notes import faults_among
-from npdr_ppl.rollouts.segments import motion
+from npdr_ppl.rollouts.segments import layout_of, motion
 from npdr_ppl.rollouts.simulator_checks import limited_commands
 
 __all__ = ["Repair", "repair"]
@@ -161,43 +161,100 @@ def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollout
 
 def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remedy | None:
     """Returns the remedy that explains a recording best, if the recording is not explained."""
-    as_read = _fitted(model, rollouts, options)
+    windows = _Windows(rollouts, options)
+    as_read = windows.fitted(model, rollouts)
     if as_read is not None and _rms(_misfits(as_read)) >= REPAIR.large_residual:
-        # Before data are blamed, the parameters are searched for, also with wider priors.
-        as_read = min(_searched(as_read), key=lambda found: _rms(_misfits(found)))
-        model = as_read.model
+        # Before data are blamed, the parameters are searched for.
+        searched = _searched(as_read.segments)
+        if searched is not None and _rms(_misfits(searched)) < _rms(_misfits(as_read)):
+            as_read = searched
     if as_read is not None and _rms(_misfits(as_read)) < REPAIR.large_residual:
         return None
-    trials = _Trials(model, rollouts, options, as_read)
+    trials = _Trials(model, rollouts, windows, as_read)
     present, ratio = trials.present, trials.ratio
-    sensors = (
-        SegmentModel(model, rollouts, options).measured
-        if as_read is None
-        else (as_read.segments.measured)
-    )
+    segments = SegmentModel(model, rollouts, options) if as_read is None else as_read.segments
+    sensors = segments.measured
     # A channel that the simulation explains has no fault.
-    suspects = {name for name, value in present.items() if value >= REPAIR.large_residual}
+    suspects = {s.name for s in sensors if present.get(s.name, math.inf) >= REPAIR.large_residual}
     joints = {s.rate_of or s.name for s in sensors if s.name in suspects}
     singly = len(joints) <= REPAIR.most_suspects
-    possible = remedies(sensors, rollouts, suspects if present else None, singly=singly)
-    best, least = _best(possible, ratio)
+    best, least = _best(remedies(sensors, rollouts, suspects, singly=singly), ratio)
     if best is not None and isinstance(best.apply, Shift):
         best, least = _refined(best.apply, ratio)
     if best is not None and least < REPAIR.remedy_factor:
-        return best if least < REPAIR.remedy_factor * trials.ratio_without(best) else None
-    # A channel is given up only if nothing else helps.
-    best, least = _best(without_one(sensors) if singly else (), ratio)
-    return best if least < REPAIR.remedy_factor else None
+        without = trials.ratio_without(best)
+    else:
+        # A channel is given up only if nothing else helps.
+        best, least = _best(without_one(sensors) if singly else (), ratio)
+        without = 1.0
+    if best is None or least >= REPAIR.remedy_factor * without:
+        return None
+    if as_read is None or least * _rms(present) < REPAIR.large_residual:
+        return best
+    # What a remedy does not explain, either, may be a matter of priors that are too narrow.
+    return best if least < REPAIR.remedy_factor * trials.ratio_with_wider_priors(as_read) else None
+
+
+class _Windows:
+    """The segments along which remedies are tried: the same with each of them, where possible.
+
+    Attributes:
+        options: How a recording is cut into segments.
+    """
+
+    def __init__(self, rollouts: Rollouts, options: DataOptions) -> None:
+        """Chooses segments of a recording; those that move are preferred."""
+        self.options = options
+        self._places: list[tuple[int, int]] | None = None
+        used = options.used_segments(rollouts)
+        if len(used) <= REPAIR.most_segments:
+            return
+        length = options.steps(rollouts)
+        weights = motion(rollouts, length)[used]
+        index = one_of_each_part(REPAIR.most_segments, len(used), seed=0, weights=weights)
+        layout = layout_of(rollouts, length)
+        self._places = [layout[k][:2] for k in used[index].tolist()]
+
+    def fitted(
+        self, model: Model, rollouts: Rollouts, start: Mapping[str, Tensor] | None = None
+    ) -> Hypothesis | None:
+        """Returns a rough fit from the smoother's initial states.
+
+        Args:
+            model: The model.
+            rollouts: The recording, as it was or with a remedy.
+            start: Parameters from which the fit begins; by default the middle of the priors.
+
+        Returns:
+            ``None`` if simulations fail.
+        """
+        try:
+            segments = self._along(SegmentModel(model, rollouts, self.options))
+            return fit_segment_model(segments, start=start, max_steps=6, is_rough=True)
+        except DataError:
+            return None
+
+    def _along(self, segments: SegmentModel) -> SegmentModel:
+        """Returns a model along the segments that begin closest to the chosen ones."""
+        if self._places is None:
+            return segments
+        rollout, start = segments.inputs.rollout, segments.inputs.start
+        found = set()
+        for own, place in self._places:
+            distance = (start - place).abs().double().masked_fill(rollout != own, math.inf)
+            if bool(distance.isfinite().any()):
+                found.add(int(distance.argmin()))
+        return segments.along(torch.tensor(sorted(found)))
 
 
 class _Trials:
     """Fits of a recording with remedies."""
 
     def __init__(
-        self, model: Model, rollouts: Rollouts, options: DataOptions, as_read: Hypothesis | None
+        self, model: Model, rollouts: Rollouts, windows: _Windows, as_read: Hypothesis | None
     ) -> None:
         """Keeps the recording and its fit as it was read, ``None`` if simulations fail."""
-        self._model, self._rollouts, self._options = model, rollouts, options
+        self._model, self._rollouts, self._windows = model, rollouts, windows
         self._as_read = None if as_read is None else as_read.parameters
         self.present = {} if as_read is None else _misfits(as_read)
         """Misfit of the recording as it was read, by channel."""
@@ -219,7 +276,7 @@ class _Trials:
             if known:
                 start = known[min(known, key=lambda steps: abs(steps - shift.steps))]
         try:
-            tried = _fitted(self._model, remedy.apply(self._rollouts), self._options, start)
+            tried = self._windows.fitted(self._model, remedy.apply(self._rollouts), start)
         except NpdrError:
             return math.inf
         if tried is None:
@@ -237,8 +294,17 @@ class _Trials:
         speed alone, whatever the commands.
         """
         start = self._parameters[remedy.sentence]
-        again = _fitted(self._model, self._rollouts, self._options, start)
+        again = self._windows.fitted(self._model, self._rollouts, start)
         return 1.0 if again is None else min(1.0, self._relative(_misfits(again)))
+
+    def ratio_with_wider_priors(self, as_read: Hypothesis) -> float:
+        """Returns the relative misfit of the recording as it was read, with wider priors.
+
+        Args:
+            as_read: Its fit with the model's own priors.
+        """
+        widest, _ = with_widest_priors(as_read, is_rough=True)
+        return self._relative(_misfits(widest))
 
     def _relative(self, found: Mapping[str, float]) -> float:
         before = {name: self.present[name] for name in found if name in self.present}
@@ -276,43 +342,13 @@ def _refined(shift: Shift, ratio: Callable[[Remedy], float]) -> tuple[Remedy, fl
     return remedy, least
 
 
-def _fitted(
-    model: Model,
-    rollouts: Rollouts,
-    options: DataOptions,
-    start: Mapping[str, Tensor] | None = None,
-) -> Hypothesis | None:
-    """Returns a rough fit from the smoother's initial states; ``None`` if simulations fail."""
+def _searched(segments: SegmentModel) -> Hypothesis | None:
+    """Returns a rough fit that begins at the result of a search; ``None`` if simulations fail."""
     try:
-        segments = _part_along(model, rollouts, options)
-        return fit_segment_model(segments, start=start, max_steps=6, is_rough=True)
+        *_, found = first_guesses(segments)
+        return fit_segment_model(segments, start=found, max_steps=6, is_rough=True)
     except DataError:
         return None
-
-
-def _part_along(model: Model, rollouts: Rollouts, options: DataOptions) -> SegmentModel:
-    """Returns a model along the segments with which remedies are tried."""
-    segments = SegmentModel(model, rollouts, options)
-    num = segments.inputs.num_segments
-    if num <= REPAIR.most_segments:
-        return segments
-    weights = motion(rollouts, options.steps(rollouts))[options.used_segments(rollouts)]
-    index = one_of_each_part(REPAIR.most_segments, num, seed=0, weights=weights)
-    return segments.along(index)
-
-
-def _searched(as_read: Hypothesis) -> list[Hypothesis]:
-    """Returns rough fits: the given one, one that begins at a search, one with wider priors."""
-    found = [as_read]
-    try:
-        (_, searched) = first_guesses(as_read.segments)
-        found.append(
-            fit_segment_model(as_read.segments, start=searched, max_steps=6, is_rough=True)
-        )
-    except DataError:  # no parameters of the prior can be simulated along all segments
-        pass
-    widest, names = with_widest_priors(closest(found), is_rough=True)
-    return [*found, widest] if names else found
 
 
 def _misfits(hypothesis: Hypothesis) -> dict[str, float]:

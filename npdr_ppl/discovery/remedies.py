@@ -64,7 +64,8 @@ def remedies(
     for si, (other, factor) in OTHER_UNITS.items():
         chosen = [name for name, unit in units.items() if unit == si]
         single = [[name] for name in chosen if singly]
-        for group in [*single, *([chosen] if len(chosen) > 1 else [])]:
+        together = [chosen] if len(chosen) > 1 or (chosen and not singly) else []
+        for group in [*single, *together]:
             looks = "look" if len(group) > 1 else "looks"
             names = " and ".join(group)
             text = f"{names} {looks} recorded in {other}, not in SI units; converted."

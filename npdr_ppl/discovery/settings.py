@@ -29,9 +29,9 @@ class RepairSettings:
         most_remedies: Greatest number of remedies of one recording.
         most_segments: Greatest number of segments along which remedies are tried. A unit, a sign
             or a clock is wrong in the whole recording. With the default length they last 20 s.
-        most_suspects: Greatest number of joints, unexplained as the recording is, of which single
-            channels are suspected. If one channel is wrong, its joint and those that it moves are
-            not explained. If more joints are not, the model lacks something in each of them.
+        most_suspects: Single channels are suspected only if at most this many joints are not
+            explained. If one channel is wrong, its joint and those that it moves are not. If more
+            joints are not, the model lacks something in each of them.
         shifts: Shifts of the commands, and of one channel, that are tried first, in steps.
         longest_delay: Longest time in seconds that a device takes to answer a command. Early time
             stamps of commands look the same, so only larger shifts are tried for them.

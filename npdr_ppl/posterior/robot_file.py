@@ -27,12 +27,14 @@ class Identified(NamedTuple):
         finer_steps: How often the simulator's steps were refined, those of the model included.
         time_step: Seconds per step of the recording; ``None`` if the run does not say.
         verdict: The verdict of a discovery, ``""`` of a fit.
+        reason: The reason for it.
     """
 
     values: dict[str, float]
     finer_steps: int
     time_step: float | None
     verdict: str = ""
+    reason: str = ""
 
 
 def identified(run: Path) -> Identified:
@@ -61,8 +63,9 @@ def identified(run: Path) -> Identified:
     prepared = found.get("preparation") or {}
     length, seconds = prepared.get("segment_length"), prepared.get("segment_seconds")
     step = float(seconds) / float(length) if length and seconds else None
-    verdict = str(found.get("verdict") or "")
-    return Identified(values, int(found.get("finer_steps") or 0), step, verdict)
+    finer_steps = int(found.get("finer_steps") or 0)
+    verdict, reason = (str(found.get(key) or "") for key in ("verdict", "reason"))
+    return Identified(values, finer_steps, step, verdict, reason)
 
 
 def export_robot(model: Callable[..., Any], found: Identified) -> ExportedMjcf:

@@ -39,8 +39,12 @@ PHASE_SHARE = 0.1
 it follows a clock that drifts, and has a quarter of the jitter of one stamp."""
 
 JUMP = 5.0
-"""Change of a command across lost ones, in median changes nearby, above which a straight line
-does not tell when it changed. Smooth commands change less; steps and reversals are larger."""
+"""Change of a command across lost ones, in median changes nearby, above which it may be a jump: a
+straight line does not tell when it happened."""
+
+JUMP_SHARE = 0.2
+"""Smallest share of the command's range that is a jump. A smooth command that is written with
+coarse steps, or held for several rows, changes less from one value to the next."""
 
 NEARBY = 10
 """Number of commands before, and after, a gap that tell how much the command usually changes."""
@@ -153,8 +157,8 @@ def grid_of(channels: Sequence[Track], actions: Sequence[Track], step: float) ->
     for track in actions:
         bridged, jumps = _bridged(track)
         commands.append(_mean_held(bridged, begin + rows))
-        for first, end in (jumps - begin) / step:
-            is_unknown[max(0, math.floor(first)) : max(0, math.ceil(end))] = True
+        for first, last in (jumps - begin) / step:
+            is_unknown[max(0, math.floor(first + 1e-6)) : max(0, math.ceil(last - 1e-6))] = True
     return Gridded.of(
         [Track(track.time - begin, track.values) for track in channels],
         rows,
@@ -186,7 +190,7 @@ def _bridged(track: Track) -> tuple[Track, Array]:
     Commands that were written only when they changed are left as they are.
 
     Returns:
-        The commands, and the times in s between which they jumped and were lost, ``(N, 2)``.
+        The commands, and the times in s between which one that jumped is not known, ``(N, 2)``.
     """
     usual, steps = track.rate, np.diff(track.time)
     if usual is None or not (steps > 1.5 * usual).any():
@@ -194,23 +198,29 @@ def _bridged(track: Track) -> tuple[Track, Array]:
     mean = track.step
     # The median step differs from the mean one if a clock of whole milliseconds rounds.
     count = np.diff(_slots(track.time, mean if abs(mean - usual) < 0.5 * usual else usual))
-    short = np.flatnonzero((count > 1) & (count <= MOST_BRIDGED))
+    lost = np.flatnonzero(count > 1)
+    jumps = [
+        (track.time[k] + steps[k] / count[k], track.time[k + 1])
+        for k in lost
+        if _jumps(track.values, int(k))
+    ]
+    unknown = np.reshape(np.array(jumps, dtype=np.float64), (-1, 2))
+    short = lost[count[lost] <= MOST_BRIDGED]
     if not len(short):
-        return track, np.zeros((0, 2))
+        return track, unknown
     time = [track.time[k] + steps[k] * np.arange(1, int(count[k])) / count[k] for k in short]
     added = np.concatenate(time)
     every = np.concatenate((track.time, added))
     order = np.argsort(every, kind="stable")
     values = np.concatenate((track.values, np.interp(added, track.time, track.values)))
-    jumps = [(track.time[k], track.time[k + 1]) for k in short if _jumps(track.values, int(k))]
-    return Track(every[order], values[order]), np.reshape(jumps, (-1, 2))
+    return Track(every[order], values[order]), unknown
 
 
 def _jumps(values: Array, index: int) -> bool:
     """Returns whether a command and the next one differ by much more than those around them."""
     changes = np.abs(np.diff(values[max(0, index - NEARBY) : index + 2 + NEARBY]))
     change = changes[min(index, NEARBY)]
-    return bool(change > JUMP * np.median(changes))
+    return bool(change > max(JUMP * np.median(changes), JUMP_SHARE * np.ptp(values)))
 
 
 def _slots(time: Array, usual: float) -> NDArray[np.int64]:

@@ -58,12 +58,12 @@ def test_a_verdict_that_names_no_effect_is_said(fitted, verdict):
     run = folder / verdict
     run.mkdir()
     parameters = {"kp": {"mean": 44.0, "sd": 0.1, "hdi_94": [0.0, 1.0]}}
-    found = {"verdict": verdict, "reason": "", "parameters": parameters, "finer_steps": 0}
+    found = {"verdict": verdict, "reason": "Because.", "parameters": parameters, "finer_steps": 0}
     (run / "discovery.json").write_text(json.dumps(found))
     words = "export", run, f"{folder / 'arm_model.py'}:model", "--to", run / "new.xml"
     code, text, err = run_for_module(*words)
     assert code == 0, err
-    assert (f"is {verdict}" in text) == (verdict != "named")
+    assert (f"is {verdict}: Because." in text) == (verdict != "named")
 
 
 def test_what_the_file_cannot_hold_is_said(fitted):

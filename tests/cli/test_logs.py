@@ -67,7 +67,49 @@ def test_a_mapping_for_a_model_names_its_columns(monkeypatch, capsys, tmp_path):
     rollouts = load_all([log], toml)
     assert rollouts.channel_names == ("angle", "velocity")
     assert rollouts.action_names == ("torque",)
-    assert rollouts.channel_units == ("rad", "rad/s")
+    assert '# unit = "rad/s"' in toml.read_text()
+
+
+def test_a_mapping_for_a_model_says_what_the_log_lacks(monkeypatch, capsys, tmp_path):
+    """Also of joints whose names are no plain keys of TOML, in the order of the log."""
+    robot = tmp_path / "robot.xml"
+    joints = ["left hip", "a.b", "knee"]
+    hinges = "".join(
+        f'<body><joint name="{name}" axis="0 1 0"/><geom size="1" mass="1" pos="1 0 0"/></body>'
+        for name in joints
+    )
+    robot.write_text(f"<mujoco><worldbody>{hinges}</worldbody></mujoco>")
+    time = 0.02 * np.arange(100)
+    frame = pd.DataFrame(
+        {"time": time} | {f"pos_{n}": np.sin(time + k) for k, n in enumerate("xyz")}
+    )
+    frame.loc[5, "pos_y"] = np.nan
+    log, toml = tmp_path / "log.csv", tmp_path / "mapping.toml"
+    frame.to_csv(log, index=False)
+    words = "inspect", log, "--model", robot, "--write", toml
+    code, out, err = run(monkeypatch, capsys, *words)
+    assert code == 0, err
+    assert "No signal was found" not in out
+    mapping = Mapping.of(toml)
+    assert {n: mapping.channels[n].signal for n in joints} == dict(
+        zip(joints, ("pos_x", "pos_y", "pos_z"), strict=True)
+    )
+    frame.drop(columns="pos_z").to_csv(log, index=False)
+    toml.unlink()
+    assert "No signal was found for left hip, a.b, knee." in run(monkeypatch, capsys, *words)[1]
+
+
+@pytest.mark.parametrize(
+    "body", ["inputs.actions[..., 0].sum()", "inputs.channel_names.index('angle')"]
+)
+def test_a_model_that_needs_a_recording_gets_a_sentence(monkeypatch, capsys, tmp_path, log, body):
+    (tmp_path / "model.py").write_text(
+        "import npdr_ppl as npdr\nfrom npdr_ppl.models.pendulum import pendulum\n"
+        f"def model(inputs):\n    {body}\n    return pendulum(inputs)\n"
+    )
+    words = "inspect", log, "--model", f"{tmp_path / 'model.py'}:model", "--write"
+    code, _, err = run(monkeypatch, capsys, *words, tmp_path / "m.toml")
+    assert code == 2 and "without a recording" in err
 
 
 def test_the_mapping_that_is_written_converts_the_log(monkeypatch, capsys, log, tmp_path):

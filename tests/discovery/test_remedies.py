@@ -9,10 +9,11 @@ import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery import recording_repair
-from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.recording_repair import repair
 from npdr_ppl.discovery.remedies import Shift, remedies
+from npdr_ppl.engines.ode.simulator import ODESimulator
 from npdr_ppl.errors import DataError
+from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.models.cart_pole import cart_pole
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.rollouts.notes import Remark
@@ -170,18 +171,20 @@ def test_commands_beyond_the_range_of_a_model_are_said():
 def test_the_fit_of_a_shift_begins_at_that_of_the_nearest_shift(monkeypatch):
     begun = {}
 
-    def fitted(model, rollouts, options, start=None):
-        found = fit_hypothesis(model, rollouts, options, start=start, max_steps=6, is_rough=True)
+    fit = recording_repair._Windows.fitted
+
+    def fitted(self, model, rollouts, start=None):
+        found = fit(self, model, rollouts, start)
         begun[id(found)] = start
         kept.append(found)
         return found
 
     kept = []
-    monkeypatch.setattr(recording_repair, "_fitted", fitted)
+    monkeypatch.setattr(recording_repair._Windows, "fitted", fitted)
     rollouts = swinging(steps=240)
-    options = npdr.DataOptions(None, 30)
-    as_read = fitted(pendulum, rollouts, options)
-    trials = recording_repair._Trials(pendulum, rollouts, options, as_read)
+    windows = recording_repair._Windows(rollouts, npdr.DataOptions(None, 30))
+    as_read = windows.fitted(pendulum, rollouts)
+    trials = recording_repair._Trials(pendulum, rollouts, windows, as_read)
     for remedy in (Shift(None, 2).remedy, Shift(None, 4).remedy, Shift(None, 1).remedy):
         trials.ratio(remedy)
     inverted = next(r for r in remedies(Pendulum.sensors, rollouts) if "sign" in r.sentence)
@@ -197,29 +200,88 @@ def test_remedies_of_the_whole_recording_are_fewer():
     every = {r.sentence for r in remedies(Pendulum.sensors, recording(SWING))}
     whole = {r.sentence for r in remedies(Pendulum.sensors, recording(SWING), singly=False)}
     assert whole < every
-    assert all("time stamps of the commands" in s or "torque" in s or " and " in s for s in whole)
+    assert all(
+        "time stamps of the commands" in s or "torque" in s or "angle and velocity look" in s
+        for s in whole
+    )
 
 
 def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is(monkeypatch):
     """A fit that got stuck is no fault of the data."""
     rollouts, options = swinging(steps=240), npdr.DataOptions(None, 30)
-    fitted = recording_repair._fitted
+    fit = recording_repair._Windows.fitted
 
-    def stuck(model, recording, options, start=None):
-        found = fitted(model, recording, options, start)
+    def stuck(self, model, recording, start=None):
+        found = fit(self, model, recording, start)
         if recording is rollouts and start is None:
             away = dataclasses.replace(found.fit, z=found.fit.z + 2.0)
             return dataclasses.replace(found, fit=away)
         return found
 
-    monkeypatch.setattr(recording_repair, "_fitted", stuck)
-    monkeypatch.setattr(recording_repair, "_searched", lambda as_read: [as_read])
-    as_read = stuck(pendulum, rollouts, options)
-    trials = recording_repair._Trials(pendulum, rollouts, options, as_read)
+    monkeypatch.setattr(recording_repair._Windows, "fitted", stuck)
+    monkeypatch.setattr(recording_repair, "_searched", lambda segments: None)
+    windows = recording_repair._Windows(rollouts, options)
+    as_read = windows.fitted(pendulum, rollouts)
+    trials = recording_repair._Trials(pendulum, rollouts, windows, as_read)
     shift = Shift(None, 1).remedy
     assert trials.ratio(shift) < recording_repair.REPAIR.remedy_factor
     assert trials.ratio_without(shift) < trials.ratio(shift)
     assert recording_repair._remedy_for(pendulum, rollouts, options) is None
+
+
+class Wheel(ODESimulator):
+    """A wheel with viscous friction, whose motion is linear: its inertia can hide a wrong unit."""
+
+    states = (Channel("angle", "rad"), Channel("velocity", "rad/s", rate_of="angle"))
+    sensors = states
+    actions = (Channel("torque", "N m"),)
+    parameters = (Parameter("inertia", "kg m²", 1.0), Parameter("damping", "N m s/rad", 0.5))
+    joints = ("axle",)
+    ports = (Port("axle", "force", "N m", rated=1.0),)
+    time_step = STEP
+
+    def accelerations(self, positions, velocities, actions, forces, constants):
+        moment = actions[0] - constants["damping"] * velocities[0] + forces[0]
+        return (moment / constants["inertia"],)
+
+
+def wheel(inputs):
+    names = "inertia", "damping"
+    values = {name: pyro.sample(name, dist.LogNormal(-0.3, 0.4)) for name in names}
+    return npdr.simulate("x", Wheel(), values, inputs)
+
+
+def turned(inertia, unit):
+    """A wheel that a torque turns to and fro, by exact steps; readings in a unit."""
+    states, decay = [np.zeros(2)], np.exp(-0.5 * STEP / inertia)
+    torque = 2.0 * np.sin(3.0 * STEP * np.arange(600)) + np.sign(np.sin(STEP * np.arange(600)))
+    for value in torque:
+        (angle, velocity), final = states[-1], value / 0.5
+        moved = final * STEP + (velocity - final) * (1.0 - decay) * inertia / 0.5
+        states.append(np.array([angle + moved, final + (velocity - final) * decay]))
+    noise = np.random.default_rng(0).normal(0.0, (1e-3, 1e-2), (601, 2))
+    angle, velocity = ((np.array(states) + noise) / unit).T
+    return recording(angle, velocity, torque)
+
+
+def test_a_wrong_unit_is_found_although_other_parameters_could_explain_it():
+    repaired = repair(wheel, turned(1.0, np.pi / 180.0), npdr.DataOptions())
+    assert any("angle and velocity look recorded in degrees" in n for n in repaired.rollouts.notes)
+
+
+def test_parameters_beyond_their_priors_are_no_fault():
+    assert not repair(wheel, turned(8.0, 1.0), npdr.DataOptions()).remedies
+
+
+def test_of_a_long_recording_remedies_are_tried_along_the_same_segments(monkeypatch):
+    settings = dataclasses.replace(recording_repair.REPAIR, most_segments=5)
+    monkeypatch.setattr(recording_repair, "REPAIR", settings)
+    rollouts = turned(1.0, 1.0)
+    windows = recording_repair._Windows(rollouts, npdr.DataOptions(None, 20))
+    whole = windows.fitted(wheel, rollouts).segments.inputs
+    moved = windows.fitted(wheel, Shift(None, -3)(rollouts)).segments.inputs
+    assert len(whole.start) == 5 and whole.start.max() > 300
+    assert (moved.start - whole.start).abs().max() <= 10
 
 
 def _swapped(time):

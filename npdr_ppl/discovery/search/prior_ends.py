@@ -102,7 +102,7 @@ def with_widest_priors(
         is_rough: Whether rough fits are enough.
 
     Returns:
-        The fit with the widest priors that help, and the sites that they belong to.
+        The fit with the widest priors that help, and the sites whose priors were widened.
     """
     names: set[str] = set()
     for _ in range(PRIOR_ENDS.most_widenings):

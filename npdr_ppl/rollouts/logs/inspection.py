@@ -44,6 +44,7 @@ class SignalSummary:
         least: Smallest value in ``unit``, NaN if there is no value.
         greatest: Largest value in ``unit``, NaN if there is no value.
         role: What its name usually means.
+        place: Its place among the signals of the log, from 0.
     """
 
     name: str
@@ -51,6 +52,7 @@ class SignalSummary:
     least: float
     greatest: float
     role: Role
+    place: int = 0
 
     @property
     def is_constant(self) -> bool:
@@ -108,10 +110,10 @@ class Description:
 
 def described(log: Log) -> Description:
     """Describes a log."""
-    groups: dict[bytes, list[Signal]] = {}
-    for signal in log.signals:
-        groups.setdefault(_known_time(signal).tobytes(), []).append(signal)
-    times = [_known_time(group[0]) for group in groups.values()]
+    groups: dict[bytes, list[tuple[int, Signal]]] = {}
+    for place, signal in enumerate(log.signals):
+        groups.setdefault(_known_time(signal).tobytes(), []).append((place, signal))
+    times = [_known_time(group[0][1]) for group in groups.values()]
     first = min((float(t.min()) for t in times if len(t)), default=0.0)
     last = max((float(t.max()) for t in times if len(t)), default=0.0)
     timings = [
@@ -127,7 +129,7 @@ def _known_time(signal: Signal) -> Array:
     return signal.time[np.isfinite(signal.values) & (np.abs(signal.time) < LARGEST)]
 
 
-def _timing(time: Array, signals: list[Signal]) -> Timing:
+def _timing(time: Array, signals: list[tuple[int, Signal]]) -> Timing:
     """Describes the signals that share time stamps ``(N,)``, in s after the log's begin."""
     steps = np.diff(time)
     forward = steps[steps > 0]
@@ -139,7 +141,7 @@ def _timing(time: Array, signals: list[Signal]) -> Timing:
         jitter = float(np.percentile(np.abs(forward - step), USUAL_SHARE))
         largest, at = float(steps.max()), float(time[np.argmax(steps)])
     return Timing(
-        signals=tuple(_summary(signal) for signal in signals),
+        signals=tuple(_summary(signal, place) for place, signal in signals),
         count=len(time),
         begin=float(time[0]) if len(time) else 0.0,
         end=float(time[-1]) if len(time) else 0.0,
@@ -152,7 +154,7 @@ def _timing(time: Array, signals: list[Signal]) -> Timing:
     )
 
 
-def _summary(signal: Signal) -> SignalSummary:
+def _summary(signal: Signal, place: int) -> SignalSummary:
     known = signal.values[np.isfinite(signal.values)]
     return SignalSummary(
         name=signal.name,
@@ -160,6 +162,7 @@ def _summary(signal: Signal) -> SignalSummary:
         least=float(known.min()) if len(known) else float("nan"),
         greatest=float(known.max()) if len(known) else float("nan"),
         role=role_of(signal.name),
+        place=place,
     )
 
 

@@ -40,7 +40,7 @@ from npdr_ppl.rollouts.logs.units import si_unit
 from npdr_ppl.rollouts.notes import Remark
 from npdr_ppl.rollouts.recording import Recording
 
-__all__ = ["Mapping", "SignalMapping", "settings_lines", "toml_text"]
+__all__ = ["Mapping", "SignalMapping", "settings_lines", "toml_key", "toml_text"]
 
 MAX_BYTES = 2**16
 """Largest mapping in bytes; one of fifty joints takes a tenth of it."""
@@ -124,7 +124,7 @@ class Mapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             lines += ["[log]", *given.values(), ""]
         for section, entries in (("channels", self.channels), ("actions", self.actions)):
             for name, entry in entries.items():
-                lines.append(f"[{section}.{_key(name)}]")
+                lines.append(f"[{section}.{toml_key(name)}]")
                 default = SignalMapping("")
                 for field, value in msgspec.structs.asdict(entry).items():
                     if field == "signal" or value != getattr(default, field):
@@ -197,7 +197,7 @@ def _checked(content: dict[str, Any]) -> Mapping:
                 if not isinstance(entry, dict | SignalMapping):
                     raise DataError(
                         f"{rollout_checks.shown(name)} in [{section}] should be a table such as "
-                        f"[{section}.{_key(str(name)[:40])}] with the key signal."
+                        f"[{section}.{toml_key(str(name)[:40])}] with the key signal."
                     )
                 _check_keys(entry, SignalMapping, f"{section}.{str(name)[:40]}")
     try:
@@ -241,7 +241,7 @@ def _plain(message: str) -> str:
     return line if line.isprintable() else ascii(line)
 
 
-def _key(name: str) -> str:
+def toml_key(name: str) -> str:
     """Returns a name as a key of TOML."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_text(name)
 

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 from npdr_ppl.rollouts.logs.inspection import Description, SignalSummary
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
-from npdr_ppl.rollouts.logs.mapping import settings_lines, toml_text
+from npdr_ppl.rollouts.logs.mapping import settings_lines, toml_key, toml_text
 from npdr_ppl.rollouts.logs.matching import Column, matched
 from npdr_ppl.rollouts.logs.signal_names import plain_names
 
-__all__ = ["mapping_to_start_from", "possible_actions", "proposed_actions"]
+__all__ = ["mapping_to_start_from", "possible_actions", "proposed_actions", "without_signal"]
 
 _HEAD = """\
 # Which signals of the log {source} are channels and actions of the rollouts.
@@ -105,21 +105,18 @@ def _tables_of_columns(columns: Sequence[Column], signals: Sequence[SignalSummar
     lines = []
     for column in columns:
         section = "actions" if column.role == "command" else "channels"
-        entry = [f"[{section}.{column.name}]"]
+        entry = [f"[{section}.{toml_key(column.name)}]"]
         if column.name not in found:
-            hint = "may be left out" if column.role == "velocity" else "name it"
+            hint = "may be left out" if column.rate_of in found else "name it"
             entry.append('signal = "..."')
             lines += [f"# No signal has a matching name; {hint}:", *map(_comment, entry), ""]
             continue
-        signal, is_by_order = found[column.name]
-        remark = "  # by its place among the others" if is_by_order else ""
-        entry.append(f"signal = {toml_text(signal.name)}{remark}")
+        signal, doubt = found[column.name]
+        entry.append(f"signal = {toml_text(signal.name)}{f'  # {doubt}' if doubt else ''}")
         if signal.unit:
             entry.append(f"unit = {toml_text(signal.unit)}")
         elif column.unit:
-            entry.append(
-                f"unit = {toml_text(column.unit)}  # as in the model; the log states none"
-            )
+            entry.append(f"# unit = {toml_text(column.unit)}  # the model's; the log states none")
         lines += [*entry, ""]
     used = {match.signal.name for match in found.values()}
     rest = [signal.name for signal in signals if signal.name not in used]
@@ -128,10 +125,17 @@ def _tables_of_columns(columns: Sequence[Column], signals: Sequence[SignalSummar
     return lines
 
 
+def without_signal(description: Description, columns: Sequence[Column]) -> list[str]:
+    """Returns the names of a model's columns, without rates, for which a log has no signal."""
+    found = matched(columns, _signals(description))
+    return [c.name for c in columns if c.name not in found and c.rate_of is None]
+
+
 def _signals(description: Description) -> list[SignalSummary]:
-    """Returns the signals, without the one that marks episodes."""
+    """Returns the signals in the order of the log, without the one that marks episodes."""
     signals = [s for timing in description.timings for s in timing.signals]
-    return [s for s in signals if s.name != description.episodes]
+    signals = [s for s in signals if s.name != description.episodes]
+    return sorted(signals, key=lambda signal: signal.place)
 
 
 def proposed_actions(description: Description) -> list[str]:

@@ -30,11 +30,13 @@ class Column(NamedTuple):
         name: Name of the model's sensor or action.
         unit: Its unit.
         role: What it is; the role of an action is ``"command"``.
+        rate_of: The position whose rate it is; ``None`` for others.
     """
 
     name: str
     unit: str
     role: Role
+    rate_of: str | None = None
 
 
 class Match(NamedTuple):
@@ -42,17 +44,17 @@ class Match(NamedTuple):
 
     Attributes:
         signal: The signal.
-        is_by_order: Whether the order of the signals tells so; otherwise their names do.
+        doubt: Why this should be checked, ``""`` if the names agree.
     """
 
     signal: SignalSummary
-    is_by_order: bool
+    doubt: str
 
 
 def columns_of(sensors: Sequence[Channel], actions: Sequence[Channel]) -> list[Column]:
     """Returns the columns that a model reads: those of its sensors, then those of its actions."""
     return [
-        *(Column(c.name, c.unit, _role_of_sensor(c)) for c in sensors),
+        *(Column(c.name, c.unit, _role_of_sensor(c), c.rate_of) for c in sensors),
         *(Column(c.name, c.unit, "command") for c in actions),
     ]
 
@@ -75,48 +77,84 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
 
     Columns of a role that do not match are taken in the order of the log if there are as many
     signals of this role, and no name contradicts it. Numbers do not contradict, because some count
-    joints from 0 and others from 1.
+    joints from 0 and others from 1. A measurement that never changes is no match.
 
     Args:
         columns: The columns.
         signals: The signals, in the order of the log.
     """
-    result = {}
+    result: dict[str, Match] = {}
     for role in dict.fromkeys(column.role for column in columns):
         wanted = [column for column in columns if column.role == role]
-        own = [signal for signal in signals if signal.role == role]
+        own = [s for s in signals if s.role == role and (role == "command" or not s.is_constant)]
+        doubt = ""
         if role == "command" and not own:
-            own = [signal for signal in signals if signal.role == "effort"]
-        found = _by_name(wanted, own)
-        if len(found) < len(wanted) == len(own):
-            in_order = dict(zip([column.name for column in wanted], own, strict=True))
-            names = [name for name in found if not "".join(_words(name)).isdigit()]
-            if all(found[name] is in_order[name] for name in names):
-                is_clear = len(wanted) == 1
-                result |= {
-                    name: Match(signal, is_by_order=not (is_clear or found.get(name) is signal))
-                    for name, signal in in_order.items()
-                }
-                continue
-        result |= {name: Match(signal, is_by_order=False) for name, signal in found.items()}
+            taken = {match.signal.name for match in result.values()}
+            own = [s for s in signals if s.role == "effort" and s.name not in taken]
+            doubt = "may be a measurement"
+        result |= _of_one_role(wanted, _in_order(own), doubt)
     return result
+
+
+def _of_one_role(
+    columns: Sequence[Column], signals: Sequence[SignalSummary], doubt: str
+) -> dict[str, Match]:
+    """Returns the signals that columns probably are; all have the same role.
+
+    Args:
+        columns: The columns.
+        signals: The signals, in their order.
+        doubt: What to check in any case.
+    """
+    found = _by_name(columns, signals)
+    numbered = {name for name in found if "".join(_words(name)).isdigit()}
+    if len(found) < len(columns) == len(signals) and columns[0].role != "other":
+        in_order = dict(zip([column.name for column in columns], signals, strict=True))
+        if all(found[name] is in_order[name] for name in found.keys() - numbered):
+            found, unsure = in_order, in_order.keys() - (found.keys() - numbered)
+            (first, *others) = columns
+            is_clear = not others and not (_words(first.name) and _words(signals[0].name))
+            place = "" if is_clear else "by its place among the others"
+            return {
+                name: Match(signal, doubt or (place if name in unsure else ""))
+                for name, signal in found.items()
+            }
+    by_number = "by its number; some count from 0" if len(found) < len(signals) else ""
+    return {
+        name: Match(signal, doubt or (by_number if name in numbered else ""))
+        for name, signal in found.items()
+    }
 
 
 def _by_name(
     columns: Sequence[Column], signals: Sequence[SignalSummary]
 ) -> dict[str, SignalSummary]:
-    """Returns the signals whose names match, without those that match several columns."""
+    """Returns the signals whose names match; of columns that share one, the closest gets it."""
     words = [_words(signal.name) for signal in signals]
-    found = {}
+    found: dict[str, tuple[int, int]] = {}  # signal, and number of its words that do not match
     for column in columns:
         own = _words(column.name)
         extra = {k: sum((w - own).values()) for k, w in enumerate(words) if own <= w}
         least = [k for k, number in extra.items() if number == min(extra.values())]
         # A name such as "angle" tells no joints apart, so that it is no evidence beside others.
         if own and len(least) == 1:
-            found[column.name] = least[0]
-    times = Counter(found.values())
-    return {name: signals[k] for name, k in found.items() if times[k] == 1}
+            found[column.name] = least[0], extra[least[0]]
+    result = {}
+    for name, (k, number) in found.items():
+        rivals = [other for title, (place, other) in found.items() if place == k and title != name]
+        if all(number < other for other in rivals):
+            result[name] = signals[k]
+    return result
+
+
+def _in_order(signals: Sequence[SignalSummary]) -> list[SignalSummary]:
+    """Returns signals in their order; by number if their names differ in nothing else.
+
+    Columns in alphabetical order have ``q10`` before ``q2``.
+    """
+    if len({re.sub(r"\d+", "", signal.name) for signal in signals}) != 1:
+        return list(signals)
+    return sorted(signals, key=lambda signal: [int(n) for n in re.findall(r"\d+", signal.name)])
 
 
 def _words(name: str) -> Counter[str]:

@@ -21,7 +21,10 @@ COLUMNS = columns_of(SENSORS, ACTIONS)
 def found(columns, names):
     signals = [SignalSummary(name, "", -1.0, 1.0, role_of(name)) for name in names]
     matches = matched(columns, signals)
-    return {name: (match.signal.name, match.is_by_order) for name, match in matches.items()}
+    return {name: (match.signal.name, match.doubt) for name, match in matches.items()}
+
+
+PLACE = "by its place among the others"
 
 
 @pytest.mark.parametrize(
@@ -37,30 +40,57 @@ def test_names_with_the_same_joint_and_role_match(joint_states, goals):
     names = [text.format(joint) for text in (*joint_states, goals) for joint in joints]
     found_by_name = found(COLUMNS, names)
     assert len(found_by_name) == len(COLUMNS)
-    for column, (signal, is_by_order) in found_by_name.items():
+    for column, (signal, doubt) in found_by_name.items():
         joint = column.removesuffix("_velocity").removesuffix("_command")
-        assert joint in signal and not is_by_order
+        assert joint in signal and not doubt
 
 
 def test_the_name_with_the_fewest_other_words_matches():
     names = ["wrist_shoulder_position", "shoulder_position", "upper_arm_position"]
-    assert found(COLUMNS, names)["shoulder"] == ("shoulder_position", False)
+    assert found(COLUMNS, names)["shoulder"] == ("shoulder_position", "")
 
 
 def test_other_names_are_taken_in_their_order_if_no_name_contradicts_it():
     assert found(COLUMNS, ["Rotation_pos", "upper_arm_pos"]) == {
-        "shoulder": ("Rotation_pos", True),
-        "upper_arm": ("upper_arm_pos", False),
+        "shoulder": ("Rotation_pos", PLACE),
+        "upper_arm": ("upper_arm_pos", ""),
     }
     assert found(COLUMNS, ["upper_arm_pos", "Rotation_pos"]) == {
-        "upper_arm": ("upper_arm_pos", False)
+        "upper_arm": ("upper_arm_pos", "")
     }
 
 
 def test_joints_may_be_counted_from_zero():
     columns = columns_of([Channel("joint_1", "rad"), Channel("joint_2", "rad")], [])
-    assert found(columns, ["q0", "q1"]) == {"joint_1": ("q0", True), "joint_2": ("q1", True)}
-    assert found(columns, ["q2", "q1"]) == {"joint_1": ("q1", False), "joint_2": ("q2", False)}
+    assert found(columns, ["q0", "q1"]) == {"joint_1": ("q0", PLACE), "joint_2": ("q1", PLACE)}
+    assert found(columns, ["q2", "q1"]) == {"joint_1": ("q1", ""), "joint_2": ("q2", "")}
+    doubt = "by its number; some count from 0"
+    three = ["q2", "q0", "q1"]
+    assert found(columns, three) == {"joint_1": ("q1", doubt), "joint_2": ("q2", doubt)}
+
+
+def test_numbered_signals_in_alphabetical_order_are_taken_by_number():
+    columns = columns_of([Channel(f"joint_{k}", "rad") for k in range(1, 12)], [])
+    names = sorted(f"q{k}" for k in range(11))
+    assert [signal for signal, _ in found(columns, names).values()] == [f"q{k}" for k in range(11)]
+
+
+def test_of_two_columns_the_closer_one_gets_a_signal():
+    columns = columns_of([Channel("wrist", "rad"), Channel("wrist_roll", "rad")], [])
+    names = ["wrist_roll_pos", "forearm_pos"]
+    assert found(columns, names) == {"wrist_roll": ("wrist_roll_pos", "")}
+
+
+def test_a_name_that_says_something_else_is_doubted():
+    assert found(columns_of([Channel("shoulder", "rad")], []), ["elbow_pos"]) == {
+        "shoulder": ("elbow_pos", PLACE)
+    }
+    assert not found(columns_of([Channel("level", "1")], []), ["temperature"])
+
+
+def test_a_measurement_that_never_changes_is_no_match():
+    signals = [SignalSummary("shoulder_vel", "", 0.0, 0.0, "velocity")]
+    assert not matched(columns_of(SENSORS, []), signals)
 
 
 def test_the_only_signal_of_a_role_matches_whatever_its_name():
@@ -68,7 +98,9 @@ def test_the_only_signal_of_a_role_matches_whatever_its_name():
     columns = columns_of(sensors, [Channel("torque", "N m")])
     names = ["position", "velocity", "tau"]
     assert found(columns, names) == {
-        column.name: (name, False) for column, name in zip(columns, names, strict=True)
+        "angle": ("position", ""),
+        "velocity": ("velocity", ""),
+        "torque": ("tau", "may be a measurement"),
     }
 
 
@@ -76,7 +108,13 @@ def test_an_effort_is_no_command_beside_commands():
     names = ["arm_angle", "pole_angle", "motor_voltage", "motor_current"]
     columns = columns_of(Furuta.sensors, Furuta.actions)
     assert found(columns, names) == {
-        "arm_angle": ("arm_angle", False),
-        "pole_angle": ("pole_angle", False),
-        "voltage": ("motor_voltage", False),
+        "arm_angle": ("arm_angle", ""),
+        "pole_angle": ("pole_angle", ""),
+        "voltage": ("motor_voltage", ""),
     }
+
+
+def test_an_effort_that_is_a_sensor_is_no_command():
+    sensors = [Channel("angle", "rad"), Channel("motor_current", "A")]
+    columns = columns_of(sensors, [Channel("voltage", "V")])
+    assert found(columns, ["angle", "motor_current"]).keys() == {"angle", "motor_current"}
