@@ -58,3 +58,17 @@ def test_a_rig_of_the_gallery_reads_its_log_and_can_be_fitted(file, name, mappin
     inputs = rollouts.inputs(20)
     trajectories = pyro.infer.Predictive(model, num_samples=3)(inputs)["trajectory"]
     assert trajectories.shape[0] == 3 and trajectories.isfinite().all()
+
+
+def test_the_driven_rig_of_the_gallery_reads_its_log_and_can_be_simulated():
+    time = 0.002 * np.arange(300)
+    log = pd.DataFrame({"time": time, "voltage": np.sin(7.0 * time)})
+    for joint, rest in (("arm", 80.0), ("pole", -6.0 * np.pi)):
+        log[f"{joint}_position"] = rest + 0.3 * np.sin(4.0 * time)
+        log[f"{joint}_velocity"] = 1.2 * np.cos(4.0 * time)
+    gallery = EXAMPLES / "gallery"
+    rollouts = npdr.Rollouts.from_dataframe(log, gallery / "furuta_odrive_driven.toml")
+    model = runpy.run_path(str(gallery / "furuta_odrive_driven.py"))["furuta"]
+    inputs = rollouts.inputs(20)
+    trajectories = pyro.infer.Predictive(model, num_samples=3)(inputs)["trajectory"]
+    assert trajectories.shape[0] == 3 and trajectories.isfinite().all()
