@@ -18,7 +18,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
 from npdr_ppl.discovery.remedies import Remedy, Shift, remedies, without_one
-from npdr_ppl.discovery.search.base_fit import first_guesses
+from npdr_ppl.discovery.search.base_fit import fit_base
 from npdr_ppl.discovery.search.prior_ends import with_widest_priors
 from npdr_ppl.discovery.settings import REPAIR
 from npdr_ppl.errors import DataError, NpdrError
@@ -164,7 +164,7 @@ def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remed
     windows = _Windows(rollouts, options)
     as_read = windows.fitted(model, rollouts)
     if as_read is not None and _rms(_misfits(as_read)) >= REPAIR.large_residual:
-        # Before data are blamed, the parameters are searched for.
+        # Before data are blamed, the parameters are searched for as thoroughly as for a fit.
         searched = _searched(as_read.segments)
         if searched is not None and _rms(_misfits(searched)) < _rms(_misfits(as_read)):
             as_read = searched
@@ -345,8 +345,8 @@ def _refined(shift: Shift, ratio: Callable[[Remedy], float]) -> tuple[Remedy, fl
 def _searched(segments: SegmentModel) -> Hypothesis | None:
     """Returns a rough fit that begins at the result of a search; ``None`` if simulations fail."""
     try:
-        *_, found = first_guesses(segments)
-        return fit_segment_model(segments, start=found, max_steps=6, is_rough=True)
+        found, _ = fit_base(segments)
+        return fit_segment_model(segments, start=found.parameters, max_steps=6, is_rough=True)
     except DataError:
         return None
 

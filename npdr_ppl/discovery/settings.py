@@ -28,7 +28,7 @@ class RepairSettings:
         remedy_factor: A remedy is applied if it reduces the residual to less than this fraction.
         most_remedies: Greatest number of remedies of one recording.
         most_segments: Greatest number of segments along which remedies are tried. A unit, a sign
-            or a clock is wrong in the whole recording. With the default length they last 20 s.
+            or a clock is wrong in the whole recording. With the default length they last 40 s.
         most_suspects: Single channels are suspected only if at most this many joints are not
             explained. If one channel is wrong, its joint and those that it moves are not. If more
             joints are not, the model lacks something in each of them.
@@ -44,7 +44,7 @@ class RepairSettings:
     disregarded_share: float = 0.2
     remedy_factor: float = 0.5
     most_remedies: int = 3
-    most_segments: int = 50
+    most_segments: int = 200
     most_suspects: int = 3
     shifts: tuple[int, ...] = (1, 2, 4, 7, 10, 13, 16, 19)
     longest_delay: float = 0.04

@@ -29,7 +29,7 @@ from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
 
-__all__ = ["BaseFit", "first_guesses", "fit_base", "in_finer_steps", "off_the_ends", "polished"]
+__all__ = ["BaseFit", "fit_base", "in_finer_steps", "off_the_ends", "polished"]
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def fit_base(
     step = progress or (lambda fraction, status: None)
     begun: list[Hypothesis] = []
     failure: DataError | None = None
-    starts = first_guesses(segments, near, seed, progress)
+    starts = _starts(segments, near, seed, progress)
     few = segments.along(part_of(segments, seed=seed))
     for number, start in enumerate(starts, 1):
         # How many steps a fit takes is not known.
@@ -256,11 +256,11 @@ def in_finer_steps(
     return BaseFit(bases[0], current, is_coarse)
 
 
-def first_guesses(
+def _starts(
     segments: SegmentModel,
-    near: Mapping[str, Tensor] | None = None,
-    seed: int = 0,
-    progress: Step | None = None,
+    near: Mapping[str, Tensor] | None,
+    seed: int,
+    progress: Step | None,
 ) -> list[Mapping[str, Tensor]]:
     """Returns initial guesses: the prior's middle and a search's result, or known parameters."""
     if near:
