@@ -23,6 +23,7 @@ from npdr_ppl.discovery.recording_repair import repair
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.notes import faults_among
 
 STEP = 0.01
 FIRST_SEED = 5000
@@ -177,10 +178,11 @@ def main() -> None:
         kind = list(KINDS)[k % len(KINDS)]
         model, rollouts = KINDS[kind](options.first_seed + k)
         notes = repair(model, rollouts, segment_options(rollouts)).rollouts.notes
+        faults = faults_among(notes)
         counts[kind][1] += 1
-        if notes:
+        if faults:
             counts[kind][0] += 1
-            print(f"{kind}, seed {options.first_seed + k}: {' '.join(notes)}", flush=True)
+            print(f"{kind}, seed {options.first_seed + k}: {' '.join(faults)}", flush=True)
     for kind, (reported, number) in counts.items():
         print(f"{kind:14} fault reported {reported} of {number}")
     reported = sum(r for r, _ in counts.values())

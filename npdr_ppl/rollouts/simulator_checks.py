@@ -157,7 +157,7 @@ def limited_commands(recording: Recording, actions: Sequence[Channel]) -> tuple[
         unit = f" {action.unit}" if action.unit not in ("", "1") else ""
         remarks.append(
             Remark(
-                f"{100.0 * beyond.mean():.2g} % of the commands {action.name} are beyond the "
+                f"{100.0 * beyond.mean():.3g} % of the commands {action.name} are beyond the "
                 f"model's range, {action.lower:.4g} to {action.upper:.4g}{unit}; simulations "
                 "limit them to it."
             )

@@ -162,7 +162,7 @@ def test_commands_beyond_the_range_of_a_model_are_said():
         n for n in repair(pendulum, strong, npdr.DataOptions()).rollouts.notes if "range" in n
     ]
     assert note == (
-        f"{100.0 * share:.2g} % of the commands torque are beyond the model's range, -4.5 to "
+        f"{100.0 * share:.3g} % of the commands torque are beyond the model's range, -4.5 to "
         "4.5 N m; simulations limit them to it."
     )
     assert isinstance(note, Remark)
