@@ -273,6 +273,20 @@ def test_parameters_beyond_their_priors_are_no_fault():
     assert not repair(wheel, turned(8.0, 1.0), npdr.DataOptions()).remedies
 
 
+@pytest.mark.parametrize(("wider", "is_applied"), [(1.0, True), (0.5, False)])
+def test_a_remedy_that_leaves_much_must_beat_wider_priors(monkeypatch, wider, is_applied):
+    def ratio(trials, remedy):
+        return 0.4 if remedy.sentence.startswith("The sign of torque") else 1.0
+
+    trials = recording_repair._Trials
+    monkeypatch.setattr(trials, "ratio", ratio)
+    monkeypatch.setattr(trials, "ratio_without", lambda trials, remedy: 1.0)
+    monkeypatch.setattr(trials, "ratio_with_wider_priors", lambda trials, as_read: wider)
+    options = npdr.DataOptions(None, 20)
+    found = recording_repair._remedy_for(wheel, turned(20.0, 1.0), options)
+    assert (found is not None) == is_applied
+
+
 def test_of_a_long_recording_remedies_are_tried_along_the_same_segments(monkeypatch):
     settings = dataclasses.replace(recording_repair.REPAIR, most_segments=5)
     monkeypatch.setattr(recording_repair, "REPAIR", settings)
