@@ -139,10 +139,13 @@ def _by_name(
         # A name such as "angle" tells no joints apart, so that it is no evidence beside others.
         if own and len(least) == 1:
             found[column.name] = least[0], extra[least[0]]
-    result = {}
+    by_signal: dict[int, list[tuple[int, str]]] = {}
     for name, (k, number) in found.items():
-        rivals = [other for title, (place, other) in found.items() if place == k and title != name]
-        if all(number < other for other in rivals):
+        by_signal.setdefault(k, []).append((number, name))
+    result = {}
+    for k, claims in by_signal.items():
+        (number, name), *others = sorted(claims)
+        if not others or number < others[0][0]:
             result[name] = signals[k]
     return result
 
