@@ -149,6 +149,15 @@ class Hypothesis:
         residual = self.segments.whitened(self.difference, scale)
         return 0.5 * (residual.square().sum(-1) + self.fit.offsets.square().sum(-1))
 
+    def squares(self, scale: Tensor) -> Tensor:
+        """Returns the sum of squared whitened residuals of each channel, ``(C,)``.
+
+        Args:
+            scale: Standard deviation of the measurements per channel, ``(C,)``.
+        """
+        residual = self.segments.whitened(self.difference, scale)
+        return residual.square().unflatten(-1, (-1, len(scale))).sum((0, 1))
+
     def at_edge(self, effect: Effect) -> tuple[str, ...]:
         """Returns the names of an effect's shape parameters with an implausible value.
 

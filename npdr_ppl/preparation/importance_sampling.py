@@ -128,7 +128,7 @@ def sample_posterior(
     proposals: Sequence[Density] = (),
     *,
     seed: int,
-    reaches_ends: bool = True,
+    is_rough: bool = False,
     most_iterations: int | None = None,
 ) -> WeightedDraws:
     """Draws from the posterior of a recording by adaptive importance sampling.
@@ -141,11 +141,11 @@ def sample_posterior(
         proposals: Further first proposals, densities over reference coordinates; for example
             posteriors that a backend has learnt.
         seed: Seed of the draws.
-        reaches_ends: Whether draws move on to the ends of a ridge.
+        is_rough: Whether ridges are taken as straight, and draws do not move on to their ends.
         most_iterations: Greatest number of proposals; that of the settings by default.
     """
     prior = likelihood.segments.prior
-    space = RidgeCoordinates.of(likelihood, seed=seed)
+    space = RidgeCoordinates.of(likelihood, seed=seed, is_rough=is_rough)
     settings = IMPORTANCE_SAMPLING
     own = [_Proposal(heavy_tailed(*space.moments()), settings.draws_per_iteration, space)]
     given = [_Proposal(density, settings.draws_of_given) for density in proposals]
@@ -179,7 +179,7 @@ def sample_posterior(
         adapted = _adapted(w, log_weights, seed, iteration)
         own.append(_Proposal(adapted, settings.draws_per_iteration, space))
     assert result is not None
-    if reaches_ends and space.num_weak and result.is_reliable:
+    if space.num_weak and result.is_reliable:
         return _moved(result, target, likelihood, seed)
     return result
 

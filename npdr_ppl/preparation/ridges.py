@@ -59,8 +59,16 @@ class RidgeCoordinates:
     weak_covariance: Tensor
 
     @classmethod
-    def of(cls, likelihood: SegmentLikelihood, *, seed: int) -> "RidgeCoordinates":
-        """Finds the coordinates of a recording's posterior."""
+    def of(
+        cls, likelihood: SegmentLikelihood, *, seed: int, is_rough: bool = False
+    ) -> "RidgeCoordinates":
+        """Finds the coordinates of a recording's posterior.
+
+        Args:
+            likelihood: The recording's likelihood.
+            seed: Seed of the points of a ridge.
+            is_rough: Whether ridges are taken as straight, which needs no simulations.
+        """
         space, z = SamplingCoordinates.of(likelihood.segments.prior), likelihood.fit.z
         slope = space.slope(z).clamp_min(1e-12)
         spread = space.variance.sqrt()
@@ -69,7 +77,7 @@ class RidgeCoordinates:
         information = information.clamp_min(0.0)
         # Along a direction of width δ the ridge departs from a line by about δ², in units of the
         # prior. The direction can be weak if that exceeds the width of the stiffest one.
-        can_be_weak = int((information**2 < information[-1]).sum())
+        can_be_weak = 0 if is_rough else int((information**2 < information[-1]).sum())
         basis = spread[:, None] * vectors
         straight = cls._straight(space, space.from_reference(z[None])[0], basis, information, 0)
         is_weak = torch.zeros(len(z), dtype=torch.bool)

@@ -409,13 +409,16 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str]) -> list[str]:
         )
     used = np.sum([part.sampling.is_read.sum(0) for part in parts], axis=0).tolist()
     num_unused = np.sum([part.num_unused for part in parts], axis=0).tolist()
-    shared = [
-        f"{unused} of {unused + taken} measurements of {name}"
-        for name, taken, unused in zip(channels, used, num_unused, strict=True)
-        if unused
-    ]
+    shared: dict[str, list[str]] = {}
+    for name, taken, unused in zip(channels, used, num_unused, strict=True):
+        if unused:
+            shared.setdefault(f"{unused} of {unused + taken} measurements", []).append(name)
     if shared:
-        told = ", ".join(shared)
+        num_channels = max(2, len(channels))
+        told = ", ".join(
+            f"{number} of {', '.join(names) if len(names) < num_channels else 'every channel'}"
+            for number, names in shared.items()
+        )
         notes.append(Remark(f"{told} share a time step with another and are not used."))
     num_rows = sum(len(part.time) for part in parts)
     slow = [

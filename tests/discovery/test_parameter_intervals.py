@@ -57,6 +57,18 @@ def test_draws_follow_a_ridge_that_bends():
     assert float(straight.mean()) > 1.3 * float(draws.weights @ drawn)
 
 
+def test_rough_draws_do_not_look_for_ridges(monkeypatch):
+    def fail(*_):
+        raise AssertionError("looked for a ridge")
+
+    hypothesis = fitted((Spring("hinge"),))
+    monkeypatch.setattr(RidgeCoordinates, "_most_curved", fail)
+    with pytest.raises(AssertionError, match="ridge"):
+        posterior_draws(hypothesis, seed=0)
+    draws = posterior_draws(hypothesis, seed=0, is_rough=True)
+    assert bool(hypothesis.likelihood.log_prob(draws.z).isfinite().all())
+
+
 def test_draws_are_taken_as_often_as_they_weigh():
     torch.manual_seed(0)
     draws = Draws(

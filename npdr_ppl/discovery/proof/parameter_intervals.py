@@ -81,7 +81,7 @@ def posterior_draws(hypothesis: Hypothesis, *, seed: int, is_rough: bool = False
         hypothesis: The fitted model.
         seed: Seed of the draws.
         is_rough: Whether the draws are for predictions only: then they take at most
-            ``INTERVALS.rough_iterations`` proposals and do not move on to the ends of ridges.
+            ``INTERVALS.rough_iterations`` proposals, and ridges are taken as straight.
 
     Raises:
         DataError: Simulations fail close to the fit.
@@ -90,7 +90,7 @@ def posterior_draws(hypothesis: Hypothesis, *, seed: int, is_rough: bool = False
     found = sample_posterior(
         hypothesis.likelihood,
         seed=own_seed,
-        reaches_ends=not is_rough,
+        is_rough=is_rough,
         most_iterations=INTERVALS.rough_iterations if is_rough else None,
     )
     counts = found.weights > 0.0  # without failed simulations, whose parameters can be anything

@@ -48,6 +48,16 @@ class Screened:
         """Name of the effect."""
         return self.variant.effect.name
 
+    def gain_by_channel(self, projection: Projection) -> Tensor:
+        """Returns in which channels the misfit falls, ``(C,)``, up to what initial states explain.
+
+        Args:
+            projection: The fitted hypothesis.
+        """
+        moved = projection.projected(self.variant.change) @ self.sizes
+        num_channels = len(projection.hypothesis.fit.scale)
+        return moved.square().unflatten(-1, (-1, num_channels)).sum((0, 1))
+
     def without_change(self) -> "Screened":
         """Returns the candidate without its change along the recording, to save memory."""
         nothing = self.variant.change.new_zeros(0)

@@ -19,7 +19,15 @@ from xml.etree import ElementTree
 from npdr_ppl.errors import ModelError
 from npdr_ppl.reading_limits import LIMITS
 
-__all__ = ["RobotFiles", "is_inside", "located", "read_robot", "references", "relative_to"]
+__all__ = [
+    "RobotFiles",
+    "is_inside",
+    "is_urdf",
+    "located",
+    "read_robot",
+    "references",
+    "relative_to",
+]
 
 _ROOTS = ("mujoco", "mujocoinclude")
 
@@ -104,6 +112,11 @@ def read_robot(path: str | PathLike[str]) -> RobotFiles:
             "a robot may have."
         )
     return files
+
+
+def is_urdf(files: RobotFiles) -> bool:
+    """Returns whether a robot's first file is a URDF file."""
+    return next(iter(files.trees.values())).tag == "robot"
 
 
 def is_inside(folder: Path, name: str) -> bool:

@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from npdr_ppl.engines.common.robot_files import read_robot
+from npdr_ppl.engines.common.robot_files import is_urdf, read_robot
+from npdr_ppl.engines.mujoco.urdf_files import compiled_urdf
 from npdr_ppl.errors import ModelError, ShapeError
 
 __all__ = ["INERTIAL", "JOINT", "MujocoInverseDynamics", "actuator_forces", "load_mjcf"]
@@ -48,27 +49,31 @@ MAX_FIELD = 1e6
 
 
 def load_mjcf(source: Any) -> Any:
-    """Returns the ``mujoco.MjModel`` of an MJCF file, or the given one.
+    """Returns the ``mujoco.MjModel`` of an MJCF or URDF file, or the given one.
 
     Args:
-        source: Path of an MJCF file, or a ``mujoco.MjModel``.
+        source: Path of a file, or a ``mujoco.MjModel``.
 
     Raises:
-        ModelError: The file is not MJCF, includes a file outside of its folder, or describes far
-            more than a robot.
+        ModelError: The file is neither MJCF nor URDF, includes a file outside of its folder, or
+            describes far more than a robot.
     """
     mujoco: Any = importlib.import_module("mujoco")
     if not isinstance(source, str | PathLike):
         return source
-    read_robot(source)
+    files = read_robot(source)
     try:
-        model = mujoco.MjModel.from_xml_path(str(source))
+        if is_urdf(files):
+            model = compiled_urdf(source)
+        else:
+            model = mujoco.MjModel.from_xml_path(str(source))
         # A model may compile although the memory that it reserves is too small for it.
         mujoco.mj_forward(model, mujoco.MjData(model))
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())[:MAX_REASON].rstrip(".")
         reason = reason if reason.isprintable() else ascii(reason)
-        raise ModelError(f"{source} is not a readable MJCF file: {reason}.") from error
+        kind = "URDF" if is_urdf(files) else "MJCF"
+        raise ModelError(f"{source} is not a readable {kind} file: {reason}.") from error
     step, field = model.opt.timestep, np.concatenate((model.opt.gravity, model.opt.wind))
     if not (0 < step < math.inf and np.all(np.abs(field) < MAX_FIELD)):
         raise ModelError(

@@ -9,6 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from npdr_ppl.engines.common.robot_files import is_urdf, read_robot
 from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
 from npdr_ppl.engines.mujoco.batches import quiet
 from npdr_ppl.engines.mujoco.dependent_fields import dependent_fields
@@ -37,6 +38,10 @@ GAIN_RANGE = (0.5, 1.5)
 FRICTION_RANGE = (0.0, 2.0)
 """Prior of joint damping and friction loss as factors on the file's values. Lubricant, wear and
 temperature change friction by such factors."""
+
+ROTOR_RANGE = (0.0, 10.0)
+"""Prior of an armature of a URDF file, which cannot state any, as factors on the inertia of the
+links that the joint moves. Rotors behind high gears exceed light links, as in a wrist."""
 
 LEAST_SHARE = 0.001
 """A body lighter than this share of what its joint carries keeps its mass: at most 0.03 % of the
@@ -140,9 +145,9 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
 
     These are the masses of the bodies that joints move, with their inertias; damping, armature and
     friction loss of joints, where the file has positive values; and kp and kv of position and
-    velocity servos. The priors are uniform around the file's values. What positions do not
-    determine beside the others keeps the file's value; see
-    :func:`~npdr_ppl.engines.mujoco.dependent_fields.dependent_fields`.
+    velocity servos. A URDF file cannot state armatures, so all of its joints get one. The priors
+    are uniform around the file's values. What positions do not determine beside the others keeps
+    the file's value; see :func:`~npdr_ppl.engines.mujoco.dependent_fields.dependent_fields`.
 
     Args:
         source: Path of the file.
@@ -160,6 +165,9 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
             f"{title} has actuators with states of their own, such as filters, which recordings "
             "do not contain; remove them, e.g. timeconst, and let npdr discover find a lag."
         )
+    without_rotors = is_urdf(read_robot(source))
+    if without_rotors:
+        model.dof_armature[:] = model.dof_M0
     chosen: dict[str, tuple[Field, str, tuple[float, float]]] = {}
     for kind, name, quantity, ends in [*_masses(model), *_joints(model), *_servos(model)]:
         field = find_field(model, f"{kind} {name} {quantity}")
@@ -170,9 +178,14 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
         held = dependent_fields(model, order) if order else {}
     found: list[DerivedParameter] = []
     for text, (field, name, (low, high)) in chosen.items():
-        if text not in held:
-            own, value = _identifier(name, [p.name for p in found]), field.nominal or 0.0
-            found.append(DerivedParameter(own, text, field.unit, value, low * value, high * value))
+        if text in held:
+            continue
+        own, value, typical = _identifier(name, [p.name for p in found]), 0.0, field.nominal or 0.0
+        if without_rotors and text.endswith(" armature"):
+            low, high = ROTOR_RANGE
+        else:
+            value = typical
+        found.append(DerivedParameter(own, text, field.unit, value, low * typical, high * typical))
     if not found:
         raise ModelError(f"{title} has no masses, friction or gains that its motion depends on.")
     return DerivedModel(title, tuple(found), held)

@@ -1,7 +1,6 @@
 """Writes identified parameters and effects into the text of an MJCF file."""
 
 import copy
-import importlib
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,13 +13,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.engines.common.robot_files import RobotFiles, read_robot, references
+from npdr_ppl.engines.common.robot_files import RobotFiles, is_urdf, read_robot, references
 from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
 from npdr_ppl.engines.mujoco.effects_in_file import file_assignments, why_not
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.mjcf_edits import Edits, array_of
 from npdr_ppl.engines.mujoco.mjcf_text import MjcfText, flattened
 from npdr_ppl.engines.mujoco.parameters import Assignments
+from npdr_ppl.engines.mujoco.urdf_files import as_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
 
@@ -155,14 +155,7 @@ def _new_text(
 
 def _text_of(file: Path, files: RobotFiles) -> str:
     """Returns the MJCF text of a robot's file; of a URDF file, what MuJoCo makes of it."""
-    (first, *_) = files.trees
-    if files.trees[first].tag != "robot":
-        return flattened(files).decode()
-    mujoco: Any = importlib.import_module("mujoco")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "robot.xml"
-        mujoco.mj_saveLastXML(str(path), load_mjcf(file))
-        return path.read_text(encoding="utf-8")
+    return as_mjcf(file) if is_urdf(files) else flattened(files).decode()
 
 
 def _written(model: Any, assignments: Assignments) -> Any:
