@@ -9,6 +9,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from npdr_ppl.engines.common.robot_files import is_urdf, read_robot
 from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
 from npdr_ppl.engines.mujoco.batches import quiet
@@ -40,12 +43,20 @@ FRICTION_RANGE = (0.0, 2.0)
 temperature change friction by such factors."""
 
 ROTOR_RANGE = (0.0, 10.0)
-"""Prior of an armature of a URDF file, which cannot state any, as factors on the inertia of the
-links that the joint moves. Rotors behind high gears exceed light links, as in a wrist."""
+"""Prior of an armature of a URDF file, which cannot state any, as factors on a typical value. This
+is the inertia of the links that the joint moves or, for light links as those of a wrist, what the
+joint's effort accelerates by ``ROTOR_ACCELERATION``."""
+
+ROTOR_ACCELERATION = 500.0
+"""Usual acceleration in rad/s² of a geared motor without load, behind the gear: 50 N m move a
+rotor of 0.1 kg m² there."""
 
 LEAST_SHARE = 0.001
 """A body lighter than this share of what its joint carries keeps its mass: at most 0.03 % of the
 joint's load would change. Such bodies are placeholders in the file."""
+
+_HINGE = 3
+"""MuJoCo's ``mjJNT_HINGE``."""
 
 _TEMPLATE = '''"""Model of a robot, derived from its file."""
 
@@ -167,7 +178,7 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
         )
     without_rotors = is_urdf(read_robot(source))
     if without_rotors:
-        model.dof_armature[:] = model.dof_M0
+        model.dof_armature[:] = _typical_rotors(model)
     chosen: dict[str, tuple[Field, str, tuple[float, float]]] = {}
     for kind, name, quantity, ends in [*_masses(model), *_joints(model), *_servos(model)]:
         field = find_field(model, f"{kind} {name} {quantity}")
@@ -193,6 +204,17 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
 
 _Choice = tuple[str, str, str, tuple[float, float]]
 """Kind and name of an element, a quantity of it, and factors on the file's value."""
+
+
+def _typical_rotors(model: Any) -> NDArray[np.float64]:
+    """Returns a typical armature of each degree of freedom, in kg m² or kg, ``(nv,)``."""
+    typical = np.array(model.dof_M0)
+    for joint in range(model.njnt):
+        at = int(model.jnt_dofadr[joint])
+        if model.jnt_type[joint] == _HINGE and model.jnt_actfrclimited[joint]:
+            effort = float(model.jnt_actfrcrange[joint, 1])
+            typical[at] = max(typical[at], effort / ROTOR_ACCELERATION)
+    return typical
 
 
 def _masses(model: Any) -> list[_Choice]:
