@@ -116,6 +116,7 @@ def judge(task: Task) -> dict[str, Any]:
         )
         row |= {
             "verdict": found.verdict,
+            "reason": found.reason,
             "problems": list(found.problems),
             "p_value": found.alarm.p_value,
             "left_p_value": found.remainder.p_value,

@@ -3,7 +3,7 @@
 A real cause acts in all parts of a recording with the same strength. A law that compensates for
 something else has another strength wherever the motion is different. The parameters are estimated
 again in each of two disjoint parts, by one Gauss-Newton step from the fit to the whole recording,
-which needs no simulation.
+which needs no simulation. Only where these estimates contradict each other, the parts are fitted.
 """
 
 import math
@@ -18,6 +18,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.search.settings import REPEATABILITY
 from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
 
 __all__ = ["HALVES", "PartEstimate", "Repetition", "halves", "repeated_effects", "repetitions"]
@@ -79,8 +80,8 @@ def repetitions(hypothesis: Hypothesis) -> dict[str, Repetition]:
 
     An effect is not found again if its estimates in two parts differ by more than chance allows,
     and by more than the effect's size. A part that hardly determines the effect contradicts
-    nothing. A contradiction of an effect with local minima counts only if fits of the parts
-    confirm it: a Gauss-Newton step does not lead to another minimum.
+    nothing. A contradiction counts only if fits of the parts confirm it: one Gauss-Newton step is
+    wrong where the motion is sensitive or sticks, and does not lead to another minimum.
 
     Args:
         hypothesis: The fitted model; its effects are compared.
@@ -94,19 +95,24 @@ def repetitions(hypothesis: Hypothesis) -> dict[str, Repetition]:
     if not is_long or not hypothesis.effects or not hypothesis.can_be_linearised:
         return {}
     pairs = list(_pairs(hypothesis.segments.inputs.rollout))
-    by_part = _ByPart(hypothesis)
+    by_part, refitted = _ByPart(hypothesis), _Refitted(hypothesis)
     result = {}
     for effect in hypothesis.effects:
         found = [_compared(by_part, effect, pair, len(pairs)) for pair in pairs]
-        if effect.has_local_minima:
-            found = [
-                each
-                if each.is_found_again
-                else _compared(_Refitted(hypothesis), effect, pair, len(pairs))
-                for each, pair in zip(found, pairs, strict=True)
-            ]
-        contradicted = [each for each in found if not each.is_found_again]
-        result[effect.name] = max(contradicted or found, key=lambda each: each.contradiction)
+        doubtful = sorted(
+            (k for k, each in enumerate(found) if not each.is_found_again),
+            key=lambda k: -found[k].contradiction,
+        )
+        confirmed = None
+        for k in doubtful:
+            try:
+                found[k] = _compared(refitted, effect, pairs[k], len(pairs))
+            except NpdrError:  # a part alone cannot be simulated
+                pass
+            if not found[k].is_found_again:
+                confirmed = found[k]
+                break
+        result[effect.name] = confirmed or max(found, key=lambda each: each.contradiction)
     return result
 
 
@@ -212,17 +218,24 @@ class _Refitted:
 
     def __init__(self, hypothesis: Hypothesis) -> None:
         self._whole = hypothesis
+        self._parts: dict[tuple[int, ...], _ByPart] = {}
 
     def estimate(self, sites: list[str], index: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns mean and covariance of some parameters in a part; see :class:`_ByPart`."""
-        whole = self._whole
-        part = fit_segment_model(
-            whole.segments.along(index),
-            effects=whole.effects,
-            start=whole.parameters,
-            offsets=whole.fit.offsets[index],
-        )
-        return _ByPart(part).estimate(sites, torch.arange(len(index)))
+        """Returns mean and covariance of some parameters in a part; see :class:`_ByPart`.
+
+        Raises:
+            NpdrError: The part cannot be simulated.
+        """
+        whole, key = self._whole, tuple(index.tolist())
+        if key not in self._parts:
+            part = fit_segment_model(
+                whole.segments.along(index),
+                effects=whole.effects,
+                start=whole.parameters,
+                offsets=whole.fit.offsets[index],
+            )
+            self._parts[key] = _ByPart(part)
+        return self._parts[key].estimate(sites, torch.arange(len(index)))
 
 
 def _compared(
