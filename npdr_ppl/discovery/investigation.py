@@ -259,7 +259,7 @@ class Investigation:
                 return draws
         with self._stage(f"posterior {len(self._drawn) + 1}"):
             self.progress.say("drawing parameters")
-            # The original model only predicts; where it lacks effects, its intervals are wrong.
+            # The original model predicts; where it lacks effects, its intervals are wrong.
             is_rough = hypothesis is not self.search.final
             draws = posterior_draws(hypothesis, seed=self.seed, is_rough=is_rough)
         self._drawn.append((hypothesis, draws))

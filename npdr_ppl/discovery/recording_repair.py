@@ -154,10 +154,8 @@ def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollout
     try:
         rollouts.check(simulator.sensors, simulator.actions, allow_extra=True, strict=False)
     except DataError as error:
-        reason = str(error)
-        fault = faults_among(rollouts.notes)[-1:]
-        sentences = (*fault, reason[:1].upper() + reason[1:]) if fault else (reason,)
-        raise DataError(" ".join(sentences)) from None
+        faults = [fault.rstrip(".") for fault in faults_among(rollouts.notes)[-1:]]
+        raise DataError("; ".join((*faults, str(error)))) from None
     limited = limited_commands(rollouts, simulator.actions)
     return replace(rollouts, notes=(*rollouts.notes, *limited)) if limited else rollouts
 

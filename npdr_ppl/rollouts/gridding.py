@@ -415,7 +415,7 @@ def _notes(parts: Sequence[Gridded], channels: Sequence[str]) -> list[str]:
             shared.setdefault(f"{unused} of {unused + taken} measurements", []).append(name)
     if shared:
         num_channels = max(2, len(channels))
-        told = ", ".join(
+        told = "; ".join(
             f"{number} of {', '.join(names) if len(names) < num_channels else 'every channel'}"
             for number, names in shared.items()
         )

@@ -4,7 +4,6 @@ import math
 import re
 
 import mujoco
-import numpy as np
 import pyro
 import pyro.distributions as dist
 import pytest
@@ -12,7 +11,6 @@ import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.engines.mujoco import Scale
-from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
 from npdr_ppl.engines.mujoco.derived_model import derive_model
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
@@ -179,28 +177,6 @@ def test_a_urdf_file_gets_motors(tmp_path):
     ]
     moved = robot.simulate({"hinge_damping": torch.tensor([0.1, 0.2])}, inputs(robot))
     assert float((moved[0] - moved[1]).abs().max()) > 1e-4
-
-
-def test_meshes_of_a_urdf_file_that_are_elsewhere_are_left_out(tmp_path):
-    shape = (
-        '<collision><geometry><mesh filename="package://lever/meshes/{}.stl"/></geometry>'
-        "</collision>"
-    )
-    # A tetrahedron beside the file, although the file says that it is in a package.
-    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]], dtype="<f4")
-    faces = np.zeros(4, dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("end", "<u2")])
-    faces["corners"] = corners[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]]
-    here = bytes(80) + len(faces).to_bytes(4, "little") + faces.tobytes()
-    (tmp_path / "here.stl").write_bytes(here)
-    path = tmp_path / "lever.urdf"
-    path.write_text(
-        LEVER.replace("</inertial>", "</inertial>" + shape.format("here") + shape.format("lost"))
-        .replace('type="continuous"', 'type="revolute"')
-        .replace("<dynamics", '<limit effort="7" lower="-2" upper="2"/><dynamics')
-    )
-    model = load_mjcf(path)
-    assert model.ngeom == 1 and float(model.body_mass[1]) == 1.0
-    assert model.actuator_ctrlrange.tolist() == [[-7.0, 7.0]]
 
 
 @pytest.mark.parametrize(

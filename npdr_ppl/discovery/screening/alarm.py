@@ -38,6 +38,7 @@ class Alarm:
         strongest: Name of the effect, or of the law outside the catalogue, with the least p-value.
         gain: Greatest reduction of the misfit by one candidate or law.
         p_values: P-value of each candidate and law, by name.
+        limit: The p-value up to which it fires.
     """
 
     p_value: float
@@ -45,6 +46,7 @@ class Alarm:
     strongest: str
     gain: float
     p_values: dict[str, float]
+    limit: float
 
 
 def sound_alarm(
@@ -109,17 +111,19 @@ def sound_alarm(
     # Some segments stand out by chance: their gain is used only where that is unlikely.
     unlikely = [moment for moment in moments if values[moment.name] <= false_alarm_rate]
     gains |= {moment.name: moment.gain for moment in unlikely}
+    # Every added effect means one more test of the same recording.
+    limit = false_alarm_rate / (1 + num_looks)
     if not values:
-        return Alarm(1.0, False, "", 0.0, {}), ranking
+        return Alarm(1.0, False, "", 0.0, {}, limit), ranking
     p_value = min(values.values())
     strongest = [name for name, p in values.items() if p == p_value]
     alarm = Alarm(
         p_value,
-        # Every added effect means one more test of the same recording.
-        p_value <= false_alarm_rate / (1 + num_looks),
+        p_value <= limit,
         min(strongest, key=lambda name: (-gains.get(name, 0.0), name)),
         max(gains.values(), default=0.0),
         values,
+        limit,
     )
     return alarm, ranking
 

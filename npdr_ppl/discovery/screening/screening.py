@@ -48,15 +48,18 @@ class Screened:
         """Name of the effect."""
         return self.variant.effect.name
 
-    def gain_by_channel(self, projection: Projection) -> Tensor:
-        """Returns in which channels the misfit falls, ``(C,)``, up to what initial states explain.
+    def shares_by_channel(self, projection: Projection) -> Tensor:
+        """Returns the share of each channel in what the candidate changes, ``(C,)``.
+
+        What initial states and parameters could change as well does not count.
 
         Args:
             projection: The fitted hypothesis.
         """
-        moved = projection.projected(self.variant.change) @ self.sizes
-        num_channels = len(projection.hypothesis.fit.scale)
-        return moved.square().unflatten(-1, (-1, num_channels)).sum((0, 1))
+        change = projection.projected(self.variant.change) @ self.sizes
+        squares = change.square().unflatten(-1, (-1, len(projection.hypothesis.fit.scale)))
+        by_channel = squares.sum((0, 1))
+        return by_channel / by_channel.sum()
 
     def without_change(self) -> "Screened":
         """Returns the candidate without its change along the recording, to save memory."""

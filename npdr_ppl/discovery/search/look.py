@@ -60,7 +60,7 @@ def look(
     separation = separation_matrix(projection, ranking[: SEARCH.num_leading])
     pairs = ranked_pairs(projection, ranking[: SEARCH.num_paired])
     laws = ranked_laws(projection, ranking)
-    by_channel = ranking[0].gain_by_channel(projection) if ranking else None
+    shares = {c.name: c.shares_by_channel(projection) for c in ranking[: SEARCH.num_leading]}
     ranking = [candidate.without_change() for candidate in ranking]
     width = averaged.segments.steps_per_average
     if width > 1:
@@ -71,7 +71,7 @@ def look(
         )
     best = ", ".join(s.name for s in ranking[:3]) or "none"
     report(f"p = {alarm.p_value:.2g} ({alarm.strongest}); the best candidates are {best}")
-    return Round(hypothesis, averaged, alarm, ranking, separation, pairs, laws, by_channel)
+    return Round(hypothesis, averaged, alarm, ranking, separation, pairs, laws, shares)
 
 
 def _counted(variants: Iterator[Variant], num: int, step: Step) -> Iterator[Variant]:

@@ -27,8 +27,8 @@ class Round:
         separation: Distances between the best candidates; see :mod:`separation`.
         pairs: Pairs of the best candidates by joint linear gain.
         laws: Groups of the same law at several joints by joint linear gain.
-        gain_by_channel: Linear gain of the best candidate by channel, ``(C,)``; ``None`` if no
-            candidate has one.
+        shares: Share of each channel in the change by each of the best candidates, ``(C,)``, by
+            name.
         hopeless: Candidates that need not be fitted in full, by name.
         weights: Probability of each candidate fitted in full, by name; ``""`` for no effect.
         trials: The model with each of these candidates, by name.
@@ -41,7 +41,7 @@ class Round:
     separation: Tensor
     pairs: list[Group] = field(default_factory=list)
     laws: list[Group] = field(default_factory=list)
-    gain_by_channel: Tensor | None = None
+    shares: dict[str, Tensor] = field(default_factory=dict)
     hopeless: frozenset[str] = frozenset()
     weights: dict[str, float] = field(default_factory=dict)
     trials: dict[str, Hypothesis] = field(default_factory=dict)
@@ -77,41 +77,43 @@ def explained(first: Hypothesis, final: Hypothesis) -> float:
 
 def is_something_left(first: Round, now: Round) -> bool:
     """Returns whether more is missing than differences between integrators can explain."""
-    if not now.alarm.fired:
+    alarm, before = now.alarm, first.hypothesis
+    if not alarm.fired:
         return False
-    done = explained(first.hypothesis, now.hypothesis)
-    if now.alarm.gain > SEARCH.least_unexplained * done:
+    if alarm.gain > SEARCH.least_unexplained * explained(before, now.hypothesis):
         return True
-    by_channel = now.gain_by_channel
-    if by_channel is None:
-        return False
-    there = _explained_where(by_channel, first.hypothesis, now.hypothesis)
-    return float(by_channel.sum()) > SEARCH.least_unexplained * there
+    return any(
+        candidate.gain
+        > SEARCH.least_unexplained
+        * _explained_where(now.shares[candidate.name], before, now.hypothesis)
+        for candidate in now.ranking
+        if candidate.name in now.shares and alarm.p_values[candidate.name] <= alarm.limit
+    )
 
 
 def is_negligible(first: Hypothesis, current: Hypothesis, extended: Hypothesis) -> bool:
     """Returns whether the last addition explains a negligible share of all that was explained."""
-    if extended is current:
+    added = 0.0 if extended is current else explained(current, extended)
+    if added == 0.0:
         return True
     scale = closest([current, extended]).fit.scale
-    by_channel = (current.squares(scale) - extended.squares(scale)).clamp_min(0.0)
-    there = _explained_where(by_channel, first, extended)
-    return explained(current, extended) < SEARCH.least_unexplained * there
+    reduction = (current.squares(scale) - extended.squares(scale)).clamp_min(0.0)
+    shares = reduction / reduction.sum().clamp_min(1e-300)
+    return added < SEARCH.least_unexplained * _explained_where(shares, first, extended)
 
 
-def _explained_where(by_channel: Tensor, first: Hypothesis, final: Hypothesis) -> float:
-    """Returns the reduction of the misfit in the channels in which another one is.
+def _explained_where(shares: Tensor, first: Hypothesis, final: Hypothesis) -> float:
+    """Returns the reduction of the misfit, weighted by channel.
 
-    Precise channels can make up nearly all of the reduction. A large misfit that is left in a
-    channel with more noise is not small beside them. If both reductions are spread alike over C
-    equal channels, the result is that over all channels.
+    A precise channel can hold nearly all of the reduction. A misfit in a noisy channel is compared
+    with that channel's own reduction.
 
     Args:
-        by_channel: The other reduction by channel, ``(C,)``.
+        shares: Weight of each channel, ``(C,)``. With equal weights the result is the whole
+            reduction, which it never exceeds.
         first: The original model.
         final: The model whose reduction is returned.
     """
     scale = closest([first, final]).fit.scale
-    fell = (first.squares(scale) - final.squares(scale)).clamp_min(0.0)
-    place = by_channel / by_channel.sum().clamp_min(1e-300)
-    return min(explained(first, final), len(place) * float(place @ fell))
+    reduction = (first.squares(scale) - final.squares(scale)).clamp_min(0.0)
+    return min(explained(first, final), len(shares) * float(shares @ reduction))

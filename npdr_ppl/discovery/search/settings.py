@@ -61,8 +61,8 @@ class SearchSettings:
             ones: a log evidence of −230. An error of the steps of 10 standard deviations, of which
             the parameters absorb most, changes it by up to 10 √(2 · 230), less than itself.
         least_unexplained: Stop when the unexplained misfit is below this fraction of the explained
-            misfit. If a large effect was missing, differences between integrators and in details
-            of the laws are this large.
+            misfit, over all channels and in those in which it is. If a large effect was missing,
+            differences between integrators and in details of the laws are this large.
         num_leading: Number of best candidates whose pairwise distances are computed.
         num_paired: Number of best candidates whose pairs are screened.
         prior_of_any: Prior probability that any effect of the catalogue is missing.

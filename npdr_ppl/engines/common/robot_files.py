@@ -21,12 +21,14 @@ from npdr_ppl.reading_limits import LIMITS
 
 __all__ = [
     "RobotFiles",
+    "asset_folders",
     "is_inside",
     "is_urdf",
     "located",
     "read_robot",
     "references",
     "relative_to",
+    "urdf_mesh",
 ]
 
 _ROOTS = ("mujoco", "mujocoinclude")
@@ -45,6 +47,11 @@ _FACTORS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40, "p": 2**50, "
 
 _BLOCK = 2**16
 """Characters that are parsed at a time."""
+
+_FOLDERS = ("assetdir", "meshdir", "texturedir")
+"""Attributes of MJCF's compiler element that name folders of further files."""
+
+_PACKAGE = "package://"
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -115,8 +122,39 @@ def read_robot(path: str | PathLike[str]) -> RobotFiles:
 
 
 def is_urdf(files: RobotFiles) -> bool:
-    """Returns whether a robot's first file is a URDF file."""
-    return next(iter(files.trees.values())).tag == "robot"
+    """Returns whether a robot's first file is a URDF file; ``False`` if there is no such file."""
+    first = next(iter(files.trees.values()), None)
+    return first is not None and first.tag == "robot"
+
+
+def urdf_mesh(folder: Path, name: str, mesh_folder: str = "") -> Path | None:
+    """Returns where a mesh of a URDF file is, ``None`` if it is nowhere.
+
+    A URDF file of ROS names a mesh in a package, whose folder is usually above the file's. Other
+    places are the path as it is written, the folder that an extension for MuJoCo names, and the
+    file's own folder.
+
+    Args:
+        folder: Folder of the URDF file.
+        name: The mesh as the file names it.
+        mesh_folder: ``meshdir`` of the extension.
+    """
+    package, _, rest = name.removeprefix(_PACKAGE).partition("/")
+    written = name.removeprefix("file://")
+    places = [folder / mesh_folder / written, folder / written]
+    if name.startswith(_PACKAGE):
+        above = [*folder.absolute().parents, folder.absolute()]
+        places = [path / rest for path in above if path.name == package]
+        places.append(folder / package / rest)
+    places.append(folder / Path(written).name)
+    return next((place for place in places if _is_file(place)), None)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # the name is too long or has a null byte
+        return False
 
 
 def is_inside(folder: Path, name: str) -> bool:
@@ -232,10 +270,14 @@ def _parts(files: RobotFiles, name: str, known: dict[str, float]) -> float:
 
 def _check(files: RobotFiles, tree: ElementTree.Element, name: str) -> None:
     """Checks the sizes that an MJCF file states."""
-    for reference in references(tree):
-        _check_mesh(files.folder / reference.removeprefix("package://"))
     if tree.tag not in _ROOTS:
+        for place in asset_folders(tree):
+            for reference in references(tree):
+                if (found := urdf_mesh(files.folder, reference, place)) is not None:
+                    _check_mesh(found)
         return
+    for reference in references(tree):
+        _check_mesh(files.folder / reference)
     folders = [files.folder / compiler.get("texturedir", "") for compiler in tree.iter("compiler")]
     for element in tree.iter():
         for word, value in element.items():
@@ -257,6 +299,12 @@ def _check(files: RobotFiles, tree: ElementTree.Element, name: str) -> None:
                 f"{name} has a picture or height field of {pixels:.4g} points, more than "
                 f"{LIMITS.free_bytes // 4}."
             )
+
+
+def asset_folders(tree: ElementTree.Element) -> list[str]:
+    """Returns the folders in which a file's assets may be, relative to its own; that one first."""
+    found = [compiler.get(name, "") for compiler in tree.iter("compiler") for name in _FOLDERS]
+    return list(dict.fromkeys(["", *found]))
 
 
 def references(tree: ElementTree.Element) -> Iterator[str]:

@@ -2,22 +2,28 @@
 
 import hashlib
 import importlib
+import os
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from npdr_ppl.engines.common.robot_files import is_inside, read_robot, references
+from npdr_ppl.engines.common.robot_files import (
+    asset_folders,
+    is_inside,
+    is_urdf,
+    read_robot,
+    references,
+    urdf_mesh,
+)
 from npdr_ppl.reading_limits import LIMITS
 
 __all__ = ["recorded_files", "recorded_mjcf"]
 
 OUTSIDE = "not recorded: outside of the folder of the description"
 """What is recorded of an asset that is neither in the robot's folder nor below it."""
-
-# Attributes of MJCF's compiler element that name folders of further files.
-_FOLDERS = ("assetdir", "meshdir", "texturedir")
 
 
 def recorded_files(source: str | PathLike[str]) -> dict[str, Any]:
@@ -35,12 +41,13 @@ def recorded_files(source: str | PathLike[str]) -> dict[str, Any]:
         ModelError: A file outside of the folder is included; see :func:`read_robot`.
     """
     files = read_robot(source)
-    folders = [""]
-    for tree in files.trees.values():
-        for compiler in tree.iter("compiler"):
-            folders += [compiler.get(name, "") for name in _FOLDERS]
+    folders = [place for tree in files.trees.values() for place in asset_folders(tree)]
     names = {name for tree in files.trees.values() for name in references(tree)}
-    assets = {name: _digest(files.folder, name, folders) for name in sorted(names)}
+    find = urdf_mesh if is_urdf(files) else _found
+    assets = {
+        name: _digest(files.folder, [find(files.folder, name, place) for place in folders])
+        for name in sorted(names)
+    }
     return {"file": Path(source).name, "text": files.texts, "assets": assets}
 
 
@@ -60,12 +67,17 @@ def recorded_mjcf(source: Any) -> dict[str, Any]:
     return {"file": None, "model_sha256": hashlib.sha256(compiled.tobytes()).hexdigest()}
 
 
-def _digest(folder: Path, name: str, places: list[str]) -> str | None:
-    for place in places:
-        file = folder / place / name
-        if not file.is_file() or file.stat().st_size > LIMITS.file_bytes:
+def _found(folder: Path, name: str, place: str) -> Path | None:
+    """Returns an asset of an MJCF file in one of its folders; ``None`` if it is not there."""
+    file = folder / place / name
+    return file if file.is_file() else None
+
+
+def _digest(folder: Path, places: Iterable[Path | None]) -> str | None:
+    for file in places:
+        if file is None or file.stat().st_size > LIMITS.file_bytes:
             continue
-        if not is_inside(folder, str(Path(place) / name)):
+        if not is_inside(folder, os.path.relpath(file, folder)):
             return OUTSIDE
         with file.open("rb") as content:
             return hashlib.file_digest(content, "sha256").hexdigest()

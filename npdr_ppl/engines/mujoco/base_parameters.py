@@ -61,18 +61,15 @@ def load_mjcf(source: Any) -> Any:
     mujoco: Any = importlib.import_module("mujoco")
     if not isinstance(source, str | PathLike):
         return source
-    files = read_robot(source)
+    kind = "URDF" if is_urdf(read_robot(source)) else "MJCF"
+    compiled = compiled_urdf if kind == "URDF" else mujoco.MjModel.from_xml_path
     try:
-        if is_urdf(files):
-            model = compiled_urdf(source)
-        else:
-            model = mujoco.MjModel.from_xml_path(str(source))
+        model = compiled(str(source))
         # A model may compile although the memory that it reserves is too small for it.
         mujoco.mj_forward(model, mujoco.MjData(model))
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())[:MAX_REASON].rstrip(".")
         reason = reason if reason.isprintable() else ascii(reason)
-        kind = "URDF" if is_urdf(files) else "MJCF"
         raise ModelError(f"{source} is not a readable {kind} file: {reason}.") from error
     step, field = model.opt.timestep, np.concatenate((model.opt.gravity, model.opt.wind))
     if not (0 < step < math.inf and np.all(np.abs(field) < MAX_FIELD)):

@@ -3,14 +3,13 @@
 The model is Python text, so that what runs is what a user can print and edit.
 """
 
+import copy
+import importlib
 import re
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from npdr_ppl.engines.common.robot_files import is_urdf, read_robot
 from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
@@ -43,9 +42,9 @@ FRICTION_RANGE = (0.0, 2.0)
 temperature change friction by such factors."""
 
 ROTOR_RANGE = (0.0, 10.0)
-"""Prior of an armature of a URDF file, which cannot state any, as factors on a typical value. This
-is the inertia of the links that the joint moves or, for light links as those of a wrist, what the
-joint's effort accelerates by ``ROTOR_ACCELERATION``."""
+"""Prior of an armature of a URDF file, which cannot state any, as factors on a typical value: the
+inertia about the joint, or effort / ``ROTOR_ACCELERATION`` if that is larger, as in a wrist. Where
+an effort is a placeholder, the largest inertia about any joint limits this."""
 
 ROTOR_ACCELERATION = 500.0
 """Usual acceleration in rad/s² of a geared motor without load, behind the gear: 50 N m move a
@@ -54,9 +53,6 @@ rotor of 0.1 kg m² there."""
 LEAST_SHARE = 0.001
 """A body lighter than this share of what its joint carries keeps its mass: at most 0.03 % of the
 joint's load would change. Such bodies are placeholders in the file."""
-
-_HINGE = 3
-"""MuJoCo's ``mjJNT_HINGE``."""
 
 _TEMPLATE = '''"""Model of a robot, derived from its file."""
 
@@ -156,9 +152,10 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
 
     These are the masses of the bodies that joints move, with their inertias; damping, armature and
     friction loss of joints, where the file has positive values; and kp and kv of position and
-    velocity servos. A URDF file cannot state armatures, so all of its joints get one. The priors
-    are uniform around the file's values. What positions do not determine beside the others keeps
-    the file's value; see :func:`~npdr_ppl.engines.mujoco.dependent_fields.dependent_fields`.
+    velocity servos. Of a URDF file, which cannot state armatures, those of all joints are varied,
+    too. The priors are uniform, around the file's values or from zero. What positions do not
+    determine beside the others keeps the file's value; see
+    :func:`~npdr_ppl.engines.mujoco.dependent_fields.dependent_fields`.
 
     Args:
         source: Path of the file.
@@ -176,27 +173,29 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
             f"{title} has actuators with states of their own, such as filters, which recordings "
             "do not contain; remove them, e.g. timeconst, and let npdr discover find a lag."
         )
-    without_rotors = is_urdf(read_robot(source))
-    if without_rotors:
-        model.dof_armature[:] = _typical_rotors(model)
+    has_rotors = not is_urdf(read_robot(source))
+    typical = model if has_rotors else _with_rotors(model)
+    armature = ARMATURE_RANGE if has_rotors else ROTOR_RANGE
     chosen: dict[str, tuple[Field, str, tuple[float, float]]] = {}
-    for kind, name, quantity, ends in [*_masses(model), *_joints(model), *_servos(model)]:
-        field = find_field(model, f"{kind} {name} {quantity}")
+    for kind, name, quantity, ends in [
+        *_masses(typical),
+        *_joints(typical, armature),
+        *_servos(typical),
+    ]:
+        field = find_field(typical, f"{kind} {name} {quantity}")
         if field.nominal is not None and field.nominal > 0.0:
             chosen[field.text] = field, f"{name}_{quantity}".removesuffix("_and_inertia"), ends
     order = sorted((f for f, *_ in chosen.values()), key=_preference)
     with quiet():
-        held = dependent_fields(model, order) if order else {}
+        held = dependent_fields(typical, order) if order else {}
     found: list[DerivedParameter] = []
     for text, (field, name, (low, high)) in chosen.items():
-        if text in held:
-            continue
-        own, value, typical = _identifier(name, [p.name for p in found]), 0.0, field.nominal or 0.0
-        if without_rotors and text.endswith(" armature"):
-            low, high = ROTOR_RANGE
-        else:
-            value = typical
-        found.append(DerivedParameter(own, text, field.unit, value, low * typical, high * typical))
+        if text not in held:
+            own, value = _identifier(name, [p.name for p in found]), field.nominal or 0.0
+            in_file = find_field(model, text).nominal or 0.0
+            found.append(
+                DerivedParameter(own, text, field.unit, in_file, low * value, high * value)
+            )
     if not found:
         raise ModelError(f"{title} has no masses, friction or gains that its motion depends on.")
     return DerivedModel(title, tuple(found), held)
@@ -206,15 +205,22 @@ _Choice = tuple[str, str, str, tuple[float, float]]
 """Kind and name of an element, a quantity of it, and factors on the file's value."""
 
 
-def _typical_rotors(model: Any) -> NDArray[np.float64]:
-    """Returns a typical armature of each degree of freedom, in kg m² or kg, ``(nv,)``."""
-    typical = np.array(model.dof_M0)
-    for joint in range(model.njnt):
-        at = int(model.jnt_dofadr[joint])
-        if model.jnt_type[joint] == _HINGE and model.jnt_actfrclimited[joint]:
-            effort = float(model.jnt_actfrcrange[joint, 1])
-            typical[at] = max(typical[at], effort / ROTOR_ACCELERATION)
-    return typical
+def _with_rotors(model: Any) -> Any:
+    """Returns a copy with a typical armature of each hinge and slide; see ``ROTOR_RANGE``."""
+    mujoco: Any = importlib.import_module("mujoco")
+    hinge, slide = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+    result, kinds = copy.copy(model), model.jnt_type.tolist()
+    places = model.jnt_dofadr.tolist()
+    inertias = [float(model.dof_M0[p]) for p, k in zip(places, kinds, strict=True) if k == hinge]
+    for joint, (kind, place) in enumerate(zip(kinds, places, strict=True)):
+        if kind not in (hinge, slide):
+            continue
+        typical = float(model.dof_M0[place])
+        if kind == hinge and model.jnt_actfrclimited[joint]:
+            rotor = float(model.jnt_actfrcrange[joint, 1]) / ROTOR_ACCELERATION
+            typical = max(typical, min(rotor, max(inertias)))
+        result.dof_armature[place] = typical
+    return result
 
 
 def _masses(model: Any) -> list[_Choice]:
@@ -227,11 +233,11 @@ def _masses(model: Any) -> list[_Choice]:
     return chosen
 
 
-def _joints(model: Any) -> list[_Choice]:
+def _joints(model: Any, armature: tuple[float, float]) -> list[_Choice]:
     ranges = {
         "damping": FRICTION_RANGE,
         "frictionloss": FRICTION_RANGE,
-        "armature": ARMATURE_RANGE,
+        "armature": armature,
     }
     names = element_names(model, "joint")
     return [("joint", name, word, ends) for word, ends in ranges.items() for name in names]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
+from xml.etree import ElementTree
 
 import numpy as np
 import torch
@@ -76,23 +77,39 @@ def export_mjcf(
     step = time_step / simulator.num_substeps(time_step)
     files = read_robot(simulator.file)
     before = _text_of(simulator.file, files)
-    needs_folder = any(True for tree in files.trees.values() for _ in references(tree))
+    # Of a URDF file, meshes that were not found are left out.
+    trees = [ElementTree.fromstring(before)] if is_urdf(files) else files.trees.values()
+    needs_folder = any(True for tree in trees for _ in references(tree))
     place = simulator.file.parent if needs_folder else None
-    kept, refused = _effects_that_fit(simulator, given, before, step, place)
+    original = _Original(before, step, place, has_six_digits=is_urdf(files))
+    kept, refused = _effects_that_fit(simulator, given, original)
     chosen = copy.copy(simulator)
     chosen.effects = kept
-    text = _new_text(chosen, given, before, step, place)
+    text = _new_text(chosen, given, original)
     return ExportedMjcf(
         simulator.file.name, simulator.file.parent, before, text, refused, needs_folder
     )
 
 
+@dataclass(frozen=True)
+class _Original:
+    """The text that is changed.
+
+    Attributes:
+        text: The text.
+        step: Seconds per engine step.
+        place: Folder in which the text finds the files that it refers to; any if ``None``.
+        has_six_digits: Whether its numbers have no more.
+    """
+
+    text: str
+    step: float
+    place: Path | None
+    has_six_digits: bool
+
+
 def _effects_that_fit(
-    simulator: MujocoMechanism,
-    given: Mapping[str, Tensor],
-    before: str,
-    step: float,
-    place: Path | None,
+    simulator: MujocoMechanism, given: Mapping[str, Tensor], original: _Original
 ) -> tuple[tuple[Effect, ...], dict[str, str]]:
     """Returns the effects that the file can hold, and why it cannot hold the others.
 
@@ -107,7 +124,7 @@ def _effects_that_fit(
             alone.effects = (effect,)
             own = {n: given[n] for n in effect.parameter_names if n in given}
             try:
-                _new_text(alone, own, before, step, place)
+                _new_text(alone, own, original)
             except ModelError as error:
                 reason = str(error).rstrip(".")
         if reason is None:
@@ -117,21 +134,13 @@ def _effects_that_fit(
     return tuple(kept), refused
 
 
-def _new_text(
-    simulator: MujocoMechanism,
-    given: Mapping[str, Tensor],
-    before: str,
-    step: float,
-    place: Path | None,
-) -> str:
+def _new_text(simulator: MujocoMechanism, given: Mapping[str, Tensor], original: _Original) -> str:
     """Returns the text with values in it.
 
     Args:
         simulator: The simulator with the effects to write.
         given: Values of parameters, float64 numbers.
-        before: The text without them.
-        step: Seconds per engine step.
-        place: Folder in which the text finds the files that it refers to.
+        original: The text without them.
 
     Raises:
         ModelError: A value cannot be written.
@@ -142,14 +151,14 @@ def _new_text(
     assignments = file_assignments(simulator, given)
     # The solver's settings of dry friction follow from what simulations set, without effects.
     set_anyway, _ = simulator.assignments(given, torch.zeros((), dtype=torch.float64))
-    model = _written(simulator.prepared(step, set(set_anyway)), assignments)
-    edits = Edits(MjcfText(before.encode()), simulator.model, model)
+    model = _written(simulator.prepared(original.step, set(set_anyway)), assignments)
+    edits = Edits(MjcfText(original.text.encode()), simulator.model, model)
     for array in dict.fromkeys(array for array, _ in assignments):
         edits.write(array, sorted({at for name, at in assignments if name == array}))
     edits.keep_damping()
-    edits.write_options(step)
+    edits.write_options(original.step)
     text = edits.text.result()
-    _check(text, place, model)
+    _check(text, original, model)
     return text
 
 
@@ -176,23 +185,24 @@ _COMPARED = (
     "qpos0", "qpos_spring", "dof_damping", "dof_dampingpoly", "dof_armature", "dof_frictionloss",
     "geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_solref", "site_pos",
     "actuator_gainprm", "actuator_biasprm", "actuator_dynprm", "actuator_gear",
-    "actuator_forcerange", "actuator_ctrlrange", "tendon_stiffness", "tendon_damping",
-    "tendon_frictionloss", "tendon_armature", "tendon_lengthspring",
+    "actuator_forcerange", "actuator_ctrlrange", "jnt_actfrcrange", "tendon_stiffness",
+    "tendon_damping", "tendon_frictionloss", "tendon_armature", "tendon_lengthspring",
     "opt.gravity", "opt.wind", "opt.density", "opt.viscosity", "opt.timestep", "opt.integrator",
 )  # fmt: skip
 """Arrays of a model that the motion follows from."""
 
 
-def _check(text: str, place: Path | None, wanted: Any) -> None:
+def _check(text: str, original: _Original, wanted: Any) -> None:
     """Raises a ModelError if a file does not have the numbers that it should have.
 
     Args:
         text: The file's text.
-        place: Folder in which it finds the files that it refers to; any if ``None``.
+        original: The text that was changed.
         wanted: The model that it should describe.
     """
+    relative, absolute = (1e-5, 1e-6) if original.has_six_digits else (1e-9, 1e-12)
     with tempfile.TemporaryDirectory() as folder:
-        path = (place or Path(folder)) / f".npdr-{uuid4().hex}.xml"
+        path = (original.place or Path(folder)) / f".npdr-{uuid4().hex}.xml"
         try:
             path.write_text(text, encoding="utf-8")
             found = load_mjcf(path)
@@ -204,7 +214,7 @@ def _check(text: str, place: Path | None, wanted: Any) -> None:
         if not hasattr(wanted, name) and not name.startswith("opt."):
             continue  # of a later version of the engine
         one, other = array_of(found, name).reshape(-1), array_of(wanted, name).reshape(-1)
-        if one.shape != other.shape or not np.allclose(one, other, rtol=1e-9, atol=1e-12):
+        if one.shape != other.shape or not np.allclose(one, other, rtol=relative, atol=absolute):
             raise ModelError(
                 f"The new file's {name} would differ from the model's, because a setting of the "
                 "file replaces it, such as dampratio, inertiafromgeom, springdamper or a <frame>. "

@@ -1,39 +1,51 @@
-"""Models of URDF files as they are: with meshes that are elsewhere, and without actuators."""
+"""Models of URDF files, which have no actuators, and whose meshes are often elsewhere."""
 
 import importlib
+import logging
+import os
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from npdr_ppl.engines.common.robot_files import urdf_mesh
+from npdr_ppl.errors import ModelError
+
 __all__ = ["MOTOR", "as_mjcf", "compiled_urdf"]
+
+_LOGGER = logging.getLogger(__name__)
 
 MOTOR = "_motor"
 """What the motor of a joint has behind the joint's name."""
 
-_PACKAGE = "package://"
+_READABLE = (".stl", ".obj", ".msh")
+"""Endings of the meshes that MuJoCo reads."""
 
 
 def compiled_urdf(path: str | PathLike[str]) -> Any:
-    """Returns the ``mujoco.MjModel`` of a URDF file, with a motor at every joint.
+    """Returns the ``mujoco.MjModel`` of a URDF file, with motors.
 
-    A URDF file has no actuators, unless it has an extension for MuJoCo. So each hinge and slide
-    gets a motor whose command is the joint's torque in N m or force in N, up to the joint's
-    effort.
+    A URDF file has no actuators. So each hinge and slide gets a motor, whose command is the
+    joint's torque in N m or force in N, up to the joint's effort if that is positive. Joints that
+    mimic another one get none.
 
-    A mesh that is neither where the file says nor beside the file is left out. Masses and inertias
-    are in the file itself, so that only contacts of that link are lost.
+    A mesh that is nowhere, or in a format that MuJoCo does not read, is left out, and a warning
+    says so: a link with an ``<inertial>`` loses its contacts only.
 
     Args:
         path: The file.
 
     Raises:
+        ModelError: A link without ``<inertial>`` lacks a mesh, from which its mass would follow.
         ValueError: MuJoCo cannot compile it.
     """
     return _spec(path).compile()
 
 
 def as_mjcf(path: str | PathLike[str]) -> str:
-    """Returns the text of an MJCF file with the same model; see :func:`compiled_urdf`."""
+    """Returns the text of an MJCF file in the same folder with the same model.
+
+    Its numbers have six digits; see :func:`compiled_urdf` for the model.
+    """
     spec = _spec(path)
     spec.compile()
     return str(spec.to_xml())
@@ -43,36 +55,47 @@ def _spec(path: str | PathLike[str]) -> Any:
     mujoco: Any = importlib.import_module("mujoco")
     spec = mujoco.MjSpec.from_file(str(path))
     _find_meshes(spec, Path(path).parent)
-    if not len(spec.actuators):
-        _add_motors(spec)
+    for number, joint in enumerate(spec.joints):
+        joint.name = joint.name or f"joint_{number}"
+    _add_motors(spec)
     return spec
 
 
 def _find_meshes(spec: Any, folder: Path) -> None:
-    """Sets where the meshes are; removes those that cannot be found, with their shapes."""
-    missing = set()
-    for mesh in list(spec.meshes):
-        written = mesh.file.removeprefix(_PACKAGE)
-        places = (Path(spec.meshdir or "") / written, Path(written), Path(Path(written).name))
-        found = next((place for place in places if (folder / place).is_file()), None)
-        if found is None:
-            missing.add(mesh.name)
+    """Sets where the meshes are; removes those that are left out, with their shapes."""
+    missing: dict[str, str] = {}
+    for mesh in spec.meshes:
+        found = urdf_mesh(folder, mesh.file, spec.meshdir or "")
+        if found is None or found.suffix.lower() not in _READABLE:
+            missing[mesh.name] = mesh.file
         else:
-            mesh.file = str((folder / found).absolute())
-    for shape in [*spec.geoms]:
-        if shape.meshname in missing:
+            mesh.file = os.path.relpath(found, folder)
+    spec.meshdir = ""
+    for body in spec.bodies:
+        lacking = [shape for shape in body.geoms if shape.meshname in missing]
+        if lacking and body.name != "world" and not body.explicitinertial:
+            raise ModelError(
+                f"link {body.name} has no <inertial>, and its mesh {missing[lacking[0].meshname]} "
+                "was not found; give the link its mass and inertia, or copy the mesh beside the "
+                "file."
+            )
+        for shape in lacking:
             spec.delete(shape)
-    for mesh in [*spec.meshes]:
+    for mesh in list(spec.meshes):
         if mesh.name in missing:
             spec.delete(mesh)
+    if missing:
+        names = ", ".join(sorted(set(missing.values())))
+        _LOGGER.warning("Links have no contacts where their mesh was not found: %s", names)
 
 
 def _add_motors(spec: Any) -> None:
-    """Adds a motor at every hinge and slide."""
+    """Adds a motor at every hinge and slide that moves by itself."""
     mujoco: Any = importlib.import_module("mujoco")
     kinds = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+    coupled = {e.name1 for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT}
     for joint in spec.joints:
-        if joint.type not in kinds:
+        if joint.type not in kinds or joint.name in coupled:
             continue
         motor = spec.add_actuator(name=joint.name + MOTOR, target=joint.name)
         motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
