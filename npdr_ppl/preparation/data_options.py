@@ -38,10 +38,10 @@ FEWEST_SEGMENTS = 8
 """Least number of segments of a recording that is long enough. With fewer, a test cannot
 distinguish an effect from chance."""
 
-MOST_READINGS = 100_000
-"""Greatest number of measurements that a fit uses, in at least ``FEWEST_SEGMENTS`` segments; 14 s
-of 7 channels at 1 kHz. The derivatives of all measurements are in memory together; a fit of an arm
-of seven joints in ``benchmarks/memory.py`` needed more than 2 GB with three times as many."""
+MOST_READINGS = 80_000
+"""Greatest number of measurements that a fit uses, in at least ``FEWEST_SEGMENTS`` segments; 11 s
+of 7 channels at 1 kHz. The derivatives of all measurements are in memory together; the search of an
+arm of seven joints in ``benchmarks/memory.py`` needed 1.93 GiB with 100 000."""
 
 PLAIN_FEATURES = "bayessim"
 """Features if there is no closest fit, at which the score features are computed."""
