@@ -40,8 +40,8 @@ distinguish an effect from chance."""
 
 MOST_READINGS = 80_000
 """Greatest number of measurements that a fit uses, in at least ``FEWEST_SEGMENTS`` segments; 11 s
-of 7 channels at 1 kHz. The derivatives of all measurements are in memory together; the search of an
-arm of seven joints in ``benchmarks/memory.py`` needed 1.93 GiB with 100 000."""
+of 7 channels at 1 kHz. The derivatives of all measurements are in memory together; the search of
+an arm of seven joints in ``benchmarks/memory.py`` needed 1.93 GiB with 100 000."""
 
 PLAIN_FEATURES = "bayessim"
 """Features if there is no closest fit, at which the score features are computed."""
