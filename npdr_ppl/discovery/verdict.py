@@ -96,7 +96,7 @@ def _best_so_far(effects: Sequence[Finding], options: DiscoveryOptions) -> str:
     names = " and ".join(found.effect.name for found in effects) or "no effect"
     return (
         f"The time limit of {limit:.4g} s ended the search. The best explanation so far is "
-        f"{names}. A longer limit continues the search."
+        f"{names}; not all alternatives to it were tried. A longer limit continues the search."
     )
 
 

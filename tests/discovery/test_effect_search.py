@@ -6,7 +6,7 @@ import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
-from npdr_ppl.discovery.search import shortlist
+from npdr_ppl.discovery.search import rivals, shortlist
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.rivals import with_rivals
 from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
@@ -61,6 +61,22 @@ def test_every_effect_gets_its_own_alternatives(dragged):
         assert set(trials[effect.name, "hinge.cogging"].names) == others | {"hinge.cogging"}
     # The drag is there and the others are not, so that all is lost without it.
     assert added[0].share > 0.5 > added[2].share
+
+
+def test_after_a_time_limit_effects_are_compared_with_nothing_new(dragged, monkeypatch):
+    case, base = dragged
+    both = QuadraticDrag("hinge"), CoulombFriction("hinge")
+    options = npdr.DiscoveryOptions(effects=(*both, Bias("hinge")))
+    searcher = Searcher(case.model, case.fit, options)
+    found = fit_hypothesis(case.model, case.fit, searcher.data_options, effects=both)
+    monkeypatch.setattr(rivals, "find_alternatives", lambda *_, **__: 1 / 0)
+    _, added, _ = with_rivals(
+        found, [searcher.look(base)], searcher.trials, options, stops=lambda: True
+    )
+    assert [each.alternatives for each in added] == [{e.name: 1.0} for e in both]
+    drag, friction = (each.share for each in added)
+    # Only drag is there; without it, friction would explain a part.
+    assert 0.0 <= friction < 0.05 < drag <= 1.0
 
 
 def test_candidates_are_fitted_along_a_part_where_one_explains_very_much(dragged, monkeypatch):

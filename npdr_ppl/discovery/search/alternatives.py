@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.latent_force import responses
-from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.screening.screening import screen
 from npdr_ppl.discovery.screening.settings import GENERIC_LAWS
 from npdr_ppl.discovery.screening.variants import candidates_at, variants_of
@@ -161,7 +161,7 @@ def weigh_alternatives(
         base: The original model.
         current: The model with the effect.
         effect: The effect.
-        alternatives: Its alternatives.
+        alternatives: Its alternatives; ``None`` if it is not compared with any.
         is_approximate: Whether something remains that no law of the catalogue explains. A law
             that contains a simpler one must then explain clearly more than others.
 
@@ -169,7 +169,8 @@ def weigh_alternatives(
         The model with the likeliest effect, and this effect.
     """
     if alternatives is None:
-        return current, Added(effect, effect.name, 1.0, {effect.name: 1.0})
+        share = _linear_share(base, current, effect)
+        return current, Added(effect, effect.name, share, {effect.name: 1.0})
     without, trials = (
         alternatives.without,
         {effect.name: alternatives.with_it} | alternatives.others,
@@ -197,6 +198,14 @@ def weigh_alternatives(
     fitting = _fitting(trials, best)
     swapped = current if best == effect.name else swapped
     return swapped, Added(chosen, effect.name, share, probabilities, fitting)
+
+
+def _linear_share(base: Hypothesis, current: Hypothesis, effect: Effect) -> float:
+    """Returns the share of the explained misfit that is lost without an effect, to first order."""
+    whole = float((base.losses(current.fit.scale) - current.losses(current.fit.scale)).sum())
+    lost = loss_without(current, effect) / current.share if current.can_be_linearised else math.nan
+    # If the model cannot be simulated without the effect, all is lost.
+    return min(1.0, lost / max(whole, 1e-12)) if math.isfinite(lost) else 1.0
 
 
 def _probabilities(

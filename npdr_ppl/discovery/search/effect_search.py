@@ -290,6 +290,7 @@ class Searcher:
             is_approximate=is_approximate,
             report=self._report,
             progress=self._progress.stage("compare with alternatives"),
+            stops=self._deadline.stops,
         )
 
     def _looked(self, current: Hypothesis, rounds: list[Round]) -> Round:

@@ -30,6 +30,7 @@ def with_rivals(
     is_approximate: bool = False,
     report: Callable[[str], None] = lambda _: None,
     progress: Step = lambda fraction, status: None,
+    stops: Callable[[], bool] = lambda: False,
 ) -> tuple[Hypothesis, list[Added], dict[tuple[str, str], Hypothesis]]:
     """Compares each effect with its alternatives, and replaces it if one is likelier.
 
@@ -41,6 +42,7 @@ def with_rivals(
         is_approximate: Whether something remains that no law of the catalogue explains.
         report: Called with a sentence about each effect.
         progress: Called with the fraction of the effects that is compared.
+        stops: Returns whether to compare the rest only with what the search has tried already.
 
     Returns:
         The final model, its effects, and the models with each alternative; see
@@ -54,7 +56,7 @@ def with_rivals(
         asked = current
         compared = num - len(waiting)
         progress(compared / num, f"{compared} of {num} effects compared")
-        of_each = _alternatives(asked, waiting, rounds, trials, options)
+        of_each = _alternatives(asked, waiting, rounds, trials, options, stops)
         for effect, alternatives in zip(waiting, of_each, strict=True):
             waiting = waiting[1:]
             current, found = weigh_alternatives(
@@ -84,8 +86,9 @@ def _alternatives(
     rounds: Sequence[Round],
     trials: Trials,
     options: DiscoveryOptions,
+    stops: Callable[[], bool],
 ) -> Iterator[Alternatives | None]:
-    """Yields the alternatives of each effect, in the order of the effects."""
+    """Yields the alternatives of each effect, in order; ``None`` for those that are not tried."""
     seen = [(r.hypothesis, r.trials) for r in rounds]
     known = {effect.name: tried_before(current, effect, seen) for effect in effects}
     new = [effect for effect in effects if known[effect.name] is None]
@@ -93,5 +96,8 @@ def _alternatives(
     number = num_processes(current.simulator)
     # With fewer effects than processes, it is faster if each search uses all processes.
     found = side_by_side(function, new, number if len(new) >= number else 1)
+    has_stopped = False
     for effect in effects:
-        yield known[effect.name] or next(found)
+        if known[effect.name] is None:
+            has_stopped = has_stopped or stops()
+        yield known[effect.name] or (None if has_stopped else next(found))
