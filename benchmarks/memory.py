@@ -203,7 +203,12 @@ def measured(name: str, recording: Path, out: Path) -> dict[str, Any]:
 
 
 def measured_arm(
-    verbs: list[str], seconds: float, *, has_velocities: bool, time_limit: float
+    verbs: list[str],
+    seconds: float,
+    *,
+    has_velocities: bool,
+    time_limit: float,
+    search_limit: float | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Runs commands with a MJCF file on a recording of an arm; see the module's docstring.
 
@@ -212,6 +217,7 @@ def measured_arm(
         seconds: Duration of the recording.
         has_velocities: Whether the velocities are recorded.
         time_limit: Seconds after which a command is ended.
+        search_limit: Seconds after which ``npdr discover`` searches nothing further.
     """
     # Not at the top: npdr reads this file as a model, wherever its workers run.
     from clean_fits_runs import npdr_command, run
@@ -225,7 +231,10 @@ def measured_arm(
         write_recording_of_arm(recording, seconds, has_velocities=has_velocities)
         for verb in verbs:
             out = folder / verb
-            done = run(npdr_command(verb, model, recording, out, 1), time_limit=time_limit)
+            command = npdr_command(verb, model, recording, out, 1)
+            if verb == "discover" and search_limit:
+                command += ["--time-limit", str(search_limit)]
+            done = run(command, time_limit=time_limit)
             rows[verb] = {
                 "seconds": round(done.seconds, 1),
                 "cpu_seconds": round(done.cpu_seconds, 1),
@@ -266,6 +275,9 @@ def main() -> int:
     parser.add_argument("--model", choices=MODELS, default=MODELS[0])
     parser.add_argument("--commands", help="default: all that the model has")
     parser.add_argument("--time-limit", type=float, default=7200.0, help="s, for the arm")
+    parser.add_argument(
+        "--search-limit", type=float, help="s, the arm's npdr discover --time-limit"
+    )
     parser.add_argument("--limit", type=float, default=2.0, help="GiB")
     parser.add_argument("--out", type=Path, default=Path("memory.json"))
     parser.add_argument("--child", help=argparse.SUPPRESS)
@@ -288,6 +300,7 @@ def main() -> int:
             chosen.seconds,
             has_velocities=chosen.model == "arm",
             time_limit=chosen.time_limit,
+            search_limit=chosen.search_limit,
         )
     found = {"model": chosen.model, "seconds": chosen.seconds, "commands": rows}
     chosen.out.write_text(json.dumps(found, indent=2))
