@@ -47,7 +47,7 @@ def test_the_closed_share_is_that_of_the_gap_above_the_noise_floor():
     assert Gap(3.0, 1.5, 1.0).closed == pytest.approx(0.75)
     assert Gap(3.0, 3.5, 1.0).closed == pytest.approx(-0.25)
     # Nothing is left to close, or there is no floor.
-    assert Gap(1.0, 0.9, 1.0).closed is None and Gap(3.0, 1.0, None).closed is None
+    assert Gap(1.1, 0.9, 1.0).closed is None and Gap(3.0, 1.0, None).closed is None
 
 
 @pytest.mark.slow

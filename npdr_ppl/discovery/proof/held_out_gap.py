@@ -40,8 +40,11 @@ class Gap:
 
     @property
     def closed(self) -> float | None:
-        """Share of the gap above the noise floor that was closed; ``None`` without such a gap."""
-        if self.noise_floor is None or self.before <= self.noise_floor:
+        """Share of the gap above the noise floor that was closed; ``None`` without such a gap.
+
+        There is none if the original model is as close to the floor as a true model may be.
+        """
+        if self.noise_floor is None or self.before <= GAP.excess * self.noise_floor:
             return None
         return (self.before - self.after) / (self.before - self.noise_floor)
 
