@@ -366,3 +366,11 @@ def test_strict_does_not_refuse_how_a_log_was_read(change, tmp_path):
     assert "time is 't', taken as s." in read.notes
     options = npdr.DataOptions(strict=True, initial_state="estimated")
     assert repair(pendulum, read, options).rollouts.notes == read.notes
+
+
+def test_a_refusal_after_a_fault_keeps_the_columns_names():
+    frozen = recording(np.full(400, 0.3), np.gradient(SWING, STEP))
+    with pytest.raises(
+        DataError, match=r"angle never changes.* not used; the column angle is mis"
+    ):
+        repair(pendulum, frozen, npdr.DataOptions())

@@ -369,6 +369,16 @@ def test_measurements_that_share_a_row_move_to_empty_ones(rate, least, seed):
     assert "Not measured" not in " ".join(rollouts.notes)
 
 
+def test_channels_that_lose_as_many_measurements_are_said_together():
+    noise = np.random.default_rng(0).uniform(-0.005, 0.005, 2000)
+    time = np.sort(np.arange(2000) / 250.0 + noise)
+    uneven, regular = track(time), track(np.arange(2000) / 250.0)
+    text = " ".join(made([uneven, uneven]).notes)
+    assert "of 2000 measurements of every channel share a time step" in text
+    text = " ".join(made([uneven, regular]).notes)
+    assert "of 2000 measurements of channel_0 share a time step" in text
+
+
 def test_a_gap_does_not_make_measurements_share_rows():
     noise = np.random.default_rng(0).uniform(-0.2, 0.2, 500)
     time = np.delete(STEP * (np.arange(500) + noise), slice(200, 220))

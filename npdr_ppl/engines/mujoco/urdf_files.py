@@ -10,11 +10,11 @@ from typing import Any
 from npdr_ppl.engines.common.robot_files import urdf_mesh
 from npdr_ppl.errors import ModelError
 
-__all__ = ["MOTOR", "as_mjcf", "compiled_urdf"]
+__all__ = ["as_mjcf", "compiled_urdf"]
 
 _LOGGER = logging.getLogger(__name__)
 
-MOTOR = "_motor"
+_MOTOR = "_motor"
 """What the motor of a joint has behind the joint's name."""
 
 _READABLE = (".stl", ".obj", ".msh")
@@ -76,8 +76,8 @@ def _find_meshes(spec: Any, folder: Path) -> None:
         if lacking and body.name != "world" and not body.explicitinertial:
             raise ModelError(
                 f"link {body.name} has no <inertial>, and its mesh {missing[lacking[0].meshname]} "
-                "was not found; give the link its mass and inertia, or copy the mesh beside the "
-                "file."
+                "was not found or cannot be read; give the link its mass and inertia, or copy the "
+                "mesh as STL or OBJ beside the file."
             )
         for shape in lacking:
             spec.delete(shape)
@@ -86,7 +86,9 @@ def _find_meshes(spec: Any, folder: Path) -> None:
             spec.delete(mesh)
     if missing:
         names = ", ".join(sorted(set(missing.values())))
-        _LOGGER.warning("Links have no contacts where their mesh was not found: %s", names)
+        _LOGGER.warning(
+            "Links have no contacts where their mesh was not found or cannot be read: %s", names
+        )
 
 
 def _add_motors(spec: Any) -> None:
@@ -97,7 +99,7 @@ def _add_motors(spec: Any) -> None:
     for joint in spec.joints:
         if joint.type not in kinds or joint.name in coupled:
             continue
-        motor = spec.add_actuator(name=joint.name + MOTOR, target=joint.name)
+        motor = spec.add_actuator(name=joint.name + _MOTOR, target=joint.name)
         motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
         motor.set_to_motor()
         if joint.actfrcrange[0] < joint.actfrcrange[1]:
