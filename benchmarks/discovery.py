@@ -26,7 +26,7 @@ from typing import Any
 
 import torch
 from discovery_report import print_summary
-from discovery_rows import PAIRS, REMOVED
+from discovery_rows import REMOVED, SEVERAL
 from hidden_rigs import RIGS, Case, Place, make_case, places
 from sparse_regression import sparse_choice
 
@@ -90,7 +90,7 @@ def tasks(
                         # One separation per place and seed, in turn.
                         wanted = separations[(place + number) % len(separations)]
                     else:
-                        wanted = separations[-1] if condition in (*PAIRS, "outside") else 0.0
+                        wanted = separations[-1] if condition in (*SEVERAL, "outside") else 0.0
                     yield Task(rig, condition, place, wanted, seed)
 
 
@@ -146,7 +146,7 @@ def _case(task: Task) -> tuple[Case, float | tuple[float, ...], float]:
         return at(1.0), 1.0, float("nan")
     if task.condition == "beyond":
         return _beyond(task, at)
-    if task.condition in PAIRS:
+    if task.condition in SEVERAL:
         # At the same multiple of their typical sizes, perhaps only one of them is detectable.
         alone = replace(task, condition="one")
         each, found = zip(*(_strength(alone, (place,)) for place in chosen), strict=True)

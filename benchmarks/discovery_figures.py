@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from discovery_rows import (
-    PAIRS,
     REMOVED,
+    SEVERAL,
     Row,
     effect_id,
     first_probability,
@@ -55,7 +55,7 @@ def reliability(rows: Iterable[Row]) -> list[Bin]:
     pairs = [
         (first_probability(row), is_first_right(row))
         for row in rows
-        if row["condition"] in ("one", "inseparable", *PAIRS) and found_names(row)
+        if row["condition"] in ("one", "inseparable", *SEVERAL) and found_names(row)
     ]
     bins = []
     for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
@@ -94,7 +94,7 @@ def confusion(rows: Iterable[Row]) -> dict[str, Counter[str]]:
     """
     table: dict[str, Counter[str]] = defaultdict(Counter)
     for row in rows:
-        if row["condition"] in ("bad_data", "absorbed", *PAIRS):
+        if row["condition"] in ("bad_data", "absorbed", *SEVERAL):
             continue
         truth = effect_id(row["truth"][0]) if row["truth"] else "nothing"
         names = found_names(row)

@@ -10,8 +10,8 @@ from hidden_rigs import RIGS
 
 __all__ = [
     "Judged",
-    "PAIRS",
     "REMOVED",
+    "SEVERAL",
     "Row",
     "effect_id",
     "estimates",
@@ -21,6 +21,7 @@ __all__ = [
     "has_all_classes",
     "has_any",
     "has_too_many",
+    "has_wrong",
     "is_bic_right",
     "is_class_right",
     "is_confident_and_wrong",
@@ -41,8 +42,8 @@ CONFIDENT = 0.9
 REMOVED = ("without", "beyond")
 """Conditions in which the true effect's entry is taken from the catalogue."""
 
-PAIRS = ("two", "two_at_one_place")
-"""Conditions in which two effects are hidden."""
+SEVERAL = ("two", "two_at_one_place", "three")
+"""Conditions in which several effects are hidden."""
 
 Row = dict[str, Any]
 
@@ -146,6 +147,14 @@ def has_any(row: Row) -> bool:
 def has_too_many(row: Row) -> bool:
     """Returns whether more effects were found than any right answer has."""
     return len(found_names(row)) > max(len(right) for right in right_sets(row))
+
+
+def has_wrong(row: Row) -> bool:
+    """Returns whether an effect was found that is no hidden one and is not reported with one."""
+    return any(
+        not any(stands_for(effect, name) for right in right_sets(row) for name in right)
+        for effect in large_effects(row)
+    )
 
 
 def is_bic_right(row: Row) -> bool:

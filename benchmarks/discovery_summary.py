@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from discovery_figures import calibration_error, calibration_error_by_chance, reliability
 from discovery_rows import (
-    PAIRS,
+    SEVERAL,
     Row,
     effect_id,
     estimates,
@@ -20,6 +20,7 @@ from discovery_rows import (
     has_all_classes,
     has_any,
     has_too_many,
+    has_wrong,
     is_bic_right,
     is_class_right,
     is_confident_and_wrong,
@@ -73,6 +74,10 @@ def summary_lines(rows: Sequence[Row]) -> list[Line]:
         _wrong("inseparable: confident wrong name", of["inseparable"], upper=0.02),
         *_pair_lines("two effects", of["two"], both=0.80, third=0.05),
         *_pair_lines("two at one place", of["two_at_one_place"], both=0.90, third=0.03),
+        _rate("three effects: all", of["three"], has_all, lower=0.70),
+        _rate("three effects: all, or in their classes", of["three"], has_all_classes),
+        _rate("three effects: at least one", of["three"], has_any, baselines=_naming(of["three"])),
+        _rate("three effects: a wrong one", of["three"], has_wrong, upper=0.05),
         *(
             _rate(
                 f"{where}: “unknown”",
@@ -229,7 +234,7 @@ def gap_closed(rows: Iterable[Row]) -> list[float]:
 
 
 def _has_visible_gap(row: Row) -> bool:
-    if row["condition"] not in ("one", *PAIRS) or not row["d"] >= STRONG or not row.get("gap"):
+    if row["condition"] not in ("one", *SEVERAL) or not row["d"] >= STRONG or not row.get("gap"):
         return False
     if row.get("true_model") is None:
         return False

@@ -29,14 +29,16 @@ Condition = Literal[
     "one",
     "two",
     "two_at_one_place",
+    "three",
     "inseparable",
     "outside",
     "absorbed",
     "bad_data",
 ]
 """What is hidden: nothing, under four kinds of noise; one effect; two at different ports; two at
-one joint or command; one of a class that the excitation cannot split; one that no catalogue has;
-one that the model's parameters swallow; or nothing, in data that were spoilt."""
+one joint or command; three at different ports; one of a class that the excitation cannot split;
+one that no catalogue has; one that the model's parameters swallow; or nothing, in data that were
+spoilt."""
 
 CONDITIONS: tuple[Condition, ...] = get_args(Condition)
 """All conditions."""
@@ -90,7 +92,8 @@ def cases(
 ) -> Iterator[Case]:
     """Records the cases of a condition one after the other.
 
-    Every place of a rig gets every seed and every strength; ``two`` draws one pair per seed.
+    Every place of a rig gets every seed and every strength; ``two`` draws one pair per seed, and
+    ``three`` one triple.
 
     Args:
         condition: What is hidden.
@@ -113,7 +116,7 @@ def places(rig: str, condition: Condition, seed: int = 0) -> tuple[tuple[Place, 
     Args:
         rig: Name of the rig.
         condition: What is hidden.
-        seed: Draws the pair of condition ``two``.
+        seed: Draws the effects of conditions ``two`` and ``three``.
 
     Raises:
         ModelError: There is no such condition or rig.
@@ -124,7 +127,9 @@ def places(rig: str, condition: Condition, seed: int = 0) -> tuple[tuple[Place, 
     if condition == "bad_data":
         return tuple((("data", kind),) for kind in FAULTS)
     if condition == "two":
-        return (_pair(chosen, seed),)
+        return (_several(chosen, 2, "pair", seed),)
+    if condition == "three":
+        return (_several(chosen, 3, "triple", seed),)
     if condition == "two_at_one_place":
         return chosen.pairs
     groups: dict[str, Sequence[Place]] = {
@@ -221,18 +226,25 @@ def _rig(name: str) -> Rig:
     return RIGS[name]
 
 
-def _pair(rig: Rig, seed: int) -> tuple[Place, ...]:
-    """Draws two effects that no class holds both of, and that act at different ports."""
-    pairs = [
-        (first, second)
-        for first, second in itertools.combinations(rig.effects, 2)
-        if first[0] != second[0]
+def _several(rig: Rig, number: int, key: str, seed: int) -> tuple[Place, ...]:
+    """Draws effects that act at different ports, and of which no class holds two."""
+    choices = [
+        chosen
+        for chosen in itertools.combinations(rig.effects, number)
+        if all(_is_apart(rig, *pair) for pair in itertools.combinations(chosen, 2))
+    ]
+    generator = np.random.default_rng(derived_seed(seed, rig.name, key))
+    return choices[int(generator.integers(len(choices)))]
+
+
+def _is_apart(rig: Rig, first: Place, second: Place) -> bool:
+    """Returns whether two places differ in port and effect, and share no class."""
+    return (
+        first[0] != second[0]
         and first[1] != second[1]
         and (second,) not in rig.inseparable.get(first, ())
         and (second,) not in rig.same.get(first, ())
-    ]
-    generator = np.random.default_rng(derived_seed(seed, rig.name, "pair"))
-    return pairs[int(generator.integers(len(pairs)))]
+    )
 
 
 def _alternatives(

@@ -1,10 +1,11 @@
 """Cases of the blind benchmark: deterministic, complete, and spoilt as they say."""
 
+import itertools
 import time
 
 import numpy as np
 import pytest
-from discovery_rows import PAIRS
+from discovery_rows import SEVERAL
 from hidden_rigs import CONDITIONS, RIGS, cases, make_case, places
 from hidden_rigs.measurement import Measurement, noisy
 
@@ -56,9 +57,13 @@ def test_conditions(condition):
     # Of conditions with many places one strength will do: the loop over strengths is shared.
     strengths = [2.0] if number > 6 else [0.5, 2.0]
     found = list(cases(condition, seeds=[0], rigs=["emps"], strengths=strengths))
-    scaled = condition in ("one", *PAIRS, "inseparable", "outside", "absorbed")
+    scaled = condition in ("one", *SEVERAL, "inseparable", "outside", "absorbed")
     assert len(found) == number * (len(strengths) if scaled else 1)
-    sizes = dict.fromkeys(PAIRS, 2) | {c: 0 for c in CONDITIONS if c.startswith("null")}
+    sizes = (
+        dict.fromkeys(SEVERAL, 2)
+        | {"three": 3}
+        | {c: 0 for c in CONDITIONS if c.startswith("null")}
+    )
     for case in found:
         assert case.condition == condition
         assert len(case.truth) == sizes.get(condition, 1)
@@ -83,6 +88,14 @@ def test_pairs_at_one_place_are_effects_of_the_rig():
             assert len({port for port, _ in pair}) == 1
             assert len(set(pair)) == 2
             assert set(pair) <= set(rig.effects)
+
+
+def test_three_effects_are_apart_from_each_other():
+    for seed in range(5):
+        ((*chosen,),) = places("pendulum", "three", seed)
+        assert len({port for port, _ in chosen}) == 3
+        for first, second in itertools.permutations(chosen, 2):
+            assert (second,) not in RIGS["pendulum"].inseparable.get(first, ())
 
 
 def test_what_comes_to_the_same_is_said():
