@@ -22,7 +22,6 @@ from residual_forces import Array, ResidualForces, residual_forces
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.errors import NpdrError
-from npdr_ppl.models.effects import Cogging
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = [
@@ -37,6 +36,9 @@ __all__ = [
 
 NUM_THRESHOLDS = 40
 """Thresholds tried, from a thousandth of the largest coefficient to the one that keeps none."""
+
+COGGING_ORDERS = range(6, 25)
+"""Periods of cogging per turn in the library."""
 
 RIDGE = 1e-6
 """Weight of the squared coefficients of columns of unit length: keeps collinear ones solvable."""
@@ -144,7 +146,7 @@ def terms(found: ResidualForces, joint: int, actions: Sequence[str]) -> list[Ter
         q, v = motion.positions[:, joint], motion.velocities[:, joint]
         laws = _force_laws(q, v, static)
         if port.coordinate == "rad":
-            laws |= _turning_laws(q, Cogging(port.name).order)
+            laws |= _turning_laws(q)
         named = {(label, port.name, effect): x for (label, effect), x in laws.items()}
         if command < len(actions):
             u, rate = motion.actions[:, command], motion.action_rates[:, command]
@@ -225,13 +227,15 @@ def _force_laws(q: Array, v: Array, static: float) -> Laws:
     }
 
 
-def _turning_laws(q: Array, order: int) -> Laws:
+def _turning_laws(q: Array) -> Laws:
     """Returns waves over the angle of a joint that turns."""
     return {
         ("sin q", "unbalance"): np.sin(q),
         ("cos q", "unbalance"): np.cos(q),
-        (f"sin {order} q", "cogging"): np.sin(order * q),
-        (f"cos {order} q", "cogging"): np.cos(order * q),
+    } | {
+        (f"{name} {order} q", "cogging"): wave(order * q)
+        for order in COGGING_ORDERS
+        for name, wave in (("sin", np.sin), ("cos", np.cos))
     }
 
 

@@ -11,14 +11,11 @@ import numpy as np
 
 from hidden_rigs.mechanics import Array
 
-__all__ = ["COGGING_ORDER", "FORCE_LAWS", "ForceLaw"]
+__all__ = ["FORCE_LAWS", "ForceLaw"]
 
 Values = Mapping[str, float]
 
 ForceLaw = Callable[[Values, Array, Array, float], Array]
-
-COGGING_ORDER = 12
-"""Periods of the cogging per turn, as a data sheet would tell."""
 
 
 def viscous_friction(p: Values, q: Array, v: Array, t: float) -> Array:
@@ -39,7 +36,7 @@ def bias(p: Values, q: Array, v: Array, t: float) -> Array:
 def cogging(p: Values, q: Array, v: Array, t: float) -> Array:
     """Ripples over the angle."""
     amplitude, phase = math.hypot(p["sine"], p["cosine"]), math.atan2(p["cosine"], p["sine"])
-    return amplitude * np.sin(COGGING_ORDER * q + phase)
+    return amplitude * np.sin(p["order"] * q + phase)
 
 
 def spring(p: Values, q: Array, v: Array, t: float) -> Array:

@@ -16,6 +16,9 @@ Values = dict[str, float]
 Size = Callable[[Port, float, Generator], Values]
 """Parameters at a port, for a strength s; everything else comes from the generator."""
 
+COGGING_ORDERS = 6, 25
+"""Range of the periods of cogging per turn of a joint."""
+
 
 def drawn(port: Port, effect_id: str, strength: float, generator: Generator) -> Hidden:
     """Returns an effect of some strength, its signs, phases and shapes drawn.
@@ -80,6 +83,10 @@ def _wave(share: float) -> Size:
         return {"sine": amplitude * math.cos(phase), "cosine": amplitude * math.sin(phase)}
 
     return size
+
+
+def _cogging(port: Port, s: float, g: Generator) -> Values:
+    return {**_wave(0.03)(port, s, g), "order": float(g.integers(*COGGING_ORDERS))}
 
 
 def _asymmetric(port: Port, s: float, g: Generator) -> Values:
@@ -192,7 +199,7 @@ _SIZES: dict[str, Size] = {
     "dead_zone": _share("width", 0.04),
     "actuator_gain": _signed("error", 0.08, is_rated=False),
     "bias": _signed("offset", 0.02, is_rated=True),
-    "cogging": _wave(0.03),
+    "cogging": _cogging,
     "spring": _spring,
     "hardening_spring": _share("stiffness", 0.06, (0, 3)),
     "joint_elasticity": _elasticity,

@@ -1,8 +1,9 @@
 """External forces and changes: ripple, wind, vibration, drift."""
 
+import copy
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 import pyro.distributions as dist
 import torch
@@ -28,7 +29,8 @@ class Cogging(LinearForceEffect):
 
     Args:
         port: Name of the port to attach to.
-        order: Number of periods per turn N, known from the motor's poles and slots.
+        order: Number of periods per turn N, if it is known from the motor's poles and slots and
+            its gear. Otherwise a search takes the best whole number, and N is 12 without a search.
         priors: Priors that replace the effect's own, by parameter name.
     """
 
@@ -42,9 +44,15 @@ class Cogging(LinearForceEffect):
     reference = ARMSTRONG_1994
 
     def __init__(
-        self, port: str, *, order: int = 12, priors: Mapping[str, Distribution] | None = None
+        self,
+        port: str,
+        *,
+        order: float | None = None,
+        priors: Mapping[str, Distribution] | None = None,
     ) -> None:
         super().__init__(port, priors=priors)
+        self.has_ripples = order is None
+        order = 12 if order is None else order
         if order < 1:
             raise ModelError(f"cogging has at least one period per turn, got {order=}.")
         self.order = order
@@ -70,8 +78,19 @@ class Cogging(LinearForceEffect):
         angle = self.order * position
         return torch.sin(angle), torch.cos(angle)
 
+    @property
+    def constants(self) -> dict[str, float]:
+        """The number of periods per turn."""
+        return {"order": self.order}
+
+    def with_ripples(self, number: int) -> Self:
+        """Returns the effect with another number of periods per turn."""
+        changed = copy.copy(self)
+        changed.order = number
+        return changed
+
     def __repr__(self) -> str:
-        return f"Cogging(port={self.port!r}, order={self.order})"
+        return f"Cogging(port={self.port!r}, order={self.order:g})"
 
 
 class PeriodicDisturbance(TimedForceEffect):

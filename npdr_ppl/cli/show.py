@@ -151,6 +151,8 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
                     f"{low:.3g} … {high:.3g}",
                 )
                 name = probability = ""
+            for constant, value in row.get("constants", {}).items():
+                table.add_row("", escape(constant), "", f"{value:.4g}", "", "")
         console.print(table)
         minor = [f"{e['port']}.{e['effect']}" for e in found["effects"] if e.get("is_minor")]
         if minor:

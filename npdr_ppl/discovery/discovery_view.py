@@ -133,17 +133,7 @@ def discovery_html(
     """Returns verdict, findings and gap as HTML."""
     parts = [f"<div><strong>Discovery: {escape(verdict)}</strong><p>{escape(reason)}</p>"]
     if effects:
-        rows = [
-            [
-                f.effect.name if k == 0 else "",
-                f"{f.probability:.0%}" if k == 0 else "",
-                name,
-                f"{p.mean:.4g} ± {p.sd:.2g} {'' if p.unit == '1' else p.unit}",
-                (", ".join(f.equivalent_to) or "–") if k == 0 else "",
-            ]
-            for f in effects
-            for k, (name, p) in enumerate(f.parameters.items())
-        ]
+        rows = [row for found in effects for row in _effect_rows(found)]
         head = ["effect", "probability", "parameter", "estimate", "indistinguishable from"]
         parts.append(table(head, rows))
     if gap:
@@ -159,3 +149,16 @@ def discovery_html(
         ]
         parts.append(table(["held out", "before", "after", "noise floor", "closed"], rows))
     return "".join([*parts, "</div>"])
+
+
+def _effect_rows(found: Finding) -> list[list[str]]:
+    """Returns a row per parameter of an effect; the first one has what concerns the effect."""
+    values = [
+        (name, f"{p.mean:.4g} ± {p.sd:.2g} {'' if p.unit == '1' else p.unit}")
+        for name, p in found.parameters.items()
+    ]
+    values += [(name, f"{value:.4g}") for name, value in found.effect.constants.items()]
+    rows = [["", "", name, value, ""] for name, value in values]
+    rows[0][:2] = found.effect.name, f"{found.probability:.0%}"
+    rows[0][-1] = ", ".join(found.equivalent_to) or "–"
+    return rows

@@ -62,6 +62,7 @@ class Finding:
             "equivalent_to": list(self.equivalent_to),
             "alternatives": self.alternatives,
             "share": self.share,
+            "constants": self.effect.constants,
             "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
             "at_edge": list(self.at_edge),
             "is_minor": self.is_minor,

@@ -82,6 +82,8 @@ class Effect(ABC):
         wave: Name of the parameter that is the frequency in Hz of a wave in time, empty if none
             is. Priors are too wide to hit a wave's frequency, so a search takes it from the
             spectrum of the residuals and corrects for the number of frequencies it examined.
+        has_ripples: Whether it repeats a whole and unknown number of times per turn of a joint. A
+            search finds the number in the same way, and sets it by :meth:`with_ripples`.
         incidental: Names of shape parameters without which the law is still the same cause.
         contains: Ids of the simpler laws at the same port whose sum it equals at a limit of its
             shape.
@@ -102,6 +104,7 @@ class Effect(ABC):
     has_local_minima: ClassVar[bool] = False
     is_noise: ClassVar[bool] = False
     wave: ClassVar[str] = ""
+    has_ripples: bool = False
     incidental: ClassVar[tuple[str, ...]] = ()
     contains: ClassVar[tuple[str, ...]] = ()
     beside: ClassVar[tuple[str, ...]] = ()
@@ -195,6 +198,15 @@ class Effect(ABC):
     def name(self) -> str:
         """``"<port>.<effect>"``, unique within a simulator."""
         return f"{self.port}.{self.id}"
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """Numbers of the law that are known, and so are no parameters."""
+        return {}
+
+    def with_ripples(self, number: int) -> Self:
+        """Returns the effect with another number of ripples per turn; see :attr:`has_ripples`."""
+        return self
 
     @property
     def may_cover_several(self) -> bool:
@@ -364,6 +376,10 @@ class ActionEffect(Effect):
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("action", "servo")
     may_be_shared: ClassVar[bool] = False
 
+    def with_ripples(self, number: int) -> Self:
+        """Returns the effect with another number of ripples per turn; see :attr:`has_ripples`."""
+        return self
+
     @property
     def may_cover_several(self) -> bool:
         """Whether several commands may have it; see ``may_be_shared``."""
@@ -439,6 +455,10 @@ class SensorEffect(Effect):
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
     needs_past: ClassVar[bool] = False
     spans: ClassVar[tuple[SensorSpan, ...]] = ("position", "rate", "positions", "rates")
+
+    def with_ripples(self, number: int) -> Self:
+        """Returns the effect with another number of ripples per turn; see :attr:`has_ripples`."""
+        return self
 
     @property
     def may_cover_several(self) -> bool:

@@ -169,6 +169,15 @@ class Recording:
             for first, end in spans
         )
 
+    @property
+    def usable_actions(self) -> tuple[Array, ...]:
+        """The actions of every usable stretch of every rollout, ``(T, A)`` each."""
+        return tuple(
+            actions[first:end]
+            for actions, spans in zip(self.actions, self.spans, strict=True)
+            for first, end in spans
+        )
+
     def sampling(self, index: int) -> Sampling:
         """Returns the measurements of one rollout as they were taken."""
         return self.samplings[index] if self.samplings else Sampling.at_rows(self.readings[index])

@@ -24,7 +24,7 @@ def laws(projection):
     ports = {name: PulseChanges(projection, change) for name, change in found.by_port.items()}
     sensors = projection.hypothesis.simulator.sensors
     every = generic_laws(found, ports, sensors) + ripple_laws(found, ports, sensors)
-    every += [wave for port in wave_laws(found, ports).values() for wave in port]
+    every += wave_laws(found, ports)
     (change,) = found.by_port.values()
     return [law.change for law in every], change
 

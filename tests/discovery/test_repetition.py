@@ -34,8 +34,8 @@ def test_other_motions_have_none(motion):
     assert period_of(motion[:, None]) is None
 
 
-@pytest.mark.parametrize(("frequency", "is_in_step"), [(2 / 3.2, True), (0.7, False)])
-def test_a_wave_is_in_step_where_it_repeats_with_the_motion(frequency, is_in_step):
+def _wave(frequency):
+    """Returns a wave at the hinge, and a fitted model that has it."""
     case = make_case("pendulum", "null", (), strength=1.0, seed=2000)
     effect = PeriodicDisturbance("hinge")
     options = segment_options(case.fit)
@@ -44,12 +44,29 @@ def test_a_wave_is_in_step_where_it_repeats_with_the_motion(frequency, is_in_ste
         case.model, case.fit, options, effects=(effect,), start=start, max_steps=1, is_rough=True
     )
     fitted.parameters[f"{effect.name}.frequency"] = torch.tensor(frequency)
-    motion = np.sin(2.0 * np.pi * TIME / 3.2)[:, None]
-    swings = npdr.Rollouts.from_arrays(
-        [motion],
-        [np.zeros((len(TIME) - 1, 1))],
+    return effect, fitted
+
+
+def _recording(motion, command):
+    return npdr.Rollouts.from_arrays(
+        [motion[:, None]],
+        [command[:-1, None]],
         channel_names=("angle",),
         action_names=("torque",),
         time_step=0.01,
     )
+
+
+@pytest.mark.parametrize(("frequency", "is_in_step"), [(2 / 3.2, True), (0.7, False)])
+def test_a_wave_is_in_step_where_it_repeats_with_the_motion(frequency, is_in_step):
+    effect, fitted = _wave(frequency)
+    swings = _recording(np.sin(2.0 * np.pi * TIME / 3.2), np.zeros(len(TIME)))
     assert keeps_in_step(fitted, effect, swings) == is_in_step
+
+
+@pytest.mark.parametrize(("frequency", "is_in_step"), [(2 / 3.2, True), (0.7, False)])
+def test_a_wave_is_in_step_where_it_repeats_with_the_command(frequency, is_in_step):
+    effect, fitted = _wave(frequency)
+    fading = np.exp(-0.3 * TIME) * np.sin(5.0 * TIME)
+    command = np.where(TIME > 3.0, np.sin(2.0 * np.pi * TIME / 3.2), 0.0)  # after a rest
+    assert keeps_in_step(fitted, effect, _recording(fading, command)) == is_in_step

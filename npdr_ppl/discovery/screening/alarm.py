@@ -80,9 +80,7 @@ def sound_alarm(
     chance = LargestStatistic(projection, seed=seed)
     ports = {name: PulseChanges(projection, change) for name, change in found.by_port.items()}
     generic = generic_laws(found, ports, sensors) + reading_laws(projection)
-    waves = wave_laws(found, ports)
-    listed = [wave for port in waves.values() for wave in port]
-    listed += ripple_laws(found, ports, sensors)
+    listed = wave_laws(found, ports) + ripple_laws(found, ports, sensors)
     # Each kind is tested separately, so that many implausible laws do not hide an effect of the
     # catalogue.
     values: dict[str, float] = {}
@@ -102,9 +100,15 @@ def sound_alarm(
     changes = _unexplained(ringing_laws(projection), projection, gains, names)
     for p, name in zip(chance.p_values(changes), names, strict=True):
         values[name] = min(1.0, p / ALARM.ringing_share)
-    for effect in {effect.name: effect for effect in effects if effect.wave}.values():
-        own = [values[wave.name] for wave in waves.get(effect.port, [])]
-        values[effect.name] = min([values[effect.name], *own])
+    by_kind: dict[tuple[str, str], float] = {}
+    for law in listed:
+        key = law.kind, law.port
+        by_kind[key] = min(values[law.name], by_kind.get(key, 1.0))
+    for effect in (candidate.variant.effect for candidate in ranking):
+        kind = "wave" if effect.wave else "ripple" if effect.has_ripples else ""
+        if kind and (kind, effect.port) in by_kind:
+            own = values.get(effect.name, 1.0)
+            values[effect.name] = min(own, by_kind[kind, effect.port])
     moments = forces_at_moments(projection, found)
     for moment in moments:
         values[moment.name] = min(1.0, len(moments) * moment.p_value / ALARM.moment_share)

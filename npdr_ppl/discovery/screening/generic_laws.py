@@ -12,6 +12,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -30,8 +32,13 @@ __all__ = [
     "ringing_laws",
     "ripple_laws",
     "strongest_frequency",
+    "strongest_ripple",
     "wave_laws",
 ]
+
+
+PER_TURN = range(2, GENERIC_LAWS.most_per_turn + 1)
+"""Numbers of ripples per turn that are tried; one ripple per turn is unbalance."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +49,14 @@ class GenericLaw:
         name: Description, e.g. ``"arm: arm_velocity²"``.
         make: Returns the change. It is computed on demand, because the changes of hundreds of
             laws on a long recording do not fit into memory together.
+        port: Port of a law that an effect of the catalogue has with the right frequency.
+        kind: What such an effect is: a wave in time, or a ripple over a position.
     """
 
     name: str
     make: Callable[[], Tensor | ForceChange]
+    port: str = ""
+    kind: Literal["", "wave", "ripple"] = ""
 
     @property
     def change(self) -> Tensor | ForceChange:
@@ -74,23 +85,23 @@ def generic_laws(
     ]
 
 
-def wave_laws(found: Responses, ports: Mapping[str, PulseChanges]) -> dict[str, list[GenericLaw]]:
-    """Returns waves in time of many frequencies, as forces, by port.
+def wave_laws(found: Responses, ports: Mapping[str, PulseChanges]) -> list[GenericLaw]:
+    """Returns waves in time of many frequencies, as forces at every port.
 
     Args:
         found: The responses to pulses.
         ports: The changes that forces can cause, by port.
     """
-    return {
-        port: [
-            GenericLaw(
-                f"{port}: wave of {frequency:.3g} Hz",
-                partial(_waved, pulses, found, frequency),
-            )
-            for frequency in _frequencies(found).tolist()
-        ]
+    return [
+        GenericLaw(
+            f"{port}: wave of {frequency:.3g} Hz",
+            partial(_waved, pulses, found, frequency),
+            port,
+            "wave",
+        )
         for port, pulses in ports.items()
-    }
+        for frequency in _frequencies(found).tolist()
+    ]
 
 
 def ripple_laws(
@@ -107,26 +118,25 @@ def ripple_laws(
     velocities = {sensor.rate_of: sensor.name for sensor in recorded if sensor.rate_of}
     commands = [name for name in found.channels if name not in {s.name for s in recorded}]
     laws = []
-    for position in (s for s in recorded if not s.rate_of and not s.unit.endswith("/s")):
+    for position in _positions(found, sensors):
         x = found.channels[position.name]
-        extent = float(x.max() - x.min())
-        if extent <= 0.0:
-            continue
         factors = {"": torch.ones_like(x)}
         factors |= {f"{name} times ": found.channels[name] for name in commands}
         if position.name in velocities:
             direction = _sign(found.channels[velocities[position.name]])
             factors["direction times "] = direction
-        for j in range(1, GENERIC_LAWS.num_ripples + 1):
-            number = j * math.pi / extent
-            name = f"ripple of {number:.3g} 1/{position.unit} in {position.name}"
+        for (port, pulses), (text, factor) in product(ports.items(), factors.items()):
+            is_own = (
+                not text and position.unit == "rad" and found.positions.get(port) == position.name
+            )
             laws += [
                 GenericLaw(
-                    f"{port}: {text}{name}",
+                    f"{port}: {text}ripple of {number:.3g} 1/{position.unit} in {position.name}",
                     partial(_rippled, pulses, factor, x, number),
+                    port,
+                    "ripple" if is_own else "",
                 )
-                for port, pulses in ports.items()
-                for text, factor in factors.items()
+                for number in (PER_TURN if is_own else _numbers(x))
             ]
     return laws
 
@@ -137,9 +147,31 @@ def _waved(pulses: PulseChanges, found: Responses, frequency: float) -> ForceCha
 
 def _rippled(pulses: PulseChanges, factor: Tensor, x: Tensor, number: float) -> ForceChange:
     """Returns the change from a factor times a ripple over x, both ``(S, pulses)``."""
+    return ForceChange(pulses, factor[..., None] * _ripple(x, number))
+
+
+def _ripple(x: Tensor, number: float) -> Tensor:
+    """Returns sine and cosine of a position at the pulses, ``(S, pulses, 2)``."""
     phase = number * (x - x.mean())
-    ripple = torch.stack((phase.sin(), phase.cos()), dim=-1)
-    return ForceChange(pulses, factor[..., None] * ripple)
+    return torch.stack((phase.sin(), phase.cos()), dim=-1)
+
+
+def _positions(found: Responses, sensors: Sequence[Channel]) -> list[Channel]:
+    """Returns the recorded positions that change."""
+    return [
+        s
+        for s in sensors
+        if s.name in found.channels
+        and not s.rate_of
+        and not s.unit.endswith("/s")
+        and float(found.channels[s.name].max() - found.channels[s.name].min()) > 0.0
+    ]
+
+
+def _numbers(x: Tensor) -> list[float]:
+    """Returns the wave numbers that are tried over a position."""
+    step = math.pi / float(x.max() - x.min())
+    return [j * step for j in range(1, GENERIC_LAWS.num_ripples + 1)]
 
 
 def reading_laws(projection: Projection) -> list[GenericLaw]:
@@ -261,6 +293,25 @@ def strongest_frequency(projection: Projection, found: Responses, port: str) -> 
     scores = PulseChanges(projection, found.by_port[port]).scores(waves)
     gains = [scores.gain(slice(2 * k, 2 * k + 2)) for k in range(len(frequencies))]
     return float(frequencies[max(range(len(gains)), key=gains.__getitem__)])
+
+
+def strongest_ripple(projection: Projection, found: Responses, port: str) -> int | None:
+    """Returns how many ripples per turn, as a force at a port, explain most.
+
+    The result is ``None`` if the position that the force moves is not recorded or is constant.
+
+    Args:
+        projection: The fitted model.
+        found: The responses to pulses.
+        port: The port.
+    """
+    x = found.channels.get(found.positions.get(port, ""))
+    if x is None or float(x.max() - x.min()) <= 0.0:
+        return None
+    waves = torch.cat([_ripple(x, number) for number in PER_TURN], dim=-1)
+    scores = PulseChanges(projection, found.by_port[port]).scores(waves)
+    gains = [scores.gain(slice(2 * k, 2 * k + 2)) for k in range(len(PER_TURN))]
+    return PER_TURN[max(range(len(gains)), key=gains.__getitem__)]
 
 
 def _frequencies(found: Responses) -> Tensor:

@@ -61,6 +61,7 @@ class Responses:
         by_port: Change of the whitened measurements per unit force, ``(S, N, pulses)``, by port.
         units: Unit of each port's force.
         rated: Each port's rated force.
+        positions: Name of the position that each port's force moves most, if one is recorded.
         channels: Simulated measurements, by channel, and commands, by action, at the beginning of
             each pulse, ``(S, pulses)``.
         time: Beginning of each pulse in seconds since the rollout began, ``(S, pulses)``.
@@ -70,6 +71,7 @@ class Responses:
     by_port: dict[str, Tensor]
     units: dict[str, str]
     rated: dict[str, float]
+    positions: dict[str, str]
     channels: dict[str, Tensor]
     time: Tensor
     rollout: Tensor
@@ -108,7 +110,7 @@ def responses(hypothesis: Hypothesis) -> Responses:
     seconds = edges.double() * inputs.time_step
     box = segments.black_box(fit.z[None])
     base = segments.run(simulator, box.parameters, fit.offsets[None])[0]
-    by_port, units, rated = {}, {}, {}
+    by_port, units, rated, positions = {}, {}, {}, {}
     for port in simulator.ports:
         if port.kind != "force":
             continue
@@ -121,10 +123,19 @@ def responses(hypothesis: Hypothesis) -> Responses:
         }
         starts = fit.offsets[None].expand(len(edges) - 1, -1, -1)
         moved = segments.run(simulator.with_effects(pulse), {**box.parameters, **batch}, starts)
-        change = segments.whitened(moved - base, fit.scale) / height
+        difference = moved - base
+        change = segments.whitened(difference, fit.scale) / height
         if bool(change.isfinite().all()):
             by_port[port.name] = change.permute(1, 2, 0)
             units[port.name], rated[port.name] = port.unit, port.rated
+            moved_by = difference.square().sum((0, 1, 2)).tolist()
+            sizes = {
+                sensor.name: size
+                for sensor, size in zip(segments.measured, moved_by, strict=True)
+                if sensor.unit == port.coordinate and not sensor.rate_of
+            }
+            if sizes:
+                positions[port.name] = max(sizes, key=sizes.__getitem__)
     begins = edges[:-1]
     channels = {
         name: base[:, begins.clamp_min(1) - 1, k].double()
@@ -133,7 +144,7 @@ def responses(hypothesis: Hypothesis) -> Responses:
     for k, name in enumerate(inputs.action_names):
         channels[name] = inputs.actions[:, begins, k].double()
     time = (inputs.start[:, None] + begins) * inputs.time_step
-    return Responses(by_port, units, rated, channels, time.double(), inputs.rollout)
+    return Responses(by_port, units, rated, positions, channels, time.double(), inputs.rollout)
 
 
 def latent_force(projection: Projection, found: Responses) -> list[LatentForce]:

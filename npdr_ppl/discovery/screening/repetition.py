@@ -1,8 +1,9 @@
-"""Periodic motions, and waves that are synchronous with them.
+"""Periodic motions and commands, and waves that are synchronous with them.
 
-Along a periodic motion, any function of the state is a sum of waves with the same period. A
-synchronous wave in time is therefore no external disturbance. It indicates a law of the state that
-the catalogue does not have.
+Along a periodic motion, any function of the state is a sum of waves with the same period. Under a
+periodic command, so is any function of the command, and the driven motion tends to the same
+period. A synchronous wave in time is therefore no external disturbance. It indicates a law of the
+state or of the command that the catalogue does not have.
 """
 
 import numpy as np
@@ -20,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 def keeps_in_step(hypothesis: Hypothesis, effect: Effect, rollouts: Rollouts) -> bool:
-    """Returns whether an effect is a wave that is synchronous with a periodic motion.
+    """Returns whether an effect is a wave that is synchronous with the motion or the commands.
 
     Args:
         hypothesis: A fitted model with the effect.
@@ -30,32 +31,40 @@ def keeps_in_step(hypothesis: Hypothesis, effect: Effect, rollouts: Rollouts) ->
     if not effect.wave:
         return False
     frequency = float(hypothesis.parameters[f"{effect.name}.{effect.wave}"])
-    return all(
-        _is_in_step(frequency, readings, rollouts.time_step)
-        for readings in rollouts.usable_readings
+    return any(
+        all(_is_in_step(frequency, values, rollouts.time_step) for values in signals)
+        for signals in (rollouts.usable_readings, rollouts.usable_actions)
     )
 
 
-def _is_in_step(frequency: float, readings: Array, time_step: float) -> bool:
-    period = period_of(readings)
+def _is_in_step(frequency: float, values: Array, time_step: float) -> bool:
+    values = _without_rest(values)
+    period = period_of(values)
     if period is None:
         return False
     turns = frequency * period * time_step
-    slip = abs(turns - round(turns)) * len(readings) / period
+    slip = abs(turns - round(turns)) * len(values) / period
     return round(turns) > 0 and slip < REPETITION.largest_phase_error
 
 
-def period_of(readings: Array) -> int | None:
-    """Returns the number of steps after which all channels repeat, ``None`` if they do not.
+def _without_rest(values: Array) -> Array:
+    """Returns values from their first change to their last one."""
+    changes = np.flatnonzero(np.any(values[1:] != values[:-1], axis=1))
+    return values[changes[0] : changes[-1] + 2] if len(changes) else values[:1]
+
+
+def period_of(values: Array) -> int | None:
+    """Returns the number of steps after which all columns repeat, ``None`` if they do not.
 
     Args:
-        readings: Measurements, ``(T, C)``; a period longer than half of them is not found.
+        values: Measurements or commands, ``(T, C)``; a period longer than half of them is not
+            found.
     """
-    spread = np.sqrt(2.0) * readings.std(0)
+    spread = np.sqrt(2.0) * values.std(0)
     moving = spread > 0
     if not moving.any():
         return None
-    scaled = readings[:, moving] / spread[moving]
+    scaled = values[:, moving] / spread[moving]
 
     def change(lag: int) -> float:
         return float(np.sqrt(np.square(scaled[lag:] - scaled[:-lag]).mean(0).max()))

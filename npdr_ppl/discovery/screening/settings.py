@@ -77,6 +77,8 @@ class GenericLawSettings:
             resolution of the longest rollout.
         num_ripples: Number of wave numbers tried for a ripple, spaced by half the resolution of a
             position's range.
+        most_per_turn: Greatest number of ripples per turn that is tried at the joint itself.
+            Motors without a gear have up to 84 (12 slots and 14 poles), most of them fewer.
         num_ringing_frequencies: Number of ringing frequencies tried, evenly spaced in their
             logarithm.
         lowest_ringing_frequency: Lowest ringing frequency, in periods per time step; the highest
@@ -87,6 +89,7 @@ class GenericLawSettings:
     sign_width: float = 0.1
     num_frequencies: int = 120
     num_ripples: int = 40
+    most_per_turn: int = 84
     num_ringing_frequencies: int = 30
     lowest_ringing_frequency: float = 0.02
     ringing_damping: float = 0.1
@@ -94,7 +97,8 @@ class GenericLawSettings:
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 0.0, 1.0, "sign_width", "lowest_ringing_frequency", "ringing_damping")
-        check_range(self, 1, 10_000, "num_frequencies", "num_ripples", "num_ringing_frequencies")
+        check_range(self, 1, 10_000, "num_frequencies", "num_ripples")
+        check_range(self, 2, 10_000, "most_per_turn", "num_ringing_frequencies")
 
 
 @dataclass(frozen=True)

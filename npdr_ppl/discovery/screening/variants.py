@@ -7,7 +7,7 @@ from functools import partial
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.equivalents import irreducible
-from npdr_ppl.discovery.screening.generic_laws import strongest_frequency
+from npdr_ppl.discovery.screening.generic_laws import strongest_frequency, strongest_ripple
 from npdr_ppl.discovery.screening.latent_force import Responses
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.sensitivities import Variant, sensitivities
@@ -43,7 +43,9 @@ def variants_of(
     *,
     number: int | None = None,
 ) -> Iterator[Variant]:
-    """Yields the candidates in all shapes and sizes, and waves also at the strongest frequency.
+    """Yields the candidates in all shapes and sizes, waves also at the strongest frequency.
+
+    Ripples have the strongest number per turn.
 
     Args:
         candidates: The effects.
@@ -57,6 +59,33 @@ def variants_of(
         for effect in candidates
         if effect.wave and effect.port in found.by_port
     }
+    candidates, tuned = _with_ripples(candidates, projection, found)
+    for variant in _every(hypothesis, candidates, hints, number):
+        yield replace(variant, is_hinted=True) if variant.effect.name in tuned else variant
+
+
+def _with_ripples(
+    candidates: tuple[Effect, ...], projection: Projection, found: Responses
+) -> tuple[tuple[Effect, ...], set[str]]:
+    """Returns candidates with the strongest ripples, and the names of those that have some."""
+    result, tuned = [], set()
+    for effect in candidates:
+        if effect.has_ripples and effect.port in found.by_port:
+            strongest = strongest_ripple(projection, found, effect.port)
+            if strongest is not None:
+                effect = effect.with_ripples(strongest)
+                tuned.add(effect.name)
+        result.append(effect)
+    return tuple(result), tuned
+
+
+def _every(
+    hypothesis: Hypothesis,
+    candidates: tuple[Effect, ...],
+    hints: Mapping[str, Mapping[str, float]],
+    number: int | None,
+) -> Iterator[Variant]:
+    """Yields the candidates in all shapes and sizes, from several processes if there are any."""
     number = number or num_processes(hypothesis.simulator)
     if number == 1:
         yield from sensitivities(hypothesis, candidates, hints)

@@ -225,8 +225,8 @@ def _is_found_again(trial: Hypothesis, name: str) -> bool:
 
 def log_prior(hypothesis: Hypothesis) -> float:
     """Returns the penalty for searching frequencies: all of them share one hypothesis's prior."""
-    waves = sum(bool(effect.wave) for effect in hypothesis.effects)
-    return -waves * math.log(GENERIC_LAWS.num_frequencies)
+    searched = sum(bool(effect.wave) or effect.has_ripples for effect in hypothesis.effects)
+    return -searched * math.log(GENERIC_LAWS.num_frequencies)
 
 
 def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
