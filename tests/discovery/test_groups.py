@@ -112,8 +112,7 @@ def test_a_pair_that_cannot_be_simulated_is_left_out(rubbed, monkeypatch):
         return None if has_drag else along(self, effects, starts)
 
     monkeypatch.setattr(Trials, "with_effects", without_drag)
-    starts = first.hypothesis.segments.starts
-    found = fit_groups(searcher.trials, first.hypothesis, first.pairs[:3], starts)
+    found = fit_groups(searcher.trials, first.hypothesis, first.pairs[:3], first.hypothesis)
     kept = {pair.name for pair in first.pairs[:3] if "hinge.quadratic_drag" not in pair.names}
     assert set(found) == kept
 

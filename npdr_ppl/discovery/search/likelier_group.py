@@ -45,14 +45,13 @@ def likelier_group(
     Returns:
         ``None`` if no group is likelier.
     """
-    # Losses can be compared only if initial states and their errors are the same.
-    starts = current.segments.starts
-    tried = fit_groups(trials, before, groups[: TRIALS.pairs], starts, report, progress)
+    tried = fit_groups(trials, before, groups[: TRIALS.pairs], current, report, progress)
     if tried:
         tried = {
             name: trial
-            for name, trial in fit_contenders(trials, tried, before).items()
-            if trials.apart_from_waves_in_step(
+            for name, trial in fit_contenders(trials, tried, current, done={"": current}).items()
+            if name
+            and trials.apart_from_waves_in_step(
                 {name: trial}, len(trial.effects) - len(before.effects)
             )
         }

@@ -13,7 +13,6 @@ from npdr_ppl.discovery.search.evidence import closest, evidence
 from npdr_ppl.discovery.search.settings import TRIALS
 from npdr_ppl.discovery.search.trials import Fit, Trials, refit
 from npdr_ppl.preparation.closest_fit import part_of
-from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.progress import Step
 
 __all__ = ["enough_segments", "fit_contenders", "fit_groups", "fit_shortlist"]
@@ -122,7 +121,7 @@ def fit_contenders(
             result[name] = longer
         progress(number / num, f"{number} of {num} best fits converged")
     for name in likeliest:
-        if not is_part or not result.keys().isdisjoint(tried):
+        if not is_part or result:
             break
         # None of the likeliest can be simulated along all segments.
         if name in tried and name not in contenders:
@@ -135,17 +134,21 @@ def fit_groups(
     trials: Trials,
     current: Hypothesis,
     groups: Sequence[Group],
-    starts: InitialStates | None,
+    present: Hypothesis,
     report: Callable[[str], None] = lambda _: None,
     progress: Step = lambda fraction, status: None,
 ) -> dict[str, Hypothesis]:
     """Fits the hypothesis with each of several groups of candidates, from linear estimates.
 
+    As in :func:`fit_shortlist`, a part of the segments is enough where the best group explains
+    very much.
+
     Args:
         trials: Fits the model.
         current: The hypothesis.
-        groups: The groups.
-        starts: Initial states of the segments.
+        groups: The groups, the best first.
+        present: The model to compare with, whose initial states are used: losses can be compared
+            only if these and their errors are the same.
         report: Called with a sentence about each group.
         progress: Called with the fraction of the groups that is fitted.
 
@@ -153,6 +156,13 @@ def fit_groups(
         The model with each group, by the names of its members; groups that cannot be simulated
         are left out.
     """
+    if groups:
+        num = enough_segments(current, 0.5 * current.share * groups[0].gain)
+        if num < current.segments.inputs.num_segments:
+            index = part_of(current.segments, num)
+            trials = Trials(trials.base.along(index))
+            current, present = current.along(index), present.along(index)
+    starts = present.segments.starts
     asked = [
         trials.extension(current, group.effects, group.parameters, starts) for group in groups
     ]

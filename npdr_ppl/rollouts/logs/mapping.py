@@ -58,6 +58,9 @@ class SignalMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         sign: ``-1`` turns the direction around.
         scale: Factor without a unit, e.g. of a gear.
         offset: What to add, in the SI unit.
+        first_turn: Whether whole turns are then subtracted, so that the log begins between −π and
+            π. An encoder counts on when a joint turns, and laws such as springs are no periodic
+            functions of the angle.
     """
 
     signal: str
@@ -65,6 +68,7 @@ class SignalMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sign: int = 1
     scale: float = 1.0
     offset: float = 0.0
+    first_turn: bool = False
 
 
 class Mapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -181,6 +185,13 @@ def _converted(log: Log, name: str, entry: SignalMapping) -> Signal:
     if (factor, entry.sign, entry.scale, entry.offset) != (1.0, 1, 1.0, 0.0):
         with np.errstate(over="ignore", invalid="ignore"):
             values = entry.sign * entry.scale * (values * factor) + entry.offset
+    if entry.first_turn:
+        if unit != "rad":
+            raise DataError(
+                f"first_turn of {name} needs an angle; give the signal a unit such as 'rad'."
+            )
+        begin = values[np.isfinite(values)][:1]
+        values = values - 2.0 * np.pi * np.round(begin.sum() / (2.0 * np.pi))
     return Signal(name, signal.time, values, unit)
 
 

@@ -31,6 +31,22 @@ def test_units_signs_and_offsets():
     assert rollouts.action_names == ()
 
 
+def test_whole_turns_are_subtracted():
+    turned = Signal("/arm/position", TIME, np.linspace(30.0, 50.0, 9), "rad")
+    entry = {"signal": "/arm/position", "first_turn": True, "offset": 0.5}
+
+    def angles(log):
+        mapping = Mapping.of({"channels": {"angle": entry}})
+        return Rollouts.of(mapping.apply(log)).readings[0][:, 0]
+
+    found = angles(Log("x.mcap", (turned,)))
+    assert abs(found[0]) <= np.pi
+    assert (30.5 - found[0]) / (2.0 * np.pi) == pytest.approx(5)
+    np.testing.assert_allclose(np.diff(found), 2.5, rtol=1e-12)
+    with pytest.raises(DataError, match="first_turn of angle needs an angle"):
+        angles(log("mm"))
+
+
 def test_the_logs_own_unit_is_converted_and_an_unknown_one_is_kept():
     plain = Mapping.of({"channels": {"angle": {"signal": "/arm/position"}}})
     assert plain.apply(log("mm")).channel_units == ("m",)
