@@ -31,8 +31,8 @@ def furuta(inputs: Inputs) -> Tensor:
     parameters = {
         "pole_mass": 0.01125,  # kg, of a rod with the authors' moment and moment of inertia
         "arm_length": 0.0935,  # m
-        "motor_constant": 0.103,  # N m/A
-        "motor_resistance": 16.0,  # Ω
+        "motor_constant": pyro.sample("motor_constant", dist.LogNormal(-2.3, 0.7)),  # N m/A
+        "motor_resistance": pyro.sample("motor_resistance", dist.LogNormal(2.8, 0.7)),  # Ω
         "arm_mass": pyro.sample("arm_mass", dist.LogNormal(0.0, 0.7)),  # kg
         "pole_length": pyro.sample("pole_length", dist.LogNormal(-1.8, 0.3)),  # m
         "arm_damping": pyro.sample("arm_damping", dist.HalfNormal(0.01)),  # N m s/rad

@@ -8,6 +8,7 @@ the recording and the recording as it is cannot be explained. What was done is s
 ``Recording.notes``.
 """
 
+import copy
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -201,11 +202,14 @@ class _Windows:
 
     Attributes:
         options: How a recording is cut into segments.
+        few: A part of them, which shows the remedies that help little; ``None`` if the recording
+            is short.
     """
 
     def __init__(self, rollouts: Rollouts, options: DataOptions) -> None:
         """Chooses segments of a recording; those that move are preferred."""
         self.options = options
+        self.few: _Windows | None = None
         self._places: list[tuple[int, int]] | None = None
         used = options.used_segments(rollouts)
         if len(used) <= REPAIR.most_segments:
@@ -215,6 +219,8 @@ class _Windows:
         index = one_of_each_part(REPAIR.most_segments, len(used), seed=0, weights=weights)
         layout = layout_of(rollouts, length)
         self._places = [layout[k][:2] for k in used[index].tolist()]
+        self.few = copy.copy(self)
+        self.few._places = self._places[:: REPAIR.part_of_first_trials]
 
     def fitted(
         self, model: Model, rollouts: Rollouts, start: Mapping[str, Tensor] | None = None
@@ -237,15 +243,18 @@ class _Windows:
 
     def _along(self, segments: SegmentModel) -> SegmentModel:
         """Returns a model along the segments that begin closest to the chosen ones."""
-        if self._places is None:
-            return segments
+        return segments if self._places is None else segments.along(self.index(segments))
+
+    def index(self, segments: SegmentModel) -> Tensor:
+        """Returns the indices of the segments that begin closest to the chosen ones."""
+        assert self._places is not None
         rollout, start = segments.inputs.rollout, segments.inputs.start
         found = set()
         for own, place in self._places:
             distance = (start - place).abs().double().masked_fill(rollout != own, math.inf)
             if bool(distance.isfinite().any()):
                 found.add(int(distance.argmin()))
-        return segments.along(torch.tensor(sorted(found)))
+        return torch.tensor(sorted(found))
 
 
 class _Trials:
@@ -259,6 +268,12 @@ class _Trials:
         self._as_read = None if as_read is None else as_read.parameters
         self.present = {} if as_read is None else _misfits(as_read)
         """Misfit of the recording as it was read, by channel."""
+        self._few: _Windows | None = None
+        self._present_in_few: dict[str, float] = {}
+        if as_read is not None and windows.few is not None:
+            self._few = windows.few
+            part = as_read.along(windows.few.index(as_read.segments))
+            self._present_in_few = _misfits(part)
         self._shifted: dict[str | None, dict[float, Mapping[str, Tensor]]] = {}
         """Fitted parameters by channel and number of steps."""
         self._parameters: dict[str, Mapping[str, Tensor]] = {}
@@ -277,7 +292,16 @@ class _Trials:
             if known:
                 start = known[min(known, key=lambda steps: abs(steps - shift.steps))]
         try:
-            tried = self._windows.fitted(self._model, remedy.apply(self._rollouts), start)
+            changed = remedy.apply(self._rollouts)
+            if self._few is not None:
+                first = self._few.fitted(self._model, changed, start)
+                if first is None:
+                    return math.inf
+                ratio = _relative(_misfits(first), self._present_in_few)
+                if ratio >= REPAIR.hopeless_ratio:
+                    return ratio
+                start = first.parameters
+            tried = self._windows.fitted(self._model, changed, start)
         except NpdrError:
             return math.inf
         if tried is None:
@@ -285,7 +309,7 @@ class _Trials:
         if isinstance(shift, Shift):
             known[shift.steps] = tried.parameters
         self._parameters[remedy.sentence] = tried.parameters
-        return self._relative(_misfits(tried))
+        return _relative(_misfits(tried), self.present)
 
     def ratio_without(self, remedy: Remedy) -> float:
         """Returns the relative misfit without a remedy, fitted from where it was fitted with it.
@@ -296,7 +320,7 @@ class _Trials:
         """
         start = self._parameters[remedy.sentence]
         again = self._windows.fitted(self._model, self._rollouts, start)
-        return 1.0 if again is None else min(1.0, self._relative(_misfits(again)))
+        return 1.0 if again is None else min(1.0, _relative(_misfits(again), self.present))
 
     def ratio_with_wider_priors(self, as_read: Hypothesis) -> float:
         """Returns the relative misfit of the recording as it was read, with wider priors.
@@ -305,11 +329,7 @@ class _Trials:
             as_read: Its fit with the model's own priors.
         """
         widest, _ = with_widest_priors(as_read, is_rough=True)
-        return self._relative(_misfits(widest))
-
-    def _relative(self, found: Mapping[str, float]) -> float:
-        before = {name: self.present[name] for name in found if name in self.present}
-        return _rms(found) / (_rms(before) if before else 1.0)
+        return _relative(_misfits(widest), self.present)
 
 
 def _best(
@@ -374,6 +394,12 @@ def _misfits(hypothesis: Hypothesis) -> dict[str, float]:
     left, moved = ((values * is_counted).sum(0) for values in (residuals, changes))
     ratio = (left / moved.clamp_min(1e-24)).sqrt().clamp_max(10.0).nan_to_num(10.0)
     return dict(zip(segments.channel_names, ratio.tolist(), strict=True))
+
+
+def _relative(found: Mapping[str, float], present: Mapping[str, float]) -> float:
+    """Returns misfits relative to those of the same channels in the recording as it was read."""
+    before = {name: present[name] for name in found if name in present}
+    return _rms(found) / (_rms(before) if before else 1.0)
 
 
 def _rms(misfits: Mapping[str, float]) -> float:

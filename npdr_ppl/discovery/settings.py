@@ -29,6 +29,10 @@ class RepairSettings:
         most_remedies: Greatest number of remedies of one recording.
         most_segments: Greatest number of segments along which remedies are tried. A unit, a sign
             or a clock is wrong in the whole recording. With the default length they last 40 s.
+        part_of_first_trials: Each remedy is first tried along one of so many of these segments.
+        hopeless_ratio: Residual of this trial, relative to that of the recording as it was read,
+            from which the remedy is not tried along all of them. It is far from
+            ``remedy_factor``, below which a remedy may be applied.
         most_suspects: Single channels are suspected only if at most this many joints are not
             explained. If one channel is wrong, its joint and those that it moves are not. If more
             joints are not, the model lacks something in each of them.
@@ -45,6 +49,8 @@ class RepairSettings:
     remedy_factor: float = 0.5
     most_remedies: int = 3
     most_segments: int = 200
+    part_of_first_trials: int = 4
+    hopeless_ratio: float = 0.8
     most_suspects: int = 3
     shifts: tuple[int, ...] = (1, 2, 4, 7, 10, 13, 16, 19)
     longest_delay: float = 0.04
@@ -60,10 +66,12 @@ class RepairSettings:
             "large_residual",
             "disregarded_share",
             "remedy_factor",
+            "hopeless_ratio",
             "longest_delay",
         )
         check_range(self, 1.0, 100.0, "long_shifts")
         check_range(self, 1, 1000, "most_remedies", "most_segments", "most_suspects")
+        check_range(self, 1, 100, "part_of_first_trials")
         check_range(self, 1, 1000, "shifts", "fewest_clipped")
 
 

@@ -10,7 +10,13 @@ import pytest
 import npdr_ppl as npdr
 from npdr_ppl.discovery import recording_repair
 from npdr_ppl.discovery.recording_repair import repair
-from npdr_ppl.discovery.remedies import Shift, remedies
+from npdr_ppl.discovery.remedies import (
+    Remedy,
+    Shift,
+    _Scaled,
+    _ScaledAction,
+    remedies,
+)
 from npdr_ppl.engines.ode.simulator import ODESimulator
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel, Parameter, Port
@@ -296,6 +302,26 @@ def test_of_a_long_recording_remedies_are_tried_along_the_same_segments(monkeypa
     moved = windows.fitted(wheel, Shift(None, -3)(rollouts)).segments.inputs
     assert len(whole.start) == 5 and whole.start.max() > 300
     assert (moved.start - whole.start).abs().max() <= 10
+
+
+def test_of_a_long_recording_only_hopeful_remedies_are_tried_along_all_segments(monkeypatch):
+    settings = dataclasses.replace(recording_repair.REPAIR, most_segments=16)
+    monkeypatch.setattr(recording_repair, "REPAIR", settings)
+    rollouts = _ScaledAction("torque", -1.0)(turned(1.0, 1.0))
+    windows = recording_repair._Windows(rollouts, npdr.DataOptions(None, 20))
+    trials = recording_repair._Trials(wheel, rollouts, windows, windows.fitted(wheel, rollouts))
+    fit, sizes = recording_repair._Windows.fitted, []
+
+    def counted(self, model, recording, start=None):
+        found = fit(self, model, recording, start)
+        sizes.append(found.segments.inputs.num_segments)
+        return found
+
+    monkeypatch.setattr(recording_repair._Windows, "fitted", counted)
+    assert trials.ratio(Remedy("", _Scaled(["angle"], 57.3))) > settings.hopeless_ratio
+    assert sizes == [4]
+    assert trials.ratio(Remedy("", _ScaledAction("torque", -1.0))) < settings.remedy_factor
+    assert sizes == [4, 4, 16]
 
 
 def _swapped(time):

@@ -37,8 +37,8 @@ __all__ = [
 ]
 
 
-PER_TURN = range(2, GENERIC_LAWS.most_per_turn + 1)
-"""Numbers of ripples per turn that are tried; one ripple per turn is unbalance."""
+PER_TURN = range(GENERIC_LAWS.fewest_per_turn, GENERIC_LAWS.most_per_turn + 1)
+"""Numbers of ripples per turn that are tried at the joint itself."""
 
 
 @dataclass(frozen=True)

@@ -77,8 +77,10 @@ class GenericLawSettings:
             resolution of the longest rollout.
         num_ripples: Number of wave numbers tried for a ripple, spaced by half the resolution of a
             position's range.
-        most_per_turn: Greatest number of ripples per turn that is tried at the joint itself.
-            Motors without a gear have up to 84 (12 slots and 14 poles), most of them fewer.
+        fewest_per_turn: Least number of ripples per turn that is tried at the joint itself. The
+            smallest motors have six: two poles and three slots.
+        most_per_turn: The greatest number. Motors without a gear have up to 84 (12 slots and 14
+            poles), most of them fewer.
         num_ringing_frequencies: Number of ringing frequencies tried, evenly spaced in their
             logarithm.
         lowest_ringing_frequency: Lowest ringing frequency, in periods per time step; the highest
@@ -89,6 +91,7 @@ class GenericLawSettings:
     sign_width: float = 0.1
     num_frequencies: int = 120
     num_ripples: int = 40
+    fewest_per_turn: int = 6
     most_per_turn: int = 84
     num_ringing_frequencies: int = 30
     lowest_ringing_frequency: float = 0.02
@@ -98,7 +101,7 @@ class GenericLawSettings:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 0.0, 1.0, "sign_width", "lowest_ringing_frequency", "ringing_damping")
         check_range(self, 1, 10_000, "num_frequencies", "num_ripples")
-        check_range(self, 2, 10_000, "most_per_turn", "num_ringing_frequencies")
+        check_range(self, 1, 10_000, "fewest_per_turn", "most_per_turn", "num_ringing_frequencies")
 
 
 @dataclass(frozen=True)
