@@ -24,9 +24,9 @@ class SmallFuruta(Furuta):
 def furuta(inputs: Inputs) -> Tensor:
     """Motor, arm and pole with viscous friction and nothing else.
 
-    Arm and motor are so heavy that the light pole hardly moves them. So the recording tells only
-    ratios of torque, damping and inertia, and the motor's constants are those of the authors. The
-    arm's mass is that of a rod with the moment of inertia of the arm and the motor.
+    The motor's constants are free: with those of the authors, the arm would move at a seventh of
+    the recorded speed. The arm's mass is that of a rod with the moment of inertia of the arm and
+    the motor.
     """
     parameters = {
         "pole_mass": 0.01125,  # kg, of a rod with the authors' moment and moment of inertia

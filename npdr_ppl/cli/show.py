@@ -138,7 +138,7 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         for column, wide in {"prob.": 5, "mean": 10, "sd": 7, "94 % HDI": 21}.items():
             table.add_column(column, justify="right", no_wrap=True, min_width=wide)
         for row in found["effects"]:
-            name, probability = f"{row['effect']}\nat {row['port']}", f"{row['probability']:.0%}"
+            name, probability = f"{row['effect']}\nat {row['port']}", _share(row["probability"])
             for parameter, p in row["parameters"].items():
                 unit = "" if p["unit"] in ("", "1") else f" [{p['unit']}]"
                 low, high = p["hdi_94"]
@@ -157,6 +157,11 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         minor = [f"{e['port']}.{e['effect']}" for e in found["effects"] if e.get("is_minor")]
         if minor:
             console.print(f"Too small to be named, but in the model: {escape(', '.join(minor))}.")
+        alone = [
+            f"{e['port']}.{e['effect']}" for e in found["effects"] if e["probability"] is None
+        ]
+        if alone:
+            console.print(f"Not compared with alternatives: {escape(', '.join(alone))}.")
         for effect in found["effects"]:
             in_halves = effect.get("in_halves") or {}
             if not all(in_halves.values()):
@@ -297,6 +302,10 @@ def show_missing_effect(found: Mapping[str, Any], result: Mapping[str, Any], out
         _print_reason(_console(), f"{what} skipped", reason)
 
 
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{value:.0%}"
+
+
 def show_demo(result: Mapping[str, Any]) -> None:
     """Prints the content of ``demo.json`` in the order of events."""
     console = _console()
@@ -310,7 +319,7 @@ def show_demo(result: Mapping[str, Any]) -> None:
             for name, row in effect["parameters"].items()
             if row["mean"] is not None
         )
-        share = f"{effect['probability']:.0%}"
+        share = _share(effect["probability"])
         what = f"{effect['effect']} at {effect['port']}, {share}"
         _print_reason(console, what, values)
     console.print(

@@ -159,6 +159,6 @@ def _effect_rows(found: Finding) -> list[list[str]]:
     ]
     values += [(name, f"{value:.4g}") for name, value in found.effect.constants.items()]
     rows = [["", "", name, value, ""] for name, value in values]
-    rows[0][:2] = found.effect.name, f"{found.probability:.0%}"
+    rows[0][:2] = found.effect.name, f"{found.probability:.0%}" if found.is_compared else "–"
     rows[0][-1] = ", ".join(found.equivalent_to) or "–"
     return rows

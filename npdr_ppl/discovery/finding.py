@@ -30,6 +30,8 @@ class Finding:
         repetition: Its strengths in parts of the recording; ``None`` for short recordings.
         in_halves: Whether it was found in each half of the recording, by the half's name; empty if
             the halves were not searched.
+        is_compared: Whether it was compared with alternatives. If a time limit prevented it, the
+            probability says nothing.
     """
 
     effect: Effect
@@ -42,6 +44,7 @@ class Finding:
     is_minor: bool = False
     repetition: Repetition | None = None
     in_halves: Mapping[str, bool] = field(default_factory=dict)
+    is_compared: bool = True
 
     @property
     def is_found_again(self) -> bool:
@@ -58,7 +61,7 @@ class Finding:
         return {
             "effect": self.effect.id,
             "port": self.effect.port,
-            "probability": self.probability,
+            "probability": self.probability if self.is_compared else None,
             "equivalent_to": list(self.equivalent_to),
             "alternatives": self.alternatives,
             "share": self.share,

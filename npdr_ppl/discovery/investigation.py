@@ -466,6 +466,7 @@ def _finding(
         is_zero or is_small,
         repetition,
         in_halves,
+        added.is_compared,
     )
 
 

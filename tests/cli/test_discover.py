@@ -266,6 +266,10 @@ def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
     assert "Too small to be named, but in the model: hinge.wind." in shown
     assert "hinge.wind was not found in the first half." in shown
     assert "hinge.bias was not found" not in shown
+    assert "Not compared with alternatives" not in shown
+    found["effects"][0]["probability"] = None  # a time limit ended the search
+    show.show_discovery(found, tmp_path)
+    assert "Not compared with alternatives: hinge.bias." in " ".join(text.getvalue().split())
 
 
 def test_the_command_has_the_defaults_of_the_options():

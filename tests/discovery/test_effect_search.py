@@ -74,6 +74,7 @@ def test_after_a_time_limit_effects_are_compared_with_nothing_new(dragged, monke
         found, [searcher.look(base)], searcher.trials, options, stops=lambda: True
     )
     assert [each.alternatives for each in added] == [{e.name: 1.0} for e in both]
+    assert not any(each.is_compared for each in added)
     drag, friction = (each.share for each in added)
     # Only drag is there; without it, friction would explain a part.
     assert 0.0 <= friction < 0.05 < drag <= 1.0

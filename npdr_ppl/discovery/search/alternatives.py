@@ -54,6 +54,7 @@ class Added:
         fitting: Names of the alternatives that fit equally well. The simplest law is the
             likeliest. But a law that contains it, as bristles contain dry friction, fits equally
             well if its further parameters have no visible influence.
+        is_compared: Whether it was compared with alternatives; after a time limit it may not be.
     """
 
     effect: Effect
@@ -61,6 +62,7 @@ class Added:
     share: float
     alternatives: dict[str, float]
     fitting: tuple[str, ...] = ()
+    is_compared: bool = True
 
     @property
     def probability(self) -> float:
@@ -170,7 +172,8 @@ def weigh_alternatives(
     """
     if alternatives is None:
         share = _linear_share(base, current, effect)
-        return current, Added(effect, effect.name, share, {effect.name: 1.0})
+        alone = {effect.name: 1.0}
+        return current, Added(effect, effect.name, share, alone, is_compared=False)
     without, trials = (
         alternatives.without,
         {effect.name: alternatives.with_it} | alternatives.others,
