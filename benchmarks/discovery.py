@@ -18,7 +18,7 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,6 +28,7 @@ import torch
 from discovery_report import print_summary
 from discovery_rows import REMOVED, SEVERAL
 from hidden_rigs import RIGS, Case, Place, make_case, places
+from hidden_rigs.hidden import Hidden
 from sparse_regression import sparse_choice
 
 import npdr_ppl as npdr
@@ -269,13 +270,19 @@ def _separation_of_each(case: Case) -> float:
             f"{hidden.name}.{name}": torch.tensor(value).double()
             for name, value in hidden.parameters.items()
         }
-        found = searcher.trials.refitted(base, (known[hidden.name],), start=start)
+        found = searcher.trials.refitted(base, (_as_hidden(known, hidden),), start=start)
         left = math.inf
         if found is not None:
             scale = null.fit.scale
             left = 2.0 * float((found.losses(scale) - null.losses(scale)).sum())
         distances.append(max(left, 0.0) ** 0.5)
     return min(distances)
+
+
+def _as_hidden(known: Mapping[str, npdr.Effect], hidden: Hidden) -> npdr.Effect:
+    """Returns the catalogue's effect that was hidden, with its number of ripples per turn."""
+    effect = known[hidden.name]
+    return effect.with_ripples(int(hidden.parameters["order"])) if effect.has_ripples else effect
 
 
 @functools.lru_cache(maxsize=1)
@@ -312,7 +319,7 @@ def true_model_errors(case: Case, found: npdr.Discovery) -> dict[str, float] | N
         given.model,
         case.fit,
         segment_options(case.fit),
-        effects=tuple(known[name] for name in case.names),
+        effects=tuple(_as_hidden(known, hidden) for hidden in case.truth),
         start={name: value.double() for name, value in truth.items()},
         max_steps=0,
     )

@@ -18,6 +18,7 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
+from hidden_rigs.sizes import COGGING_ORDERS
 from residual_forces import Array, ResidualForces, residual_forces
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
@@ -36,9 +37,6 @@ __all__ = [
 
 NUM_THRESHOLDS = 40
 """Thresholds tried, from a thousandth of the largest coefficient to the one that keeps none."""
-
-COGGING_ORDERS = range(6, 25)
-"""Periods of cogging per turn in the library."""
 
 RIDGE = 1e-6
 """Weight of the squared coefficients of columns of unit length: keeps collinear ones solvable."""

@@ -175,6 +175,7 @@ class EffectRecord(TypedDict):
     port: str
     probability: NotRequired[Number]
     equivalent_to: NotRequired[list[str] | None]
+    constants: NotRequired[dict[str, Number]]
     parameters: NotRequired[dict[str, EffectInterval] | None]
     share: NotRequired[Number]
     is_minor: NotRequired[bool]

@@ -9,15 +9,15 @@ from hidden_rigs.hidden import Hidden
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Port
 
-__all__ = ["drawn", "known_ids"]
+__all__ = ["COGGING_ORDERS", "drawn", "known_ids"]
 
 Generator = np.random.Generator
 Values = dict[str, float]
 Size = Callable[[Port, float, Generator], Values]
 """Parameters at a port, for a strength s; everything else comes from the generator."""
 
-COGGING_ORDERS = 6, 25
-"""Range of the periods of cogging per turn of a joint."""
+COGGING_ORDERS = range(6, 25)
+"""Periods of cogging per turn that a joint may have."""
 
 
 def drawn(port: Port, effect_id: str, strength: float, generator: Generator) -> Hidden:
@@ -86,7 +86,7 @@ def _wave(share: float) -> Size:
 
 
 def _cogging(port: Port, s: float, g: Generator) -> Values:
-    return {**_wave(0.03)(port, s, g), "order": float(g.integers(*COGGING_ORDERS))}
+    return {**_wave(0.03)(port, s, g), "order": float(g.choice(COGGING_ORDERS))}
 
 
 def _asymmetric(port: Port, s: float, g: Generator) -> Values:

@@ -90,7 +90,7 @@ class Cogging(LinearForceEffect):
         return changed
 
     def __repr__(self) -> str:
-        return f"Cogging(port={self.port!r}, order={self.order:g})"
+        return f"Cogging(port={self.port!r}, order={self.order!r})"
 
 
 class PeriodicDisturbance(TimedForceEffect):

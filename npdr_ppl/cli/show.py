@@ -138,7 +138,7 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         for column, wide in {"prob.": 5, "mean": 10, "sd": 7, "94 % HDI": 21}.items():
             table.add_column(column, justify="right", no_wrap=True, min_width=wide)
         for row in found["effects"]:
-            name, probability = f"{row['effect']}\nat {row['port']}", _share(row["probability"])
+            name, probability = f"{row['effect']}\nat {row['port']}", _percent(row["probability"])
             for parameter, p in row["parameters"].items():
                 unit = "" if p["unit"] in ("", "1") else f" [{p['unit']}]"
                 low, high = p["hdi_94"]
@@ -157,11 +157,11 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         minor = [f"{e['port']}.{e['effect']}" for e in found["effects"] if e.get("is_minor")]
         if minor:
             console.print(f"Too small to be named, but in the model: {escape(', '.join(minor))}.")
-        alone = [
+        uncompared = [
             f"{e['port']}.{e['effect']}" for e in found["effects"] if e["probability"] is None
         ]
-        if alone:
-            console.print(f"Not compared with alternatives: {escape(', '.join(alone))}.")
+        if uncompared:
+            console.print(f"Not compared with alternatives: {escape(', '.join(uncompared))}.")
         for effect in found["effects"]:
             in_halves = effect.get("in_halves") or {}
             if not all(in_halves.values()):
@@ -302,7 +302,7 @@ def show_missing_effect(found: Mapping[str, Any], result: Mapping[str, Any], out
         _print_reason(_console(), f"{what} skipped", reason)
 
 
-def _share(value: float | None) -> str:
+def _percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.0%}"
 
 
@@ -319,7 +319,7 @@ def show_demo(result: Mapping[str, Any]) -> None:
             for name, row in effect["parameters"].items()
             if row["mean"] is not None
         )
-        share = _share(effect["probability"])
+        share = _percent(effect["probability"])
         what = f"{effect['effect']} at {effect['port']}, {share}"
         _print_reason(console, what, values)
     console.print(

@@ -177,7 +177,10 @@ class Discovery:
         return discovery_html(self.verdict, self.reason, self.effects, self.gap)
 
     def __repr__(self) -> str:
-        found = ", ".join(f"{f.effect.name} ({f.probability:.0%})" for f in self.effects)
+        found = ", ".join(
+            f"{f.effect.name} ({f.probability:.0%})" if f.is_compared else f.effect.name
+            for f in self.effects
+        )
         return f"Discovery({self.verdict}{': ' + found if found else ''})"
 
 

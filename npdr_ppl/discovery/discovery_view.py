@@ -158,7 +158,7 @@ def _effect_rows(found: Finding) -> list[list[str]]:
         for name, p in found.parameters.items()
     ]
     values += [(name, f"{value:.4g}") for name, value in found.effect.constants.items()]
-    rows = [["", "", name, value, ""] for name, value in values]
+    rows = [["", "", name, value, ""] for name, value in values or [("–", "–")]]
     rows[0][:2] = found.effect.name, f"{found.probability:.0%}" if found.is_compared else "–"
     rows[0][-1] = ", ".join(found.equivalent_to) or "–"
     return rows

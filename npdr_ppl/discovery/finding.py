@@ -63,7 +63,7 @@ class Finding:
             "port": self.effect.port,
             "probability": self.probability if self.is_compared else None,
             "equivalent_to": list(self.equivalent_to),
-            "alternatives": self.alternatives,
+            "alternatives": self.alternatives if self.is_compared else {},
             "share": self.share,
             "constants": self.effect.constants,
             "parameters": {name: e.to_dict() for name, e in self.parameters.items()},

@@ -254,6 +254,8 @@ class _Windows:
             distance = (start - place).abs().double().masked_fill(rollout != own, math.inf)
             if bool(distance.isfinite().any()):
                 found.add(int(distance.argmin()))
+        if not found:
+            raise DataError("No segment is left close to those that were chosen.")
         return torch.tensor(sorted(found))
 
 

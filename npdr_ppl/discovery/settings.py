@@ -29,10 +29,10 @@ class RepairSettings:
         most_remedies: Greatest number of remedies of one recording.
         most_segments: Greatest number of segments along which remedies are tried. A unit, a sign
             or a clock is wrong in the whole recording. With the default length they last 40 s.
-        part_of_first_trials: Each remedy is first tried along one of so many of these segments.
+        part_of_first_trials: A remedy is first tried along every so-manyth of these segments.
         hopeless_ratio: Residual of this trial, relative to that of the recording as it was read,
-            from which the remedy is not tried along all of them. It is far from
-            ``remedy_factor``, below which a remedy may be applied.
+            from which the remedy is not tried along all of them. It is above ``remedy_factor``, so
+            that a remedy is not missed because its residual differs between the segments.
         most_suspects: Single channels are suspected only if at most this many joints are not
             explained. If one channel is wrong, its joint and those that it moves are not. If more
             joints are not, the model lacks something in each of them.
@@ -72,6 +72,8 @@ class RepairSettings:
         check_range(self, 1.0, 100.0, "long_shifts")
         check_range(self, 1, 1000, "most_remedies", "most_segments", "most_suspects")
         check_range(self, 1, 100, "part_of_first_trials")
+        if self.hopeless_ratio <= self.remedy_factor:
+            raise ValueError("hopeless_ratio must be greater than remedy_factor.")
         check_range(self, 1, 1000, "shifts", "fewest_clipped")
 
 

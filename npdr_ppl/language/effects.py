@@ -201,7 +201,7 @@ class Effect(ABC):
 
     @property
     def constants(self) -> dict[str, float]:
-        """Numbers of the law that are known, and so are no parameters."""
+        """Numbers of the law that a fit does not change, by name."""
         return {}
 
     def with_ripples(self, number: int) -> Self:
@@ -376,10 +376,6 @@ class ActionEffect(Effect):
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("action", "servo")
     may_be_shared: ClassVar[bool] = False
 
-    def with_ripples(self, number: int) -> Self:
-        """Returns the effect with another number of ripples per turn; see :attr:`has_ripples`."""
-        return self
-
     @property
     def may_cover_several(self) -> bool:
         """Whether several commands may have it; see ``may_be_shared``."""
@@ -455,10 +451,6 @@ class SensorEffect(Effect):
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
     needs_past: ClassVar[bool] = False
     spans: ClassVar[tuple[SensorSpan, ...]] = ("position", "rate", "positions", "rates")
-
-    def with_ripples(self, number: int) -> Self:
-        """Returns the effect with another number of ripples per turn; see :attr:`has_ripples`."""
-        return self
 
     @property
     def may_cover_several(self) -> bool:

@@ -70,3 +70,18 @@ def test_a_wave_is_in_step_where_it_repeats_with_the_command(frequency, is_in_st
     fading = np.exp(-0.3 * TIME) * np.sin(5.0 * TIME)
     command = np.where(TIME > 3.0, np.sin(2.0 * np.pi * TIME / 3.2), 0.0)  # after a rest
     assert keeps_in_step(fitted, effect, _recording(fading, command)) == is_in_step
+
+
+def test_a_short_command_is_no_reason_to_exclude_a_wave():
+    effect, fitted = _wave(0.55)
+    fading = np.exp(-0.3 * TIME) * np.sin(5.0 * TIME)
+    command = np.where(TIME < 4.0, np.sin(np.pi * TIME), 0.0)  # of 0.5 Hz
+    assert not keeps_in_step(fitted, effect, _recording(fading, command))
+
+
+def test_without_commands_only_the_motion_counts():
+    effect, fitted = _wave(0.7)
+    swings = npdr.Rollouts.from_arrays(
+        [np.sin(2.0 * np.pi * 0.7 * TIME)[:, None]], channel_names=("angle",), time_step=0.01
+    )
+    assert keeps_in_step(fitted, effect, swings)

@@ -26,6 +26,20 @@ def test_the_number_per_turn_is_the_hidden_one(case):
     assert strongest_ripple(Projection(fitted), found, "hinge") == hidden.parameters["order"]
 
 
+@pytest.mark.parametrize(
+    ("rig", "positions"),
+    [
+        ("furuta", {"arm": "arm_angle", "pole": "pole_angle"}),
+        # A torque at the shoulder moves the elbow's angle more than the shoulder's.
+        ("two_link_arm", {"shoulder": "shoulder_angle", "elbow": "elbow_angle"}),
+    ],
+)
+def test_each_port_has_the_position_of_its_own_joint(rig, positions):
+    made = make_case(rig, "null", (), seed=3)
+    searcher = Searcher(made.model, made.fit, npdr.DiscoveryOptions())
+    assert responses(searcher.fit_base(may_be_rough=True)).positions == positions
+
+
 @pytest.mark.slow
 def test_cogging_is_named_with_its_number_per_turn(case):
     options = npdr.DiscoveryOptions(effects=(Cogging("hinge"),))
@@ -46,4 +60,5 @@ def test_a_known_number_per_turn_is_kept(case):
     options = npdr.DiscoveryOptions(effects=(Cogging("hinge", order=5),))
     searcher = Searcher(case.model, case.fit, options)
     ranking = searcher.look(searcher.fit_base()).ranking
+    assert ranking
     assert all(candidate.variant.effect.order == 5 for candidate in ranking)

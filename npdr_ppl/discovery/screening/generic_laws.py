@@ -26,6 +26,7 @@ from npdr_ppl.discovery.screening.settings import GENERIC_LAWS
 from npdr_ppl.language.channels import Channel
 
 __all__ = [
+    "PER_TURN",
     "GenericLaw",
     "generic_laws",
     "reading_laws",
@@ -49,8 +50,9 @@ class GenericLaw:
         name: Description, e.g. ``"arm: arm_velocity²"``.
         make: Returns the change. It is computed on demand, because the changes of hundreds of
             laws on a long recording do not fit into memory together.
-        port: Port of a law that an effect of the catalogue has with the right frequency.
-        kind: What such an effect is: a wave in time, or a ripple over a position.
+        port: Port of the force.
+        kind: ``"wave"`` or ``"ripple"`` if an effect of the catalogue at this port can be the same
+            law. Its p-value then counts for that effect, too.
     """
 
     name: str
@@ -126,17 +128,25 @@ def ripple_laws(
             direction = _sign(found.channels[velocities[position.name]])
             factors["direction times "] = direction
         for (port, pulses), (text, factor) in product(ports.items(), factors.items()):
-            is_own = (
-                not text and position.unit == "rad" and found.positions.get(port) == position.name
-            )
             laws += [
                 GenericLaw(
                     f"{port}: {text}ripple of {number:.3g} 1/{position.unit} in {position.name}",
                     partial(_rippled, pulses, factor, x, number),
-                    port,
-                    "ripple" if is_own else "",
                 )
-                for number in (PER_TURN if is_own else _numbers(x))
+                for number in _numbers(x)
+            ]
+    turning = {s.name for s in _positions(found, sensors) if s.unit == "rad"}
+    for port, name in found.positions.items():
+        if name in turning:
+            x, one = found.channels[name], torch.ones_like(found.time)
+            laws += [
+                GenericLaw(
+                    f"{port}: {number} ripples per turn",
+                    partial(_rippled, ports[port], one, x, number),
+                    port,
+                    "ripple",
+                )
+                for number in PER_TURN
             ]
     return laws
 
@@ -290,9 +300,7 @@ def strongest_frequency(projection: Projection, found: Responses, port: str) -> 
     """
     frequencies = _frequencies(found)
     waves = torch.cat([_wave(found, frequency) for frequency in frequencies.tolist()], dim=-1)
-    scores = PulseChanges(projection, found.by_port[port]).scores(waves)
-    gains = [scores.gain(slice(2 * k, 2 * k + 2)) for k in range(len(frequencies))]
-    return float(frequencies[max(range(len(gains)), key=gains.__getitem__)])
+    return float(frequencies[_strongest(projection, found, port, waves)])
 
 
 def strongest_ripple(projection: Projection, found: Responses, port: str) -> int | None:
@@ -309,9 +317,21 @@ def strongest_ripple(projection: Projection, found: Responses, port: str) -> int
     if x is None or float(x.max() - x.min()) <= 0.0:
         return None
     waves = torch.cat([_ripple(x, number) for number in PER_TURN], dim=-1)
+    return PER_TURN[_strongest(projection, found, port, waves)]
+
+
+def _strongest(projection: Projection, found: Responses, port: str, waves: Tensor) -> int:
+    """Returns the index of the wave that, as a force at a port, explains most.
+
+    Args:
+        projection: The fitted model.
+        found: The responses to pulses.
+        port: The port.
+        waves: Sine and cosine of each wave at the pulses, ``(S, pulses, 2 n)``.
+    """
     scores = PulseChanges(projection, found.by_port[port]).scores(waves)
-    gains = [scores.gain(slice(2 * k, 2 * k + 2)) for k in range(len(PER_TURN))]
-    return PER_TURN[max(range(len(gains)), key=gains.__getitem__)]
+    gains = [scores.gain(slice(k, k + 2)) for k in range(0, waves.shape[-1], 2)]
+    return max(range(len(gains)), key=gains.__getitem__)
 
 
 def _frequencies(found: Responses) -> Tensor:

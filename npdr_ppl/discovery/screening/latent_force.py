@@ -22,6 +22,7 @@ from npdr_ppl.discovery.screening.settings import LATENT_FORCE
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Start
 from npdr_ppl.models.effects.timed import TimedForceEffect
+from npdr_ppl.preparation.segment_model import SegmentModel
 
 __all__ = ["LatentForce", "Responses", "latent_force", "responses"]
 
@@ -30,6 +31,8 @@ class Pulse(TimedForceEffect):
     """A constant force during a part of each segment."""
 
     id = "pulse"
+    positions: Tensor | None = None
+    """The joint's positions at the starts of the segments, once they were simulated."""
     parameters = (
         Parameter("height", "{port}", 0.0, "force during the pulse"),
         Parameter("begin", "s", 0.0, "when it begins, from the segment's start"),
@@ -43,6 +46,7 @@ class Pulse(TimedForceEffect):
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:
         """Returns the time since the segment's start, in the middle of the first step."""
+        self.positions = position.detach()
         return torch.full_like(start.time, 0.5 * start.time_step)
 
     def force(
@@ -61,7 +65,7 @@ class Responses:
         by_port: Change of the whitened measurements per unit force, ``(S, N, pulses)``, by port.
         units: Unit of each port's force.
         rated: Each port's rated force.
-        positions: Name of the position that each port's force moves most, if one is recorded.
+        positions: Name of the channel that measures the position at each port, if there is one.
         channels: Simulated measurements, by channel, and commands, by action, at the beginning of
             each pulse, ``(S, pulses)``.
         time: Beginning of each pulse in seconds since the rollout began, ``(S, pulses)``.
@@ -123,19 +127,13 @@ def responses(hypothesis: Hypothesis) -> Responses:
         }
         starts = fit.offsets[None].expand(len(edges) - 1, -1, -1)
         moved = segments.run(simulator.with_effects(pulse), {**box.parameters, **batch}, starts)
-        difference = moved - base
-        change = segments.whitened(difference, fit.scale) / height
+        change = segments.whitened(moved - base, fit.scale) / height
         if bool(change.isfinite().all()):
             by_port[port.name] = change.permute(1, 2, 0)
             units[port.name], rated[port.name] = port.unit, port.rated
-            moved_by = difference.square().sum((0, 1, 2)).tolist()
-            sizes = {
-                sensor.name: size
-                for sensor, size in zip(segments.measured, moved_by, strict=True)
-                if sensor.unit == port.coordinate and not sensor.rate_of
-            }
-            if sizes:
-                positions[port.name] = max(sizes, key=sizes.__getitem__)
+            measured = None if pulse.positions is None else _measuring(pulse, port, segments)
+            if measured is not None:
+                positions[port.name] = measured
     begins = edges[:-1]
     channels = {
         name: base[:, begins.clamp_min(1) - 1, k].double()
@@ -145,6 +143,32 @@ def responses(hypothesis: Hypothesis) -> Responses:
         channels[name] = inputs.actions[:, begins, k].double()
     time = (inputs.start[:, None] + begins) * inputs.time_step
     return Responses(by_port, units, rated, positions, channels, time.double(), inputs.rollout)
+
+
+def _measuring(pulse: Pulse, port: Port, segments: SegmentModel) -> str | None:
+    """Returns the channel that measures the position at a port; ``None`` if there is none.
+
+    Of the channels in the port's unit, it is the one whose values at the starts of the segments
+    differ from the joint's positions only by a constant, up to errors that are small beside the
+    motion.
+
+    Args:
+        pulse: A pulse at the port, which was simulated.
+        port: The port.
+        segments: The model along the recording.
+    """
+    assert pulse.positions is not None
+    inputs = segments.inputs
+    position = pulse.positions.double().reshape(-1, inputs.num_segments)[0]
+    names = inputs.channel_names
+    found: dict[str, float] = {}
+    for sensor in segments.measured:
+        if sensor.unit == port.coordinate and not sensor.rate_of:
+            values = inputs.initial_values[..., names.index(sensor.name)].double()
+            values = values.reshape(-1, inputs.num_segments)[0]
+            found[sensor.name] = float((values - position).std() / position.std())
+    best = min(found, key=found.__getitem__, default=None)
+    return best if best is not None and found[best] < LATENT_FORCE.largest_difference else None
 
 
 def latent_force(projection: Projection, found: Responses) -> list[LatentForce]:

@@ -38,8 +38,7 @@ def keeps_in_step(hypothesis: Hypothesis, effect: Effect, rollouts: Rollouts) ->
 
 
 def _is_in_step(frequency: float, values: Array, time_step: float) -> bool:
-    values = _without_rest(values)
-    period = period_of(values)
+    period = period_of(_without_rest(values))
     if period is None:
         return False
     turns = frequency * period * time_step

@@ -77,10 +77,10 @@ class GenericLawSettings:
             resolution of the longest rollout.
         num_ripples: Number of wave numbers tried for a ripple, spaced by half the resolution of a
             position's range.
-        fewest_per_turn: Least number of ripples per turn that is tried at the joint itself. The
-            smallest motors have six: two poles and three slots.
-        most_per_turn: The greatest number. Motors without a gear have up to 84 (12 slots and 14
-            poles), most of them fewer.
+        fewest_per_turn: Least number of ripples per turn that cogging may have. The smallest
+            motors have six: two poles and three slots.
+        most_per_turn: The greatest number. 12 slots and 14 poles have 84. Cogging behind a gear
+            has more; a search finds it only if its order is given.
         num_ringing_frequencies: Number of ringing frequencies tried, evenly spaced in their
             logarithm.
         lowest_ringing_frequency: Lowest ringing frequency, in periods per time step; the highest
@@ -112,15 +112,18 @@ class LatentForceSettings:
         num_pulses: Number of pulses per segment and joint.
         pulse_height: Height of a pulse, as a fraction of the port's rated force. It is small,
             because the response is a derivative.
+        largest_difference: Difference of a channel from a joint's position, relative to the
+            spread of the position, from which the channel measures something else.
     """
 
     num_pulses: int = 10
     pulse_height: float = 1e-3
+    largest_difference: float = 0.5
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, 1000, "num_pulses")
-        check_range(self, 0.0, 1.0, "pulse_height")
+        check_range(self, 0.0, 1.0, "pulse_height", "largest_difference")
 
 
 @dataclass(frozen=True)
@@ -187,7 +190,7 @@ class PermutationTestSettings:
 
 @dataclass(frozen=True)
 class RepetitionSettings:
-    """Detection of periodic motion.
+    """Detection of periodic motions and commands.
 
     Attributes:
         periodic_change: A motion is periodic if its change after one period is below this fraction

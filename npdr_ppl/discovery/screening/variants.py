@@ -59,27 +59,28 @@ def variants_of(
         for effect in candidates
         if effect.wave and effect.port in found.by_port
     }
-    candidates, tuned = _with_ripples(candidates, projection, found)
-    for variant in _every(hypothesis, candidates, hints, number):
-        yield replace(variant, is_hinted=True) if variant.effect.name in tuned else variant
+    candidates, numbered = _with_ripples(candidates, projection, found)
+    for variant in _in_all_shapes(hypothesis, candidates, hints, number):
+        yield replace(variant, is_hinted=True) if variant.effect.name in numbered else variant
 
 
 def _with_ripples(
     candidates: tuple[Effect, ...], projection: Projection, found: Responses
 ) -> tuple[tuple[Effect, ...], set[str]]:
     """Returns candidates with the strongest ripples, and the names of those that have some."""
-    result, tuned = [], set()
+    result, numbered = [], set()
     for effect in candidates:
-        if effect.has_ripples and effect.port in found.by_port:
+        port = projection.hypothesis.simulator.port(effect.port)
+        if effect.has_ripples and port.coordinate == "rad" and effect.port in found.by_port:
             strongest = strongest_ripple(projection, found, effect.port)
             if strongest is not None:
                 effect = effect.with_ripples(strongest)
-                tuned.add(effect.name)
+                numbered.add(effect.name)
         result.append(effect)
-    return tuple(result), tuned
+    return tuple(result), numbered
 
 
-def _every(
+def _in_all_shapes(
     hypothesis: Hypothesis,
     candidates: tuple[Effect, ...],
     hints: Mapping[str, Mapping[str, float]],

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.generic_laws import PER_TURN
 from npdr_ppl.discovery.screening.latent_force import responses
 from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.screening.screening import screen
@@ -172,8 +173,7 @@ def weigh_alternatives(
     """
     if alternatives is None:
         share = _linear_share(base, current, effect)
-        alone = {effect.name: 1.0}
-        return current, Added(effect, effect.name, share, alone, is_compared=False)
+        return current, Added(effect, effect.name, share, {effect.name: 1.0})
     without, trials = (
         alternatives.without,
         {effect.name: alternatives.with_it} | alternatives.others,
@@ -228,8 +228,12 @@ def _is_found_again(trial: Hypothesis, name: str) -> bool:
 
 def log_prior(hypothesis: Hypothesis) -> float:
     """Returns the penalty for searching frequencies: all of them share one hypothesis's prior."""
-    searched = sum(bool(effect.wave) or effect.has_ripples for effect in hypothesis.effects)
-    return -searched * math.log(GENERIC_LAWS.num_frequencies)
+    tried = [
+        GENERIC_LAWS.num_frequencies if effect.wave else len(PER_TURN)
+        for effect in hypothesis.effects
+        if effect.wave or effect.has_ripples
+    ]
+    return -sum(map(math.log, tried))
 
 
 def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:

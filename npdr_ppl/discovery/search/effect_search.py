@@ -350,7 +350,9 @@ class Searcher:
         best = max(trials, key=lambda name: weights[name])
         trials = self.trials.apart_from_waves_in_step(trials)
         if best not in trials:
-            self._report(f"{best} is synchronous with the motion, so it is a law of the state")
+            self._report(
+                f"{best} has the period of the motion or of the commands, so it is no disturbance"
+            )
             if not trials:
                 return None, weights, trials
             wave, best = best, max(trials, key=lambda name: weights[name])

@@ -49,7 +49,9 @@ def likelier_group(
     if tried:
         tried = {
             name: trial
-            for name, trial in fit_contenders(trials, tried, current, done={"": current}).items()
+            for name, trial in fit_contenders(
+                trials, tried, current, done={"": current}, most=TRIALS.most_converged + 1
+            ).items()
             if name
             and trials.apart_from_waves_in_step(
                 {name: trial}, len(trial.effects) - len(before.effects)

@@ -1,6 +1,7 @@
 """Each effect of a model against its alternatives: is another law likelier in its place?"""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
@@ -57,7 +58,7 @@ def with_rivals(
         compared = num - len(waiting)
         progress(compared / num, f"{compared} of {num} effects compared")
         of_each = _alternatives(asked, waiting, rounds, trials, options, stops)
-        for effect, alternatives in zip(waiting, of_each, strict=True):
+        for effect, (alternatives, is_tried) in zip(waiting, of_each, strict=True):
             waiting = waiting[1:]
             current, found = weigh_alternatives(
                 rounds[0].hypothesis,
@@ -66,8 +67,11 @@ def with_rivals(
                 alternatives,
                 is_approximate=is_approximate,
             )
-            probability = found.alternatives[effect.name]
-            report(f"{effect.name}: probability {probability:.2f}")
+            if not is_tried:
+                found = replace(found, is_compared=False)
+                report(f"{effect.name}: not compared with alternatives")
+            else:
+                report(f"{effect.name}: probability {found.alternatives[effect.name]:.2f}")
             added.append(found)
             others = {} if alternatives is None else alternatives.others
             for name, trial in ({effect.name: asked} | others).items():
@@ -87,8 +91,11 @@ def _alternatives(
     trials: Trials,
     options: DiscoveryOptions,
     stops: Callable[[], bool],
-) -> Iterator[Alternatives | None]:
-    """Yields the alternatives of each effect, in order; ``None`` for those that are not tried."""
+) -> Iterator[tuple[Alternatives | None, bool]]:
+    """Yields the alternatives of each effect, in order, and whether they were tried.
+
+    They are ``None`` if they were not, or if the model cannot be simulated without the effect.
+    """
     seen = [(r.hypothesis, r.trials) for r in rounds]
     known = {effect.name: tried_before(current, effect, seen) for effect in effects}
     new = [effect for effect in effects if known[effect.name] is None]
@@ -100,4 +107,7 @@ def _alternatives(
     for effect in effects:
         if known[effect.name] is None:
             has_stopped = has_stopped or stops()
-        yield known[effect.name] or (None if has_stopped else next(found))
+        if known[effect.name] is not None:
+            yield known[effect.name], True
+        else:
+            yield (None, False) if has_stopped else (next(found), True)

@@ -61,17 +61,19 @@ def fit_contenders(
     current: Hypothesis,
     *,
     done: Mapping[str, Hypothesis] | None = None,
+    most: int = TRIALS.most_converged,
     progress: Step = lambda fraction, status: None,
 ) -> dict[str, Hypothesis]:
     """Fits the likeliest trials until convergence.
 
-    At most ``TRIALS.most_converged``, and none whose loss is far above the least.
+    None is fitted whose loss is far above the least, that of models which are ``done`` included.
 
     Args:
         trials: Fits the model.
         tried: The model with each of several effects, all along the same segments.
-        current: The model without them, along all segments.
-        done: Models with further effects whose fits have converged, along all segments.
+        current: A model along all segments, whose initial states are used.
+        done: Models to compare them with whose fits have converged, along all segments.
+        most: Greatest number of fits that converge, with those of ``done`` that are likelier.
         progress: Called with the fraction of these trials that has converged.
 
     Returns:
@@ -98,7 +100,7 @@ def fit_contenders(
     likeliest = sorted(compared, key=lambda name: -likelihood[name])
     contenders = [
         name
-        for name in likeliest[: TRIALS.most_converged]
+        for name in likeliest[:most]
         if name in tried
         and losses[name] <= least + max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))
     ]
@@ -121,7 +123,7 @@ def fit_contenders(
             result[name] = longer
         progress(number / num, f"{number} of {num} best fits converged")
     for name in likeliest:
-        if not is_part or result:
+        if not is_part or not contenders or not result.keys().isdisjoint(contenders):
             break
         # None of the likeliest can be simulated along all segments.
         if name in tried and name not in contenders:
@@ -134,7 +136,7 @@ def fit_groups(
     trials: Trials,
     current: Hypothesis,
     groups: Sequence[Group],
-    present: Hypothesis,
+    compared: Hypothesis,
     report: Callable[[str], None] = lambda _: None,
     progress: Step = lambda fraction, status: None,
 ) -> dict[str, Hypothesis]:
@@ -147,8 +149,8 @@ def fit_groups(
         trials: Fits the model.
         current: The hypothesis.
         groups: The groups, the best first.
-        present: The model to compare with, whose initial states are used: losses can be compared
-            only if these and their errors are the same.
+        compared: The model that they are compared with. Its initial states are used, because
+            losses can be compared only if these and their errors are the same.
         report: Called with a sentence about each group.
         progress: Called with the fraction of the groups that is fitted.
 
@@ -161,8 +163,11 @@ def fit_groups(
         if num < current.segments.inputs.num_segments:
             index = part_of(current.segments, num)
             trials = Trials(trials.base.along(index))
-            current, present = current.along(index), present.along(index)
-    starts = present.segments.starts
+            # The same object, so that fits begin at the fitted offsets.
+            is_same = compared.segments.starts is current.segments.starts
+            current = current.along(index)
+            compared = current if is_same else compared.along(index)
+    starts = compared.segments.starts
     asked = [
         trials.extension(current, group.effects, group.parameters, starts) for group in groups
     ]

@@ -158,7 +158,7 @@ class Trials:
     def apart_from_waves_in_step(
         self, tried: Mapping[str, Hypothesis], num_new: int = 1
     ) -> dict[str, Hypothesis]:
-        """Removes models with a new wave that is synchronous with the motion.
+        """Removes models with a new wave that is synchronous with the motion or the commands.
 
         Args:
             tried: The models, by name.

@@ -205,6 +205,11 @@ def _effects(effects: list[Any], ranking: list[Any]) -> list[Part]:
         for effect in effects
         for name, row in (effect.get("parameters") or {}).items()
     ]
+    parameters += [
+        [f"{_named(effect)}, {name}", number(value, ".4g"), "–", "–", ""]
+        for effect in effects
+        for name, value in (effect.get("constants") or {}).items()
+    ]
     if parameters:
         columns = ("parameter", "mean", "sd", "94 % interval", "unit")
         parts.append(TablePart(columns, parameters, "Parameters of the effects."))

@@ -58,9 +58,9 @@ class SignalMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         sign: ``-1`` turns the direction around.
         scale: Factor without a unit, e.g. of a gear.
         offset: What to add, in the SI unit.
-        first_turn: Whether whole turns are then subtracted, so that the log begins between −π and
-            π. An encoder counts on when a joint turns, and laws such as springs are no periodic
-            functions of the angle.
+        first_turn: Whether whole turns of a measured angle are then subtracted, so that the log,
+            though not each of its rollouts, begins between −π and π. An encoder counts on when a
+            joint turns, and laws such as springs are no periodic functions of the angle.
     """
 
     signal: str
@@ -223,6 +223,11 @@ def _checked(content: dict[str, Any]) -> Mapping:
             value = getattr(entry, field)
             if not abs(value) < rollout_checks.MAX_MAGNITUDE:
                 raise DataError(f"{field} of {name} is {value}, but it should be finite.")
+        if entry.first_turn and name in mapping.actions:
+            raise DataError(
+                f"first_turn of {name} is for measured angles; a goal that is shifted alone would "
+                "be whole turns away from them. Give it an offset."
+            )
         if entry.scale == 0:
             raise DataError(f"scale of {name} is 0, which removes the signal.")
     rollout_checks.check_unit_texts(

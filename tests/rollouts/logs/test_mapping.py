@@ -45,6 +45,8 @@ def test_whole_turns_are_subtracted():
     np.testing.assert_allclose(np.diff(found), 2.5, rtol=1e-12)
     with pytest.raises(DataError, match="first_turn of angle needs an angle"):
         angles(log("mm"))
+    with pytest.raises(DataError, match="first_turn of goal is for measured angles"):
+        Mapping.of({"channels": {"angle": entry}, "actions": {"goal": entry}})
 
 
 def test_the_logs_own_unit_is_converted_and_an_unknown_one_is_kept():
