@@ -68,6 +68,8 @@ def main() -> None:
     # Waiting threads of torch would spin and slow down a busy machine. OpenMP reads this variable
     # when torch is first imported, which happens after this line.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # After an interruption, the process that removes the files of workers would name each of them.
+    os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning")
     try:
         with stop_on_signals():
             sys.exit(_run() or 0)
