@@ -18,7 +18,7 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,7 +28,7 @@ import torch
 from discovery_report import print_summary
 from discovery_rows import REMOVED, SEVERAL
 from hidden_rigs import RIGS, Case, Place, make_case, places
-from hidden_rigs.hidden import Hidden
+from hidden_rigs.under_test import as_hidden
 from sparse_regression import sparse_choice
 
 import npdr_ppl as npdr
@@ -266,23 +266,15 @@ def _separation_of_each(case: Case) -> float:
     known = {effect.name: effect for effect in candidate_effects(base.simulator)}
     distances = []
     for hidden in case.truth:
-        start = {
-            f"{hidden.name}.{name}": torch.tensor(value).double()
-            for name, value in hidden.parameters.items()
-        }
-        found = searcher.trials.refitted(base, (_as_hidden(known, hidden),), start=start)
+        start = {name: torch.tensor(value).double() for name, value in hidden.sites.items()}
+        effect = as_hidden(known[hidden.name], hidden)
+        found = searcher.trials.refitted(base, (effect,), start=start)
         left = math.inf
         if found is not None:
             scale = null.fit.scale
             left = 2.0 * float((found.losses(scale) - null.losses(scale)).sum())
         distances.append(max(left, 0.0) ** 0.5)
     return min(distances)
-
-
-def _as_hidden(known: Mapping[str, npdr.Effect], hidden: Hidden) -> npdr.Effect:
-    """Returns the catalogue's effect that was hidden, with its number of ripples per turn."""
-    effect = known[hidden.name]
-    return effect.with_ripples(int(hidden.parameters["order"])) if effect.has_ripples else effect
 
 
 @functools.lru_cache(maxsize=1)
@@ -313,13 +305,13 @@ def true_model_errors(case: Case, found: npdr.Discovery) -> dict[str, float] | N
     known = {effect.name: effect for effect in candidate_effects(given.simulator)}
     if case.condition == "bad_data" or not known.keys() >= set(case.names):
         return None
-    truth = {f"{h.name}.{n}": torch.tensor(v) for h in case.truth for n, v in h.parameters.items()}
+    truth = {name: torch.tensor(v) for h in case.truth for name, v in h.sites.items()}
     truth |= {name: torch.tensor(value) for name, value in case.parameters.items()}
     true = fit_hypothesis(
         given.model,
         case.fit,
         segment_options(case.fit),
-        effects=tuple(_as_hidden(known, hidden) for hidden in case.truth),
+        effects=tuple(as_hidden(known[hidden.name], hidden) for hidden in case.truth),
         start={name: value.double() for name, value in truth.items()},
         max_steps=0,
     )

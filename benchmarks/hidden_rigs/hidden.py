@@ -3,7 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["Hidden"]
+__all__ = ["CONSTANTS", "Hidden"]
+
+CONSTANTS = ("order",)
+"""Names of true values that are constants of the catalogue's law and no parameters."""
 
 
 @dataclass(frozen=True)
@@ -13,7 +16,8 @@ class Hidden:
     Attributes:
         port: The port of the model under test where a finder should see it.
         effect_id: Its id: the catalogue's, or one that the catalogue does not have.
-        parameters: True values by the catalogue's short names, in the catalogue's units.
+        parameters: True values by the catalogue's short names, in the catalogue's units; of
+            cogging, also the number of periods per turn, ``order``.
     """
 
     port: str
@@ -28,4 +32,5 @@ class Hidden:
     @property
     def sites(self) -> dict[str, float]:
         """True values by the names that sample sites would have."""
-        return {f"{self.name}.{name}": value for name, value in self.parameters.items()}
+        own = self.parameters.items()
+        return {f"{self.name}.{name}": value for name, value in own if name not in CONSTANTS}

@@ -10,6 +10,8 @@ import pyro
 import pyro.distributions as dist
 from torch import Tensor
 
+from hidden_rigs.hidden import Hidden
+from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.noise import Noise
 from npdr_ppl.language.sites import simulate
@@ -20,6 +22,7 @@ from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.models.two_link_arm import TwoLinkArm
 
 __all__ = [
+    "as_hidden",
     "cart_pole",
     "cart_pole_simulator",
     "emps",
@@ -31,6 +34,11 @@ __all__ = [
     "two_link_arm",
     "two_link_arm_simulator",
 ]
+
+
+def as_hidden(effect: Effect, hidden: Hidden) -> Effect:
+    """Returns an effect of the catalogue with the number of ripples per turn that is hidden."""
+    return effect.with_ripples(int(hidden.parameters["order"])) if effect.has_ripples else effect
 
 
 @cache

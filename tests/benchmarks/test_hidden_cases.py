@@ -151,4 +151,4 @@ def test_errors_name_what_there_is():
     with pytest.raises(ModelError, match="above 0"):
         make_case("pendulum", "one", ONE, strength=0.0, seed=0)
     with pytest.raises(ModelError, match="inseparable"):
-        places("emps", "three")
+        places("emps", "four")

@@ -11,6 +11,7 @@ from hidden_rigs.furuta_engine import record_in_mujoco
 from hidden_rigs.plant import Plant
 from hidden_rigs.recording import record
 from hidden_rigs.sizes import drawn
+from hidden_rigs.under_test import as_hidden
 
 from npdr_ppl.models.effects import effects
 from npdr_ppl.models.effects.candidates import candidate_effects
@@ -62,7 +63,7 @@ def simulated(rig, simulator, rollouts, hidden=()):
     known = {parameter.name for parameter in simulator.parameters}
     values = {k: v for k, v in parameters_of(rig).items() if k in known}
     for h in hidden:
-        simulator = simulator.with_effects(effects()[h.effect_id](h.port))
+        simulator = simulator.with_effects(as_hidden(effects()[h.effect_id](h.port), h))
         values |= h.sites
     values = {k: torch.tensor(v, dtype=torch.float64) for k, v in values.items()}
     noise = torch.tensor(rig.measurement.counts + rig.measurement.velocity_noise)
