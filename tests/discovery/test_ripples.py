@@ -26,6 +26,7 @@ def test_the_number_per_turn_is_the_hidden_one(case):
     assert strongest_ripple(Projection(fitted), found, "hinge") == hidden.parameters["order"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rig", "positions"),
     [
