@@ -29,7 +29,7 @@ class RepairSettings:
         most_remedies: Greatest number of remedies of one recording.
         most_segments: Greatest number of segments along which remedies are tried. A unit, a sign
             or a clock is wrong in the whole recording. With the default length they last 40 s.
-        part_of_first_trials: A remedy is first tried along every so-manyth of these segments.
+        part_of_first_trials: A remedy is first tried along every n-th of these segments.
         hopeless_ratio: Residual of this trial, relative to that of the recording as it was read,
             from which the remedy is not tried along all of them. It is above ``remedy_factor``, so
             that a remedy is not missed because its residual differs between the segments.

@@ -2,8 +2,9 @@
 
 import torch
 
-from npdr_ppl.discovery.screening.latent_force import latent_force, responses
+from npdr_ppl.discovery.screening.latent_force import Pulse, latent_force, responses
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.engines.common.compilation import signature
 
 
 def test_the_latent_force_correlates_with_the_hidden_drag(dragged):
@@ -16,3 +17,9 @@ def test_the_latent_force_correlates_with_the_hidden_drag(dragged):
     both = torch.stack((latent.force.flatten(), (-drag * speed * speed.abs()).flatten()))
     assert torch.corrcoef(both)[0, 1] > 0.6
     assert bool((latent.error > 0).all())
+
+
+def test_a_compiled_loop_does_not_depend_on_where_a_pulse_began():
+    fresh, used = Pulse("hinge"), Pulse("hinge")
+    used.start_positions = torch.zeros(3)
+    assert signature(fresh) == signature(used)

@@ -306,7 +306,7 @@ def strongest_frequency(projection: Projection, found: Responses, port: str) -> 
 def strongest_ripple(projection: Projection, found: Responses, port: str) -> int | None:
     """Returns how many ripples per turn, as a force at a port, explain most.
 
-    The result is ``None`` if the position that the force moves is not recorded or is constant.
+    The result is ``None`` if no channel measures the position at the port, or it is constant.
 
     Args:
         projection: The fitted model.

@@ -31,7 +31,7 @@ class Pulse(TimedForceEffect):
     """A constant force during a part of each segment."""
 
     id = "pulse"
-    positions: Tensor | None = None
+    start_positions: Tensor | None = None
     """The joint's positions at the starts of the segments, once they were simulated."""
     parameters = (
         Parameter("height", "{port}", 0.0, "force during the pulse"),
@@ -46,7 +46,7 @@ class Pulse(TimedForceEffect):
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:
         """Returns the time since the segment's start, in the middle of the first step."""
-        self.positions = position.detach()
+        self.start_positions = position.detach()
         return torch.full_like(start.time, 0.5 * start.time_step)
 
     def force(
@@ -131,7 +131,8 @@ def responses(hypothesis: Hypothesis) -> Responses:
         if bool(change.isfinite().all()):
             by_port[port.name] = change.permute(1, 2, 0)
             units[port.name], rated[port.name] = port.unit, port.rated
-            measured = None if pulse.positions is None else _measuring(pulse, port, segments)
+            is_known = pulse.start_positions is not None
+            measured = _measuring(pulse, port, segments) if is_known else None
             if measured is not None:
                 positions[port.name] = measured
     begins = edges[:-1]
@@ -157,9 +158,9 @@ def _measuring(pulse: Pulse, port: Port, segments: SegmentModel) -> str | None:
         port: The port.
         segments: The model along the recording.
     """
-    assert pulse.positions is not None
+    assert pulse.start_positions is not None
     inputs = segments.inputs
-    position = pulse.positions.double().reshape(-1, inputs.num_segments)[0]
+    position = pulse.start_positions.double().reshape(-1, inputs.num_segments)[0]
     names = inputs.channel_names
     found: dict[str, float] = {}
     for sensor in segments.measured:

@@ -94,7 +94,8 @@ def _alternatives(
 ) -> Iterator[tuple[Alternatives | None, bool]]:
     """Yields the alternatives of each effect, in order, and whether they were tried.
 
-    They are ``None`` if they were not, or if the model cannot be simulated without the effect.
+    The alternatives are ``None`` if a time limit prevented them, or if the model cannot be
+    simulated without the effect.
     """
     seen = [(r.hypothesis, r.trials) for r in rounds]
     known = {effect.name: tried_before(current, effect, seen) for effect in effects}

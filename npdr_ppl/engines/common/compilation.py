@@ -68,9 +68,9 @@ _RECOMPILE_LIMIT = 64
 # would take 20 s and is skipped; if the compiler does not, loops run eagerly.
 _OPTIONS = (("max_fusion_size", 100_000), ("size_asserts", False), ("cpp.vec_isa_ok", True))
 
-# Attributes that traced code does not read: priors of effects, and values and defaults of the
-# parameters of policies.
-_INVISIBLE = frozenset({"_priors", "parameters", "parameter_info", "compile"})
+# Attributes that traced code does not read: priors of effects, where a pulse of force began, and
+# values and defaults of the parameters of policies.
+_INVISIBLE = frozenset({"_priors", "start_positions", "parameters", "parameter_info", "compile"})
 
 # Number of characters that an error quotes from the start and from the end of torch's message. The
 # start says what failed, and the end is the output of the C++ compiler. Its long command line is
