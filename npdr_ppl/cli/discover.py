@@ -81,6 +81,13 @@ def discover(
             help="Search both halves of the recording, too; name only what is found in both.",
         ),
     ] = False,
+    learn: Annotated[
+        bool,
+        typer.Option(
+            "--learn",
+            help="If no effect explains the recording, learn a law, and write it as an effect.",
+        ),
+    ] = False,
     time_limit: Annotated[
         float | None,
         typer.Option(
@@ -134,6 +141,7 @@ def discover(
         max_effects=max_effects,
         false_alarm_rate=false_alarm_rate,
         repeat=repeat,
+        learn=learn,
         time_limit=time_limit,
     )
     folder = DiscoveryFolder(out)
@@ -161,7 +169,10 @@ def discover(
                     write_stage_figures(investigation, stage.value, out)
                 else:
                     write_discovery_figures(discovery, out)
-            folder.finish(found, None if discovery is None else discovery.source())
+            if discovery is None:
+                folder.finish(found)
+            else:
+                folder.finish(found, discovery.source(), discovery.learned_source())
     if as_json:
         typer.echo((out / "discovery.json").read_text(), nl=False)
     elif not quiet:

@@ -4,6 +4,7 @@
     discovery.json      the results; written last. A folder with this file is complete, unless a
                         time limit ended the search
     revised_model.py    the model with the effects that were missing
+    learned_effect.py   the law that was learned, if the catalogue has none that explains
     fits/               the fits that an unfinished discovery has finished
 
 A discovery that was killed leaves no ``discovery.json``, and continues when it is run again: it
@@ -110,13 +111,19 @@ class DiscoveryFolder:
             raise DataError(f"{file} has an unknown stage.")
         return found if STAGES.index(reached) >= STAGES.index(stage) else None
 
-    def finish(self, found: dict[str, Any], source: str | None = None) -> None:
+    def finish(
+        self, found: dict[str, Any], source: str | None = None, learned: str | None = None
+    ) -> None:
         """Writes the results.
 
         Args:
             found: The content of ``discovery.json``.
             source: The revised model as Python source, if there is one.
+            learned: The learned effects as Python source, if there are any.
         """
+        if learned is not None:
+            with replacing(self.path / "learned_effect.py") as temporary:
+                temporary.write_text(learned, encoding="utf-8")
         if source is not None:
             with replacing(self.path / "revised_model.py") as temporary:
                 temporary.write_text(source, encoding="utf-8")

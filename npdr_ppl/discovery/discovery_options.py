@@ -23,6 +23,7 @@ class DiscoveryOptions:
         confidence: Probability above which one cause is named.
         repeat: Whether both halves of the recording are searched, too. An effect that is not found
             in both is not named. This takes about twice as long.
+        learn: Whether a law is learned if no effect of the catalogue explains the recording.
         time_limit: Seconds after which no further effect is searched; ``None`` for no limit. The
             running step is finished. Then the effects found so far are compared with their
             alternatives, and the posterior and the held-out gap are computed. The verdict is
@@ -34,6 +35,7 @@ class DiscoveryOptions:
     false_alarm_rate: float = 0.01
     confidence: float = 0.9
     repeat: bool = False
+    learn: bool = False
     time_limit: float | None = None
 
     def __post_init__(self) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.finding import Finding
+from npdr_ppl.discovery.learning.result import Learned
 from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.discovery.proof.next_experiment import NextExperiment
 from npdr_ppl.discovery.proof.parameter_intervals import Draws, Estimate
@@ -29,9 +30,10 @@ from npdr_ppl.run_files import write_json
 
 __all__ = ["Discovery", "Verdict", "describe_candidate"]
 
-Verdict = Literal["none", "named", "ambiguous", "unknown"]
+Verdict = Literal["none", "named", "ambiguous", "unknown", "learned"]
 """``none``: no effect is missing. ``named``: the missing effects are known. ``ambiguous``: the
-recording cannot tell several causes apart. ``unknown``: the cause is none of the catalogue."""
+recording cannot tell several causes apart. ``unknown``: the cause is none of the catalogue.
+``learned``: likewise, and a law was learned that helps wherever it was checked."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,8 @@ class Discovery:
         seconds: Time spent, by stage.
         halves: Names of the effects that a search of each half found, by the half's name; empty if
             the halves were not searched.
+        learned: The law that was learned because no effect explains the recording, if one was
+            asked for and found.
     """
 
     verdict: Verdict
@@ -97,6 +101,7 @@ class Discovery:
     seed: int
     seconds: dict[str, float]
     halves: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    learned: Learned | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values, the content of ``discovery.json``."""
@@ -128,26 +133,43 @@ class Discovery:
             "next_experiment": self.next_experiment and self.next_experiment.to_dict(),
             "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
             "counts": {name: count.to_dict() for name, count in self.counts.items()},
+            "learned": self.learned and self.learned.to_dict(),
             "seconds": self.seconds,
         }
 
     def source(self) -> str:
         """Returns the revised model as Python source."""
         effects = tuple(finding.effect for finding in self.effects)
+        final, written = self.search.final, ""
+        if self.learned is not None and self.learned.is_offered:
+            final, written = self.learned.model.hypothesis, self.learned.source()
+            effects += self.learned.effects
         fitted = {
             name: float(value)
-            for name, value in self.search.final.parameters.items()
+            for name, value in final.parameters.items()
             if torch.as_tensor(value).numel() == 1
         }
-        return revised_source(self.model, effects, fitted)
+        return revised_source(self.model, effects, fitted, written)
+
+    def learned_source(self) -> str | None:
+        """Returns the learned effects as Python source; ``None`` if there are none to offer."""
+        if self.learned is None or not self.learned.is_offered:
+            return None
+        name = getattr(self.model, "__name__", "")
+        return self.learned.source(f"Learned from a recording of {name}, seed {self.seed}.")
 
     def save(self, folder: Path) -> None:
-        """Writes ``revised_model.py``, then ``discovery.json``, which marks the folder complete.
+        """Writes ``revised_model.py``, a learned effect, and last ``discovery.json``.
+
+        ``discovery.json`` marks the folder complete.
 
         Args:
             folder: The folder; created if it does not exist.
         """
         folder.mkdir(parents=True, exist_ok=True)
+        if (learned := self.learned_source()) is not None:
+            with replacing(folder / "learned_effect.py") as temporary:
+                temporary.write_text(learned, encoding="utf-8")
         with replacing(folder / "revised_model.py") as temporary:
             temporary.write_text(self.source(), encoding="utf-8")
         write_json(folder / "discovery.json", self.to_dict())

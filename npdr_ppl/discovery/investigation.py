@@ -13,6 +13,7 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery
 from npdr_ppl.discovery.finding import Finding
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.learning.result import Learned, learn
 from npdr_ppl.discovery.proof.held_out_gap import Gap, prove
 from npdr_ppl.discovery.proof.next_experiment import NextExperiment, next_experiment
 from npdr_ppl.discovery.proof.parameter_intervals import (
@@ -25,6 +26,7 @@ from npdr_ppl.discovery.proof.residual_map import Spot, worst_windows
 from npdr_ppl.discovery.recording_repair import Repair, repair
 from npdr_ppl.discovery.screening.encoder_resolution import counts
 from npdr_ppl.discovery.screening.equivalents import equivalents
+from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.deadline import Deadline
 from npdr_ppl.discovery.search.effect_search import Searcher
@@ -260,7 +262,7 @@ class Investigation:
         with self._stage(f"posterior {len(self._drawn) + 1}"):
             self.progress.say("drawing parameters")
             # The original model predicts; where it lacks effects, its intervals are wrong.
-            is_rough = hypothesis is not self.search.final
+            is_rough = hypothesis is self.given and bool(hypothesis is not self.search.final)
             draws = posterior_draws(hypothesis, seed=self.seed, is_rough=is_rough)
         self._drawn.append((hypothesis, draws))
         return draws
@@ -268,9 +270,13 @@ class Investigation:
     @cached_property
     def gap(self) -> dict[str, Gap]:
         """Metrics on the held-out recording; empty without one."""
+        return self._gap_of(self.search.final)
+
+    def _gap_of(self, final: Hypothesis) -> dict[str, Gap]:
+        """Returns the metrics of a revised model on the held-out recording."""
         if self.holdout is None:
             return {}
-        given, final = self.given, self.search.final
+        given = self.given
         draws_before, draws_after = self._draws(given), self._draws(final)
         with self._stage("prove"):
             self.progress.say("predicting the held-out recording")
@@ -283,6 +289,27 @@ class Investigation:
                 draws_before=draws_before,
                 draws_after=draws_after,
                 seed=self.seed,
+            )
+
+    @cached_property
+    def learned(self) -> Learned | None:
+        """The laws that the model misses, learned without the catalogue.
+
+        It is ``None`` if none is found. They are learned beside the effects of the search, and
+        without them; the better model is taken.
+        """
+        search, holdout, options = self.search, self.holdout, None
+        if holdout is not None:
+            options = _like(self._data_options, self.rollouts, holdout)
+        starts = [self.start, *([search.final] if search.added else [])]
+        with self._stage("learn"):
+            return learn(
+                self._searcher.trials,
+                starts,
+                candidates_at(self.start, self.settings),
+                holdout=holdout,
+                options=options,
+                report=self.progress.say,
             )
 
     def _advice(self, name: str) -> NextExperiment | None:
@@ -340,6 +367,26 @@ class Investigation:
         effects.sort(key=lambda found: found.share, reverse=True)
         gap = self.gap
         verdict, reason = judge(search, effects, unexplained, gap, self.settings)
+        learned: Learned | None = None
+        if self.settings.learn and verdict == "unknown" and not search.has_stopped:
+            learned = self.learned
+        if learned is not None and learned.is_offered:
+            proven = self._gap_of(learned.model.hypothesis)
+            if proven and proven["rmse"].has_grown:
+                learned = learned.withdrawn(
+                    f"{learned.reason} But the error on the held-out rollouts grows from "
+                    f"{proven['rmse'].before:.3g} to {proven['rmse'].after:.3g}."
+                )
+            else:
+                verdict, gap = "learned", proven
+                left = self._searcher.look(learned.model.hypothesis)
+                search = replace(search, rounds=[*search.rounds, left])
+                unexplained = _unexplained(search)
+                final = learned.model.hypothesis
+                reason = f"No effect of the catalogue explains the recording. {learned.reason}"
+                every = estimates(final, self._draws(final), _units(final))
+                kept = {effect.name for effect in learned.model.start.effects}
+                effects = [found for found in effects if found.effect.name in kept]
         if self.narrow_priors:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
         is_short = len(halves) < len(HALVES) and not search.has_stopped
@@ -381,6 +428,7 @@ class Investigation:
             halves={
                 name: [added.effect.name for added in half.added] for name, half in halves.items()
             },
+            learned=learned,
         )
 
 

@@ -19,8 +19,16 @@ __all__ = ["revised_source"]
 
 FUNCTION = "revised_model"
 
+LEARNED = "npdr_learned"
+"""Module of learned effects, which exists only while they are learned."""
 
-def revised_source(model: Model, effects: tuple[Effect, ...], fitted: Mapping[str, float]) -> str:
+
+def revised_source(
+    model: Model,
+    effects: tuple[Effect, ...],
+    fitted: Mapping[str, float],
+    written: str = "",
+) -> str:
     """Returns Python source that defines ``revised_model``.
 
     A model from an installed module is imported. A model from a file is copied, so that the result
@@ -30,12 +38,14 @@ def revised_source(model: Model, effects: tuple[Effect, ...], fitted: Mapping[st
         model: The original model.
         effects: The effects to add.
         fitted: Parameters of the closest fit by site, which the source lists for information.
+        written: Source of effects that no module has.
     """
     base, *handlers = layers(model)
     head, name = _base(base)
     every = [e for h in handlers if isinstance(h, ModelWithEffects) for e, _ in h.effects]
     every += effects
-    imports = sorted({f"from {type(e).__module__} import {type(e).__name__}" for e in every})
+    own = [e for e in every if type(e).__module__ != LEARNED]
+    imports = sorted({f"from {type(e).__module__} import {type(e).__name__}" for e in own})
     functions = [
         *(["add_effect"] if every else []),
         *(["with_finer_steps"] if num_finer_steps(model) else []),
@@ -45,7 +55,10 @@ def revised_source(model: Model, effects: tuple[Effect, ...], fitted: Mapping[st
         imports = [f"from npdr_ppl import {', '.join(functions)}", *imports]
     if any(effect.given_priors for effect in every):
         imports = ["import pyro.distributions", "", *imports]
-    lines = [head.rstrip(), "", "", *imports, "", f"{FUNCTION} = {name}"]
+    lines = [head.rstrip(), "", "", *imports, ""]
+    if written:
+        lines += [written.strip(), "", ""]
+    lines += [f"{FUNCTION} = {name}"]
     for handler in handlers:
         lines += _handled(handler)
     for effect in effects:

@@ -1,0 +1,190 @@
+"""The formulas at every port, and the laws and effects that they become."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.learning.law import Law, module_source
+from npdr_ppl.discovery.learning.recorded_motion import PortMotion, motion_at_ports
+from npdr_ppl.discovery.learning.regression import (
+    Formula,
+    NormalEquations,
+    PortProducts,
+    pareto_front,
+)
+from npdr_ppl.discovery.learning.settings import LEARNING
+from npdr_ppl.discovery.learning.terms import Term, terms_at, with_harmonics
+from npdr_ppl.discovery.revised_model import LEARNED
+from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.errors import NpdrError
+from npdr_ppl.language.effects import Effect
+
+__all__ = ["PortFormulas", "effects_of", "formulas_by_port", "law_of"]
+
+
+@dataclass(frozen=True)
+class PortFormulas:
+    """The formulas at one port.
+
+    Attributes:
+        products: Products of the responses at the port.
+        equations: Products of the terms.
+        front: The best formula of each number of terms.
+    """
+
+    products: PortProducts
+    equations: NormalEquations
+    front: list[Formula]
+
+    @property
+    def motion(self) -> PortMotion:
+        """The motion at the port."""
+        return self.products.motion
+
+
+def formulas_by_port(hypothesis: Hypothesis) -> list[PortFormulas]:
+    """Returns the formulas at each port, the port with the least error first.
+
+    Args:
+        hypothesis: The fitted model.
+    """
+    projection = Projection(hypothesis)
+    result = []
+    for motion in motion_at_ports(hypothesis):
+        terms = terms_at(motion)
+        if motion.responses is None:
+            known = _sensor_responses(hypothesis, motion, terms)
+            if known is None:
+                continue
+            responses, values = known
+        else:
+            responses = motion.responses
+            values = [motion.columns(term.values(motion)) for term in terms]
+        products = PortProducts(projection, motion, responses)
+        equations = products.equations(terms, values)
+        front = equations.front()
+        if motion.responses is not None:
+            front += _with_harmonics(products, terms, front)
+            front = [_refined(products, formula) for formula in pareto_front(front)]
+        result.append(PortFormulas(products, equations, pareto_front(front)))
+    return sorted(result, key=lambda port: min(f.error for f in port.front))
+
+
+def _refined(products: PortProducts, formula: Formula) -> Formula:
+    """Returns a formula with shape constants between those that were tried.
+
+    Each constant is varied in smaller and smaller steps, and the others are kept.
+    """
+    motion, best = products.motion, formula
+    step = LEARNING.shape_step
+    while step > LEARNING.finest_shape_step:
+        before = best
+        for index, term in enumerate(formula.terms):
+            for place in range(len(term.shapes)):
+                for factor in (1.0 - step, 1.0 + step):
+                    terms = list(best.terms)
+                    shapes = list(terms[index].shapes)
+                    shapes[place] = replace(shapes[place], value=factor * shapes[place].value)
+                    terms[index] = replace(terms[index], shapes=tuple(shapes))
+                    values = [motion.columns(t.values(motion)) for t in terms]
+                    equations = products.equations(terms, values)
+                    if len(equations.terms) == len(terms):
+                        found = equations.all_terms
+                        if found.misfit < best.misfit:
+                            best = replace(found, errors=formula.errors)
+        if best is before:
+            step *= 0.5
+    return best
+
+
+def _with_harmonics(
+    products: PortProducts, terms: Sequence[Term], front: Sequence[Formula]
+) -> list[Formula]:
+    """Returns formulas with the harmonics of the waves that were found; empty without waves."""
+    found = list({term.key: term for formula in front for term in formula.terms}.values())
+    waves = [more for term in found if (more := with_harmonics(term)) is not None]
+    if not waves:
+        return []
+    chosen = [term for term in terms if not term.shapes and term not in found]
+    chosen += [*found, *waves]
+    motion = products.motion
+    values = [motion.columns(term.values(motion)) for term in chosen]
+    return products.equations(chosen, values).front()[1:]
+
+
+def _sensor_responses(
+    hypothesis: Hypothesis, motion: PortMotion, terms: Sequence[Term]
+) -> tuple[Tensor, list[Tensor]] | None:
+    """Returns the change by each column of errors of a sensor, simulated, and which is whose.
+
+    An error of a sensor also changes the state at which a segment begins.
+
+    Args:
+        hypothesis: The fitted model.
+        motion: The motion at the sensor.
+        terms: The terms.
+    """
+    segments, fit = hypothesis.segments, hypothesis.fit
+    ones = (1.0,) * sum(len(term.columns) for term in terms)
+    ranges = {name: (0.0, 1.0) for name in motion.values}
+    every = Law(motion.port, tuple(terms), ones, ones, ranges, motion.units)
+    (effect,), start = effects_of([every])
+    sizes = torch.cat([term.values(motion).square().mean((0, 1)).sqrt() for term in terms])
+    num = len(sizes)
+    steps = LEARNING.pulse_height * motion.port.rated / sizes.clamp_min(1e-12)
+    batch = {
+        name: value.expand(num + 1) for name, value in start.items() if not _is_coefficient(name)
+    }
+    for k in range(num):
+        batch[f"{effect.name}.c{k + 1}"] = torch.zeros(num + 1, dtype=torch.float64)
+        batch[f"{effect.name}.c{k + 1}"][k + 1] = steps[k]
+    box = segments.black_box(fit.z[None])
+    try:
+        simulator = segments.simulator.with_effects(effect)
+        offsets = fit.offsets[None].expand(num + 1, -1, -1)
+        runs = segments.run(simulator, {**box.parameters, **batch}, offsets)
+    except (NpdrError, NotImplementedError):
+        return None
+    change = segments.whitened(runs[1:] - runs[:1], fit.scale).permute(1, 2, 0) / steps
+    if not bool(change.isfinite().all()):
+        return None
+    eye = torch.eye(num, dtype=torch.float64).expand(change.shape[0], num, num)
+    widths = [len(term.columns) for term in terms]
+    return change, list(eye.split(widths, dim=-1))
+
+
+def _is_coefficient(site: str) -> bool:
+    return site.rpartition(".")[2][1:].isdigit()
+
+
+def law_of(port: PortFormulas, formula: Formula) -> Law:
+    """Returns a formula as a law."""
+    motion, spreads = port.motion, []
+    for term in formula.terms:
+        size = term.values(motion).square().mean((0, 1)).sqrt()
+        spreads += (LEARNING.prior_spread * motion.port.rated / size).tolist()
+    return Law(
+        motion.port,
+        formula.terms,
+        tuple(formula.coefficients.tolist()),
+        tuple(spreads),
+        {name: (float(x.min()), float(x.max())) for name, x in motion.values.items()},
+        motion.units,
+    )
+
+
+def effects_of(laws: Sequence[Law]) -> tuple[tuple[Effect, ...], dict[str, torch.Tensor]]:
+    """Returns the effects with these laws, and their parameters by site."""
+    source = module_source(laws, "Not yet fitted.")
+    space: dict[str, object] = {"__name__": LEARNED}
+    exec(compile(source, "learned_effect.py", "exec"), space)
+    effects, start = [], {}
+    for law in laws:
+        effect = space[law.class_name](law.port.name)  # pyright: ignore[reportCallIssue]
+        effects.append(effect)
+        for constant in law.constants:
+            start[f"{effect.name}.{constant.name}"] = torch.tensor(constant.value).double()
+    return tuple(effects), start

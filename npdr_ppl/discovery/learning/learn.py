@@ -1,0 +1,149 @@
+"""Learns the laws that a model misses, port by port, and fits them by simulation.
+
+In every round, the formulas at each port are compared by linear least squares. The best one at
+each of a few ports is fitted by simulation, together with all parameters, and the closest fit
+stays. The next round begins from there.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.learning.formulas import (
+    PortFormulas,
+    effects_of,
+    formulas_by_port,
+    law_of,
+)
+from npdr_ppl.discovery.learning.law import Law
+from npdr_ppl.discovery.learning.regression import Formula, simplest
+from npdr_ppl.discovery.learning.settings import LEARNING
+from npdr_ppl.discovery.search.evidence import closest
+from npdr_ppl.discovery.search.trials import Trials
+
+__all__ = ["LearnedModel", "learned_model", "with_fitted_values"]
+
+
+@dataclass(frozen=True)
+class LearnedModel:
+    """A model with learned laws.
+
+    Attributes:
+        start: The fitted model without the laws.
+        hypothesis: The model with the laws, fitted by simulation.
+        laws: The laws, with their fitted constants.
+        ports: The formulas at each port for the model without the laws, the best port first.
+    """
+
+    start: Hypothesis
+    hypothesis: Hypothesis
+    laws: tuple[Law, ...]
+    ports: tuple[PortFormulas, ...]
+
+    def complexity(self) -> float:
+        """Returns what its laws and the effects beside them cost, in units of the misfit."""
+        beside = sum(len(effect.parameters) for effect in self.start.effects)
+        own = sum(term.cost for law in self.laws for term in law.terms)
+        return max(port.equations.penalty for port in self.ports) * (own + beside)
+
+
+def learned_model(
+    trials: Trials,
+    start: Hypothesis,
+    report: Callable[[str], None] = lambda _: None,
+) -> LearnedModel | None:
+    """Learns the laws that a fitted model misses.
+
+    Args:
+        trials: Fits of the model.
+        start: The fitted model.
+        report: Called with a sentence about each step.
+
+    Returns:
+        ``None`` if no law predicts parts of the recording better than the model without one.
+    """
+    current, laws = start, ()
+    first: list[PortFormulas] = []
+    for number in range(LEARNING.most_laws):
+        report("comparing formulas at every port")
+        ports = formulas_by_port(current)
+        first = first or ports
+        chosen = [(port, simplest(port.front)) for port in ports]
+        chosen = [(port, formula) for port, formula in chosen if _improves(port, formula)]
+        if number:
+            chosen = [pair for pair in chosen if _is_large(pair, first)]
+        chosen.sort(key=lambda pair: pair[1].error)
+        tried: list[tuple[Hypothesis, tuple[Law, ...]]] = []
+        for port, formula in chosen[: LEARNING.num_fitted]:
+            new = law_of(port, formula)
+            report(f"fitting {new.formula} at {new.port.name}")
+            together = _together(laws, new)
+            effects, values = effects_of(together)
+            given = {k: v for k, v in values.items() if k not in current.parameters}
+            found = trials.refitted(current, (*start.effects, *effects), start=given)
+            if found is not None:
+                tried.append((found, together))
+        if not tried:
+            break
+        best = closest([h for h, _ in tried])
+        if closest([current, best]) is current:
+            break
+        current = best
+        laws = next(together for h, together in tried if h is best)
+    if not laws:
+        return None
+    fitted = tuple(with_fitted_values(law, current) for law in laws)
+    return LearnedModel(start, current, fitted, tuple(first))
+
+
+def _improves(port: PortFormulas, formula: Formula) -> bool:
+    """Returns whether a formula predicts the folds better than chance does."""
+    less = port.front[0].error - formula.error
+    return bool(formula.terms) and less > port.equations.penalty
+
+
+def _is_large(pair: tuple[PortFormulas, Formula], first: Sequence[PortFormulas]) -> bool:
+    """Returns whether another law explains more than a small part of what the first one did."""
+    port, formula = pair
+    before = max(p.front[0].error - p.front[-1].error for p in first)
+    return port.front[0].error - formula.error > LEARNING.least_share * before
+
+
+def _together(laws: Sequence[Law], new: Law) -> tuple[Law, ...]:
+    """Returns the laws with a new one, which is added to one at the same port."""
+    result = [law for law in laws if law.port.name != new.port.name]
+    for law in laws:
+        if law.port.name == new.port.name:
+            known = {term.key for term in law.terms}
+            kept = [k for k, term in enumerate(new.terms) if term.key not in known]
+            widths = [len(term.columns) for term in new.terms]
+            starts = [sum(widths[:k]) for k in range(len(widths))]
+            new = replace(
+                law,
+                terms=(*law.terms, *(new.terms[k] for k in kept)),
+                coefficients=(*law.coefficients, *_parts(new.coefficients, starts, widths, kept)),
+                spreads=(*law.spreads, *_parts(new.spreads, starts, widths, kept)),
+            )
+    return (*result, new)
+
+
+def _parts(
+    values: Sequence[float], starts: Sequence[int], widths: Sequence[int], kept: Sequence[int]
+) -> tuple[float, ...]:
+    return tuple(v for k in kept for v in values[starts[k] : starts[k] + widths[k]])
+
+
+def with_fitted_values(law: Law, hypothesis: Hypothesis) -> Law:
+    """Returns a law with the constants of a fitted model that has it."""
+    values = [
+        float(hypothesis.parameters[f"{law.port.name}.{law.id}.{constant.name}"])
+        for constant in law.constants
+    ]
+    num, terms = len(law.coefficients), []
+    shapes = iter(values[num:])
+    for term in law.terms:
+        own = tuple(replace(shape, value=next(shapes)) for shape in term.shapes)
+        terms.append(replace(term, shapes=own))
+    # Priors for those who take the law to another rig: it may be twice as strong there.
+    spreads = tuple(max(2.0 * abs(value), 1e-12) for value in values[:num])
+    return replace(law, terms=tuple(terms), coefficients=tuple(values[:num]), spreads=spreads)

@@ -1,0 +1,60 @@
+"""Numbers of learning that users do not set."""
+
+from dataclasses import dataclass
+
+from npdr_ppl.settings import check_range
+
+__all__ = ["LEARNING"]
+
+
+@dataclass(frozen=True)
+class LearningSettings:
+    """How a law is learned.
+
+    Attributes:
+        num_parts: Parts of each segment in each of which a pulse tells what a force does.
+        pulse_height: Height of a pulse, as a fraction of the port's rated value. It is small,
+            because the response is a derivative.
+        num_folds: Parts of the recording each of which is predicted from the others.
+        beam: Formulas of each size that are extended by another term.
+        most_terms: Greatest number of terms of a formula.
+        num_waves: Wave numbers that are tried over the visited range of a position.
+        waves_per_turn: Greatest wave number that is tried over an angle, in 1/rad.
+        num_harmonics: Number of harmonics of a wave that are tried together.
+        most_laws: Greatest number of laws at different ports.
+        num_fitted: Ports whose best formula is fitted by simulation.
+        least_share: Least improvement by another law, relative to that by the first.
+        num_shapes: Values of every other shape constant that are tried.
+        shape_step: First relative step by which a shape constant is varied.
+        finest_shape_step: Relative step at which that ends.
+        num_knots: Knots of a spline.
+        prior_spread: Standard deviation of the prior of a coefficient, as a multiple of the
+            port's rated value over the root mean square of the term.
+    """
+
+    num_parts: int = 20
+    pulse_height: float = 1e-3
+    num_folds: int = 8
+    beam: int = 8
+    most_terms: int = 4
+    num_waves: int = 60
+    waves_per_turn: float = 12.0
+    num_harmonics: int = 5
+    most_laws: int = 3
+    num_fitted: int = 3
+    least_share: float = 0.05
+    num_shapes: int = 6
+    shape_step: float = 0.16
+    finest_shape_step: float = 0.002
+    num_knots: int = 9
+    prior_spread: float = 3.0
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, 1000, "num_parts", "num_folds", "beam", "most_terms")
+        check_range(self, 1, 1000, "num_waves", "num_shapes", "num_knots")
+        check_range(self, 0.0, 1000.0, "pulse_height", "prior_spread")
+
+
+LEARNING = LearningSettings()
+"""The values that are used."""
