@@ -27,7 +27,7 @@ from hidden_rigs.friction_laws import DRY_LAWS
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.learning.law import Law
+from npdr_ppl.discovery.learning.curves import law_along
 from npdr_ppl.discovery.learning.learn import LearnedModel, learned_model
 from npdr_ppl.discovery.learning.proof import checks, misfit
 from npdr_ppl.discovery.learning.recorded_motion import motion_at_ports
@@ -105,7 +105,7 @@ def _force_error(case: Case, learned: LearnedModel) -> float | None:
     if hidden.port not in laws or hidden.effect_id not in {**FORCE_LAWS, **DRY_LAWS}:
         return None
     motion = next(m for m in motion_at_ports(learned.start) if m.port.name == hidden.port)
-    found = _force(laws[hidden.port], motion)
+    found = law_along(laws[hidden.port], motion)
     x = {name: value.numpy() for name, value in motion.values.items()}
     p = hidden.parameters
     if hidden.effect_id in FORCE_LAWS:
@@ -117,15 +117,6 @@ def _force_error(case: Case, learned: LearnedModel) -> float | None:
         )
         true = -torch.as_tensor(bound) * side
     return float((found - true).square().mean().sqrt() / true.square().mean().sqrt())
-
-
-def _force(law: Law, motion: Any) -> torch.Tensor:
-    flat = iter(law.coefficients)
-    total = torch.zeros_like(motion.values["t"])
-    for term in law.terms:
-        for column in term.values(motion).unbind(-1):
-            total = total + next(flat) * column
-    return total
 
 
 def summarise(rows: list[dict[str, Any]]) -> None:

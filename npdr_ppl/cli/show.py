@@ -167,6 +167,8 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             if not all(in_halves.values()):
                 name, where = f"{effect['port']}.{effect['effect']}", missing_where(in_halves)
                 console.print(f"{escape(name)} was not found in {where}.")
+    if found.get("learned"):
+        _show_learned(console, found["learned"])
     if found["gap"]:
         table = Table(title="Held-out rollouts", box=SIMPLE)
         table.add_column("metric", no_wrap=True)
@@ -190,6 +192,37 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             )
     if (experiment := found["next_experiment"]) is not None:
         _print_reason(console, "next experiment", _advice(experiment))
+
+
+def _show_learned(console: Console, learned: Mapping[str, Any]) -> None:
+    """Prints the learned laws, what they depend on, and where they were checked."""
+    title = "Learned law" if learned["offered"] else "Learned law, not offered"
+    table = Table(title=title, box=SIMPLE)
+    table.add_column("port", no_wrap=True)
+    table.add_column("law", overflow="fold")
+    table.add_column("unit", no_wrap=True)
+    for law in learned["laws"]:
+        table.add_row(escape(law["port"]), escape(law["with_numbers"]), law["unit"])
+    console.print(table)
+    for law in learned["laws"]:
+        port = law["port"]
+        shares = learned["depends_on"].get(port, {})
+        words = ", ".join(f"{symbol} {share:.0%}" for symbol, share in shares.items())
+        if words:
+            console.print(f"Explained misfit lost at {escape(port)} without {words}.")
+        if (like := learned["alike"].get(port)) is not None:
+            console.print(
+                f"Most similar at {escape(port)}: {escape(like['effect'])}, "
+                f"correlation {like['correlation']:.2f}."
+            )
+    table = Table(title="Misfit where the law was not fitted", box=SIMPLE)
+    table.add_column("measurements", overflow="fold")
+    for column in ("without the law", "with the law"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for check in learned["checks"]:
+        before, after = number(check["before"], ".4g"), number(check["after"], ".4g")
+        table.add_row(check["where"], before, after)
+    console.print(table)
 
 
 def _advice(experiment: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ from torch import Tensor
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.finding import Finding
+from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.result import Learned
 from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.discovery.proof.next_experiment import NextExperiment
@@ -103,6 +104,13 @@ class Discovery:
     halves: Mapping[str, Sequence[str]] = field(default_factory=dict)
     learned: Learned | None = None
 
+    @property
+    def final(self) -> Hypothesis:
+        """The revised model, fitted to the recording."""
+        if self.learned is not None and self.learned.is_offered:
+            return self.learned.model.hypothesis
+        return self.search.final
+
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values, the content of ``discovery.json``."""
         return {
@@ -139,14 +147,12 @@ class Discovery:
 
     def source(self) -> str:
         """Returns the revised model as Python source."""
-        effects = tuple(finding.effect for finding in self.effects)
-        final, written = self.search.final, ""
+        effects, written = tuple(finding.effect for finding in self.effects), ""
         if self.learned is not None and self.learned.is_offered:
-            final, written = self.learned.model.hypothesis, self.learned.source()
-            effects += self.learned.effects
+            effects, written = (*effects, *self.learned.effects), self.learned.source()
         fitted = {
             name: float(value)
-            for name, value in final.parameters.items()
+            for name, value in self.final.parameters.items()
             if torch.as_tensor(value).numel() == 1
         }
         return revised_source(self.model, effects, fitted, written)

@@ -5,8 +5,10 @@ each of a few ports is fitted by simulation, together with all parameters, and t
 stays. The next round begins from there.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+
+from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.formulas import (
@@ -21,7 +23,7 @@ from npdr_ppl.discovery.learning.settings import LEARNING
 from npdr_ppl.discovery.search.evidence import closest
 from npdr_ppl.discovery.search.trials import Trials
 
-__all__ = ["LearnedModel", "learned_model", "with_fitted_values"]
+__all__ = ["LearnedModel", "learned_model", "with_values"]
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def learned_model(
         laws = next(together for h, together in tried if h is best)
     if not laws:
         return None
-    fitted = tuple(with_fitted_values(law, current) for law in laws)
+    fitted = tuple(with_values(law, current.parameters) for law in laws)
     return LearnedModel(start, current, fitted, tuple(first))
 
 
@@ -133,10 +135,15 @@ def _parts(
     return tuple(v for k in kept for v in values[starts[k] : starts[k] + widths[k]])
 
 
-def with_fitted_values(law: Law, hypothesis: Hypothesis) -> Law:
-    """Returns a law with the constants of a fitted model that has it."""
+def with_values(law: Law, parameters: Mapping[str, Tensor]) -> Law:
+    """Returns a law with other constants.
+
+    Args:
+        law: The law.
+        parameters: The constants, by site.
+    """
     values = [
-        float(hypothesis.parameters[f"{law.port.name}.{law.id}.{constant.name}"])
+        float(parameters[f"{law.port.name}.{law.id}.{constant.name}"])
         for constant in law.constants
     ]
     num, terms = len(law.coefficients), []

@@ -138,6 +138,10 @@ class PortMotion:
     responses: Tensor | None
     edges: Tensor
 
+    def parts(self, values: Tensor) -> Tensor:
+        """Returns the mean over each of the P parts, ``(S, P)``, of ``(S, K)``."""
+        return self.columns(values[..., None])[..., 0]
+
     def columns(self, values: Tensor) -> Tensor:
         """Returns the mean over each of the P parts, ``(S, P, k)``.
 

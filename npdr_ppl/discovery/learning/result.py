@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.learning.curves import Curve, curves
 from npdr_ppl.discovery.learning.formulas import PortFormulas
 from npdr_ppl.discovery.learning.law import Law, module_source
 from npdr_ppl.discovery.learning.learn import LearnedModel, learned_model
@@ -48,6 +49,7 @@ class Learned:
         depends_on: For each of the best ports, by how much the explained misfit shrinks without
             each variable, as a share.
         alike: For each law's port, the most similar effect of the catalogue.
+        curves: Each law over each of its variables.
         reason: Why the laws are offered or not, in a sentence.
         is_offered: Whether the laws help wherever they were checked.
     """
@@ -56,6 +58,7 @@ class Learned:
     checks: tuple[Check, ...]
     depends_on: Mapping[str, Mapping[str, float]]
     alike: Mapping[str, Likeness]
+    curves: tuple[Curve, ...]
     reason: str
     is_offered: bool
 
@@ -99,6 +102,7 @@ class Learned:
                 port: {"effect": like.effect, "correlation": like.correlation}
                 for port, like in self.alike.items()
             },
+            "curves": [curve.to_dict() for curve in self.curves],
             "ports": [_front(port) for port in self.model.ports],
         }
 
@@ -177,6 +181,7 @@ def learn(
         tuple(every),
         {port.motion.port.name: _dependence(port) for port in model.ports[: LEARNING.num_fitted]},
         _alike(model, candidates),
+        tuple(curves(model)),
         reason,
         not worse,
     )

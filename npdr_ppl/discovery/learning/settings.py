@@ -27,6 +27,8 @@ class LearningSettings:
         num_shapes: Values of every other shape constant that are tried.
         shape_step: First relative step by which a shape constant is varied.
         finest_shape_step: Relative step at which that ends.
+        num_drawn_laws: Draws of a law's constants from which its band is computed.
+        num_bins: Bins over which a law and the missing force are averaged for a figure.
         num_knots: Knots of a spline.
         prior_spread: Standard deviation of the prior of a coefficient, as a multiple of the
             port's rated value over the root mean square of the term.
@@ -46,6 +48,8 @@ class LearningSettings:
     num_shapes: int = 6
     shape_step: float = 0.16
     finest_shape_step: float = 0.002
+    num_drawn_laws: int = 100
+    num_bins: int = 16
     num_knots: int = 9
     prior_spread: float = 3.0
 

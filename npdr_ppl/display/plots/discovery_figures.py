@@ -14,6 +14,7 @@ from npdr_ppl.display.plots.comparison_panels import plot_overlaid_marginals
 from npdr_ppl.display.plots.discovery_panels import plot_gap, plot_ranking, plot_separation
 from npdr_ppl.display.plots.fit_figures import scalar_columns
 from npdr_ppl.display.plots.latent_force_figure import AFTER, BEFORE, plot_latent_force
+from npdr_ppl.display.plots.learned_law_figure import plot_learned_law
 from npdr_ppl.display.plots.residual_map_figure import plot_residual_map
 from npdr_ppl.drawing.theme import save_figure
 from npdr_ppl.randomness import seeded
@@ -32,9 +33,9 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
         discovery: The discovery.
         out: Folder for ``residual_map.png``, ``latent_force.png``, ``ranking.png``,
             ``separation.png``, ``parameters.png`` and, where there are effects or held-out
-            rollouts, ``effects.png`` and ``gap.png``.
+            rollouts or a learned law, ``effects.png``, ``gap.png`` and ``learned_law.png``.
     """
-    rounds, final = discovery.search.rounds, discovery.search.final
+    rounds, final = discovery.search.rounds, discovery.final
     first, last = rounds[0], rounds[-1]
     start = first.hypothesis
     after = final if final.effects else None
@@ -66,6 +67,8 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
     figures["parameters"] = plot_overlaid_marginals(posteriors, prior, units=units)
     if discovery.gap:
         figures["gap"] = plot_gap(discovery.gap)
+    if discovery.learned is not None:
+        figures["learned_law"] = plot_learned_law(discovery.learned)
     return [save_figure(f, out / f"{name}.png") for name, f in figures.items() if f is not None]
 
 
