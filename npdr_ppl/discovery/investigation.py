@@ -380,7 +380,9 @@ class Investigation:
             else:
                 verdict, gap = "learned", proven
                 left = self._searcher.look(learned.model.hypothesis)
-                search = replace(search, rounds=[*search.rounds, left])
+                search = replace(
+                    search, rounds=[*search.rounds, left], final=learned.model.hypothesis
+                )
                 unexplained = _unexplained(search)
                 final = learned.model.hypothesis
                 reason = f"No effect of the catalogue explains the recording. {learned.reason}"

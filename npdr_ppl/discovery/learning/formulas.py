@@ -186,5 +186,7 @@ def effects_of(laws: Sequence[Law]) -> tuple[tuple[Effect, ...], dict[str, torch
         effect = space[law.class_name](law.port.name)  # pyright: ignore[reportCallIssue]
         effects.append(effect)
         for constant in law.constants:
-            start[f"{effect.name}.{constant.name}"] = torch.tensor(constant.value).double()
+            start[f"{effect.name}.{constant.name}"] = torch.tensor(
+                constant.value, dtype=torch.float64
+            )
     return tuple(effects), start

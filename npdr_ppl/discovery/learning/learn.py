@@ -21,7 +21,9 @@ from npdr_ppl.discovery.learning.law import Law
 from npdr_ppl.discovery.learning.regression import Formula, simplest
 from npdr_ppl.discovery.learning.settings import LEARNING
 from npdr_ppl.discovery.search.evidence import closest
+from npdr_ppl.discovery.search.rounds import explained
 from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.discovery.settings import VERDICT
 
 __all__ = ["LearnedModel", "learned_model", "with_values"]
 
@@ -66,14 +68,12 @@ def learned_model(
     """
     current, laws = start, ()
     first: list[PortFormulas] = []
-    for number in range(LEARNING.most_laws):
+    for _ in range(LEARNING.most_laws):
         report("comparing formulas at every port")
         ports = formulas_by_port(current)
         first = first or ports
         chosen = [(port, simplest(port.front)) for port in ports]
         chosen = [(port, formula) for port, formula in chosen if _improves(port, formula)]
-        if number:
-            chosen = [pair for pair in chosen if _is_large(pair, first)]
         chosen.sort(key=lambda pair: pair[1].error)
         tried: list[tuple[Hypothesis, tuple[Law, ...]]] = []
         for port, formula in chosen[: LEARNING.num_fitted]:
@@ -88,7 +88,7 @@ def learned_model(
         if not tried:
             break
         best = closest([h for h, _ in tried])
-        if closest([current, best]) is current:
+        if explained(current, best) <= VERDICT.minor_share * explained(start, best):
             break
         current = best
         laws = next(together for h, together in tried if h is best)
@@ -102,13 +102,6 @@ def _improves(port: PortFormulas, formula: Formula) -> bool:
     """Returns whether a formula predicts the folds better than chance does."""
     less = port.front[0].error - formula.error
     return bool(formula.terms) and less > port.equations.penalty
-
-
-def _is_large(pair: tuple[PortFormulas, Formula], first: Sequence[PortFormulas]) -> bool:
-    """Returns whether another law explains more than a small part of what the first one did."""
-    port, formula = pair
-    before = max(p.front[0].error - p.front[-1].error for p in first)
-    return port.front[0].error - formula.error > LEARNING.least_share * before
 
 
 def _together(laws: Sequence[Law], new: Law) -> tuple[Law, ...]:

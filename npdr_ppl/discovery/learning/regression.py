@@ -309,18 +309,22 @@ def pareto_front(found: Sequence[Formula]) -> list[Formula]:
 
 
 def simplest(found: Sequence[Formula]) -> Formula:
-    """Returns the simplest formula whose error is within one standard error of the least.
+    """Returns the simplest formula whose error is close to the least.
 
-    The standard error is that of the difference between both, from the folds.
+    The difference is within one standard error, from the folds, or a negligible share of what the
+    best formula explains.
 
     Args:
         found: The formulas.
     """
     best = min(found, key=lambda formula: formula.error)
 
+    most = max(formula.error for formula in found if not formula.terms)
+    negligible = LEARNING.negligible * (most - best.error)
+
     def is_as_good(formula: Formula) -> bool:
         more = formula.errors - best.errors
-        return float(more.sum()) <= float(more.std() * len(more) ** 0.5)
+        return float(more.sum()) <= max(negligible, float(more.std() * len(more) ** 0.5))
 
     # A law that acts in few folds is missing there, however different the folds are.
     laws = [f for f in found if f.terms or not best.terms]

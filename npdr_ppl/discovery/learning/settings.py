@@ -18,13 +18,16 @@ class LearningSettings:
         num_folds: Parts of the recording each of which is predicted from the others.
         beam: Formulas of each size that are extended by another term.
         most_terms: Greatest number of terms of a formula.
-        num_waves: Wave numbers that are tried over the visited range of a position.
-        waves_per_turn: Greatest wave number that is tried over an angle, in 1/rad.
+        num_waves: Greatest number of half waves in the visited range of a position.
+        fewest_waves: Number of half waves that is tried however small the range is.
+        most_per_turn: Greatest number of periods per turn that is tried at a joint that turns.
+        largest_wave_number: Greatest other wave number that is tried, in 1/rad or 1/m.
         num_harmonics: Number of harmonics of a wave that are tried together.
         most_laws: Greatest number of laws at different ports.
         num_fitted: Ports whose best formula is fitted by simulation.
-        least_share: Least improvement by another law, relative to that by the first.
         num_shapes: Values of every other shape constant that are tried.
+        negligible: Terms are left out that explain less than this share of what all explain. With a precise recording, everything that the model simplifies is
+            significant; a formula with many small terms says nothing to a mechanic.
         shape_step: First relative step by which a shape constant is varied.
         finest_shape_step: Relative step at which that ends.
         num_drawn_laws: Draws of a law's constants from which its band is computed.
@@ -40,12 +43,14 @@ class LearningSettings:
     beam: int = 8
     most_terms: int = 4
     num_waves: int = 60
-    waves_per_turn: float = 12.0
+    fewest_waves: int = 12
+    most_per_turn: int = 84
+    largest_wave_number: float = 12.0
     num_harmonics: int = 5
     most_laws: int = 3
     num_fitted: int = 3
-    least_share: float = 0.05
     num_shapes: int = 6
+    negligible: float = 0.01
     shape_step: float = 0.16
     finest_shape_step: float = 0.002
     num_drawn_laws: int = 100
@@ -57,6 +62,7 @@ class LearningSettings:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, 1000, "num_parts", "num_folds", "beam", "most_terms")
         check_range(self, 1, 1000, "num_waves", "num_shapes", "num_knots")
+        check_range(self, 1, 1000, "fewest_waves", "most_per_turn", "num_harmonics")
         check_range(self, 0.0, 1000.0, "pulse_height", "prior_spread")
 
 

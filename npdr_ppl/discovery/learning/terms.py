@@ -152,9 +152,8 @@ def with_harmonics(term: Term) -> Term | None:
 
 def _force_terms(motion: PortMotion) -> Iterator[Term]:
     values, units = motion.values, motion.units
-    waves = _waves(motion)
-    places = [_ONE, *_powers("q", units, 3), *(w for w in waves if not w.shapes)]
-    waves = [wave for wave in waves if wave.shapes]
+    places = [_ONE, *_powers("q", units, 3), *_turns(units, "q", range(1, 4))]
+    waves = [*_turns(units, "q", range(4, LEARNING.most_per_turn + 1)), *_waves(motion)]
     speeds = [
         _single("v", "v", "v", units["v"]),
         _single("v", "v * torch.abs(v)", "v|v|", f"({units['v']})²"),
@@ -211,7 +210,7 @@ def _sensor_terms(motion: PortMotion) -> Iterator[Term]:
         yield _product(motion, power)
     yield _product(motion, _single("y", "torch.abs(y)", "|y|", unit, 1))
     yield _product(motion, _single("y", "y * torch.abs(y)", "y|y|", f"({unit})²", 1))
-    for wave in _waves(motion, "y"):
+    for wave in (*_turns(motion.units, "y", range(1, 4)), *_waves(motion, "y")):
         yield _product(motion, wave)
     yield _spline(motion, "y")
 
@@ -271,38 +270,32 @@ def _powers(variable: str, units: Mapping[str, str], most: int) -> list[_Factor]
     ]
 
 
-def _waves(motion: PortMotion, name: str = "q") -> list[_Factor]:
-    """Returns sine and cosine of a position: of whole numbers per turn, and of the range."""
-    q, unit = motion.values[name], motion.units[name]
-    span = float(q.max() - q.min())
+def _turns(units: Mapping[str, str], name: str, numbers: range) -> list[_Factor]:
+    """Returns sine and cosine of an angle for whole numbers of periods per turn."""
+    if units[name] != "rad":
+        return []
     found = []
-    if unit == "rad":
-        for n in (1, 2, 3):
-            argument = name if n == 1 else f"{n} * {name}"
-            text = name if n == 1 else f"{n} {name}"
-            found.append(
-                _Factor(
-                    (f"torch.sin({argument})", f"torch.cos({argument})"),
-                    (f"sin {text}", f"cos {text}"),
-                    frozenset({name}),
-                    "",
-                    cost=1.0,
-                )
-            )
-    if span > 0.0:
-        longest = min(LEARNING.num_waves, round(LEARNING.waves_per_turn * span / torch.pi))
-        for j in range(1, 2 * max(longest, 12) + 1):
-            number = Shape("wave_number", 0.5 * j * torch.pi / span, f"1/{unit}")
-            found.append(
-                _Factor(
-                    (f"torch.sin(wave_number * {name})", f"torch.cos(wave_number * {name})"),
-                    (f"sin(k {name})", f"cos(k {name})"),
-                    frozenset({name}),
-                    "",
-                    (number,),
-                    cost=2.0,
-                )
-            )
+    for n in numbers:
+        argument, text = (name, name) if n == 1 else (f"{n} * {name}", f"{n} {name}")
+        columns = f"torch.sin({argument})", f"torch.cos({argument})"
+        formulas = f"sin {text}", f"cos {text}"
+        found.append(_Factor(columns, formulas, frozenset({name}), "", cost=1.0))
+    return found
+
+
+def _waves(motion: PortMotion, name: str = "q") -> list[_Factor]:
+    """Returns sine and cosine of a position for wave numbers that its range can tell apart."""
+    x, unit = motion.values[name], motion.units[name]
+    span = float(x.max() - x.min())
+    if span <= 0.0:
+        return []
+    longest = min(LEARNING.num_waves, round(LEARNING.largest_wave_number * span / torch.pi))
+    found = []
+    for j in range(1, 2 * max(longest, LEARNING.fewest_waves) + 1):
+        number = Shape("wave_number", 0.5 * j * torch.pi / span, f"1/{unit}")
+        columns = f"torch.sin(wave_number * {name})", f"torch.cos(wave_number * {name})"
+        formulas = f"sin(k {name})", f"cos(k {name})"
+        found.append(_Factor(columns, formulas, frozenset({name}), "", (number,), cost=2.0))
     return found
 
 

@@ -1,0 +1,122 @@
+"""Every term is the same law along the recorded motion and in the file of the learned effect."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from npdr_ppl.discovery.learning.formulas import effects_of
+from npdr_ppl.discovery.learning.law import Law, module_source
+from npdr_ppl.discovery.learning.recorded_motion import PortMotion
+from npdr_ppl.discovery.learning.terms import terms_at, with_harmonics
+from npdr_ppl.language.channels import Port
+from npdr_ppl.language.effect_context import Joint, Start
+
+
+def made_up(kind, **values):
+    """Motion at a port with random values, in two segments of ten steps."""
+    units = {"q": "rad", "v": "rad/s", "tau": "N m", "t": "s", "u": "N m", "y": "rad"}
+    generator = torch.Generator().manual_seed(0)
+    motion = {
+        name: size * torch.randn(2, 10, generator=generator, dtype=torch.float64)
+        for name, size in values.items()
+    }
+    motion["t"] = motion["t"].abs()
+    port = Port("hinge", kind, "N m", rated=2.0)
+    edges = torch.arange(11)
+    return PortMotion(port, motion, {name: units[name] for name in motion}, None, edges)
+
+
+def law_with(motion, term):
+    num = len(term.columns)
+    coefficients = tuple(0.3 + 0.1 * k for k in range(num))
+    ranges = {name: (float(x.min()), float(x.max())) for name, x in motion.values.items()}
+    return Law(motion.port, (term,), coefficients, (1.0,) * num, ranges, motion.units)
+
+
+JOINT = made_up("force", q=1.5, v=3.0, tau=1.0, t=2.0)
+COMMAND = made_up("action", u=1.0, t=2.0)
+SENSOR = made_up("sensor", y=1.5, t=2.0)
+
+
+def waves_with_harmonics(motion):
+    return [more for term in terms_at(motion) if (more := with_harmonics(term)) is not None]
+
+
+@pytest.mark.parametrize("extra", [terms_at, waves_with_harmonics])
+def test_a_force_is_the_same_in_the_file_as_along_the_motion(extra):
+    for term in extra(JOINT):
+        law = law_with(JOINT, term)
+        (effect,), values = effects_of([law])
+        parameters = {name.rpartition(".")[2]: value for name, value in values.items()}
+        x = {name: value.flatten() for name, value in JOINT.values.items()}
+        memory = None
+        if law.uses & {"t", "tau"}:
+            start = Start(x["t"] - 0.005, 0.01, parameters)
+            memory = effect.initial_memory(x["q"], x["v"], start)
+            joint = Joint(x["q"], x["v"], x["q"], x["q"], x["tau"])
+            if effect.needs_joint:
+                memory = effect.begin_step(joint, parameters, memory, 0.01)
+        expected = (term.values(JOINT) * torch.tensor(law.coefficients)).sum(-1).flatten()
+        if term.is_dry:
+            bound = effect.dry_friction(x["q"], x["v"], parameters, memory)
+            expected = -(-expected * x["v"].sign()).relu() * x["v"].sign()
+            found = -bound * x["v"].sign()
+        else:
+            found = effect.force(x["q"], x["v"], parameters, memory)
+        assert torch.allclose(found, expected, rtol=1e-4, atol=1e-5), term.key
+
+
+def test_a_command_is_changed_in_the_file_as_along_the_motion():
+    class Present:
+        def __init__(self, command):
+            self.command = command
+
+        def now(self):
+            return self.command
+
+    for term in terms_at(COMMAND):
+        law = law_with(COMMAND, term)
+        (effect,), values = effects_of([law])
+        parameters = {name.rpartition(".")[2]: value for name, value in values.items()}
+        u, t = (COMMAND.values[name].flatten() for name in ("u", "t"))
+        memory = effect.initial_memory(u, Start(t - 0.005, 0.01, parameters))
+        found, later = effect.act(Present(u), parameters, memory, 0.01)
+        expected = (term.values(COMMAND) * torch.tensor(law.coefficients)).sum(-1).flatten()
+        assert torch.allclose(found - u, expected, rtol=1e-4, atol=1e-5), term.key
+        assert torch.allclose(later, t + 0.01)
+
+
+def test_a_sensor_reads_in_the_file_what_the_term_says():
+    for term in terms_at(SENSOR):
+        law = law_with(SENSOR, term)
+        (effect,), values = effects_of([law])
+        parameters = {name.rpartition(".")[2]: value for name, value in values.items()}
+        y = SENSOR.values["y"].flatten()
+        found, _ = effect.read(y, parameters, None, 0.01)
+        expected = (term.values(SENSOR) * torch.tensor(law.coefficients)).sum(-1).flatten()
+        assert torch.allclose(found - y, expected, rtol=1e-4, atol=1e-5), term.key
+
+
+def test_terms_have_unique_names_and_costs_that_count_their_columns():
+    for motion in (JOINT, COMMAND, SENSOR):
+        terms = terms_at(motion)
+        assert len({term.key for term in terms}) == len(terms)
+        assert all(term.cost >= len(term.columns) for term in terms)
+
+
+def test_a_file_says_the_law_its_units_and_where_it_was_learned():
+    term = next(t for t in terms_at(JOINT) if t.key == "v³")
+    source = module_source([law_with(JOINT, term)], "From a test.")
+    assert "LearnedHinge at hinge: 0.3 v³" in source
+    assert '"N m/(rad/s)³"' in source
+    assert "It was learned for v from" in source
+    assert "From a test." in source
+
+
+def test_laws_at_two_ports_are_two_classes_of_one_file():
+    term = next(t for t in terms_at(JOINT) if t.key == "v")
+    law = law_with(JOINT, term)
+    other = replace(law, port=Port("second joint", "force", "N m"))
+    effects, _ = effects_of([law, other])
+    assert [effect.id for effect in effects] == ["learned_hinge", "learned_second_joint"]
