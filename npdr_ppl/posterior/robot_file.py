@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from npdr_ppl.engines.mujoco.export import ExportedMjcf, export_mjcf
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
@@ -16,7 +18,7 @@ from npdr_ppl.posterior.run_folder import MAX_FINER_STEPS
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import DiscoveryRecord, FitRecord
 
-__all__ = ["Identified", "export_robot", "identified"]
+__all__ = ["Identified", "export_robot", "found_mechanism", "identified", "revised_model"]
 
 
 class Identified(NamedTuple):
@@ -28,6 +30,7 @@ class Identified(NamedTuple):
         time_step: Seconds per step of the recording; ``None`` if the run does not say.
         verdict: The verdict of a discovery, ``""`` of a fit.
         reason: The reason for it.
+        ripples: Ripples per turn of effects that a discovery found, by the effect's name.
     """
 
     values: dict[str, float]
@@ -35,6 +38,7 @@ class Identified(NamedTuple):
     time_step: float | None
     verdict: str = ""
     reason: str = ""
+    ripples: Mapping[str, int] = MappingProxyType({})
 
 
 def identified(run: Path) -> Identified:
@@ -65,30 +69,48 @@ def identified(run: Path) -> Identified:
     step = float(seconds) / float(length) if length and seconds else None
     finer_steps = int(found.get("finer_steps") or 0)
     verdict, reason = (str(found.get(key) or "") for key in ("verdict", "reason"))
-    return Identified(values, finer_steps, step, verdict, reason)
+    ripples = {
+        f"{effect['port']}.{effect['effect']}": int(order)
+        for effect in found.get("effects") or []
+        if (order := (effect.get("constants") or {}).get("order")) is not None
+    }
+    return Identified(values, finer_steps, step, verdict, reason, ripples)
 
 
-def export_robot(model: Callable[..., Any], found: Identified) -> ExportedMjcf:
-    """Writes a run's values into the MJCF file of its model's simulator.
-
-    Effects of the catalogue that the values name, as ``<port>.<effect>.<parameter>``, are added to
-    the model first.
+def revised_model(model: Callable[..., Any], found: Identified) -> Callable[..., Any]:
+    """Returns a model with the effects that a run's values name, and the run's steps.
 
     Args:
-        model: A Pyro model with one simulator, a ``MujocoSimulator`` of a file.
+        model: A Pyro model with one simulator.
         found: What the run found.
-
-    Raises:
-        ModelError: The model has another simulator, or the file cannot hold a parameter.
     """
     _, sites = only_simulator(model)
     for name in dict.fromkeys(s.rpartition(".")[0] for s in found.values if s not in sites):
         port, _, effect = name.rpartition(".")
         if port:
-            model = add_effect(model, effect_class(effect)(port))
+            added = effect_class(effect)(port)
+            if name in found.ripples:
+                added = added.with_ripples(found.ripples[name])
+            model = add_effect(model, added)
     finer = found.finer_steps - num_finer_steps(model)
     for _ in range(min(finer, MAX_FINER_STEPS)):
         model = with_finer_steps(model)
+    return model
+
+
+def found_mechanism(
+    model: Callable[..., Any], found: Identified
+) -> tuple[MujocoMechanism, Mapping[str, Tensor]]:
+    """Returns the simulator of a run's model, effects attached, and its parameters' values.
+
+    Args:
+        model: A Pyro model with one simulator, a ``MujocoSimulator``.
+        found: What the run found.
+
+    Raises:
+        ModelError: The model has another simulator, or other parameters than the run.
+    """
+    model = revised_model(model, found)
     given = {n: torch.tensor(value, dtype=torch.float64) for n, value in found.values.items()}
     box, sites = only_simulator(model, given)
     other = sorted(sites ^ given.keys())
@@ -98,4 +120,24 @@ def export_robot(model: Callable[..., Any], found: Identified) -> ExportedMjcf:
         )
     if not isinstance(box.simulator, MujocoMechanism):
         raise ModelError(f"{box.simulator.name} has no MJCF file.")
-    return export_mjcf(box.simulator, box.parameters, time_step=found.time_step)
+    return box.simulator, box.parameters
+
+
+def export_robot(
+    model: Callable[..., Any], found: Identified, name: str | None = None
+) -> ExportedMjcf:
+    """Writes a run's values into the MJCF file of its model's simulator.
+
+    Effects of the catalogue that the values name, as ``<port>.<effect>.<parameter>``, are added to
+    the model first.
+
+    Args:
+        model: A Pyro model with one simulator, a ``MujocoSimulator`` of a file.
+        found: What the run found.
+        name: Name of the new file; that of the robot's file by default.
+
+    Raises:
+        ModelError: The model has another simulator, or the file cannot hold a parameter.
+    """
+    simulator, parameters = found_mechanism(model, found)
+    return export_mjcf(simulator, parameters, time_step=found.time_step, name=name)

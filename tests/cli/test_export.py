@@ -1,6 +1,7 @@
 """`npdr export`: a run's values in the robot's own file."""
 
 import json
+import runpy
 
 import mujoco
 import pytest
@@ -66,15 +67,43 @@ def test_a_verdict_that_names_no_effect_is_said(fitted, verdict):
     assert (f"is {verdict}: Because." in text) == (verdict != "named")
 
 
-def test_what_the_file_cannot_hold_is_said(fitted):
+def test_what_mujoco_does_not_have_is_a_python_file_beside_the_robots(fitted):
     folder, _ = fitted
-    values = {"kp": 44.0, "elbow.encoder_bias.offset": 0.01}
+    values = {"kp": 44.0, "elbow.encoder_bias.offset": 0.01, "kp.parameter_drift.rate": 0.001}
     fit = write_fit(folder / "other", values)
-    words = "export", fit, f"{folder / 'arm_model.py'}:model", "--to", folder / "new.xml"
+    words = "export", fit, f"{folder / 'arm_model.py'}:model", "--to", folder / "my-arm.xml"
     code, text, err = run_for_module(*words, "--json")
     assert code == 0, err
-    left_out = json.loads(text)["left_out"]
-    assert "an error of the measurement" in left_out["elbow.encoder_bias"]
+    told = json.loads(text)
+    assert told["callbacks"] == str(folder / "my_arm_effects.py")
+    assert told["in_callbacks"] == ["elbow.encoder_bias"]
+    assert "over minutes" in told["left_out"]["kp.parameter_drift"]
+    scope = runpy.run_path(told["callbacks"])
+    model = mujoco.MjModel.from_xml_path(told["file"])
+    measured = scope["Effects"](model).reset(mujoco.MjData(model))
+    assert measured["elbow"] == 0.01 and measured["shoulder"] == 0.0
+    (folder / "my-arm.xml").unlink()
+    code, _, err = run_for_module(*words)
+    assert code == 2 and "my_arm_effects.py exists already" in err
+
+
+def test_the_ripples_of_a_discovery_are_kept(fitted):
+    folder, _ = fitted
+    run = folder / "discovery"
+    run.mkdir()
+    cogging = {"effect": "cogging", "port": "elbow_torque", "constants": {"order": 7}}
+    means = {"kp": 41.0, "elbow_torque.cogging.sine": 0.3, "elbow_torque.cogging.cosine": 0.1}
+    found = {
+        "verdict": "named",
+        "parameters": {name: {"mean": mean, "sd": 0.1} for name, mean in means.items()},
+        "effects": [cogging],
+    }
+    (run / "discovery.json").write_text(json.dumps(found))
+    words = "export", run, f"{folder / 'arm_model.py'}:model", "--to", folder / "new.xml"
+    code, text, err = run_for_module(*words)
+    assert code == 0, err
+    assert "new_effects.py adds them" in text
+    assert "order=7," in (folder / "new_effects.py").read_text()
 
 
 def test_a_discovery_is_exported_with_its_effects(fitted):

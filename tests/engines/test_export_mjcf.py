@@ -12,10 +12,12 @@ from npdr_ppl.engines.mujoco.mjcf_text import MjcfText
 from npdr_ppl.errors import ModelError
 from npdr_ppl.models.effects import (
     Backlash,
+    Bias,
     Contact,
     CoulombFriction,
     EncoderBias,
     InputDelay,
+    ParameterDrift,
     Payload,
     Saturation,
     ServoGain,
@@ -93,6 +95,12 @@ def largest_difference(simulator, values):
     plain = MujocoSimulator(simulator.file, time_step=simulator.time_step)
     effect = (wanted - plain.simulate({}, inputs)).abs().max()
     return float((wanted - again.simulate({}, inputs)).abs().max()), float(effect)
+
+
+class Own(Bias):
+    """An effect of a user."""
+
+    id = "own"
 
 
 EFFECTS = [
@@ -192,19 +200,21 @@ def test_a_urdf_becomes_an_mjcf_file(tmp_path):
     assert difference <= 1e-6 and matters > 1e-3
 
 
-def test_what_the_file_cannot_hold_is_listed(tmp_path):
-    simulator = MujocoSimulator(write_arm(tmp_path)).with_effects(
-        Backlash("elbow_torque"), EncoderBias("elbow"), Spring("elbow_torque")
+def test_what_neither_file_nor_python_can_hold_is_listed(tmp_path):
+    simulator = MujocoSimulator(write_arm(tmp_path), {"mass": "body hand mass"}).with_effects(
+        Backlash("elbow_torque"), EncoderBias("elbow"), Own("elbow_torque"), ParameterDrift("mass")
     )
     given = {
         f"{e.name}.{n}": value(number)
         for e in simulator.effects
         for n, number in e.probe(simulator.port(e.port)).items()
     }
-    refused = export_mjcf(simulator, given).refused
-    assert refused["elbow_torque.backlash"] == "npdr export does not write this law"
-    assert "an error of the measurement" in refused["elbow.encoder_bias"]
-    assert "has a spring already" in refused["elbow_torque.spring"]
+    found = export_mjcf(simulator, given)
+    assert found.callbacks is not None
+    assert found.callbacks.effects == ("elbow_torque.backlash", "elbow.encoder_bias")
+    assert list(found.refused) == ["elbow_torque.own", "mass.parameter_drift"]
+    assert found.refused["elbow_torque.own"] == "npdr export has no Python for this law"
+    assert "over minutes" in found.refused["mass.parameter_drift"]
 
 
 def test_all_other_text_stays(tmp_path):
@@ -300,7 +310,8 @@ def test_effects_act_where_the_engine_has_switched_its_own_law_off(tmp_path, fla
     probe = attached.probe(base.port("j_torque"))
     given = {f"{attached.name}.{name}": value(number) for name, number in probe.items()}
     assert not torch.equal(changed.simulate(given, inputs), base.simulate({}, inputs))
-    assert attached.name in export_mjcf(changed, given).refused
+    found = export_mjcf(changed, given)
+    assert found.callbacks is not None and found.callbacks.effects == (attached.name,)
 
 
 def test_an_effect_that_cannot_be_written_leaves_the_others(tmp_path):

@@ -1,56 +1,74 @@
-"""Effects that an MJCF file can hold: the numbers of a model that stand for them."""
+"""Where an effect goes: numbers of an MJCF file, Python beside it, or nowhere."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import torch
 from torch import Tensor
 
+from npdr_ppl.engines.mujoco.callbacks.python_file import LAWS, has_dry_friction
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.parameters import Assignments, present
-from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.effects import ActionEffect, Effect, ForceEffect
 
-__all__ = ["file_assignments", "why_not"]
+__all__ = ["file_assignments", "is_in_file", "why_not"]
 
 FRICTION, LIMIT = "coulomb_friction", "saturation"
 """Effects that simulations apply themselves, and that a file holds, too."""
 
 REASONS = {
-    "spring": "the joint has a spring already",
-    **dict.fromkeys(
-        ("encoder_bias", "encoder_scale", "sensor_delay", "sensor_low_pass", "clock_skew"),
-        "it is an error of the measurement, which the robot's motion does not have",
-    ),
+    "parameter_drift": "it changes a parameter over minutes; the file has the value at the start",
 }
 """Why effects are not written, where there is something to say."""
 
 
-def why_not(simulator: MujocoMechanism, effect: Effect) -> str | None:
-    """Returns why an effect is not written into a file; ``None`` if it is.
+def is_in_file(simulator: MujocoMechanism, effect: Effect) -> bool:
+    """Returns whether an MJCF file can hold an effect.
 
     Args:
         simulator: The simulator.
         effect: The effect.
     """
-    if simulator.is_native(effect) or effect.id in (FRICTION, LIMIT):
+    others = [other for other in simulator.effects if other is not effect]
+    if effect.id == LIMIT:
+        # The file's limit acts behind all Python, so no other law may act on the command.
+        return not any(isinstance(e, ActionEffect) and effect.port in e.channels for e in others)
+    if effect.id == FRICTION:
+        # Laws that need the joint's acceleration get it without dry friction of other effects.
+        return not any(isinstance(e, ForceEffect) and e.needs_joint for e in others)
+    return simulator.is_native(effect)
+
+
+def why_not(effect: Effect) -> str | None:
+    """Returns why an effect is written nowhere; ``None`` if there is Python for it.
+
+    Args:
+        effect: An effect that the file cannot hold.
+    """
+    if effect.id in LAWS:
         return None
-    return REASONS.get(effect.id, "npdr export does not write this law")
+    return REASONS.get(effect.id, "npdr export has no Python for this law")
 
 
-def file_assignments(simulator: MujocoMechanism, parameters: Mapping[str, Tensor]) -> Assignments:
+def file_assignments(
+    simulator: MujocoMechanism, parameters: Mapping[str, Tensor], chosen: Collection[Effect]
+) -> Assignments:
     """Returns what to write into a simulator's model for its parameters and effects.
 
     Args:
-        simulator: The simulator, with effects that :func:`why_not` does not refuse.
+        simulator: The simulator with all effects that are written, to the file or beside it.
         parameters: Values of parameters, those of effects included, float64 numbers.
+        chosen: The effects that the file holds.
     """
     result, _ = simulator.assignments(parameters, torch.zeros((), dtype=torch.float64))
     for effect in simulator.effects:
         values = effect.own_parameters(parameters)
-        if effect.id == FRICTION:
+        if has_dry_friction(effect):
             (dof,) = (p.velocity for p in simulator.force_ports if p.port.name == effect.port)
             own = present(simulator.model, "dof_frictionloss", dof, result)
-            result["dof_frictionloss", dof] = own + values["magnitude"]
-        elif effect.id == LIMIT:
+            # Python sets its bounds while it runs; the file has the solver's settings for them.
+            more = values["magnitude"] if effect in chosen else torch.zeros_like(own)
+            result["dof_frictionloss", dof] = own + more
+        elif effect.id == LIMIT and effect in chosen:
             actuator = [action.name for action in simulator.actions].index(effect.port)
             channel, limit = simulator.actions[actuator], values["limit"]
             lower, upper = (-limit).clamp_min(channel.lower), limit.clamp_max(channel.upper)

@@ -1,11 +1,12 @@
-"""Writes identified parameters and effects into the text of an MJCF file."""
+"""Writes identified parameters and effects into the text of an MJCF file, and Python beside it."""
 
 import copy
+import re
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from uuid import uuid4
 from xml.etree import ElementTree
 
@@ -16,7 +17,8 @@ from torch import Tensor
 
 from npdr_ppl.engines.common.robot_files import RobotFiles, is_urdf, read_robot, references
 from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
-from npdr_ppl.engines.mujoco.effects_in_file import file_assignments, why_not
+from npdr_ppl.engines.mujoco.callbacks.python_file import CallbackFile, callback_file
+from npdr_ppl.engines.mujoco.effects_in_file import file_assignments, is_in_file, why_not
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.mjcf_edits import Edits, array_of
 from npdr_ppl.engines.mujoco.mjcf_text import MjcfText, flattened
@@ -25,7 +27,7 @@ from npdr_ppl.engines.mujoco.urdf_files import as_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
 
-__all__ = ["ExportedMjcf", "export_mjcf"]
+__all__ = ["ExportedMjcf", "export_mjcf", "module_name"]
 
 Array = NDArray[np.float64]
 
@@ -39,7 +41,9 @@ class ExportedMjcf:
         folder: Its folder.
         before: The text of the robot's file, with the content of included files in their place.
         text: The new text.
-        refused: Why effects are not in it, by the effect's name.
+        callbacks: Python with the effects that MuJoCo does not have itself; ``None`` if there are
+            none.
+        refused: Why other effects are in neither, by the effect's name.
         needs_folder: Whether the text refers to other files, such as meshes, by relative paths.
     """
 
@@ -47,6 +51,7 @@ class ExportedMjcf:
     folder: Path
     before: str
     text: str
+    callbacks: CallbackFile | None
     refused: dict[str, str]
     needs_folder: bool
 
@@ -56,6 +61,7 @@ def export_mjcf(
     parameters: Mapping[str, Tensor],
     *,
     time_step: float | None = None,
+    name: str | None = None,
 ) -> ExportedMjcf:
     """Writes parameters and effects into the text of a simulator's file.
 
@@ -66,6 +72,7 @@ def export_mjcf(
         simulator: The simulator, effects attached and in the steps in which it was fitted.
         parameters: Values of its parameters and of those of its effects.
         time_step: Seconds per step of the recording; the simulator's own by default.
+        name: Name of the new file, which the Python beside it mentions; the old one by default.
 
     Raises:
         ModelError: The simulator has no file, or a parameter cannot be written into it.
@@ -82,13 +89,36 @@ def export_mjcf(
     needs_folder = any(True for tree in trees for _ in references(tree))
     place = simulator.file.parent if needs_folder else None
     original = _Original(before, step, place, has_six_digits=is_urdf(files))
-    kept, refused = _effects_that_fit(simulator, given, original)
+    found = _divided(simulator, given, original)
     chosen = copy.copy(simulator)
-    chosen.effects = kept
-    text = _new_text(chosen, given, original)
+    chosen.effects = tuple(e for e in simulator.effects if e.name not in found.refused)
+    text = _new_text(chosen, given, original, found.in_file)
+    callbacks = None
+    if found.beside:
+        robot = name or simulator.file.name
+        callbacks = callback_file(
+            chosen,
+            found.beside,
+            {name: float(value) for name, value in given.items()},
+            robot=robot,
+            module=module_name(robot),
+            substeps=simulator.num_substeps(time_step),
+        )
     return ExportedMjcf(
-        simulator.file.name, simulator.file.parent, before, text, refused, needs_folder
+        simulator.file.name,
+        simulator.file.parent,
+        before,
+        text,
+        callbacks,
+        found.refused,
+        needs_folder,
     )
+
+
+def module_name(robot: str) -> str:
+    """Returns the name of the Python module beside a robot's file, e.g. ``"arm_effects"``."""
+    stem = re.sub(r"\W", "_", Path(robot).stem)
+    return f"{'_' * stem[:1].isdigit()}{stem}_effects"
 
 
 @dataclass(frozen=True)
@@ -108,39 +138,58 @@ class _Original:
     has_six_digits: bool
 
 
-def _effects_that_fit(
-    simulator: MujocoMechanism, given: Mapping[str, Tensor], original: _Original
-) -> tuple[tuple[Effect, ...], dict[str, str]]:
-    """Returns the effects that the file can hold, and why it cannot hold the others.
+class _Division(NamedTuple):
+    """Where effects go.
 
-    Each is tried by itself; see :func:`_new_text` for the arguments.
+    Attributes:
+        in_file: Those that the file holds.
+        beside: Those that are Python beside it.
+        refused: Why others are in neither, by name.
     """
-    kept: list[Effect] = []
+
+    in_file: tuple[Effect, ...]
+    beside: tuple[Effect, ...]
+    refused: dict[str, str]
+
+
+def _divided(
+    simulator: MujocoMechanism, given: Mapping[str, Tensor], original: _Original
+) -> _Division:
+    """Returns where effects go. Each is tried by itself; see :func:`_new_text`."""
+    in_file: list[Effect] = []
+    beside: list[Effect] = []
     refused: dict[str, str] = {}
     alone = copy.copy(simulator)
     for effect in simulator.effects:
-        reason = why_not(simulator, effect)
+        place = in_file if is_in_file(simulator, effect) else beside
+        reason = None if place is in_file else why_not(effect)
         if reason is None:
             alone.effects = (effect,)
             own = {n: given[n] for n in effect.parameter_names if n in given}
             try:
-                _new_text(alone, own, original)
+                _new_text(alone, own, original, (effect,) if place is in_file else ())
             except ModelError as error:
                 reason = str(error).rstrip(".")
         if reason is None:
-            kept.append(effect)
+            place.append(effect)
         else:
             refused[effect.name] = reason
-    return tuple(kept), refused
+    return _Division(tuple(in_file), tuple(beside), refused)
 
 
-def _new_text(simulator: MujocoMechanism, given: Mapping[str, Tensor], original: _Original) -> str:
+def _new_text(
+    simulator: MujocoMechanism,
+    given: Mapping[str, Tensor],
+    original: _Original,
+    in_file: Sequence[Effect],
+) -> str:
     """Returns the text with values in it.
 
     Args:
-        simulator: The simulator with the effects to write.
+        simulator: The simulator with the effects to write, to the file or beside it.
         given: Values of parameters, float64 numbers.
         original: The text without them.
+        in_file: The effects that the file holds.
 
     Raises:
         ModelError: A value cannot be written.
@@ -148,7 +197,7 @@ def _new_text(simulator: MujocoMechanism, given: Mapping[str, Tensor], original:
     effects = {name for effect in simulator.effects for name in effect.parameter_names}
     own = {p.name for p in simulator.parameters} | effects
     given = {name: value for name, value in given.items() if name in own}
-    assignments = file_assignments(simulator, given)
+    assignments = file_assignments(simulator, given, in_file)
     # The solver's settings of dry friction follow from what simulations set, without effects.
     set_anyway, _ = simulator.assignments(given, torch.zeros((), dtype=torch.float64))
     model = _written(simulator.prepared(original.step, set(set_anyway)), assignments)

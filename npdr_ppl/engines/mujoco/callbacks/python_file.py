@@ -1,0 +1,273 @@
+"""Writes laws, with the values that were identified, as one Python file."""
+
+import ast
+import inspect
+import json
+import re
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+from npdr_ppl.engines.mujoco.callbacks import command_laws, joint_laws, runner, sensor_laws
+from npdr_ppl.engines.mujoco.channels import Reading
+from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
+from npdr_ppl.language.effects import Effect, ForceEffect, SensorEffect
+
+__all__ = ["LAWS", "CallbackFile", "callback_file", "has_dry_friction", "law_lines"]
+
+LAWS: dict[str, type] = {
+    "viscous_friction": joint_laws.ViscousFriction,
+    "coulomb_friction": joint_laws.CoulombFriction,
+    "asymmetric_coulomb_friction": joint_laws.AsymmetricCoulombFriction,
+    "stribeck_friction": joint_laws.StribeckFriction,
+    "presliding_friction": joint_laws.PreslidingFriction,
+    "quadratic_drag": joint_laws.QuadraticDrag,
+    "load_dependent_friction": joint_laws.LoadDependentFriction,
+    "friction_drift": joint_laws.FrictionDrift,
+    "bias": joint_laws.Bias,
+    "cogging": joint_laws.Cogging,
+    "spring": joint_laws.Spring,
+    "hardening_spring": joint_laws.HardeningSpring,
+    "joint_elasticity": joint_laws.JointElasticity,
+    "backlash": joint_laws.Backlash,
+    "unbalance": joint_laws.Unbalance,
+    "wind": joint_laws.Wind,
+    "periodic_disturbance": joint_laws.PeriodicDisturbance,
+    "input_delay": command_laws.InputDelay,
+    "actuator_lag": command_laws.ActuatorLag,
+    "actuator_gain": command_laws.ActuatorGain,
+    "supply_sag": command_laws.SupplySag,
+    "saturation": command_laws.Saturation,
+    "dead_zone": command_laws.DeadZone,
+    "goal_speed_limit": command_laws.GoalSpeedLimit,
+    "goal_acceleration_limit": command_laws.GoalAccelerationLimit,
+    "goal_resolution": command_laws.GoalResolution,
+    "servo_dead_band": command_laws.ServoDeadBand,
+    "encoder_bias": sensor_laws.EncoderBias,
+    "encoder_scale": sensor_laws.EncoderScale,
+    "quantisation": sensor_laws.Quantisation,
+    "sensor_low_pass": sensor_laws.SensorLowPass,
+    "sensor_delay": sensor_laws.SensorDelay,
+    "clock_skew": sensor_laws.ClockSkew,
+}
+"""The law of each effect that can be exported as Python, by the effect's id."""
+
+_SOURCES: tuple[ModuleType, ...] = (joint_laws, command_laws, sensor_laws, runner)
+
+
+@dataclass(frozen=True)
+class CallbackFile:
+    """A Python file with laws.
+
+    Attributes:
+        text: Its text.
+        effects: Names of the effects in it.
+    """
+
+    text: str
+    effects: tuple[str, ...]
+
+
+def has_dry_friction(effect: Effect) -> bool:
+    """Returns whether an effect's law has a bound of dry friction."""
+    law = LAWS.get(effect.id, joint_laws.JointLaw)
+    own = getattr(law, "dry_friction", None)
+    return own is not None and own is not joint_laws.JointLaw.dry_friction
+
+
+def law_lines(simulator: MujocoMechanism, effects: Sequence[Effect]) -> list[str]:
+    """Returns an expression that makes the law of each effect at each of its places.
+
+    Args:
+        simulator: The simulator.
+        effects: Effects with a law.
+    """
+    lines = []
+    for effect in effects:
+        given = [f"{p.name}=values[{_quoted(s)}]," for p, s in _parameters(effect)]
+        given += [f"{name}={value!r}," for name, value in effect.constants.items()]
+        for place in _places(simulator, effect):
+            inside = "\n    ".join([f"{_quoted(place)},", *given])
+            lines.append(f"{LAWS[effect.id].__name__}(\n    {inside}\n)")
+    return lines
+
+
+def callback_file(
+    simulator: MujocoMechanism,
+    effects: Sequence[Effect],
+    values: Mapping[str, float],
+    *,
+    module: str,
+    robot: str,
+    substeps: int,
+) -> CallbackFile:
+    """Returns the Python file of some effects.
+
+    Args:
+        simulator: The simulator with its channels.
+        effects: The effects, in the order of attachment.
+        values: Values of their parameters, by site.
+        module: Name of the file without its ending.
+        robot: Name of the robot's file that is to be loaded.
+        substeps: Engine steps per control step.
+    """
+    code = _code({runner.LawRunner.__name__, *(LAWS[e.id].__name__ for e in effects)})
+    table = [_HEAD.format(robot=robot, module=module, substeps=substeps)]
+    table += [*_imports(code), "", "import mujoco", "import numpy as np", "", "", code]
+    table += ["VALUES = {"]
+    for effect in effects:
+        units = effect.units(simulator.port(effect.port))
+        for parameter, site in _parameters(effect):
+            unit = units[parameter.name]
+            note = f"{parameter.description}" + (f", {unit}" if unit != "1" else "")
+            table.append(f"    {_quoted(site)}: {float(values[site])!r},  # {note}")
+    table += ["}", '"""Identified values of the effects."""', ""]
+    table += ["CHANNELS: dict[str, Channel] = {"]
+    for name, (array, element, component) in channels_of(simulator).items():
+        place = f'("{array}", {_quoted(element)}, {component})'
+        table.append(f"    {_quoted(name)}: {place},")
+    table += ["}", '"""Where each measurement is in the model."""', "", ""]
+    lines = ",\n".join(textwrap.indent(e, 8 * " ") for e in law_lines(simulator, effects))
+    table += [_TAIL.format(laws=lines, substeps=substeps)]
+    return CallbackFile("\n".join(table), tuple(effect.name for effect in effects))
+
+
+def channels_of(simulator: MujocoMechanism) -> dict[str, runner.Channel]:
+    """Returns where each measurement of a simulator is; see :data:`runner.Channel`."""
+    model: Any = simulator.model
+    result: dict[str, runner.Channel] = {}
+    for sensor in simulator.readings:
+        name = sensor.channel.name
+        if isinstance(sensor, Reading):
+            array, kind, first = "sensordata", "sensor", model.sensor_adr
+        elif sensor.is_velocity:
+            array, kind, first = "qvel", "joint", model.jnt_dofadr
+        else:
+            array, kind, first = "qpos", "joint", model.jnt_qposadr
+        number = max(i for i, place in enumerate(first) if int(place) <= sensor.address)
+        element = getattr(model, kind)(number).name or number
+        result[name] = array, element, sensor.address - int(first[number])
+    return result
+
+
+def _quoted(name: str | int) -> str:
+    """Returns a name as Python."""
+    return json.dumps(name, ensure_ascii=False)
+
+
+def _parameters(effect: Effect) -> list[tuple[Any, str]]:
+    return list(zip(effect.parameters, effect.parameter_names, strict=True))
+
+
+def _places(simulator: MujocoMechanism, effect: Effect) -> list[str | int]:
+    """Returns the names of the joints, actuators or channels at which an effect acts."""
+    model: Any = simulator.model
+    if isinstance(effect, ForceEffect):
+        (joint,) = (p.joint for p in simulator.force_ports if p.port.name == effect.port)
+        return [model.joint(joint).name or joint]
+    if isinstance(effect, SensorEffect):
+        if simulator.port(effect.port).kind == "clock":
+            return [sensor.name for sensor in simulator.sensors]
+        return list(effect.channels)
+    names = [action.name for action in simulator.actions]
+    numbers = [names.index(name) for name in effect.channels]
+    return [model.actuator(number).name or number for number in numbers]
+
+
+def _code(wanted: set[str]) -> str:
+    """Returns the source of some classes, and of everything that they use, in order."""
+    pieces: dict[str, tuple[str, set[str]]] = {}
+    for module in _SOURCES:
+        source = inspect.getsource(module)
+        lines = source.splitlines()
+        body = ast.parse(source).body
+        for node, after in zip(body, [*body[1:], None], strict=True):
+            name = _defined(node)
+            if name is None or name == "__all__":
+                continue
+            decorators = getattr(node, "decorator_list", [])
+            first = min([node.lineno, *(d.lineno for d in decorators)])
+            # The string behind a constant is its docstring.
+            is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            last = after if is_text and after is not None else node
+            text = "\n".join(lines[first - 1 : last.end_lineno])
+            used = {n.id for n in ast.walk(node) if isinstance(n, ast.Name)} - {name}
+            pieces[name] = text, used
+    kept = set(wanted)
+    while more := {u for name in kept for u in pieces[name][1] if u in pieces} - kept:
+        kept |= more
+    return "\n\n\n".join(text for name, (text, _) in pieces.items() if name in kept) + "\n\n"
+
+
+def _imports(code: str) -> list[str]:
+    """Returns the imports that some code needs."""
+    result = []
+    for module, *names in _IMPORTS:
+        used = [name for name in names if re.search(rf"\b{name}\b", code)]
+        if used:
+            result.append(f"from {module} import {', '.join(used)}")
+        elif not names and f"{module}." in code:
+            result.append(f"import {module}")
+    return result
+
+
+def _defined(node: ast.stmt) -> str | None:
+    """Returns the name that a statement of a module defines."""
+    if isinstance(node, ast.ClassDef | ast.FunctionDef):
+        return node.name
+    if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+        return node.targets[0].id
+    return None
+
+
+_HEAD = '''"""Effects that npdr_ppl identified, for {robot}. Needs only mujoco and numpy.
+
+MuJoCo does not have these effects itself. The values are those of VALUES below.
+
+    import mujoco
+    from {module} import Effects
+
+    model = mujoco.MjModel.from_xml_path("{robot}")
+    data = mujoco.MjData(model)
+    effects = Effects(model)
+    measured = effects.reset(data)
+    for _ in range(1000):
+        measured = effects.step(data, commands)  # {substeps} engine steps; measurements by name
+
+In a Gymnasium environment of MuJoCo, let the effects take the steps; call effects.reset(data)
+after each reset of the environment:
+
+    robot = env.unwrapped
+    robot._step_mujoco_simulation = lambda ctrl, count: effects.step(robot.data, ctrl, count)
+"""
+'''
+
+_IMPORTS = (
+    ("math",),
+    ("collections", "deque"),
+    ("collections.abc", "Mapping", "Sequence"),
+    ("dataclasses", "dataclass", "field"),
+    ("typing", "Any", "ClassVar"),
+)
+"""Modules of the standard library, and what the laws use of them."""
+
+_TAIL = '''class Effects(LawRunner):
+    """The identified effects.
+
+    Args:
+        model: The ``mujoco.MjModel``.
+        values: Values that replace those of VALUES, by name.
+    """
+
+    def __init__(self, model: Any, values: Mapping[str, float] | None = None) -> None:
+        super().__init__(model, laws({{**VALUES, **(values or {{}})}}), CHANNELS, {substeps})
+
+
+def laws(values: Mapping[str, float]) -> list[Any]:
+    """Returns the laws in the order in which they act."""
+    return [
+{laws},
+    ]
+'''

@@ -1,0 +1,176 @@
+"""Steps MuJoCo with laws, in the order in which npdr_ppl's own simulations apply them."""
+
+# pyright: reportAttributeAccessIssue=false
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from npdr_ppl.engines.mujoco.callbacks.command_laws import CommandLaw, ServoLaw
+from npdr_ppl.engines.mujoco.callbacks.joint_laws import Joint, JointLaw
+from npdr_ppl.engines.mujoco.callbacks.sensor_laws import SensorLaw
+
+__all__ = ["Channel", "LawRunner"]
+
+Channel = tuple[str, str | int, int]
+"""Where a measurement is: ``"qpos"`` and a joint, ``"qvel"`` and a joint, or ``"sensordata"`` and
+a sensor; then the number of the component in it."""
+
+
+class LawRunner:
+    """Passes the commands, forces and measurements of one simulation through laws.
+
+    Args:
+        model: The ``mujoco.MjModel``. Its own clipping of commands is switched off: commands are
+            clipped before the laws.
+        laws: The laws, in the order in which they act.
+        channels: Where each measurement is.
+        substeps: Engine steps per control step.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        laws: Sequence[JointLaw | CommandLaw | ServoLaw | SensorLaw],
+        channels: Mapping[str, Channel],
+        substeps: int,
+    ) -> None:
+        self.model, self.substeps = model, substeps
+        joints = [(law, model.joint(law.joint)) for law in laws if isinstance(law, JointLaw)]
+        self.forces = [(law, int(j.qposadr[0]), int(j.dofadr[0])) for law, j in joints]
+        self.dofs = sorted({dof for *_, dof in self.forces})
+        self.commands = [
+            (law, model.actuator(law.actuator).id) for law in laws if isinstance(law, CommandLaw)
+        ]
+        self.servos = [
+            (law, model.actuator(law.actuator).id) for law in laws if isinstance(law, ServoLaw)
+        ]
+        self.sensors = [law for law in laws if isinstance(law, SensorLaw)]
+        self.channels = {name: self._address(*place) for name, place in channels.items()}
+        self.rates = {name for name, place in channels.items() if place[0] == "qvel"}
+        self.needs_dynamics = any(law.needs_dynamics for law, *_ in self.forces)
+        self.is_started = False
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+
+    def reset(self, data: Any) -> dict[str, float]:
+        """Starts a rollout in the present state of the data; returns the first measurements.
+
+        The robot is taken to have rested before. Drifts and waves begin at ``data.time`` 0.
+
+        Args:
+            data: The ``mujoco.MjData``.
+        """
+        self.is_started = False
+        data.qfrc_applied[self.dofs] = 0.0
+        for law, _, dof in self.forces:
+            law.reset(float(data.qvel[dof]))
+        values = self._true_values(data)
+        step = self.substeps * float(self.model.opt.timestep)
+        for law in self.sensors:
+            is_rate = law.channel in self.rates
+            values[law.channel] = law.reset(values[law.channel], step, is_rate)
+        return values
+
+    def step(self, data: Any, commands: Any, substeps: int | None = None) -> dict[str, float]:
+        """Advances the data by one control step; returns the measurements after it.
+
+        Args:
+            data: The ``mujoco.MjData``.
+            commands: One per actuator, shape ``(nu,)``.
+            substeps: Engine steps per control step, if it differs from the recording's.
+        """
+        count = substeps or self.substeps
+        step = count * float(self.model.opt.timestep)
+        means, moments = self._after_laws(np.array(commands, dtype=float), step)
+        # A command that changes within the step is replaced by a straight line.
+        slope = 12.0 / (step * step * count)
+        for k in range(count):
+            data.ctrl[:] = means + slope * moments * (k - 0.5 * (count - 1))
+            self._substep(data)
+        values = self._true_values(data)
+        for law in self.sensors:
+            values[law.channel] = law.read(values[law.channel], float(data.time), step)
+        return values
+
+    def _after_laws(self, commands: Any, step: float) -> tuple[Any, Any]:
+        """Returns mean and moment of each command after the laws, for a step in seconds."""
+        model = self.model
+        is_limited = model.actuator_ctrllimited.astype(bool)
+        low, high = model.actuator_ctrlrange.T
+        commands = np.where(is_limited, np.clip(commands, low, high), commands)
+        if not self.is_started:
+            # A servo has held its first goal; other commands were zero.
+            gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
+            is_goal = (gain != 0.0) & ((bias[:, 1] == -gain) | (bias[:, 2] == -gain))
+            before = np.where(is_goal, commands, 0.0)
+            for law, i in self.commands:
+                before[i] = law.settle(float(before[i]), step)
+            self.is_started = True
+        moments = np.zeros_like(commands)
+        for law, i in self.commands:
+            commands[i], moment = law.act(float(commands[i]), step)
+            moments[i] += moment
+        return commands, moments
+
+    def _substep(self, data: Any) -> None:
+        """Advances the data by one engine step."""
+        model = self.model
+        for law, i in self.servos:
+            position = float(data.qpos[model.jnt_qposadr[model.actuator_trnid[i, 0]]])
+            data.ctrl[i] = position + law.act(float(data.ctrl[i]) - position)
+        own_friction = model.dof_frictionloss[self.dofs].copy()
+        h = float(model.opt.timestep)
+        joints = [
+            Joint(float(data.qpos[q]), float(data.qvel[v]), float(data.time) + 0.5 * h, h)
+            for _, q, v in self.forces
+        ]
+        if self.needs_dynamics:
+            self._add_dynamics(joints, data)
+        data.qfrc_applied[self.dofs] = 0.0
+        for (law, _, dof), joint in zip(self.forces, joints, strict=True):
+            data.qfrc_applied[dof] += law.applied_force(joint)
+            model.dof_frictionloss[dof] += law.dry_friction(joint)
+        mujoco.mj_step(model, data)
+        model.dof_frictionloss[self.dofs] = own_friction
+
+    def _add_dynamics(self, joints: list[Joint], data: Any) -> None:
+        """Gives the joints what laws need that solve for their own force, and advances them."""
+        model = self.model
+        data.qfrc_applied[self.dofs] = 0.0
+        for (law, _, dof), joint in zip(self.forces, joints, strict=True):
+            if not law.needs_dynamics:
+                data.qfrc_applied[dof] += law.applied_force(joint)
+        guess = data.qacc_warmstart.copy()
+        mujoco.mj_forward(model, data)
+        data.qacc_warmstart[:] = guess
+        for (law, _, dof), joint in zip(self.forces, joints, strict=True):
+            if law.needs_dynamics:
+                unit, reached = np.zeros((1, model.nv)), np.zeros((1, model.nv))
+                unit[0, dof] = 1.0
+                mujoco.mj_solveM(model, data, reached, unit)
+                joint.acceleration = float(data.qacc[dof])
+                joint.inverse_inertia = float(reached[0, dof])
+                joint.drive = float(data.qfrc_actuator[dof])
+                law.begin(joint)
+
+    def _address(self, array: str, element: str | int, component: int) -> tuple[str, int]:
+        """Returns an array of the data and a place in it."""
+        if array == "sensordata":
+            return array, int(self.model.sensor(element).adr[0]) + component
+        joint = self.model.joint(element)
+        first = joint.qposadr if array == "qpos" else joint.dofadr
+        return array, int(first[0]) + component
+
+    def _true_values(self, data: Any) -> dict[str, float]:
+        """Returns the true value of every channel.
+
+        Sensors of positions and velocities are computed again, because a step leaves those of its
+        start. Sensors of accelerations keep the values of the last engine step.
+        """
+        if any(array == "sensordata" for array, _ in self.channels.values()):
+            mujoco.mj_fwdPosition(self.model, data)
+            mujoco.mj_sensorPos(self.model, data)
+            mujoco.mj_fwdVelocity(self.model, data)
+            mujoco.mj_sensorVel(self.model, data)
+        return {name: float(getattr(data, a)[i]) for name, (a, i) in self.channels.items()}
