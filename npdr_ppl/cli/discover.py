@@ -169,10 +169,7 @@ def discover(
                     write_stage_figures(investigation, stage.value, out)
                 else:
                     write_discovery_figures(discovery, out)
-            if discovery is None:
-                folder.finish(found)
-            else:
-                folder.finish(found, discovery.source(), discovery.learned_source())
+            folder.finish(found, discovery)
     if as_json:
         typer.echo((out / "discovery.json").read_text(), nl=False)
     elif not quiet:

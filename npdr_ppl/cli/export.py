@@ -1,78 +1,201 @@
-"""`npdr export`: writes what a run has identified into the robot's own file."""
+"""`npdr export`: takes what a run has identified to other simulators."""
 
 import difflib
 import json
+from collections.abc import Mapping
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.cli.manners import AsJson, Quiet
-from npdr_ppl.cli.options import ModelArgument
-from npdr_ppl.errors import DataError
+from npdr_ppl.cli.options import OptionalModelArgument
+from npdr_ppl.errors import DataError, ModelError
+
+if TYPE_CHECKING:
+    from npdr_ppl.posterior.robot_file import Identified
 
 __all__ = ["export"]
 
 
+class Kind(StrEnum):
+    """What is written."""
+
+    ROBOT = "robot"
+    RANGES = "ranges"
+    GYMNASIUM = "gymnasium"
+    ISAAC_LAB = "isaac-lab"
+
+
+ENDINGS: Mapping[str, tuple[Kind, ...]] = {
+    ".xml": (Kind.ROBOT,),
+    ".mjcf": (Kind.ROBOT,),
+    ".urdf": (Kind.ROBOT,),
+    ".yaml": (Kind.RANGES,),
+    ".yml": (Kind.RANGES,),
+    ".json": (Kind.RANGES,),
+    ".py": (Kind.GYMNASIUM, Kind.ISAAC_LAB),
+}
+"""What a file with each ending can be."""
+
+
 def export(
     run: Annotated[Path, typer.Argument(help="Folder that was passed as --out.")],
-    model: ModelArgument,
+    model: OptionalModelArgument = None,
     to: Annotated[
-        Path, typer.Option(help="New file; in the robot's folder if the robot has meshes.")
-    ],
+        Path | None,
+        typer.Option(
+            help="New file: .xml or .urdf for a robot, .yaml or .json for ranges, .py for --as. A "
+            "robot with meshes stays in its folder."
+        ),
+    ] = None,
+    kind: Annotated[
+        Kind | None, typer.Option("--as", help="What to write; by default from the ending.")
+    ] = None,
+    draws: Annotated[int, typer.Option(min=1, help="Most draws of the posterior to write.")] = 500,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a copy of the robot's MJCF file with a run's parameters and effects.
+    """Take a run's parameters and effects to a robot's file or another simulator.
 
-    The copy has the same text. Changed elements have the posterior means, and a comment with the
-    values that they had. Effects become what MuJoCo has itself: damping, friction loss, springs,
-    payloads, tilted gravity, gains and limits of servos and controls. The others become a Python
-    file beside it that needs only mujoco and numpy. What can be neither is listed.
+    A robot's file is a copy with the same text. Changed elements have the posterior means, and a
+    comment with the values that they had. Effects become what MuJoCo has itself; the others become
+    a Python file beside it that needs only mujoco and numpy. What can be neither is listed.
+
+    The other kinds have draws of the posterior or ranges: a table, a Gymnasium wrapper that takes
+    another draw at every reset, or a configuration of Isaac Lab's events. MODEL may be left out
+    for a table, and for a discovery, whose folder has its revised model.
 
     Example: npdr export fit arm.xml --to arm_identified.xml
     """
-    from npdr_ppl.cli.resolve import resolve_model
-    from npdr_ppl.engines.mujoco.export import module_name
-    from npdr_ppl.posterior.robot_file import export_robot, identified
+    from npdr_ppl.posterior.robot_file import identified
 
-    if to.suffix.lower() not in (".xml", ".mjcf"):
-        raise DataError(f"{to} is no .xml file; npdr export writes MJCF.")
-    beside = to.with_name(f"{module_name(to.name)}.py")
-    run_result = identified(run)
-    found = export_robot(resolve_model(model), run_result, to.name)
-    for file in (to, beside) if found.callbacks else (to,):
-        if file.exists():
-            raise DataError(f"{file} exists already; choose another name or remove it first.")
-    if found.needs_folder and to.resolve().parent != found.folder.resolve():
-        raise DataError(
-            f"The robot's file refers to others, such as meshes; write the new one to "
-            f"{found.folder}."
-        )
-    if found.callbacks is not None:
-        with replacing(beside) as temporary:
-            temporary.write_text(found.callbacks.text, encoding="utf-8")
-    with replacing(to) as temporary:
-        temporary.write_text(found.text, encoding="utf-8")
+    if to is None:
+        raise DataError("Give the new file, as in --to arm_identified.xml or --to ranges.yaml.")
+    kind = _kind(to, kind)
+    found = identified(run)
+    if kind is Kind.ROBOT:
+        told = _robot(run, found, model, to, shows=not (as_json or quiet))
+    elif kind is Kind.RANGES:
+        told = _ranges(run, to, draws)
+    else:
+        told = _draws(run, found, model, to, kind, draws)
+    told |= {"verdict": found.verdict or None}
     if as_json:
-        told = {
-            "file": str(to),
-            "callbacks": str(beside) if found.callbacks else None,
-            "in_callbacks": list(found.callbacks.effects) if found.callbacks else [],
-            "left_out": found.refused,
-            "verdict": run_result.verdict or None,
-        }
         typer.echo(json.dumps(told, ensure_ascii=False))
     elif not quiet:
-        before, after = found.before.splitlines(), found.text.splitlines()
-        for line in difflib.unified_diff(before, after, found.name, to.name, lineterm="", n=0):
+        _tell(told, run, found)
+
+
+def _kind(to: Path, kind: Kind | None) -> Kind:
+    """Returns what to write."""
+    possible = ENDINGS.get(to.suffix.lower())
+    if possible is None:
+        raise DataError(
+            f"{to} has none of the endings {', '.join(ENDINGS)}, which say what to write."
+        )
+    if kind is None and len(possible) > 1:
+        raise DataError(f"Add --as {' or --as '.join(possible)} to say what {to} is to be.")
+    if kind is not None and kind not in possible:
+        fitting = [ending for ending, kinds in ENDINGS.items() if kind in kinds]
+        raise DataError(f"{to} cannot be {kind}; its ending has to be {' or '.join(fitting)}.")
+    return next(iter(possible)) if kind is None else kind
+
+
+def _model(run: Path, word: str | None) -> Any:
+    """Returns the model of a run; that of a discovery by default is its revised model."""
+    from npdr_ppl.cli.resolve import resolve_model
+
+    revised = run / "revised_model.py"
+    if word is None and not revised.is_file():
+        raise ModelError(f"Give the model of the run, as in npdr export {run} arm.xml --to …")
+    return resolve_model(word or f"{revised}:revised_model")
+
+
+def _robot(
+    run: Path, found: "Identified", model: str | None, to: Path, *, shows: bool
+) -> dict[str, Any]:
+    """Writes a robot's file; returns what to tell."""
+    from npdr_ppl.engines.mujoco.export import module_name
+    from npdr_ppl.posterior.robot_file import export_robot
+
+    beside = to.with_name(f"{module_name(to.name)}.py")
+    robot = export_robot(_model(run, model), found, to.name)
+    if robot.needs_folder and to.resolve().parent != robot.folder.resolve():
+        raise DataError(
+            f"The robot's file refers to others, such as meshes; write the new one to "
+            f"{robot.folder}."
+        )
+    callbacks = robot.callbacks
+    texts = {to: robot.text} | ({beside: callbacks.text} if callbacks else {})
+    _write({file: text.encode() for file, text in texts.items()})
+    if shows:
+        before, after = robot.before.splitlines(), robot.text.splitlines()
+        for line in difflib.unified_diff(before, after, robot.name, to.name, lineterm="", n=0):
             typer.echo(line)
-        for name, reason in found.refused.items():
-            typer.echo(f"\nnot written: {name}, because {reason}.")
-        if run_result.verdict in ("ambiguous", "unknown"):
-            typer.echo(f"\nThe verdict of {run} is {run_result.verdict}: {run_result.reason}")
-        typer.echo(f"\nThe robot's file with the identified values is {to}")
-        if found.callbacks is not None:
-            names = ", ".join(found.callbacks.effects)
-            typer.echo(f"MuJoCo does not have {names}; {beside} adds them, and says how.")
+    return {
+        "file": str(to),
+        "callbacks": str(beside) if callbacks else None,
+        "in_callbacks": list(callbacks.effects) if callbacks else [],
+        "left_out": robot.refused,
+    }
+
+
+def _ranges(run: Path, to: Path, num: int) -> dict[str, Any]:
+    """Writes a table of ranges; returns what to tell."""
+    from npdr_ppl.posterior.range_file import range_file
+    from npdr_ppl.posterior.run_draws import run_draws
+
+    drawn = run_draws(run, num)
+    _write({to: range_file(drawn, as_json=to.suffix.lower() == ".json").encode()})
+    return {"file": str(to), "draws": len(drawn.values), "left_out": {}}
+
+
+def _draws(
+    run: Path, found: "Identified", model: str | None, to: Path, kind: Kind, num: int
+) -> dict[str, Any]:
+    """Writes a Python file for another simulator; returns what to tell."""
+    from npdr_ppl.posterior.randomisation import for_gymnasium, for_isaac_lab
+    from npdr_ppl.posterior.run_draws import run_draws
+
+    if not to.stem.isidentifier():
+        raise DataError(f"{to.name} cannot be imported; choose a name such as my_robot.py.")
+    drawn = run_draws(run, num)
+    write = for_gymnasium if kind is Kind.GYMNASIUM else for_isaac_lab
+    made = write(_model(run, model), found, drawn, to.stem)
+    files = {to: made.text.encode()}
+    if made.draws is not None:
+        files[to.with_suffix(".npz")] = made.draws
+    _write(files)
+    return {
+        "file": str(to),
+        "draws_file": str(to.with_suffix(".npz")) if made.draws else None,
+        "draws": len(drawn.values),
+        "left_out": made.refused,
+    }
+
+
+def _write(files: Mapping[Path, bytes]) -> None:
+    """Writes new files, all or none if one exists already."""
+    for file in files:
+        if file.exists():
+            raise DataError(f"{file} exists already; choose another name or remove it first.")
+    for file, content in reversed(list(files.items())):
+        with replacing(file) as temporary:
+            temporary.write_bytes(content)
+
+
+def _tell(told: Mapping[str, Any], run: Path, found: "Identified") -> None:
+    """Prints what was written and what was not."""
+    for name, reason in told["left_out"].items():
+        typer.echo(f"\nnot written: {name}, because {reason}.")
+    if found.verdict in ("ambiguous", "unknown"):
+        typer.echo(f"\nThe verdict of {run} is {found.verdict}: {found.reason}")
+    typer.echo(f"\nThe identified values are in {told['file']}")
+    if told.get("draws_file"):
+        typer.echo(f"Its {told['draws']} draws are in {told['draws_file']}")
+    if told.get("callbacks"):
+        names = ", ".join(told["in_callbacks"])
+        typer.echo(f"MuJoCo does not have {names}; {told['callbacks']} adds them, and says how.")

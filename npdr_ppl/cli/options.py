@@ -39,6 +39,7 @@ __all__ = [
     "Noise",
     "NoiseOption",
     "OptionalDataOption",
+    "OptionalModelArgument",
     "OptionalRoundsOption",
     "OptionalSimulationsOption",
     "OutOption",
@@ -82,13 +83,13 @@ _DATA = typer.Option(
 _ROUNDS = typer.Option(min=1, help="Rounds of simulating and training.")
 _SIMULATIONS = typer.Option(min=10, help="Simulations per round.")
 
-ModelArgument = Annotated[
-    str,
-    typer.Argument(
-        help="Zoo name, path/to/file.py:function, or a robot's MJCF or URDF file.",
-        autocompletion=complete_model,
-    ),
-]
+_MODEL = typer.Argument(
+    help="Zoo name, path/to/file.py:function, or a robot's MJCF or URDF file.",
+    autocompletion=complete_model,
+)
+
+ModelArgument = Annotated[str, _MODEL]
+OptionalModelArgument = Annotated[str | None, _MODEL]
 DataOption = Annotated[list[Path], _DATA]
 OptionalDataOption = Annotated[list[Path] | None, _DATA]
 MappingOption = Annotated[

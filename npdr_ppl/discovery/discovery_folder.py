@@ -5,6 +5,7 @@
                         time limit ended the search
     revised_model.py    the model with the effects that were missing
     learned_effect.py   the law that was learned, if the catalogue has none that explains
+    draws.safetensors   draws of its posterior, by parameter
     fits/               the fits that an unfinished discovery has finished
 
 A discovery that was killed leaves no ``discovery.json``, and continues when it is run again: it
@@ -19,7 +20,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from npdr_ppl.atomic_files import replacing
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery, describe_candidate
 from npdr_ppl.discovery.investigation import Investigation
@@ -111,22 +111,15 @@ class DiscoveryFolder:
             raise DataError(f"{file} has an unknown stage.")
         return found if STAGES.index(reached) >= STAGES.index(stage) else None
 
-    def finish(
-        self, found: dict[str, Any], source: str | None = None, learned: str | None = None
-    ) -> None:
+    def finish(self, found: dict[str, Any], discovery: Discovery | None = None) -> None:
         """Writes the results.
 
         Args:
             found: The content of ``discovery.json``.
-            source: The revised model as Python source, if there is one.
-            learned: The learned effects as Python source, if there are any.
+            discovery: The discovery, if a verdict was reached.
         """
-        if learned is not None:
-            with replacing(self.path / "learned_effect.py") as temporary:
-                temporary.write_text(learned, encoding="utf-8")
-        if source is not None:
-            with replacing(self.path / "revised_model.py") as temporary:
-                temporary.write_text(source, encoding="utf-8")
+        if discovery is not None:
+            discovery.save_model(self.path)
         write_json(self.path / "discovery.json", found)
         if found["stage"] == STAGES[-1] and not found.get("has_stopped", False):
             # No later run needs them.

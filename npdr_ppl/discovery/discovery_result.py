@@ -27,9 +27,16 @@ from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import wider_sites
 from npdr_ppl.preparation.preparation_summary import PreparationSummary
-from npdr_ppl.run_files import write_json
+from npdr_ppl.randomness import seeded
+from npdr_ppl.run_files import save_tensors, write_json
 
-__all__ = ["Discovery", "Verdict", "describe_candidate"]
+__all__ = ["DRAWS", "Discovery", "Verdict", "describe_candidate"]
+
+DRAWS = "draws.safetensors"
+"""Name of the file with draws of the revised model's posterior."""
+
+NUM_DRAWS = 1_000
+"""Number of draws in this file, as many as a fit keeps of each member."""
 
 Verdict = Literal["none", "named", "ambiguous", "unknown", "learned"]
 """``none``: no effect is missing. ``named``: the missing effects are known. ``ambiguous``: the
@@ -173,12 +180,33 @@ class Discovery:
             folder: The folder; created if it does not exist.
         """
         folder.mkdir(parents=True, exist_ok=True)
+        self.save_model(folder)
+        write_json(folder / "discovery.json", self.to_dict())
+
+    def save_model(self, folder: Path) -> None:
+        """Writes ``revised_model.py``, draws of its posterior, and a learned effect if any.
+
+        Args:
+            folder: The folder, which exists.
+        """
         if (learned := self.learned_source()) is not None:
             with replacing(folder / "learned_effect.py") as temporary:
                 temporary.write_text(learned, encoding="utf-8")
         with replacing(folder / "revised_model.py") as temporary:
             temporary.write_text(self.source(), encoding="utf-8")
-        write_json(folder / "discovery.json", self.to_dict())
+        save_tensors(folder / DRAWS, self.sample(NUM_DRAWS, seed=self.seed))
+
+    def sample(self, num: int, *, seed: int = 0) -> dict[str, Tensor]:
+        """Returns draws of the posterior of every scalar parameter, ``(num,)`` each.
+
+        Args:
+            num: Number of draws.
+            seed: Seed of the choice among the weighted draws.
+        """
+        with seeded(seed, "discovery", "draws"):
+            z = self.draws.smoothed().resampled(num)
+        values = self.search.final.segments.prior.to_parameters(z)
+        return {n: v.double().flatten() for n, v in values.items() if v[0].numel() == 1}
 
     def plot(self, axes: Any = None) -> Any:
         """Draws the probabilities of the alternatives and the gap on held-out rollouts.

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from npdr_ppl.engines.mujoco.export import ExportedMjcf, export_mjcf
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
+from npdr_ppl.engines.mujoco.urdf_export import export_urdf
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.handlers import add_effect, num_finer_steps, with_finer_steps
 from npdr_ppl.language.only_simulator import only_simulator
@@ -126,7 +127,7 @@ def found_mechanism(
 def export_robot(
     model: Callable[..., Any], found: Identified, name: str | None = None
 ) -> ExportedMjcf:
-    """Writes a run's values into the MJCF file of its model's simulator.
+    """Writes a run's values into the MJCF or URDF file of its model's simulator.
 
     Effects of the catalogue that the values name, as ``<port>.<effect>.<parameter>``, are added to
     the model first.
@@ -134,10 +135,13 @@ def export_robot(
     Args:
         model: A Pyro model with one simulator, a ``MujocoSimulator`` of a file.
         found: What the run found.
-        name: Name of the new file; that of the robot's file by default.
+        name: Name of the new file; that of the robot's file by default. With the ending
+            ``.urdf`` it is a URDF file, which only a robot from a URDF file can become.
 
     Raises:
         ModelError: The model has another simulator, or the file cannot hold a parameter.
     """
     simulator, parameters = found_mechanism(model, found)
+    if name is not None and name.lower().endswith(".urdf"):
+        return export_urdf(simulator, parameters)
     return export_mjcf(simulator, parameters, time_step=found.time_step, name=name)

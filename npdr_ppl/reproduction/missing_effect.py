@@ -152,7 +152,7 @@ def reproduce_missing_effect(
             "effects": found["effects"],
             "held_out": list(holdout),
         }
-        folder.finish(found, discovery.source())
+        folder.finish(found, discovery)
         write_json(file, result)
     return story, result
 

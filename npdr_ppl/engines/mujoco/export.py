@@ -27,7 +27,7 @@ from npdr_ppl.engines.mujoco.urdf_files import as_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
 
-__all__ = ["ExportedMjcf", "export_mjcf", "module_name"]
+__all__ = ["ExportedMjcf", "export_mjcf", "module_name", "written"]
 
 Array = NDArray[np.float64]
 
@@ -200,7 +200,7 @@ def _new_text(
     assignments = file_assignments(simulator, given, in_file)
     # The solver's settings of dry friction follow from what simulations set, without effects.
     set_anyway, _ = simulator.assignments(given, torch.zeros((), dtype=torch.float64))
-    model = _written(simulator.prepared(original.step, set(set_anyway)), assignments)
+    model = written(simulator.prepared(original.step, set(set_anyway)), assignments)
     edits = Edits(MjcfText(original.text.encode()), simulator.model, model)
     for array in dict.fromkeys(array for array, _ in assignments):
         edits.write(array, sorted({at for name, at in assignments if name == array}))
@@ -216,7 +216,7 @@ def _text_of(file: Path, files: RobotFiles) -> str:
     return as_mjcf(file) if is_urdf(files) else flattened(files).decode()
 
 
-def _written(model: Any, assignments: Assignments) -> Any:
+def written(model: Any, assignments: Assignments) -> Any:
     """Returns a copy of a model with numbers written into it."""
     changed = copy.copy(model)
     for (array, place), value in assignments.items():

@@ -1,13 +1,12 @@
 """Writes laws, with the values that were identified, as one Python file."""
 
 import ast
-import inspect
 import json
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import ModuleType
+from pathlib import Path
 from typing import Any
 
 from npdr_ppl.engines.mujoco.callbacks import command_laws, joint_laws, runner, sensor_laws
@@ -15,7 +14,15 @@ from npdr_ppl.engines.mujoco.channels import Reading
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.language.effects import Effect, ForceEffect, SensorEffect
 
-__all__ = ["LAWS", "CallbackFile", "callback_file", "has_dry_friction", "law_lines"]
+__all__ = [
+    "LAWS",
+    "CallbackFile",
+    "callback_file",
+    "effects_class",
+    "has_dry_friction",
+    "python_source",
+    "quoted",
+]
 
 LAWS: dict[str, type] = {
     "viscous_friction": joint_laws.ViscousFriction,
@@ -54,7 +61,8 @@ LAWS: dict[str, type] = {
 }
 """The law of each effect that can be exported as Python, by the effect's id."""
 
-_SOURCES: tuple[ModuleType, ...] = (joint_laws, command_laws, sensor_laws, runner)
+_SOURCES = ("joint_laws.py", "command_laws.py", "sensor_laws.py", "runner.py", "randomised_env.py")
+"""Modules of this folder, in the order in which their classes are copied."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +85,7 @@ def has_dry_friction(effect: Effect) -> bool:
     return own is not None and own is not joint_laws.JointLaw.dry_friction
 
 
-def law_lines(simulator: MujocoMechanism, effects: Sequence[Effect]) -> list[str]:
+def _law_lines(simulator: MujocoMechanism, effects: Sequence[Effect]) -> list[str]:
     """Returns an expression that makes the law of each effect at each of its places.
 
     Args:
@@ -86,10 +94,10 @@ def law_lines(simulator: MujocoMechanism, effects: Sequence[Effect]) -> list[str
     """
     lines = []
     for effect in effects:
-        given = [f"{p.name}=values[{_quoted(s)}]," for p, s in _parameters(effect)]
+        given = [f"{p.name}=values[{quoted(s)}]," for p, s in _parameters(effect)]
         given += [f"{name}={value!r}," for name, value in effect.constants.items()]
         for place in _places(simulator, effect):
-            inside = "\n    ".join([f"{_quoted(place)},", *given])
+            inside = "\n    ".join([f"{quoted(place)},", *given])
             lines.append(f"{LAWS[effect.id].__name__}(\n    {inside}\n)")
     return lines
 
@@ -113,25 +121,57 @@ def callback_file(
         robot: Name of the robot's file that is to be loaded.
         substeps: Engine steps per control step.
     """
-    code = _code({runner.LawRunner.__name__, *(LAWS[e.id].__name__ for e in effects)})
+    code, imports = python_source(runner.LawRunner.__name__, effects)
     table = [_HEAD.format(robot=robot, module=module, substeps=substeps)]
-    table += [*_imports(code), "", "import mujoco", "import numpy as np", "", "", code]
+    table += [*imports, "", "import mujoco", "import numpy as np", "", "", code]
     table += ["VALUES = {"]
     for effect in effects:
         units = effect.units(simulator.port(effect.port))
         for parameter, site in _parameters(effect):
             unit = units[parameter.name]
             note = f"{parameter.description}" + (f", {unit}" if unit != "1" else "")
-            table.append(f"    {_quoted(site)}: {float(values[site])!r},  # {note}")
+            table.append(f"    {quoted(site)}: {float(values[site])!r},  # {note}")
     table += ["}", '"""Identified values of the effects."""', ""]
-    table += ["CHANNELS: dict[str, Channel] = {"]
-    for name, (array, element, component) in channels_of(simulator).items():
-        place = f'("{array}", {_quoted(element)}, {component})'
-        table.append(f"    {_quoted(name)}: {place},")
-    table += ["}", '"""Where each measurement is in the model."""', "", ""]
-    lines = ",\n".join(textwrap.indent(e, 8 * " ") for e in law_lines(simulator, effects))
-    table += [_TAIL.format(laws=lines, substeps=substeps)]
+    table += [effects_class(simulator, effects, substeps=substeps, default="VALUES")]
     return CallbackFile("\n".join(table), tuple(effect.name for effect in effects))
+
+
+def python_source(root: str, effects: Sequence[Effect]) -> tuple[str, list[str]]:
+    """Returns the source of a class of this folder and of laws, and the imports they need.
+
+    Args:
+        root: Name of the class.
+        effects: Effects with a law. With effects, the source has what takes the steps.
+    """
+    laws = {LAWS[effect.id].__name__ for effect in effects}
+    code = _code({root, *laws, *([runner.LawRunner.__name__] if laws else [])})
+    return code, _imports(code)
+
+
+def effects_class(
+    simulator: MujocoMechanism, effects: Sequence[Effect], *, substeps: int, default: str = ""
+) -> str:
+    """Returns the class ``Effects``, which makes the laws of effects from their values.
+
+    Args:
+        simulator: The simulator with its channels.
+        effects: The effects.
+        substeps: Engine steps per control step.
+        default: Name of the values that act where none are given; none if empty.
+    """
+    lines = ["CHANNELS: dict[str, Channel] = {"]
+    for name, (array, element, component) in channels_of(simulator).items():
+        lines.append(f'    {quoted(name)}: ("{array}", {quoted(element)}, {component}),')
+    lines += ["}", '"""Where each measurement is in the model."""', "", ""]
+    laws = ",\n".join(textwrap.indent(e, 8 * " ") for e in _law_lines(simulator, effects))
+    template = _CLASS_WITH_VALUES if default else _CLASS
+    lines += [template.format(laws=laws, substeps=substeps, default=default)]
+    return "\n".join(lines)
+
+
+def quoted(name: str | int) -> str:
+    """Returns a name as Python."""
+    return json.dumps(name, ensure_ascii=False)
 
 
 def channels_of(simulator: MujocoMechanism) -> dict[str, runner.Channel]:
@@ -150,11 +190,6 @@ def channels_of(simulator: MujocoMechanism) -> dict[str, runner.Channel]:
         element = getattr(model, kind)(number).name or number
         result[name] = array, element, sensor.address - int(first[number])
     return result
-
-
-def _quoted(name: str | int) -> str:
-    """Returns a name as Python."""
-    return json.dumps(name, ensure_ascii=False)
 
 
 def _parameters(effect: Effect) -> list[tuple[Any, str]]:
@@ -180,7 +215,7 @@ def _code(wanted: set[str]) -> str:
     """Returns the source of some classes, and of everything that they use, in order."""
     pieces: dict[str, tuple[str, set[str]]] = {}
     for module in _SOURCES:
-        source = inspect.getsource(module)
+        source = Path(__file__).with_name(module).read_text(encoding="utf-8")
         lines = source.splitlines()
         body = ast.parse(source).body
         for node, after in zip(body, [*body[1:], None], strict=True):
@@ -247,23 +282,14 @@ after each reset of the environment:
 _IMPORTS = (
     ("math",),
     ("collections", "deque"),
-    ("collections.abc", "Mapping", "Sequence"),
+    ("collections.abc", "Callable", "Mapping", "Sequence"),
     ("dataclasses", "dataclass", "field"),
+    ("pathlib", "Path"),
     ("typing", "Any", "ClassVar"),
 )
 """Modules of the standard library, and what the laws use of them."""
 
-_TAIL = '''class Effects(LawRunner):
-    """The identified effects.
-
-    Args:
-        model: The ``mujoco.MjModel``.
-        values: Values that replace those of VALUES, by name.
-    """
-
-    def __init__(self, model: Any, values: Mapping[str, float] | None = None) -> None:
-        super().__init__(model, laws({{**VALUES, **(values or {{}})}}), CHANNELS, {substeps})
-
+_LAWS = '''
 
 def laws(values: Mapping[str, float]) -> list[Any]:
     """Returns the laws in the order in which they act."""
@@ -271,3 +297,34 @@ def laws(values: Mapping[str, float]) -> list[Any]:
 {laws},
     ]
 '''
+
+_CLASS_WITH_VALUES = (
+    '''class Effects(LawRunner):
+    """The identified effects.
+
+    Args:
+        model: The ``mujoco.MjModel``.
+        values: Values that replace those of {default}, by name.
+    """
+
+    def __init__(self, model: Any, values: Mapping[str, float] | None = None) -> None:
+        chosen = {{**{default}, **(values or {{}})}}
+        super().__init__(model, laws(chosen), CHANNELS, {substeps})
+'''
+    + _LAWS
+)
+
+_CLASS = (
+    '''class Effects(LawRunner):
+    """The identified effects.
+
+    Args:
+        model: The ``mujoco.MjModel``.
+        values: Values of their parameters, by name.
+    """
+
+    def __init__(self, model: Any, values: Mapping[str, float]) -> None:
+        super().__init__(model, laws(values), CHANNELS, {substeps})
+'''
+    + _LAWS
+)
