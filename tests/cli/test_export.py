@@ -129,7 +129,7 @@ def test_a_discovery_is_exported_with_its_effects(fitted):
     ("words", "sentence"),
     [
         (("fit", "arm_model.py:model", "--to", "arm.xml"), "arm.xml exists already"),
-        (("fit", "arm_model.py:model", "--to", "arm.urdf"), "npdr export writes MJCF"),
+        (("fit", "arm_model.py:model", "--to", "arm.urdf"), "not made from a URDF file"),
         (("parts", "arm_model.py:model", "--to", "new.xml"), "no folder of a finished"),
         (("other", "arm_model.py:model", "--to", "new.xml"), "give the model of the run"),
         (("fit", "pendulum", "--to", "new.xml"), "has no port 'shoulder_torque'"),

@@ -87,8 +87,11 @@ class RandomisedEnv(gymnasium.Wrapper):
     def use(self, draw: int) -> None:
         """Writes a draw into the model; the next reset of the environment begins with it."""
         model = self._robot.model
-        for (array, place), value in zip(self._places, self._values[draw], strict=True):
-            array[place] = value
+        for (owner, name, place), value in zip(self._places, self._values[draw], strict=True):
+            if place is None:
+                setattr(owner, name, value)
+            else:
+                getattr(owner, name).reshape(-1)[place] = value
         # Inverse inertias and lengths follow from the numbers above.
         mujoco.mj_setConst(model, self._scratch)
         self.draw = draw
@@ -105,18 +108,20 @@ class RandomisedEnv(gymnasium.Wrapper):
         mujoco.mj_rnePostConstraint(self._robot.model, self._robot.data)
 
     @staticmethod
-    def _place(model: Any, array: str, kind: str, name: str | int, place: int) -> tuple[Any, int]:
-        """Returns a live flat view of an array, and the place of a field in it."""
+    def _place(
+        model: Any, array: str, kind: str, name: str | int, place: int
+    ) -> tuple[Any, str, int | None]:
+        """Returns what has a field, its name in it, and its place; ``None`` for a number."""
         if kind == "option":
-            return getattr(model.opt, array).reshape(-1), place
+            is_number = np.ndim(getattr(model.opt, array)) == 0
+            return model.opt, array, None if is_number else place
         element = _element(model, kind, name)
         row = element.id
         if array.startswith("dof_"):
             row = int(element.dofadr[0])
         elif array.startswith("qpos"):
             row = int(element.qposadr[0])
-        values = getattr(model, array)
-        return values.reshape(-1), row * int(values[0].size) + place
+        return model, array, row * int(getattr(model, array)[0].size) + place
 
 
 def _element(model: Any, kind: str, name: str | int) -> Any:
