@@ -9,6 +9,7 @@ import time
 from io import StringIO
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -96,6 +97,23 @@ def test_it_names_what_is_missing(finished):
         assert gap["after"] < gap["before"]
     assert "coulomb_friction" in text and "named" in text and "rmse" in text
     assert max(map(len, text.splitlines())) <= 100
+
+
+@pytest.mark.slow
+def test_its_draws_are_those_of_the_posterior(finished, tmp_path):
+    folder, _ = finished
+    found = json.loads((folder / "discovery.json").read_text())["parameters"]
+    code, _, err = run(["export", folder, "--to", tmp_path / "ranges.json", "--draws", 1000])
+    assert code == 0, err
+    ranges = json.loads((tmp_path / "ranges.json").read_text())
+    draws = np.array(ranges["draws"])
+    assert draws.shape == (1000, len(found))
+    for column, name in zip(draws.T, ranges["names"], strict=True):
+        # Systematic resampling is more even than independent draws; these are five standard
+        # errors of independent ones.
+        assert abs(column.mean() - found[name]["mean"]) < 5.0 * found[name]["sd"] / 1000**0.5
+        assert column.std() == pytest.approx(found[name]["sd"], rel=0.15)
+    assert ranges["parameters"][MISSING + ".magnitude"]["unit"] == "N m"
 
 
 @pytest.mark.slow

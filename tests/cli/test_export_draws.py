@@ -1,6 +1,7 @@
 """`npdr export` to ranges, a Gymnasium wrapper and events of Isaac Lab."""
 
 import json
+import os
 import runpy
 from pathlib import Path
 from typing import ClassVar
@@ -228,7 +229,7 @@ def test_events_of_isaac_lab_have_the_arguments_that_it_takes(draws, monkeypatch
     left_out = json.loads(text)["left_out"]
     for name in ("elbow_torque.stribeck_friction", "motor.input_delay", "elbow.encoder_bias"):
         assert left_out[name] == "Isaac Lab has no event for this law"
-    assert left_out["density of "] == "Isaac Lab has no event for it"
+    assert left_out["density"] == "Isaac Lab has no event for it"
     isaac_lab_stub.install(monkeypatch)
     found = runpy.run_path("events.py")["EventCfg"]
     mass = found.body_hand_mass.params
@@ -278,3 +279,30 @@ def test_another_robot_is_named(draws, tmp_path):
     (tmp_path / "arm.xml").write_text(text)
     with pytest.raises(ValueError, match="has no body 'hand'"):
         wrapper(arm_environment())
+
+
+HOSTILE = "x&#10;    import os; os.environ['NPDR_HOSTILE'] = '1'&#10;&quot;&quot;&quot;"
+"""A name in a robot's file that would be a statement in Python."""
+
+
+@pytest.mark.parametrize("kind", ["gymnasium", "isaac-lab"])
+def test_names_in_a_robots_file_cannot_become_code(draws, tmp_path, monkeypatch, kind):
+    monkeypatch.delenv("NPDR_HOSTILE", raising=False)
+    text = (tmp_path / "arm.xml").read_text()
+    (tmp_path / "arm.xml").write_text(
+        text.replace('"servo"', f'"{HOSTILE}"').replace("<geom", f'<geom name="{HOSTILE}"', 1)
+    )
+    # Names with line breaks can be given by patterns only.
+    fields = '"friction": "geom x* friction sliding", "gear": "actuator x* gear",'
+    model = (tmp_path / "arm_model.py").read_text()
+    model = model.replace('"kp": "actuator servo kp",', fields)
+    (tmp_path / "arm_model.py").write_text(model)
+    means = {n: v for n, v in MEANS.items() if "." not in n and n != "kp"}
+    means |= {"friction": 0.7, "gear": 1.1, "motor.input_delay.delay": 0.01}
+    write_fit(tmp_path / "hostile", means)
+    words = "export", "hostile", MODEL, "--to", "new.py", "--as", kind
+    code, _, err = run_for_module(*words)
+    assert code == 0, err
+    isaac_lab_stub.install(monkeypatch)
+    runpy.run_path("new.py")
+    assert "NPDR_HOSTILE" not in os.environ

@@ -343,6 +343,12 @@ def test_a_compiled_model_has_no_file():
         export_mjcf(MujocoSimulator(model), {})
 
 
+def test_an_inertia_that_no_body_has_is_refused(tmp_path):
+    simulator = MujocoSimulator(write_arm(tmp_path), {"it": "body hand inertia x"})
+    with pytest.raises(ModelError, match="inertia"):
+        export_mjcf(simulator, {"it": value(0.5)})
+
+
 def test_attributes_are_found_in_any_layout():
     text = b"<mujoco><worldbody>\n<body name='a>b'><joint\n name=\"j\"\n damping = '1'/></body>\n"
     text += b"</worldbody></mujoco>"

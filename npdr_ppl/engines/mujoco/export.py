@@ -117,7 +117,7 @@ def export_mjcf(
 
 def module_name(robot: str) -> str:
     """Returns the name of the Python module beside a robot's file, e.g. ``"arm_effects"``."""
-    stem = re.sub(r"\W", "_", Path(robot).stem)
+    stem = re.sub(r"\W", "_", Path(robot).stem, flags=re.ASCII)
     return f"{'_' * stem[:1].isdigit()}{stem}_effects"
 
 

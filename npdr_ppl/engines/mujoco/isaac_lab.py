@@ -6,6 +6,7 @@ The terms are those of ``isaaclab.envs.mdp``: ``randomize_rigid_body_mass``,
 are lost.
 """
 
+import re
 import textwrap
 from collections import defaultdict
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from npdr_ppl.engines.mujoco.callbacks.python_file import quoted
+from npdr_ppl.engines.mujoco.callbacks.python_file import plain, quoted
 from npdr_ppl.engines.mujoco.fields import actuated_joint, element_names, servo_gains
 from npdr_ppl.engines.mujoco.randomised import Field, RandomisedFields
 
@@ -75,7 +76,9 @@ def isaac_lab_file(
     for place, values in columns.items():
         array, kind, name, component = place
         key = f"{kind}_{name}"
-        if array == "body_mass":
+        if not isinstance(name, str):
+            refused[f"{array} of {kind} {name}"] = "it has no name in the robot's file"
+        elif array == "body_mass":
             is_solid = any(f[0] == "body_inertia" and f[2] == name for f in columns)
             terms[f"{key}_mass"] = _mass(name, values, is_solid)
         elif array == "body_ipos":
@@ -91,11 +94,16 @@ def isaac_lab_file(
         elif array == "body_inertia" and ("body_mass", kind, name, 0) in columns:
             continue  # it follows the mass
         elif array not in _GAINS:
-            refused[f"{array} of {name}"] = "Isaac Lab has no event for it"
+            refused[f"{array} of {name}" if name else array] = "Isaac Lab has no event for it"
     for joint, gains in _joint_gains(model, columns, len(found.values)).items():
         terms[f"joint_{joint}_gains"] = gains
     refused |= _undriven(model, columns)
     return _text(terms, refused, module=module, robot=robot), refused
+
+
+def _exactly(name: str) -> str:
+    """Returns a name as Python; Isaac Lab takes names as regular expressions."""
+    return quoted(name if re.fullmatch(r"[\w-]+", name) else re.escape(name))
 
 
 def _ends(values: Array) -> tuple[float, float]:
@@ -104,21 +112,21 @@ def _ends(values: Array) -> tuple[float, float]:
     return float(f"{low:.6g}"), float(f"{high:.6g}")
 
 
-def _mass(body: str | int, values: Array, is_solid: bool) -> _Term:
+def _mass(body: str, values: Array, is_solid: bool) -> _Term:
     arguments = {
         "mass_distribution_params": repr(_ends(values)),
         "operation": '"abs"',
         "recompute_inertia": repr(is_solid),
     }
-    return _Term("randomize_rigid_body_mass", "startup", f"body_names={quoted(body)}", arguments)
+    return _Term("randomize_rigid_body_mass", "startup", f"body_names={_exactly(body)}", arguments)
 
 
-def _centre(body: str | int) -> _Term:
+def _centre(body: str) -> _Term:
     note = "Offsets from the centre in the robot's file, in m."
-    return _Term("randomize_rigid_body_com", "startup", f"body_names={quoted(body)}", {}, note)
+    return _Term("randomize_rigid_body_com", "startup", f"body_names={_exactly(body)}", {}, note)
 
 
-def _joint(joint: str | int) -> _Term:
+def _joint(joint: str) -> _Term:
     note = (
         "PhysX 5.6 takes friction as an effort in N m or N, earlier ones as a coefficient. "
         "Isaac Lab sets static, dynamic and viscous friction from this range."
@@ -126,7 +134,7 @@ def _joint(joint: str | int) -> _Term:
     return _Term(
         "randomize_joint_parameters",
         "startup",
-        f"joint_names={quoted(joint)}",
+        f"joint_names={_exactly(joint)}",
         {"operation": '"abs"', "distribution": '"uniform"'},
         note,
     )
@@ -183,13 +191,15 @@ def _joint_gains(model: Any, columns: Mapping[Field, Array], num: int) -> dict[s
         if any(place[0] in _GAINS and place[1:3] == ("actuator", name) for place in columns):
             changed.add(joint)
     for joint in sorted(changed):
+        if not model.joint(joint).name:
+            continue  # it is among what has no name
         arguments = {}
         if joint in stiffness:
             arguments["stiffness_distribution_params"] = repr(_ends(stiffness[joint]))
         arguments["damping_distribution_params"] = repr(_ends(damping[joint]))
         arguments |= {"operation": '"abs"', "distribution": '"uniform"'}
         note = "Damping is that of the joint and of its servo."
-        asset = f"joint_names={quoted(model.joint(joint).name or joint)}"
+        asset = f"joint_names={_exactly(model.joint(joint).name)}"
         result[names[joint]] = _Term("randomize_actuator_gains", "reset", asset, arguments, note)
     return result
 
@@ -209,10 +219,10 @@ def _undriven(model: Any, columns: Mapping[Field, Array]) -> dict[str, str]:
 def _text(
     terms: Mapping[str, _Term], refused: Mapping[str, str], *, module: str, robot: str
 ) -> str:
-    lines = [_HEAD.format(module=module, robot=robot)]
+    lines = [_HEAD.format(module=module, robot=plain(robot))]
     for name, term in terms.items():
         lines += textwrap.wrap(term.note, 90, initial_indent="    # ", subsequent_indent="    # ")
-        safe = "".join(c if c.isidentifier() or c.isdigit() else "_" for c in name)
+        safe = re.sub(r"\W", "_", name, flags=re.ASCII)
         lines += [f"    {safe} = EventTerm(", f"        func=mdp.{term.function},"]
         lines += [f'        mode="{term.mode}",', "        params={"]
         if term.asset is not None:
@@ -225,7 +235,9 @@ def _text(
         lines.append("    pass")
     if refused:
         lines += ["", "    # Left out:"]
-        lines += [f"    # {name}, because {reason}" for name, reason in refused.items()]
+        lines += [
+            f"    # {plain(f'{name}, because {reason}')}" for name, reason in refused.items()
+        ]
     return "\n".join(lines) + "\n"
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from npdr_ppl.engines.mujoco.callbacks.python_file import (
     effects_class,
     has_dry_friction,
+    plain,
     python_source,
     quoted,
 )
@@ -134,7 +135,7 @@ def gymnasium_file(
     }
     code, imports = python_source("RandomisedEnv", effects)
     hard = _hard_joints(simulator, found)
-    lines = [_HEAD.format(robot=robot, module=module), *imports, "", "import gymnasium"]
+    lines = [_HEAD.format(robot=plain(robot), module=module), *imports, "", "import gymnasium"]
     lines += ["import mujoco", "import numpy as np", "", "", code]
     lines += ["FIELDS: list[Field] = ["]
     for array, kind, name, place in found.fields:

@@ -20,6 +20,7 @@ __all__ = [
     "callback_file",
     "effects_class",
     "has_dry_friction",
+    "plain",
     "python_source",
     "quoted",
 ]
@@ -122,7 +123,7 @@ def callback_file(
         substeps: Engine steps per control step.
     """
     code, imports = python_source(runner.LawRunner.__name__, effects)
-    table = [_HEAD.format(robot=robot, module=module, substeps=substeps)]
+    table = [_HEAD.format(robot=plain(robot), module=module, substeps=substeps)]
     table += [*imports, "", "import mujoco", "import numpy as np", "", "", code]
     table += ["VALUES = {"]
     for effect in effects:
@@ -130,7 +131,7 @@ def callback_file(
         for parameter, site in _parameters(effect):
             unit = units[parameter.name]
             note = f"{parameter.description}" + (f", {unit}" if unit != "1" else "")
-            table.append(f"    {quoted(site)}: {float(values[site])!r},  # {note}")
+            table.append(f"    {quoted(site)}: {float(values[site])!r},  # {plain(note)}")
     table += ["}", '"""Identified values of the effects."""', ""]
     table += [effects_class(simulator, effects, substeps=substeps, default="VALUES")]
     return CallbackFile("\n".join(table), tuple(effect.name for effect in effects))
@@ -167,6 +168,11 @@ def effects_class(
     template = _CLASS_WITH_VALUES if default else _CLASS
     lines += [template.format(laws=laws, substeps=substeps, default=default)]
     return "\n".join(lines)
+
+
+def plain(text: str) -> str:
+    """Returns a text for comments and docstrings: on one line, and without quotes."""
+    return " ".join(re.sub(r'["\\]', "'", text).split())
 
 
 def quoted(name: str | int) -> str:
