@@ -9,6 +9,7 @@ from npdr_ppl.engines.mujoco.callbacks.python_file import LAWS
 from npdr_ppl.models.effects import (
     ActuatorGain,
     ActuatorLag,
+    Contact,
     CoulombFriction,
     EncoderBias,
     InputDelay,
@@ -31,6 +32,7 @@ from tests.helpers.exported_robots import (
     refusals,
     write_robots,
 )
+from tests.helpers.mujoco_files import ROLLING
 
 IN_FILE = {
     "viscous_friction", "coulomb_friction", "spring", "payload", "tilt", "contact", "saturation",
@@ -125,6 +127,16 @@ def test_effects_act_together_in_their_order(arm, tmp_path, group):
     given = {n: v for e in attached for n, v in probed(simulator, e).items()} | values
     error, matters, where = difference(simulator, given, tmp_path)
     assert where == "Python" and error <= MOST_IN_PYTHON and matters > 1e-3
+
+
+def test_contact_coefficients_are_in_the_file(tmp_path):
+    path = tmp_path / "wheel.xml"
+    text = ROLLING.replace('type="plane"', 'name="floor" type="plane"')
+    path.write_text(text.replace('type="sphere"', 'name="tyre" type="sphere"'))
+    simulator = MujocoSimulator(path, time_step=0.01).with_effects(Contact("contact"))
+    values = {"contact.contact.friction": -4.0, "contact.contact.rolling": 2.0}
+    error, matters, where = difference(simulator, values, tmp_path)
+    assert where == "file" and error <= MOST_IN_FILE and matters > 1e-3
 
 
 def test_other_sensors_are_measured_after_the_step(arm, tmp_path):

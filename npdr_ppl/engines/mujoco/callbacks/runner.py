@@ -23,7 +23,7 @@ class LawRunner:
 
     Args:
         model: The ``mujoco.MjModel``. Its own clipping of commands is switched off: commands are
-            clipped before the laws.
+            clipped before the laws. ``qfrc_applied`` at the joints of laws belongs to them.
         laws: The laws, in the order in which they act.
         channels: Where each measurement is.
         substeps: Engine steps per control step.
@@ -50,6 +50,10 @@ class LawRunner:
         self.channels = {name: self._address(*place) for name, place in channels.items()}
         self.rates = {name for name, place in channels.items() if place[0] == "qvel"}
         self.needs_dynamics = any(law.needs_dynamics for law, *_ in self.forces)
+        self.friction = model.dof_frictionloss
+        low, high = model.actuator_ctrlrange.T
+        self.low = np.where(model.actuator_ctrllimited, low, -np.inf)
+        self.high = np.where(model.actuator_ctrllimited, high, np.inf)
         self.is_started = False
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
 
@@ -95,11 +99,9 @@ class LawRunner:
 
     def _after_laws(self, commands: Any, step: float) -> tuple[Any, Any]:
         """Returns mean and moment of each command after the laws, for a step in seconds."""
-        model = self.model
-        is_limited = model.actuator_ctrllimited.astype(bool)
-        low, high = model.actuator_ctrlrange.T
-        commands = np.where(is_limited, np.clip(commands, low, high), commands)
+        commands = np.minimum(np.maximum(commands, self.low), self.high)
         if not self.is_started:
+            model = self.model
             # A servo has held its first goal; other commands were zero.
             gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
             is_goal = (gain != 0.0) & ((bias[:, 1] == -gain) | (bias[:, 2] == -gain))
@@ -119,20 +121,20 @@ class LawRunner:
         for law, i in self.servos:
             position = float(data.qpos[model.jnt_qposadr[model.actuator_trnid[i, 0]]])
             data.ctrl[i] = position + law.act(float(data.ctrl[i]) - position)
-        own_friction = model.dof_frictionloss[self.dofs].copy()
-        h = float(model.opt.timestep)
-        joints = [
-            Joint(float(data.qpos[q]), float(data.qvel[v]), float(data.time) + 0.5 * h, h)
-            for _, q, v in self.forces
-        ]
+        h, qpos, qvel, applied = model.opt.timestep, data.qpos, data.qvel, data.qfrc_applied
+        middle = data.time + 0.5 * h
+        joints = [Joint(float(qpos[q]), float(qvel[v]), middle, h) for _, q, v in self.forces]
         if self.needs_dynamics:
             self._add_dynamics(joints, data)
-        data.qfrc_applied[self.dofs] = 0.0
+        own_friction = [(dof, self.friction[dof]) for dof in self.dofs]
+        for dof in self.dofs:
+            applied[dof] = 0.0
         for (law, _, dof), joint in zip(self.forces, joints, strict=True):
-            data.qfrc_applied[dof] += law.applied_force(joint)
-            model.dof_frictionloss[dof] += law.dry_friction(joint)
+            applied[dof] += law.applied_force(joint)
+            self.friction[dof] += law.dry_friction(joint)
         mujoco.mj_step(model, data)
-        model.dof_frictionloss[self.dofs] = own_friction
+        for dof, bound in own_friction:
+            self.friction[dof] = bound
 
     def _add_dynamics(self, joints: list[Joint], data: Any) -> None:
         """Gives the joints what laws need that solve for their own force, and advances them."""
