@@ -49,15 +49,13 @@ def for_gymnasium(
     simulator, fields, time_step = _fields(model, found, draws)
     substeps = simulator.num_substeps(time_step)
     robot = simulator.file.name if simulator.file else "robot"
-    text, refused = gymnasium_file(
-        simulator, fields, module=module, robot=robot, substeps=substeps
-    )
-    if not fields.fields and len(refused) == len(simulator.effects):
+    text = gymnasium_file(simulator, fields, module=module, robot=robot, substeps=substeps)
+    if not fields.fields and not fields.beside:
         raise DataError("The run's parameters change nothing of a MuJoCo model.")
     content = io.BytesIO()
     names = np.array(list(draws.means))
     np.savez(content, fields=fields.values, parameters=draws.values, names=names)
-    return ExportedDraws(text, content.getvalue(), refused)
+    return ExportedDraws(text, content.getvalue(), fields.refused)
 
 
 def for_isaac_lab(

@@ -69,9 +69,10 @@ def run_draws(run: Path, num: int) -> RunDraws:
         )
     columns = _of_fit(file) if is_fit else _of_discovery(file)
     missing = [name for name in means if name not in columns]
-    lengths = {len(columns[name]) for name in means if name in columns}
-    if missing or len(lengths) != 1:
-        raise DataError(f"{file} does not belong to this run: {missing or lengths}.")
+    if missing:
+        raise DataError(f"{file} has no draws of {', '.join(missing)}; it is of another run.")
+    if len({len(columns[name]) for name in means}) != 1:
+        raise DataError(f"{file} is damaged: it has more draws of some parameters than of others.")
     values = np.stack([columns[name] for name in means], axis=-1)
     if not np.isfinite(values).all():
         raise DataError(f"{file} has draws that are not finite.")

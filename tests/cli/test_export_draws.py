@@ -25,6 +25,7 @@ from tests.helpers.exported_runs import (
     write_fit,
     write_robot,
 )
+from tests.helpers.mujoco_files import GYMNASIUM, needs_gymnasium
 
 MODEL = "arm_model.py:model"
 
@@ -63,12 +64,11 @@ def arm_environment(file="arm.xml"):
     return Arm(str(Path(file).resolve()), 2, spaces.Box(-np.inf, np.inf, shape=(4,)))
 
 
-def exported_wrapper(*words):
-    code, text, err = run_for_module(
-        "export", "fit", MODEL, "--to", "arm_gym.py", "--as", "gymnasium", *words
-    )
+def exported_wrapper():
+    words = "export", "fit", MODEL, "--to", "arm_gym.py", "--as", "gymnasium"
+    code, _, err = run_for_module(*words)
     assert code == 0, err
-    return runpy.run_path("arm_gym.py")["RandomisedRobot"], text
+    return runpy.run_path("arm_gym.py")["RandomisedRobot"]
 
 
 @pytest.mark.parametrize("name", ["ranges.yaml", "ranges.json"])
@@ -101,7 +101,7 @@ def test_small_numbers_of_ranges_are_numbers_in_yaml(tmp_path):
 
 
 def test_a_discovery_is_exported_with_its_revised_model(draws, tmp_path):
-    means = {name: MEANS[name] for name in ("mass", "damping", "kp", "centre", "density")}
+    means = {name: MEANS[name] for name in ("mass", "damping", "kp", "centre", "density", "grip")}
     found = write_discovery(tmp_path / "discovery", means)
     (tmp_path / "discovery" / "revised_model.py").write_text(
         (tmp_path / "arm_model.py").read_text().replace("def model", "def revised_model")
@@ -118,8 +118,7 @@ def test_a_discovery_is_exported_with_its_revised_model(draws, tmp_path):
 
 
 def test_an_environment_is_another_robot_after_every_reset(draws):
-    wrapper, text = exported_wrapper()
-    assert "elbow.encoder_bias, because the environment makes its own observations" in text
+    wrapper = exported_wrapper()
     env = wrapper(arm_environment())
     model = env.unwrapped.model
     seen = []
@@ -145,7 +144,7 @@ def test_an_environment_is_another_robot_after_every_reset(draws):
 
 
 def test_the_environment_moves_as_our_simulator_with_the_same_draw(draws):
-    wrapper, _ = exported_wrapper()
+    wrapper = exported_wrapper()
     env = wrapper(arm_environment())
     ours = runpy.run_path("arm_model.py")["arm"].with_effects(
         CoulombFriction("shoulder_torque"),
@@ -166,8 +165,12 @@ def test_the_environment_moves_as_our_simulator_with_the_same_draw(draws):
         own = {n: torch.tensor(v[row]) for n, v in draws.items() if "encoder" not in n}
         wanted = ours.simulate(own, inputs)[0].numpy()
         env.reset(options={"draw": row})
-        moved = np.array([env.step(command)[0] for command in commands])
+        steps = [env.step(command) for command in commands]
+        moved = np.array([observation for observation, *_ in steps])
         assert np.abs(moved - wanted).max() < 1e-9
+        measured = np.array([info["measured"]["elbow"] for *_, info in steps])
+        bias = draws["elbow.encoder_bias.offset"][row]
+        assert np.abs(measured - bias - wanted[:, 1]).max() < 1e-9
         nominal = MujocoSimulator("arm.xml", time_step=0.01).simulate({}, inputs)[0].numpy()
         assert np.abs(wanted - nominal).max() > 0.1
 
@@ -202,7 +205,7 @@ def hidden_rig():
 
 @pytest.mark.slow
 def test_a_policy_trained_in_the_randomised_environment_works_on_the_hidden_rig(draws):
-    wrapper, _ = exported_wrapper()
+    wrapper = exported_wrapper()
     env = wrapper(arm_environment())
     names = ("shoulder", "elbow", "shoulder_velocity", "elbow_velocity")
     policy = Linear(names, ("motor",), max_gain=20.0)
@@ -244,6 +247,8 @@ def test_events_of_isaac_lab_have_the_arguments_that_it_takes(draws, monkeypatch
     )
     assert gains["damping_distribution_params"] == (0.25, 0.25)
     assert found.joint_shoulder_parameters.params["friction_distribution_params"][0] > 0.08
+    low, high = found.body_hand_material.params["static_friction_range"]
+    assert 0.7 < low < 0.8 < high < 0.9
     assert len(found.gravity.params["gravity_distribution_params"][0]) == 3
 
 
@@ -257,7 +262,7 @@ def test_events_of_isaac_lab_have_the_arguments_that_it_takes(draws, monkeypatch
         (("fit", MODEL, "--to", "a-b.py", "--as", "gymnasium"), "cannot be imported"),
         (("fit", "--to", "x.py", "--as", "gymnasium"), "Give the model of the run"),
         (("old", "--to", "x.yaml"), "has no posterior.nc"),
-        (("other", "--to", "x.yaml"), "does not belong to this run"),
+        (("other", "--to", "x.yaml"), "has no draws of lost; it is of another run"),
         (("fit", MODEL, "--to", "x.urdf"), "was not made from a URDF file"),
         (("fit", MODEL, "--to", "arm_model.py", "--as", "isaac-lab"), "exists already"),
     ],
@@ -273,8 +278,48 @@ def test_bad_input_gives_one_sentence(draws, tmp_path, words, sentence):
     assert code == 2 and err.count("\n") == 1 and sentence in err
 
 
+STOCK = """
+import pyro, pyro.distributions as dist
+import npdr_ppl as npdr
+
+cart = npdr.MujocoSimulator({path!r}, {{"gear": "actuator slide gear"}})
+
+def model(inputs):
+    gear = pyro.sample("gear", dist.Uniform(50.0, 150.0))
+    return npdr.simulate("x", cart, {{"gear": gear}}, inputs)
+"""
+
+
+@needs_gymnasium
+@pytest.mark.filterwarnings("ignore")
+def test_an_environment_of_gymnasium_is_randomised(tmp_path, monkeypatch):
+    import gymnasium
+
+    monkeypatch.chdir(tmp_path)
+    path = str(GYMNASIUM / "inverted_pendulum.xml")
+    Path("cart.py").write_text(STOCK.format(path=path))
+    name = MujocoSimulator(path).joints[0]
+    draws = write_fit(tmp_path / "fit", {"gear": 110.0, f"{name}.stribeck_friction.excess": 2.0,
+                                         f"{name}.stribeck_friction.speed": 0.2})  # fmt: skip
+    words = "export", "fit", "cart.py:model", "--to", "cart_gym.py", "--as", "gymnasium"
+    code, _, err = run_for_module(*words)
+    assert code == 0, err
+    env = runpy.run_path("cart_gym.py")["RandomisedRobot"](gymnasium.make("InvertedPendulum-v5"))
+    random, lengths = np.random.default_rng(0), []
+    for seed in range(5):
+        _, info = env.reset(seed=seed)
+        assert env.unwrapped.model.actuator_gear[0, 0] == draws["gear"][info["draw"]]
+        for step in range(1000):
+            observation, _, ends, cut, _ = env.step(random.uniform(-3.0, 3.0, 1))
+            assert np.isfinite(observation).all()
+            if ends or cut:
+                lengths.append(step)
+                break
+    assert len(lengths) == 5
+
+
 def test_another_robot_is_named(draws, tmp_path):
-    wrapper, _ = exported_wrapper()
+    wrapper = exported_wrapper()
     text = (tmp_path / "arm.xml").read_text().replace('"hand"', '"other"')
     (tmp_path / "arm.xml").write_text(text)
     with pytest.raises(ValueError, match="has no body 'hand'"):

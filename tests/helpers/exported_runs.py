@@ -18,7 +18,7 @@ ARM = """<mujoco>
       <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.8"/>
       <body name="hand" pos="0 0 -0.3">
         <joint name="elbow" axis="0 1 0" damping="0.05"/>
-        <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.3"/>
+        <geom name="palm" type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.3"/>
       </body>
     </body>
   </worldbody>
@@ -39,6 +39,7 @@ FIELDS = {
     "kp": "actuator servo kp",
     "centre": "body hand centre z",
     "density": "option density",
+    "grip": "geom palm friction sliding",
 }
 arm = npdr.MujocoSimulator("arm.xml", FIELDS, time_step=0.01)
 
@@ -53,6 +54,7 @@ MEANS = {
     "kp": 5.0,
     "centre": -0.12,
     "density": 1.2,
+    "grip": 0.8,
     "shoulder_torque.coulomb_friction.magnitude": 0.1,
     "gravity.tilt.roll": 0.02,
     "gravity.tilt.pitch": -0.01,

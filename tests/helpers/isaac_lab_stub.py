@@ -1,6 +1,7 @@
 """The names of Isaac Lab that a configuration of events uses, with the arguments they take.
 
-Written after the documentation of Isaac Lab 2.3. Isaac Lab itself needs Isaac Sim and a GPU.
+The arguments are those of ``isaaclab/envs/mdp/events.py`` of 2025. Isaac Lab itself needs Isaac
+Sim and a GPU.
 """
 
 import inspect
@@ -19,6 +20,14 @@ TERMS = {
         "distribution": "uniform",
         "recompute_inertia": True,
         "min_mass": 1e-6,
+    },
+    "randomize_rigid_body_material": {
+        "static_friction_range": REQUIRED,
+        "dynamic_friction_range": REQUIRED,
+        "restitution_range": REQUIRED,
+        "num_buckets": REQUIRED,
+        "asset_cfg": REQUIRED,
+        "make_consistent": False,
     },
     "randomize_rigid_body_com": {"com_range": REQUIRED, "asset_cfg": REQUIRED},
     "randomize_joint_parameters": {

@@ -1,9 +1,9 @@
 """Draws of parameters as ranges of Isaac Lab's events.
 
 The terms are those of ``isaaclab.envs.mdp``: ``randomize_rigid_body_mass``,
-``randomize_rigid_body_com``, ``randomize_joint_parameters``, ``randomize_actuator_gains`` and
-``randomize_physics_scene_gravity``. They draw each number by itself, uniformly, so correlations
-are lost.
+``randomize_rigid_body_com``, ``randomize_rigid_body_material``, ``randomize_joint_parameters``,
+``randomize_actuator_gains`` and ``randomize_physics_scene_gravity``. They draw each number by
+itself, uniformly, so correlations are lost.
 """
 
 import re
@@ -89,6 +89,9 @@ def isaac_lab_file(
         elif (array, component) in _JOINT:
             own = terms.setdefault(f"{key}_parameters", _joint(name))
             own.arguments[_JOINT[array, component]] = repr(_ends(values))
+        elif (array, component) == ("geom_friction", 0):
+            body = model.body(int(model.geom(name).bodyid[0])).name
+            terms[f"body_{body}_material"] = _material(model, body, columns)
         elif array == "gravity":
             terms["gravity"] = _gravity(model, columns)
         elif array == "body_inertia" and ("body_mass", kind, name, 0) in columns:
@@ -138,6 +141,26 @@ def _joint(joint: str) -> _Term:
         {"operation": '"abs"', "distribution": '"uniform"'},
         note,
     )
+
+
+def _material(model: Any, body: str, columns: Mapping[Field, Array]) -> _Term:
+    own = [
+        values
+        for (array, _, name, component), values in columns.items()
+        if (array, component) == ("geom_friction", 0)
+        and model.body(int(model.geom(name).bodyid[0])).name == body
+    ]
+    ends = repr(_ends(np.concatenate(own)))
+    arguments = {
+        "static_friction_range": ends,
+        "dynamic_friction_range": ends,
+        "restitution_range": "(0.0, 0.0)",
+        "num_buckets": "64",
+        "make_consistent": "True",
+    }
+    note = "All shapes of the body get it. MuJoCo takes the greater friction of two geoms."
+    asset = f"body_names={_exactly(body)}"
+    return _Term("randomize_rigid_body_material", "startup", asset, arguments, note)
 
 
 def _gravity(model: Any, columns: Mapping[Field, Array]) -> _Term:

@@ -19,7 +19,7 @@ from npdr_ppl.engines.mujoco.callbacks.python_file import (
 from npdr_ppl.engines.mujoco.effects_in_file import file_assignments, is_in_file, why_not
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.effects import Effect, SensorEffect
+from npdr_ppl.language.effects import Effect
 
 __all__ = ["Field", "RandomisedFields", "gymnasium_file", "randomised_fields"]
 
@@ -117,8 +117,8 @@ def _field(model: Any, array: str, place: int) -> Field:
 
 def gymnasium_file(
     simulator: MujocoMechanism, found: RandomisedFields, *, module: str, robot: str, substeps: int
-) -> tuple[str, dict[str, str]]:
-    """Returns a Python file with a ``gymnasium.Wrapper``, and why effects are not in it, by name.
+) -> str:
+    """Returns a Python file with a ``gymnasium.Wrapper``.
 
     Args:
         simulator: The simulator.
@@ -127,15 +127,15 @@ def gymnasium_file(
         robot: Name of the robot's file.
         substeps: Engine steps per control step of the recording.
     """
-    effects = [e for e in found.beside if not isinstance(e, SensorEffect)]
-    refused = dict(found.refused) | {
-        e.name: "the environment makes its own observations"
-        for e in found.beside
-        if isinstance(e, SensorEffect)
-    }
+    effects = found.beside
     code, imports = python_source("RandomisedEnv", effects)
     hard = _hard_joints(simulator, found)
-    lines = [_HEAD.format(robot=plain(robot), module=module), *imports, "", "import gymnasium"]
+    lines = [
+        _HEAD.format(robot=plain(robot), module=module, note=_MEASURED if effects else ""),
+        *imports,
+        "",
+        "import gymnasium",
+    ]
     lines += ["import mujoco", "import numpy as np", "", "", code]
     lines += ["FIELDS: list[Field] = ["]
     for array, kind, name, place in found.fields:
@@ -147,7 +147,7 @@ def gymnasium_file(
         lines += [effects_class(simulator, effects, substeps=substeps), ""]
     maker = ", Effects" if effects else ""
     lines += [_TAIL.format(module=module, maker=maker)]
-    return "\n".join(lines), refused
+    return "\n".join(lines)
 
 
 def _hard_joints(simulator: MujocoMechanism, found: RandomisedFields) -> Sequence[str | int]:
@@ -176,8 +176,13 @@ parameters. The environment has to load the same robot. Its own time step and in
 
     env = RandomisedRobot(gymnasium.make("...", xml_file="{robot}"))
     observation, info = env.reset(seed=0)  # info["parameters"] are those of the draw
-"""
+{note}"""
 '''
+
+_MEASURED = """
+Observations are the environment's own. What the robot's sensors report, with the errors that were
+identified, is in info["measured"].
+"""
 
 _TAIL = '''class RandomisedRobot(RandomisedEnv):
     """The environment with another draw of the identified robot at every reset.

@@ -31,6 +31,8 @@ class RandomisedEnv(gymnasium.Wrapper):
     Attributes:
         draw: Number of the present draw.
         parameters: Its parameters by name.
+        measured: What the robot's sensors report, with their errors, by channel; empty without
+            effects.
     """
 
     def __init__(
@@ -63,7 +65,7 @@ class RandomisedEnv(gymnasium.Wrapper):
             if not hasattr(self._robot, "_step_mujoco_simulation"):
                 raise TypeError("The environment is no MujocoEnv, so effects cannot act in it.")
             self._robot._step_mujoco_simulation = self._advance
-        self.draw, self.parameters = 0, {}
+        self.draw, self.parameters, self.measured = 0, {}, {}
         self.use(0)
 
     def reset(
@@ -81,8 +83,14 @@ class RandomisedEnv(gymnasium.Wrapper):
         self.use(int(options.pop("draw", self._random.integers(len(self._values)))))
         observation, info = self.env.reset(seed=seed, options=options or None)
         if self._effects is not None:
-            self._effects.reset(self._robot.data)
-        return observation, info | {"draw": self.draw, "parameters": self.parameters}
+            self.measured = self._effects.reset(self._robot.data)
+        told = {"draw": self.draw, "parameters": self.parameters, "measured": self.measured}
+        return observation, info | told
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Advances the environment; ``info["measured"]`` is what the robot's sensors report."""
+        observation, reward, ends, is_cut, info = self.env.step(action)
+        return observation, reward, ends, is_cut, info | {"measured": self.measured}
 
     def use(self, draw: int) -> None:
         """Writes a draw into the model; the next reset of the environment begins with it."""
@@ -104,7 +112,7 @@ class RandomisedEnv(gymnasium.Wrapper):
     def _advance(self, ctrl: Any, n_frames: int) -> None:
         """Takes the steps of one action."""
         assert self._effects is not None
-        self._effects.step(self._robot.data, ctrl, n_frames)
+        self.measured = self._effects.step(self._robot.data, ctrl, n_frames)
         mujoco.mj_rnePostConstraint(self._robot.model, self._robot.data)
 
     @staticmethod
