@@ -1,11 +1,15 @@
 """Every law of the catalogue in an exported file, or in the Python beside it, against our own."""
 
+import ast
 import dataclasses
+import sys
 
 import pytest
+import torch
 
 from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.engines.mujoco.callbacks.python_file import LAWS
+from npdr_ppl.engines.mujoco.export import export_mjcf
 from npdr_ppl.models.effects import (
     ActuatorGain,
     ActuatorLag,
@@ -127,6 +131,22 @@ def test_effects_act_together_in_their_order(arm, tmp_path, group):
     given = {n: v for e in attached for n, v in probed(simulator, e).items()} | values
     error, matters, where = difference(simulator, given, tmp_path)
     assert where == "Python" and error <= MOST_IN_PYTHON and matters > 1e-3
+
+
+@pytest.mark.parametrize("name", ["bias", "presliding_friction", "input_delay", "sensor_delay"])
+def test_the_python_file_imports_what_it_uses_and_nothing_else(arm, name):
+    effect = attachable(arm, effects()[name])
+    simulator = arm.with_effects(effect)
+    given = {n: torch.tensor(v) for n, v in probed(simulator, effect).items()}
+    found = export_mjcf(simulator, given).callbacks
+    assert found is not None
+    tree = ast.parse(found.text)
+    imports = [n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)]
+    modules = {a.name for n in imports if isinstance(n, ast.Import) for a in n.names}
+    modules |= {str(n.module) for n in imports if isinstance(n, ast.ImportFrom)}
+    assert modules - set(sys.stdlib_module_names) - {"collections.abc"} == {"mujoco", "numpy"}
+    names = {a.asname or a.name for n in imports for a in n.names}
+    assert names <= {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
 
 
 def test_contact_coefficients_are_in_the_file(tmp_path):

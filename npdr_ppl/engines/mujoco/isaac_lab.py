@@ -276,7 +276,7 @@ bodies and joints are those of the robot's file.
         events = EventCfg()
 """
 
-import isaaclab.envs.mdp as mdp
+from isaaclab.envs import mdp
 from isaaclab.managers import EventTermCfg as EventTerm
 from isaaclab.managers import SceneEntityCfg
 from isaaclab.utils import configclass

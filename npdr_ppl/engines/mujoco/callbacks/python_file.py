@@ -244,12 +244,13 @@ def _code(wanted: set[str]) -> str:
 
 def _imports(code: str) -> list[str]:
     """Returns the imports that some code needs."""
+    known = {node.id for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Name)}
     result = []
     for module, *names in _IMPORTS:
-        used = [name for name in names if re.search(rf"\b{name}\b", code)]
+        used = [name for name in names if name in known]
         if used:
             result.append(f"from {module} import {', '.join(used)}")
-        elif not names and f"{module}." in code:
+        elif not names and module in known:
             result.append(f"import {module}")
     return result
 

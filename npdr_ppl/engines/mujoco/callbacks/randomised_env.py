@@ -49,7 +49,7 @@ class RandomisedEnv(gymnasium.Wrapper):
             self._names = [str(name) for name in file["names"]]
         self._robot: Any = env.unwrapped
         model = self._robot.model
-        self._places = [self._place(model, *field) for field in fields]
+        self._places = [self._place(model, *number) for number in fields]
         for name in hard_friction:
             dof = int(_element(model, "joint", name).dofadr[0])
             model.dof_solref[dof] = 2.0 * model.opt.timestep, 1.0
