@@ -75,6 +75,17 @@ def test_a_law_moves_the_exported_robot_as_ours(arm, tmp_path, name):
     assert matters > 1e-3 or name == "contact"
 
 
+@pytest.mark.parametrize(
+    "name", ["presliding_friction", "joint_elasticity", "backlash", "asymmetric_coulomb_friction"]
+)
+def test_a_rollout_may_start_in_motion(arm, tmp_path, name):
+    effect = attachable(arm, effects()[name])
+    simulator = arm.with_effects(effect)
+    values = probed(simulator, effect)
+    error, *_ = difference(simulator, values, tmp_path, velocity=-0.7)
+    assert error <= MOST_IN_PYTHON
+
+
 def test_at_least_thirty_effects_can_be_taken_home():
     assert set(effects()) == IN_FILE | (set(LAWS) - IN_FILE) | REFUSED
     assert len(set(effects()) - REFUSED) >= 30

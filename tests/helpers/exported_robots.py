@@ -127,7 +127,7 @@ def refusals(simulator, values):
     return export_mjcf(simulator, given, time_step=CONTROL_STEP).refused
 
 
-def difference(simulator, values, folder, *, seconds=1.0):
+def difference(simulator, values, folder, *, seconds=1.0, velocity=0.0):
     """Returns how far the exported robot is from the model, how much the effects matter, and how.
 
     Args:
@@ -135,6 +135,7 @@ def difference(simulator, values, folder, *, seconds=1.0):
         values: Values of their parameters.
         folder: Folder of the new files.
         seconds: Time to simulate.
+        velocity: Velocity of every joint at the start.
     """
     num_steps = round(seconds / CONTROL_STEP)
     given = {n: torch.tensor(float(v), dtype=torch.float64) for n, v in values.items()}
@@ -150,6 +151,8 @@ def difference(simulator, values, folder, *, seconds=1.0):
         file = folder / "identified_effects.py"
         file.write_text(found.callbacks.text)
         runner = runpy.run_path(str(file))["Effects"](model)
+
+    data.qvel[:] = velocity
 
     def place(component):
         return float((data.qvel if component.is_velocity else data.qpos)[component.address])
