@@ -86,6 +86,17 @@ def test_a_rollout_may_start_in_motion(arm, tmp_path, name):
     assert error <= MOST_IN_PYTHON
 
 
+def test_refined_steps_are_taken(arm, tmp_path):
+    effect = attachable(arm, effects()["joint_elasticity"])
+    simulator = arm.with_effects(effect, InputDelay("motor"))
+    finer = simulator.with_finer_steps().with_finer_steps()
+    values = probed(simulator, effect) | {"motor.input_delay.delay": 0.0137}
+    error, *_ = difference(finer, values, tmp_path)
+    assert error <= MOST_IN_PYTHON
+    coarse, *_ = difference(simulator, values, tmp_path)
+    assert coarse <= MOST_IN_PYTHON
+
+
 def test_at_least_thirty_effects_can_be_taken_home():
     assert set(effects()) == IN_FILE | (set(LAWS) - IN_FILE) | REFUSED
     assert len(set(effects()) - REFUSED) >= 30
