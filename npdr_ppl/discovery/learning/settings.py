@@ -26,8 +26,9 @@ class LearningSettings:
         most_laws: Greatest number of laws at different ports.
         num_fitted: Ports whose best formula is fitted by simulation.
         num_shapes: Values of every other shape constant that are tried.
-        negligible: Terms are left out that explain less than this share of what all explain. With a precise recording, everything that the model simplifies is
-            significant; a formula with many small terms says nothing to a mechanic.
+        negligible: Terms are left out that explain less than this share of what all explain.
+            With a precise recording, everything that the model simplifies is significant; a
+            formula with many small terms says nothing to a mechanic.
         shape_step: First relative step by which a shape constant is varied.
         finest_shape_step: Relative step at which that ends.
         num_drawn_laws: Draws of a law's constants from which its band is computed.
