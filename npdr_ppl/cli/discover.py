@@ -61,7 +61,7 @@ def discover(
     candidates: Annotated[
         str,
         typer.Option(
-            help="Effects to try, port.effect,port.effect; all if not given.",
+            help="Effects to try, in the form of --effect; all if not given.",
             autocompletion=complete_effect,
         ),
     ] = "",
@@ -117,12 +117,8 @@ def discover(
 
     Example: npdr discover furuta --data measured.csv --holdout 3,4 --out discovery
     """
-    from npdr_ppl.cli.resolve import (
-        named_effects,
-        resolve_effects,
-        resolve_holdout,
-        resolve_model,
-    )
+    from npdr_ppl.cli.effect_words import named_effects
+    from npdr_ppl.cli.resolve import resolve_effects, resolve_holdout, resolve_model
     from npdr_ppl.cli.show import show_discovery
     from npdr_ppl.discovery import DiscoveryOptions, Investigation
     from npdr_ppl.discovery.discovery_folder import DiscoveryFolder, findings_until

@@ -125,7 +125,8 @@ SeedOption = Annotated[int, typer.Option(min=0, help="Seed of everything random.
 EffectOption = Annotated[
     list[str] | None,
     typer.Option(
-        help="Effect to attach, port.effect; repeat the option, or separate by commas.",
+        help="Effect to attach, port.effect or path/to/file.py:Class@port; repeat the option, or "
+        "separate by commas.",
         autocompletion=complete_effect,
     ),
 ]

@@ -1,19 +1,19 @@
 """Turns command-line words into models, effects, data, targets, tasks and methods."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from npdr_ppl.cli.model_files import ROBOTS, check_exists, derived_model, is_robot, load_function
+from npdr_ppl.cli.model_files import ROBOTS, derived_model, is_robot, load_function
 from npdr_ppl.engines.common.robot_files import relative_to
 from npdr_ppl.errors import BackendError, DataError, ModelError, NpdrError
 from npdr_ppl.language.model import Model
+from npdr_ppl.python_files import check_exists
 
 if TYPE_CHECKING:
     from npdr_ppl.embeddings import Embedding
     from npdr_ppl.inference.base import Backend
-    from npdr_ppl.language.effects import Effect
     from npdr_ppl.language.simulator import Simulator
     from npdr_ppl.loop.control_task import ControlTask
     from npdr_ppl.policies.policy_search import PolicySearch
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 __all__ = [
     "columns_of_model",
     "load_all",
-    "named_effects",
     "resolve_backend",
     "resolve_device",
     "resolve_effects",
@@ -96,53 +95,19 @@ def columns_of_model(word: str) -> "list[Column]":
 
 
 def resolve_effects(model: Model, words: Sequence[str]) -> Callable[..., Any]:
-    """Attaches effects given as ``port.effect``, e.g. ``pole.coulomb_friction``.
+    """Attaches effects given as ``port.effect``, or as ``path/to/file.py:Class@port``.
 
     A word may hold several effects, separated by commas.
 
     Raises:
         ModelError: There is no such effect.
     """
+    from npdr_ppl.cli.effect_words import named_effects
     from npdr_ppl.language.handlers import add_effect
 
     for effect in named_effects(words):
         model = add_effect(model, effect)
     return model
-
-
-def named_effects(words: Sequence[str]) -> "list[Effect]":
-    """Returns effects given as ``port.effect``; a word may hold several, separated by commas.
-
-    Raises:
-        ModelError: There is no such effect.
-    """
-    from npdr_ppl.models.effects import effects
-
-    catalogue = effects()
-    found = []
-    for word in (part for text in words for part in _split_effects(text, catalogue)):
-        port, separator, name = word.rpartition(".")
-        if not separator or name not in catalogue:
-            close = get_close_matches(name, catalogue, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(catalogue)}."
-            if not separator and word in catalogue:
-                hint = f"say where it attaches, as in JOINT.{word}."
-            raise ModelError(
-                f"{word!r} is not port.effect with an effect of the catalogue; {hint}"
-            )
-        found.append(catalogue[name](port))
-    return found
-
-
-def _split_effects(text: str, known: Collection[str]) -> list[str]:
-    """Splits at commas that follow an effect; the name of a port may itself contain commas."""
-    parts = [""]
-    for piece in text.split(","):
-        if parts[-1].rpartition(".")[2] in known:
-            parts.append(piece.strip())
-        else:
-            parts[-1] = f"{parts[-1]},{piece.strip()}".lstrip(",")
-    return parts
 
 
 def resolve_rollouts(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from npdr_ppl.atomic_files import replacing
-from npdr_ppl.cli.model_files import check_exists
+from npdr_ppl.python_files import check_exists
 
 if TYPE_CHECKING:
     from npdr_ppl.engines.mujoco import MujocoSimulator

@@ -1,0 +1,102 @@
+"""Loads Python files of users: models, targets and effects that no installed package has."""
+
+import hashlib
+import importlib.util
+import inspect
+import re
+import sys
+from difflib import get_close_matches
+from importlib.machinery import PathFinder
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cloudpickle
+
+from npdr_ppl.errors import ModelError
+
+__all__ = ["check_exists", "class_file", "is_importable", "load_python_file", "own_names"]
+
+_TEXT = "__npdr_text__"
+"""Name in a loaded module of the bytes that it was loaded from."""
+
+
+def check_exists(path: Path, pattern: str, ending: str = "") -> None:
+    """Raises a ModelError if a file does not exist.
+
+    Args:
+        path: The file.
+        pattern: Which files beside it may be meant, e.g. ``"*.py"``.
+        ending: What follows the name of the file on the command line.
+    """
+    if not path.is_file():
+        close = get_close_matches(path.name, [p.name for p in path.parent.glob(pattern)], n=1)
+        hint = f" Did you mean {path.with_name(close[0])}{ending}?" if close else ""
+        raise ModelError(f"{path} does not exist.{hint}")
+
+
+def load_python_file(path: Path) -> ModuleType:
+    """Returns the module that a Python file defines; an unchanged file is run only once.
+
+    Files of the same name in two folders are two modules, and a file called ``json.py`` does not
+    replace the library.
+
+    Args:
+        path: The file, which must exist.
+
+    Raises:
+        ModelError: The file raises an error.
+    """
+    path = path.absolute()
+    digest = hashlib.sha256(str(path).encode()).hexdigest()[:12]
+    stem = re.sub(r"\W", "_", path.stem)
+    name = f"_npdr_{stem}_{digest}"
+    text = path.read_bytes()
+    loaded = sys.modules.get(name)
+    if loaded is not None and getattr(loaded, _TEXT, None) == text:
+        return loaded
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None:
+        raise ModelError(f"{path} is not a Python file.")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    # Workers cannot import a module of this name, so its definitions are sent as code.
+    cloudpickle.register_pickle_by_value(module)
+    try:
+        # Not by the spec's loader: it takes a file for unchanged that was changed within a second.
+        exec(compile(text, str(path), "exec"), vars(module))
+    except (Exception, SystemExit) as error:
+        cloudpickle.unregister_pickle_by_value(module)
+        del sys.modules[name]
+        raise ModelError(f"{path} cannot be loaded: {type(error).__name__}: {error}.") from error
+    setattr(module, _TEXT, text)
+    return module
+
+
+def own_names(module: ModuleType) -> list[str]:
+    """Returns the names of the functions and classes that a module itself defines."""
+    name = module.__name__
+    return [n for n, value in vars(module).items() if getattr(value, "__module__", "") == name]
+
+
+def is_importable(module: str) -> bool:
+    """Returns whether a module belongs to an installed package.
+
+    Modules of :func:`load_python_file` and ``__main__`` do not.
+
+    Args:
+        module: Its name, e.g. ``"npdr_ppl.models.pendulum"``.
+    """
+    # importlib.util.find_spec would also find modules that were loaded from a file by path.
+    top = module.partition(".")[0]
+    return top != "__main__" and PathFinder.find_spec(top) is not None
+
+
+def class_file(cls: type[Any]) -> Path | None:
+    """Returns the file that defines a class; ``None`` if there is none.
+
+    It is found in worker processes, too, to which a class is sent as code without its module.
+    """
+    functions = filter(inspect.isfunction, vars(cls).values())
+    paths = (Path(function.__code__.co_filename) for function in functions)
+    return next((path for path in paths if path.is_file()), None)

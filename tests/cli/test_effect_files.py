@@ -1,0 +1,157 @@
+"""Effects of a user's own Python file: --effect path/to/file.py:Class@port."""
+
+import json
+
+import cloudpickle
+import pytest
+import torch
+
+from npdr_ppl.cli.effect_words import named_effects, split_effects
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.effects import ForceEffect
+from npdr_ppl.models.effects import effects
+from npdr_ppl.python_files import class_file, load_python_file
+from tests.helpers.command_line import run
+from tests.helpers.effect_files import CUBIC, GAIN
+from tests.helpers.pendulum_recordings import swinging
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The present folder, with two files of effects."""
+    (tmp_path / "cubic.py").write_text(CUBIC)
+    (tmp_path / "gain.py").write_text(GAIN)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("hinge.bias", ["hinge.bias"]),
+        ("a,b.bias, hinge.bias", ["a,b.bias", "hinge.bias"]),
+        ("cubic.py:LearnedHinge@hinge", ["cubic.py:LearnedHinge@hinge"]),
+        ("cubic.py@a,b", ["cubic.py@a,b"]),
+        ("cubic.py@a,b,hinge.bias", ["cubic.py@a,b", "hinge.bias"]),
+        ("a,b.bias,my/x.py:C@c,d,../y.py@e", ["a,b.bias", "my/x.py:C@c,d", "../y.py@e"]),
+        ("C:\\rigs\\x.py:C@hinge", ["C:\\rigs\\x.py:C@hinge"]),
+        ("cubic.py:LearnedHinge", ["cubic.py:LearnedHinge"]),
+    ],
+)
+def test_words_are_split_where_an_effect_ends(text, parts):
+    assert split_effects(text, effects()) == parts
+
+
+@pytest.mark.usefixtures("folder")
+def test_effects_of_files_stand_beside_those_of_the_catalogue():
+    found = named_effects(["cubic.py@hinge,hinge.bias", "gain.py:Shifted@angle,velocity"])
+    assert [e.name for e in found] == [
+        "hinge.learned_hinge", "hinge.bias", "angle,velocity.shifted"
+    ]  # fmt: skip
+
+
+MESSAGES = {
+    "cubc.py:LearnedHinge@hinge": "Did you mean cubic.py:LearnedHinge@hinge?",
+    "cubic.py:LearndHinge@hinge": "no class 'LearndHinge'; did you mean cubic.py:LearnedHinge?",
+    "cubic.py:hat@hinge": "cubic.py:hat is no effect",
+    "cubic.py:LearnedHinge": "port of kind force: write cubic.py:LearnedHinge@PORT.",
+    "cubic.py": "port of kind force: write cubic.py:LearnedHinge@PORT.",
+    "gain.py@torque": "has the effects Pushed, Shifted; say which, as in gain.py:Pushed@PORT.",
+    "empty.py@hinge": "empty.py has no effect",
+    "broken.py@hinge": "broken.py cannot be loaded: NameError: name 'undefined' is not defined.",
+    "ends.py@hinge": "ends.py cannot be loaded: SystemExit: 3.",
+    "nameless.py@hinge": "Nameless in nameless.py does not define id",
+    "half.py@hinge": "Half in half.py does not define default_priors",
+    "dotted.py@hinge": "has the id 'a.b'; it may have letters, digits and underscores only.",
+    "hinge.baias": "did you mean 'bias'?",
+}
+
+
+@pytest.fixture
+def wrong_files(folder):
+    """Files that are no good."""
+    (folder / "empty.py").write_text("X = 1\n")
+    (folder / "broken.py").write_text("undefined\n")
+    (folder / "ends.py").write_text("import sys\nsys.exit(3)\n")
+    (folder / "nameless.py").write_text(
+        CUBIC.replace('    id = "learned_hinge"\n', "").replace("LearnedHinge", "Nameless")
+    )
+    half = CUBIC.replace("default_priors", "other").replace("LearnedHinge", "Half")
+    (folder / "half.py").write_text(half)
+    (folder / "dotted.py").write_text(CUBIC.replace('"learned_hinge"', '"a.b"'))
+
+
+@pytest.mark.usefixtures("wrong_files")
+@pytest.mark.parametrize("word", MESSAGES)
+def test_a_wrong_word_gets_one_sentence(word):
+    with pytest.raises(ModelError) as raised:
+        named_effects([word])
+    assert MESSAGES[word] in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("cubic.py@hing", "no port 'hing'; did you mean 'hinge'?"),
+        ("cubic.py@torque", "learned_hinge attaches to a port of kind force"),
+        ("cubic.py", "write cubic.py:LearnedHinge@PORT."),
+    ],
+)
+@pytest.mark.parametrize("command", ["fit", "compare", "discover"])
+def test_commands_refuse_a_wrong_port(word, message, command, folder, monkeypatch, capsys):
+    swinging(rollouts=2).to_csv(folder / "data.csv")
+    words = [command, "pendulum", "--data", "data.csv", "--out", "out", "--effect", word]
+    words += ["--backends", "snpe-c,abc"] * (command == "compare")
+    code, _, err = run(monkeypatch, capsys, *words, "--quiet")
+    assert code == 2 and err.startswith("npdr: ") and err.count("\n") == 1
+    assert message in err
+
+
+@pytest.mark.usefixtures("folder")
+def test_workers_get_the_classes_as_code(monkeypatch):
+    (effect,) = named_effects(["cubic.py@hinge"])
+    sent = cloudpickle.dumps(effect)
+    # As in a worker, which has no module of this name.
+    monkeypatch.delitem(__import__("sys").modules, type(effect).__module__)
+    received = cloudpickle.loads(sent)
+    assert isinstance(received, ForceEffect) and received.name == "hinge.learned_hinge"
+    force = received.force(torch.zeros(1), torch.tensor([2.0]), {"cubic": torch.ones(1)}, None)
+    assert force.item() == -8.0
+    assert class_file(type(received)).name == "cubic.py"
+
+
+def test_files_of_the_same_name_do_not_collide(tmp_path):
+    for name, power in (("a", 3), ("b", 5)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "law.py").write_text(CUBIC.replace("POWER = 3", f"POWER = {power}"))
+    first, second = (
+        named_effects([f"{tmp_path}/{name}/law.py@hinge"])[0] for name in ("a", "b")
+    )  # fmt: skip
+    values = torch.zeros(1), torch.tensor([2.0]), {"cubic": torch.ones(1)}, None
+    for effect, force in ((first, -8.0), (second, -32.0)):
+        assert effect.force(*values).item() == force
+        assert cloudpickle.loads(cloudpickle.dumps(effect)).force(*values).item() == force
+
+
+def test_a_file_is_loaded_again_only_if_it_changed(tmp_path):
+    file = tmp_path / "json.py"
+    file.write_text(CUBIC)
+    module = load_python_file(file)
+    assert load_python_file(file) is module
+    assert __import__("json") is json
+    # Of the same length and within the same second.
+    file.write_text(CUBIC.replace("POWER = 3", "POWER = 5"))
+    assert load_python_file(file).POWER == 5
+
+
+@pytest.mark.slow
+def test_a_fit_with_an_effect_of_a_file(folder, monkeypatch, capsys):
+    swinging(rollouts=2, steps=100).to_csv(folder / "data.csv")
+    code, _, err = run(
+        monkeypatch, capsys, "fit", "pendulum", "--data", "data.csv", "--out", "out",
+        "--effect", "cubic.py@hinge", "--rounds", 1, "--simulations", 100, "--embedding", "all/5",
+        "--quiet",
+    )  # fmt: skip
+    assert code == 0, err
+    found = json.loads((folder / "out" / "fit.json").read_text())["parameters"]
+    assert set(found) == {"mass", "length", "hinge.learned_hinge.cubic"}
