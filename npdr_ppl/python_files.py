@@ -47,15 +47,15 @@ def load_python_file(path: Path) -> ModuleType:
     Raises:
         ModelError: The file raises an error.
     """
-    path = path.absolute()
-    digest = hashlib.sha256(str(path).encode()).hexdigest()[:12]
+    absolute = str(path.absolute())
+    digest = hashlib.sha256(absolute.encode()).hexdigest()[:12]
     stem = re.sub(r"\W", "_", path.stem)
     name = f"_npdr_{stem}_{digest}"
     text = path.read_bytes()
     loaded = sys.modules.get(name)
     if loaded is not None and getattr(loaded, _TEXT, None) == text:
         return loaded
-    spec = importlib.util.spec_from_file_location(name, path)
+    spec = importlib.util.spec_from_file_location(name, absolute)
     if spec is None:
         raise ModelError(f"{path} is not a Python file.")
     module = importlib.util.module_from_spec(spec)
@@ -64,7 +64,7 @@ def load_python_file(path: Path) -> ModuleType:
     cloudpickle.register_pickle_by_value(module)
     try:
         # Not by the spec's loader: it takes a file for unchanged that was changed within a second.
-        exec(compile(text, str(path), "exec"), vars(module))
+        exec(compile(text, absolute, "exec"), vars(module))
     except (Exception, SystemExit) as error:
         cloudpickle.unregister_pickle_by_value(module)
         del sys.modules[name]

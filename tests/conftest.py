@@ -27,6 +27,9 @@ torch.set_num_threads(int(os.environ.get("NPDR_NUM_THREADS", "1")))
 # Nor would processes that a command starts on its own, one per core.
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
 
+# Nor do the tests see effects that their user has added.
+os.environ["NPDR_EFFECTS"] = os.path.join(os.path.dirname(__file__), "no_added_effects")
+
 # The same examples every time, so that a run says something about the change under test;
 # NPDR_EXPLORE=1 looks for new ones.
 settings.register_profile("repeatable", derandomize=True)

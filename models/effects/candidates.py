@@ -9,14 +9,14 @@ from npdr_ppl.language.effects import ActionEffect, Effect, SensorEffect
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.models.effects.registry import effects
 
-__all__ = ["candidate_effects", "sensor_groups"]
+__all__ = ["attached", "candidate_effects", "sensor_groups"]
 
 # Lengths, masses and inertias do not change during a rollout.
 _LASTING_UNITS = ("m", "kg", "kg m²")
 
 
 def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
-    """Returns each effect of the catalogue at each port to which it can attach.
+    """Returns each effect of the registry at each port to which it can attach.
 
     A sensor effect attaches to the channels that one device may affect; see
     :class:`~npdr_ppl.language.effects.SensorEffect`. A delay and a lag of commands also attach to
@@ -32,19 +32,21 @@ def candidate_effects(simulator: Simulator) -> tuple[Effect, ...]:
         >>> [effect.name for effect in candidate_effects(Pendulum())][:2]
         ['hinge.viscous_friction', 'hinge.coulomb_friction']
     """
+    return tuple(found for effect in effects().values() for found in attached(simulator, effect))
+
+
+def attached(simulator: Simulator, effect: type[Effect]) -> Iterator[Effect]:
+    """Returns one effect at each port to which it can attach; see :func:`candidate_effects`."""
     present = {effect.name for effect in simulator.effects}
-    found = []
-    for effect in effects().values():
-        for port in _ports(simulator, effect):
-            attached = effect(port)
-            members = (simulator.port(name) for name in simulator.port(port).channels)
-            if (
-                attached.name not in present
-                and all(map(attached.suits, members))
-                and _is_accepted(simulator, attached)
-            ):
-                found.append(attached)
-    return tuple(found)
+    for port in _ports(simulator, effect):
+        found = effect(port)
+        members = (simulator.port(name) for name in simulator.port(port).channels)
+        if (
+            found.name not in present
+            and all(map(found.suits, members))
+            and _is_accepted(simulator, found)
+        ):
+            yield found
 
 
 def sensor_groups(simulator: Simulator, span: SensorSpan) -> tuple[tuple[str, ...], ...]:

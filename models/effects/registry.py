@@ -1,13 +1,15 @@
-"""The registry of effects: the catalogue, and effects that other packages add.
+"""The registry of effects: the catalogue, and effects that other packages and the user add.
 
 Other packages add theirs by an entry point of group ``npdr_ppl.effects``: its name is the effect's
-id, its value a subclass of :class:`~npdr_ppl.language.effects.Effect`.
+id, its value a subclass of :class:`~npdr_ppl.language.effects.Effect`. Users add theirs by
+``npdr effects --add``; see :mod:`npdr_ppl.models.effects.added`.
 """
 
 from collections.abc import Mapping
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.models.effects.added import added_effects
 from npdr_ppl.registry import Registry
 
 __all__ = ["effect_class", "effects"]
@@ -72,11 +74,17 @@ def effect_class(name: str) -> type[Effect]:
     Raises:
         ModelError: There is no such effect, it cannot be loaded, or its id differs from the name.
     """
-    return _found(name)
+    locations = _REGISTRY.locations()
+    if name in locations:
+        return _found(name, locations)
+    added = added_effects(frozenset(locations))
+    if name in added:
+        return added[name].effect
+    return _found(name, {**locations, **{key: str(own.file) for key, own in added.items()}})
 
 
 def effects() -> dict[str, type[Effect]]:
-    """Returns every effect by its id, the catalogue's first.
+    """Returns every effect by its id, the catalogue's first and those of the user last.
 
     Example:
         >>> effects()["coulomb_friction"]("arm")
@@ -84,11 +92,13 @@ def effects() -> dict[str, type[Effect]]:
     """
     # Which packages are installed is read once, not for every effect.
     locations = _REGISTRY.locations()
-    return {name: _found(name, locations) for name in locations}
+    found = {name: _found(name, locations) for name in locations}
+    added = added_effects(frozenset(locations))
+    return found | {name: own.effect for name, own in added.items()}
 
 
-def _found(name: str, locations: Mapping[str, str] | None = None) -> type[Effect]:
-    """Returns the class of an effect, see :func:`effect_class`."""
+def _found(name: str, locations: Mapping[str, str]) -> type[Effect]:
+    """Returns the class of an effect of a package, see :func:`effect_class`."""
     effect = _REGISTRY.find(name, locations)
     if effect.id != name:
         raise ModelError(

@@ -4,6 +4,7 @@ import json
 import shutil
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -75,15 +76,34 @@ def effects(
         str | None,
         typer.Argument(help=DETAILS, autocompletion=complete_effect),
     ] = None,
+    add: Annotated[
+        Path | None,
+        typer.Option(
+            help="Python file of your own whose effects to add, for every later command."
+        ),
+    ] = None,
+    remove: Annotated[
+        str, typer.Option(help="Effect that you added, to be removed with its file.")
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """List the catalogue of effects.
+    """List the catalogue of effects and those that you added; add effects of your own.
+
+    --add copies a Python file to a folder of your own: the one that NPDR_EFFECTS names, or
+    npdr_ppl/effects in the folder for your data. Its effects are then candidates of every search.
 
     Example: npdr effects --json
     """
-    from npdr_ppl.models.effects import effects as catalogue
+    from npdr_ppl.models.effects import effects as registered
+    from npdr_ppl.models.effects.added import added_effects
 
-    rows = [
+    if (name is not None) + (add is not None) + bool(remove) > 1:
+        raise DataError("`npdr effects` takes one of a name, --add and --remove.")
+    if add is not None or remove:
+        _change_effects(add, remove, as_json)
+        return
+    catalogue = registered()
+    rows: list[dict[str, object]] = [
         {
             "name": key,
             "summary": effect.law or _first_line(effect),
@@ -92,9 +112,36 @@ def effects(
             "may be confused with": [c.name for c in effect.equivalence],
             "revealed by": effect.excitation,
         }
-        for key, effect in catalogue().items()
+        for key, effect in catalogue.items()
     ]
+    files = {own.effect: str(own.file) for own in added_effects().values()}
+    for row, effect in zip(rows, catalogue.values(), strict=True):
+        if effect in files:
+            row["file"] = files[effect]
     _show("effects", rows, name, as_json)
+
+
+def _change_effects(add: Path | None, remove: str, as_json: bool) -> None:
+    """Adds the effects of a file, or removes those of an added file, and says which.
+
+    Raises:
+        ModelError: The file is refused, or the effect is not an added one.
+    """
+    from npdr_ppl.models.effect_additions import add_file, remove_file
+
+    changed = add_file(add) if add is not None else remove_file(remove)
+    names = ", ".join(changed.ids) or "a file without effects"
+    verb = "removed" if add is None else "added"
+    if as_json:
+        typer.echo(json.dumps({verb: list(changed.ids), "file": str(changed.file)}, indent=2))
+        return
+    typer.echo(f"{verb.capitalize()} {names}: {changed.file}")
+    if changed.unchecked:
+        typer.echo(
+            f"Not tried: {', '.join(changed.unchecked)}. No model of the zoo has a port for it."
+        )
+    if add is not None:
+        typer.echo(f"Attach it with --effect PORT.{changed.ids[0]}; npdr discover tries it.")
 
 
 def targets(
@@ -211,6 +258,8 @@ def _show(
     else:
         for row in rows:
             typer.echo(f"{row['name']}\n{_wrapped(str(row['summary']))}")
+            if "file" in row:
+                typer.echo(_wrapped(f"of your own, in {row['file']}"))
         if set(rows[0]) > {"name", "summary"}:
             typer.echo(f"\nDetails: npdr {command} {rows[0]['name']}")
 

@@ -2,11 +2,13 @@
 
 The registries import torch, which is too slow for tab completion. The names are therefore repeated
 here, and a test compares them with the registries. Names that other packages add are read from
-their entry points, which is fast.
+their entry points, which is fast, and those of the user's effects from their files.
 """
 
 from collections.abc import Iterable
 from importlib.metadata import entry_points
+
+from npdr_ppl.added_files import added_files, declared_ids
 
 __all__ = [
     "BACKENDS",
@@ -141,7 +143,8 @@ def complete_effect(incomplete: str) -> list[str]:
     port, dot, last = incomplete.rpartition(".")
     if not dot:
         return []
-    names = _beginning_with(last, (*EFFECTS, *_added("npdr_ppl.effects")))
+    own = [name for file in added_files() for name in declared_ids(file)]
+    names = _beginning_with(last, (*EFFECTS, *_added("npdr_ppl.effects"), *own))
     return [f"{port}.{name}" for name in names]
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from npdr_ppl.cli.effect_words import named_effects, split_effects
+from npdr_ppl.cli.names import complete_effect
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import ForceEffect
 from npdr_ppl.models.effects import effects
@@ -155,3 +156,35 @@ def test_a_fit_with_an_effect_of_a_file(folder, monkeypatch, capsys):
     assert code == 0, err
     found = json.loads((folder / "out" / "fit.json").read_text())["parameters"]
     assert set(found) == {"mass", "length", "hinge.learned_hinge.cubic"}
+
+
+@pytest.fixture
+def home(folder, monkeypatch):
+    """An empty folder of added effects."""
+    monkeypatch.setenv("NPDR_EFFECTS", str(folder / "home"))
+    return folder / "home"
+
+
+def test_npdr_effects_adds_lists_and_removes(home, monkeypatch, capsys):
+    code, text, _ = run(monkeypatch, capsys, "effects", "--add", "cubic.py")
+    assert code == 0
+    assert text.startswith(f"Added learned_hinge: {home / 'learned_hinge.py'}\n")
+    _, text, _ = run(monkeypatch, capsys, "effects", "--json")
+    rows = json.loads(text)
+    assert [row["name"] for row in rows if "file" in row] == ["learned_hinge"]
+    assert rows[-1]["file"] == str(home / "learned_hinge.py")
+    _, text, _ = run(monkeypatch, capsys, "effects")
+    assert str(home) in "".join(text.split("learned_hinge\n")[1].split())
+    assert [e.name for e in named_effects(["hinge.learned_hinge"])] == ["hinge.learned_hinge"]
+    assert complete_effect("hinge.lear") == ["hinge.learned_hinge"]
+    code, text, _ = run(monkeypatch, capsys, "effects", "--remove", "learned_hinge", "--json")
+    assert code == 0 and json.loads(text)["removed"] == ["learned_hinge"]
+    code, _, err = run(monkeypatch, capsys, "effects", "--remove", "learned_hinge")
+    assert code == 2 and err.startswith("npdr: You have added no effect")
+
+
+@pytest.mark.usefixtures("home")
+def test_npdr_effects_does_one_thing_at_a_time(monkeypatch, capsys):
+    for words in (("bias", "--add", "cubic.py"), ("--add", "cubic.py", "--remove", "bias")):
+        code, _, err = run(monkeypatch, capsys, "effects", *words)
+        assert code == 2 and "takes one of a name, --add and --remove" in err
