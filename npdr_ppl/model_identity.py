@@ -9,10 +9,12 @@ from typing import Any
 
 from pyro.poutine.messenger import Messenger
 
+from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors
+from npdr_ppl.python_files import class_file, is_importable
 
 __all__ = ["engine_settings", "file_text", "model_name", "source_text", "versions"]
 
@@ -40,9 +42,13 @@ def model_name(model: Any) -> str:
 
 
 def source_text(model: Any) -> str:
-    """Returns the source of a model, and the names of what is attached to it."""
+    """Returns the source of a model, and what is attached to it.
+
+    Effects of this and other packages are named; of those from a user's own file, which may change
+    between two runs, the file's text is returned, too.
+    """
     if isinstance(model, ModelWithEffects):
-        attached = "\n".join(f"# with {effect!r}" for effect, _ in model.effects)
+        attached = "\n".join(f"# with {e!r}{_own_file(e)}" for e, _ in model.effects)
         return f"{source_text(model.base)}\n{attached}"
     if _is_wrapped(model):
         return f"{source_text(model.args[-1])}\n# under {type(model.args[0]).__name__}"
@@ -65,6 +71,12 @@ def file_text(model: Any) -> str:
         return Path(inspect.getsourcefile(model) or "").read_text(encoding="utf-8")
     except (OSError, TypeError, UnicodeDecodeError):
         return ""
+
+
+def _own_file(effect: Effect) -> str:
+    """Returns the text of the user's file that defines an effect; empty for those of packages."""
+    file = None if is_importable(type(effect).__module__) else class_file(type(effect))
+    return "" if file is None else f" of\n{file.read_bytes().decode(errors='replace')}"
 
 
 def _is_wrapped(model: Any) -> bool:

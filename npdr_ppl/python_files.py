@@ -15,7 +15,14 @@ import cloudpickle
 
 from npdr_ppl.errors import ModelError
 
-__all__ = ["check_exists", "class_file", "is_importable", "load_python_file", "own_names"]
+__all__ = [
+    "check_exists",
+    "class_file",
+    "class_name",
+    "is_importable",
+    "load_python_file",
+    "own_names",
+]
 
 _TEXT = "__npdr_text__"
 """Name in a loaded module of the bytes that it was loaded from."""
@@ -100,3 +107,11 @@ def class_file(cls: type[Any]) -> Path | None:
     functions = filter(inspect.isfunction, vars(cls).values())
     paths = (Path(function.__code__.co_filename) for function in functions)
     return next((path for path in paths if path.is_file()), None)
+
+
+def class_name(cls: type[Any]) -> str:
+    """Returns the name by which a class is found in its module, mostly its own name."""
+    names = vars(sys.modules.get(cls.__module__, object))
+    if names.get(cls.__name__) is cls:
+        return cls.__name__
+    return next((name for name, value in names.items() if value is cls), cls.__name__)

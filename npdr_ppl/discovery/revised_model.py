@@ -2,18 +2,20 @@
 
 import inspect
 from collections.abc import Mapping
-from importlib.machinery import PathFinder
 from pathlib import Path
 
 import pyro.distributions
 from torch import Tensor
 from torch.distributions import Distribution
 
+from npdr_ppl.excerpts import import_lines
+from npdr_ppl.language.effect_sources import sources_of
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps, num_finer_steps
 from npdr_ppl.language.layers import layers
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors, wider_sites
+from npdr_ppl.python_files import is_importable
 
 __all__ = ["revised_source"]
 
@@ -31,8 +33,8 @@ def revised_source(
 ) -> str:
     """Returns Python source that defines ``revised_model``.
 
-    A model from an installed module is imported. A model from a file is copied, so that the result
-    needs no other file.
+    What an installed module defines is imported. A model from a file is copied, and so is what an
+    effect from a file needs of it, so that the result needs no other file.
 
     Args:
         model: The original model.
@@ -41,38 +43,41 @@ def revised_source(
         written: Source of effects that no module has.
     """
     base, *handlers = layers(model)
-    head, name = _base(base)
+    head, name, home = _base(base)
     every = [e for h in handlers if isinstance(h, ModelWithEffects) for e, _ in h.effects]
     every += effects
-    own = [e for e in every if type(e).__module__ != LEARNED]
-    imports = sorted({f"from {type(e).__module__} import {type(e).__name__}" for e in own})
-    functions = [
-        *(["add_effect"] if every else []),
-        *(["with_finer_steps"] if num_finer_steps(model) else []),
-        *(["with_wider_priors"] if wider_sites(model) else []),
-    ]
-    if functions:
-        imports = [f"from npdr_ppl import {', '.join(functions)}", *imports]
+    needed = {
+        "add_effect": bool(every),
+        "with_finer_steps": num_finer_steps(model) > 0,
+        "with_wider_priors": bool(wider_sites(model)),
+    }
+    imports = {
+        f"from npdr_ppl import {function}" for function, is_used in needed.items() if is_used
+    }
     if any(effect.given_priors for effect in every):
-        imports = ["import pyro.distributions", "", *imports]
-    lines = [head.rstrip(), "", "", *imports, ""]
-    if written:
-        lines += [written.strip(), "", ""]
-    lines += [f"{FUNCTION} = {name}"]
+        imports.add("import pyro.distributions")
+    own = [type(effect) for effect in every if type(effect).__module__ != LEARNED]
+    sources = sources_of(own, head, home, imports)
+    lines = [sources.head.rstrip(), "", "", *import_lines(sources.imports), *sources.blocks]
+    blocks = ["", "", written.strip()] if written else []
+    lines += [*blocks, "", *([""] if sources.blocks or written else []), f"{FUNCTION} = {name}"]
     for handler in handlers:
-        lines += _handled(handler)
+        lines += _handled(handler, sources.names)
     for effect in effects:
-        lines += _added(effect)
+        lines += _added(effect, sources.names)
     lines += ["", "# Parameters of the closest fit to the recording."]
     lines += ["CLOSEST_FIT = {"]
     lines += [f'    "{site}": {value:.6g},' for site, value in fitted.items()]
     return "\n".join([*lines, "}", ""])
 
 
-def _handled(handler: ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors) -> list[str]:
+def _handled(
+    handler: ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors,
+    names: Mapping[type[Effect], str],
+) -> list[str]:
     """Returns the lines that put a model into a handler."""
     if isinstance(handler, ModelWithEffects):
-        return [line for effect, _ in handler.effects for line in _added(effect)]
+        return [line for effect, _ in handler.effects for line in _added(effect, names)]
     if isinstance(handler, ModelWithFinerSteps):
         return [f"{FUNCTION} = with_finer_steps({FUNCTION})"]
     return [
@@ -81,8 +86,13 @@ def _handled(handler: ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPri
     ]
 
 
-def _added(effect: Effect) -> list[str]:
-    """Returns the lines that add an effect, with the priors that its user gave it."""
+def _added(effect: Effect, names: Mapping[type[Effect], str]) -> list[str]:
+    """Returns the lines that add an effect, with the priors that its user gave it.
+
+    Args:
+        effect: The effect.
+        names: Names of the classes in the source.
+    """
     lines, priors = [], []
     for name, prior in effect.given_priors.items():
         written = _distribution(prior)
@@ -90,7 +100,9 @@ def _added(effect: Effect) -> list[str]:
             lines.append(f"# The prior given to {effect.name}.{name} has no source: put it here.")
         else:
             priors.append(f'    "{name}": {written},')
-    made = repr(effect)
+    own, shown = names.get(type(effect), type(effect).__name__), repr(effect)
+    is_usual = shown.startswith(f"{type(effect).__name__}(")
+    made = f"{own}({shown.partition('(')[2] if is_usual else f'port={effect.port!r})'}"
     if priors:
         lines += ["PRIORS = {", *priors, "}"]
         made = f"{made.removesuffix(')')}, priors=PRIORS)"
@@ -112,19 +124,14 @@ def _distribution(prior: Distribution) -> str | None:
     return f"pyro.distributions.{name}({', '.join(given)})"
 
 
-def _base(model: Model) -> tuple[str, str]:
-    """Returns the source that defines a model, and the model's name."""
+def _base(model: Model) -> tuple[str, str, Path | None]:
+    """Returns the source that defines a model, the model's name, and the file that is copied."""
     module = inspect.getmodule(model)
     name = getattr(model, "__name__", type(model).__name__)
-    if module is not None and _is_installed(module.__name__):
+    if module is not None and is_importable(module.__name__):
         doc = f'"""{name} with the effects that it was missing."""'
-        return f"{doc}\n\nfrom {module.__name__} import {name}", name
+        return f"{doc}\n\nfrom {module.__name__} import {name}", name, None
     path = inspect.getsourcefile(model)
     if path is None:
-        return f"# The source of {name} was not found: import it here.", name
-    return Path(path).read_text(encoding="utf-8"), name
-
-
-def _is_installed(module: str) -> bool:
-    # importlib.util.find_spec would also find modules that were loaded from a file by path.
-    return PathFinder.find_spec(module.partition(".")[0]) is not None
+        return f"# The source of {name} was not found: import it here.", name, None
+    return Path(path).read_text(encoding="utf-8"), name, Path(path)
