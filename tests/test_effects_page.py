@@ -8,7 +8,9 @@ import pyro
 import pytest
 import torch
 
+from npdr_ppl.cli.effect_words import named_effects
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.effect_additions import add_file
 from npdr_ppl.models.pendulum import Pendulum
 
 PAGE = Path(__file__).parents[1] / "docs" / "effects.md"
@@ -51,3 +53,14 @@ def test_the_entry_point_names_the_effect(scope):
     (entry,) = tomllib.loads(text)["project"]["entry-points"]["npdr_ppl.effects"].items()
     assert entry[0] == scope["Magnet"].id
     assert entry[1].endswith(":Magnet")
+
+
+def test_the_example_can_be_attached_and_added(scope, tmp_path, monkeypatch):
+    (example,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    file = tmp_path / "magnet.py"
+    file.write_text(example)
+    monkeypatch.setenv("NPDR_EFFECTS", str(tmp_path / "home"))
+    (attached,) = named_effects([f"{file}:Magnet@hinge"])
+    assert attached.name == "hinge.magnet"
+    assert add_file(file).ids == ("magnet",)
+    assert [effect.name for effect in named_effects(["hinge.magnet"])] == ["hinge.magnet"]
