@@ -1,17 +1,23 @@
 """Effects of a user's own Python file: --effect path/to/file.py:Class@port."""
 
 import json
+import sys
 
 import cloudpickle
 import pytest
 import torch
 
 from npdr_ppl.cli.effect_words import named_effects, split_effects
+from npdr_ppl.cli.model_files import load_function
 from npdr_ppl.cli.names import complete_effect
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import ForceEffect
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.layers import layers
 from npdr_ppl.models.effects import effects
+from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.python_files import class_file, load_python_file
+from npdr_ppl.rollouts import Rollouts
 from tests.helpers.command_line import run
 from tests.helpers.effect_files import CUBIC, GAIN
 from tests.helpers.pendulum_recordings import swinging
@@ -113,7 +119,7 @@ def test_workers_get_the_classes_as_code(monkeypatch):
     (effect,) = named_effects(["cubic.py@hinge"])
     sent = cloudpickle.dumps(effect)
     # As in a worker, which has no module of this name.
-    monkeypatch.delitem(__import__("sys").modules, type(effect).__module__)
+    monkeypatch.delitem(sys.modules, type(effect).__module__)
     received = cloudpickle.loads(sent)
     assert isinstance(received, ForceEffect) and received.name == "hinge.learned_hinge"
     force = received.force(torch.zeros(1), torch.tensor([2.0]), {"cubic": torch.ones(1)}, None)
@@ -139,7 +145,7 @@ def test_a_file_is_loaded_again_only_if_it_changed(tmp_path):
     file.write_text(CUBIC)
     module = load_python_file(file)
     assert load_python_file(file) is module
-    assert __import__("json") is json
+    assert sys.modules["json"] is json
     # Of the same length and within the same second.
     file.write_text(CUBIC.replace("POWER = 3", "POWER = 5"))
     assert load_python_file(file).POWER == 5
@@ -188,3 +194,48 @@ def test_npdr_effects_does_one_thing_at_a_time(monkeypatch, capsys):
     for words in (("bias", "--add", "cubic.py"), ("--add", "cubic.py", "--remove", "bias")):
         code, _, err = run(monkeypatch, capsys, "effects", *words)
         assert code == 2 and "takes one of a name, --add and --remove" in err
+
+
+@pytest.fixture
+def damped(folder):
+    """Rollouts of a pendulum with cubic damping, ``damped.csv``."""
+    (cubic,) = named_effects(["cubic.py@hinge"])
+    generator = torch.Generator().manual_seed(0)
+    time = Pendulum.time_step * torch.arange(250, dtype=torch.float64)
+    truth = {"mass": 1.1, "length": 0.9, "hinge.learned_hinge.cubic": 0.02}
+    readings, actions = [], []
+    for k in range(2):
+        rates = torch.tensor([0.3, 0.8, 1.3]) + 0.13 * k
+        torque = 1.25 * torch.sin(2.0 * torch.pi * rates[:, None] * time + k).sum(0)
+        state = torch.tensor([0.4 * k, 0.0], dtype=torch.float64)
+        inputs = Inputs.single(
+            torque[:, None], state, action_names=("torque",),
+            state_names=("angle", "velocity"), time_step=Pendulum.time_step,
+        )  # fmt: skip
+        rig = Pendulum().with_effects(cubic)
+        given = {name: torch.tensor(v, dtype=torch.float64) for name, v in truth.items()}
+        exact = torch.cat([state[None], rig.simulate(given, inputs).reshape(-1, 2)])
+        noise = torch.randn(exact.shape, generator=generator, dtype=torch.float64)
+        readings.append((exact + noise * torch.tensor([0.002, 0.01])).numpy())
+        actions.append(torque[:, None].numpy())
+    Rollouts.from_arrays(
+        readings, actions, channel_names=("angle", "velocity"), action_names=("torque",),
+        time_step=Pendulum.time_step,
+    ).to_csv(folder / "damped.csv")  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("damped")
+def test_a_search_finds_the_effect_of_a_file(folder, monkeypatch, capsys):
+    code, _, err = run(
+        monkeypatch, capsys, "discover", "pendulum", "--data", "damped.csv", "--out", "out",
+        "--candidates", "hinge.bias,cubic.py:LearnedHinge@hinge,hinge.coulomb_friction",
+        "--executor", "loky", "--workers", 2, "--quiet",
+    )  # fmt: skip
+    assert code == 0, err
+    found = json.loads((folder / "out" / "discovery.json").read_text())
+    assert [(e["port"], e["effect"]) for e in found["effects"]] == [("hinge", "learned_hinge")]
+    assert found["parameters"]["hinge.learned_hinge.cubic"]["mean"] == pytest.approx(0.02, rel=0.2)
+    (folder / "cubic.py").unlink()
+    revised = load_function(folder / "out" / "revised_model.py", "revised_model")
+    assert [effect.name for effect, _ in layers(revised)[1].effects] == ["hinge.learned_hinge"]
