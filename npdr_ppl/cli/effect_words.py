@@ -5,14 +5,14 @@ A word names an effect of the catalogue, ``port.effect``, or a class in a Python
 """
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from npdr_ppl.cli.model_files import load_relative
 from npdr_ppl.errors import ModelError
-from npdr_ppl.python_files import check_exists
+from npdr_ppl.python_files import check_exists, is_importable
 
 if TYPE_CHECKING:
     from npdr_ppl.language.effects import Effect
@@ -34,7 +34,7 @@ def named_effects(words: Sequence[str]) -> "list[Effect]":
     found = []
     for word in (part for text in words for part in split_effects(text, catalogue)):
         if _IN_FILE.fullmatch(word):
-            found.append(_effect_in_file(word))
+            found.append(_effect_in_file(word, catalogue))
             continue
         port, separator, name = word.rpartition(".")
         if not separator or name not in catalogue:
@@ -77,7 +77,7 @@ def _is_complete(part: str, known: Collection[str]) -> bool:
     return part.rpartition(".")[2] in known or _IN_FILE.fullmatch(part) is not None
 
 
-def _effect_in_file(word: str) -> "Effect":
+def _effect_in_file(word: str, catalogue: "Mapping[str, type[Effect]]") -> "Effect":
     """Returns the effect that ``path/to/file.py:Class@port`` names."""
     from npdr_ppl.models.effects.effect_files import effect_of
 
@@ -86,6 +86,13 @@ def _effect_in_file(word: str) -> "Effect":
     path, name, port = Path(match["path"]), match["name"] or "", match["port"] or ""
     check_exists(path, "*.py", word.removeprefix(match["path"]))
     cls = effect_of(load_relative(path), path, name)
+    known = catalogue.get(cls.id)
+    # Results name effects by id. The user's own copy among the added files is the same effect.
+    if known is not None and is_importable(known.__module__):
+        raise ModelError(
+            f"{path}:{cls.__name__} has the id {cls.id!r} of another effect of `npdr effects`; "
+            f"change the id, or use {port or 'PORT'}.{cls.id}."
+        )
     if not port:
         kinds = " or ".join(cls.port_kinds)
         raise ModelError(

@@ -70,6 +70,7 @@ MESSAGES = {
     "nameless.py@hinge": "Nameless in nameless.py does not define id",
     "half.py@hinge": "Half in half.py does not define default_priors",
     "dotted.py@hinge": "has the id 'a.b'; it may have letters, digits and underscores only.",
+    "taken.py@hinge": "has the id 'spring' of another effect of `npdr effects`; change the id",
     "hinge.baias": "did you mean 'bias'?",
 }
 
@@ -85,6 +86,7 @@ def wrong_files(folder):
     )
     half = CUBIC.replace("default_priors", "other").replace("LearnedHinge", "Half")
     (folder / "half.py").write_text(half)
+    (folder / "taken.py").write_text(CUBIC.replace('"learned_hinge"', '"spring"'))
     (folder / "dotted.py").write_text(CUBIC.replace('"learned_hinge"', '"a.b"'))
 
 
@@ -182,6 +184,7 @@ def test_npdr_effects_adds_lists_and_removes(home, monkeypatch, capsys):
     _, text, _ = run(monkeypatch, capsys, "effects")
     assert str(home) in "".join(text.split("learned_hinge\n")[1].split())
     assert [e.name for e in named_effects(["hinge.learned_hinge"])] == ["hinge.learned_hinge"]
+    assert [e.name for e in named_effects(["cubic.py@hinge"])] == ["hinge.learned_hinge"]
     assert complete_effect("hinge.lear") == ["hinge.learned_hinge"]
     code, text, _ = run(monkeypatch, capsys, "effects", "--remove", "learned_hinge", "--json")
     assert code == 0 and json.loads(text)["removed"] == ["learned_hinge"]
