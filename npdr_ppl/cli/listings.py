@@ -87,10 +87,10 @@ def effects(
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """List the catalogue of effects and those that you added; add effects of your own.
+    """List the catalogue of effects and those that you added; add your own.
 
-    --add copies a Python file to a folder of your own: the one that NPDR_EFFECTS names, or
-    npdr_ppl/effects in the folder for your data. Its effects are then candidates of every search.
+    --add copies a Python file to the folder that NPDR_EFFECTS names, or else to
+    npdr_ppl/effects among your data. Every later search tries its effects.
 
     Example: npdr effects --json
     """

@@ -81,7 +81,7 @@ def _copy(
     result.head = _with_futures(result.head, part.futures)
     if not part.collides_with(taken):
         result.imports |= set(part.imports)
-        result.blocks += ["", "", f"# From {file.name}.", part.body, ""]
+        result.blocks += ["", "", f"# From {file.name}.", part.body]
         taken |= part.bound
         return
     function = _free(f"_effects_of_{file.stem}", taken)
@@ -95,7 +95,7 @@ def _copy(
 
 def _function(name: str, part: Excerpt, returned: Sequence[str], file: str) -> list[str]:
     """Returns the lines of a function inside which an excerpt has names of its own."""
-    doc = f'    """Returns the effects of {file}, which uses names that this file has, too."""'
+    doc = f'    """Returns the effects of {file}, whose names mean something else here."""'
     imports = "\n".join(import_lines(set(part.imports)))
     body = [
         *_indented(imports),

@@ -13,7 +13,9 @@ from npdr_ppl.models.effects import Bias
 from npdr_ppl.models.pendulum import pendulum
 from tests.helpers.effect_files import CUBIC, GAIN
 
-CUBIC_5 = CUBIC.replace("POWER = 3", "POWER = 5").replace('"learned_hinge"', '"learned_other"')
+# A text of two lines, whose length is the power, must keep its lines.
+CUBIC_5 = CUBIC.replace("POWER = 3", 'POWER = len("""a\n  b""")')
+CUBIC_5 = CUBIC_5.replace('"learned_hinge"', '"learned_other"')
 
 OWN_MODEL = """
 import pyro
