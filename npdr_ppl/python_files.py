@@ -106,7 +106,8 @@ def class_file(cls: type[Any]) -> Path | None:
     """
     functions = filter(inspect.isfunction, vars(cls).values())
     paths = (Path(function.__code__.co_filename) for function in functions)
-    return next((path for path in paths if path.is_file()), None)
+    # A relative path is that of code made from a text, not of a file.
+    return next((path for path in paths if path.is_absolute() and path.is_file()), None)
 
 
 def class_name(cls: type[Any]) -> str:
