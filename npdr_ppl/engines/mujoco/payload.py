@@ -1,0 +1,207 @@
+"""Mass and centre of a load, from one motion without it and one with it, without simulations.
+
+The torques of a rigid arm are linear in its inertial and friction parameters π; see
+:mod:`npdr_ppl.engines.mujoco.base_parameters`. A load adds its mass m, first moment h = m c and
+inertia I to one body, so that with the columns Y_b of that body
+
+    Y π = τ  without the load,    Y π + Y_b (m, h, I) = τ  with it.
+
+Both equations are solved together by least squares, with a constant torque for each joint in
+addition. No value of π is taken from the file, so an arm's wrong masses do not change the result.
+
+Reference: C. G. Atkeson, C. H. An, J. M. Hollerbach, Estimation of inertial parameters of
+manipulator loads and links, 1986, Section 3.
+"""
+
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.engines.mujoco.base_parameters import (
+    INERTIAL,
+    MujocoInverseDynamics,
+    actuator_forces,
+    load_mjcf,
+)
+from npdr_ppl.engines.mujoco.batches import quiet
+from npdr_ppl.engines.mujoco.fields import actuator_names, element_names
+from npdr_ppl.errors import DataError, ModelError, TooShortError
+from npdr_ppl.registry import hint
+from npdr_ppl.rollouts.collection import pieces
+from npdr_ppl.rollouts.container import Rollouts
+from npdr_ppl.rollouts.differentiation import (
+    Smoothing,
+    cutoffs,
+    differentiate,
+    held_actions,
+    thin,
+)
+
+__all__ = ["Payload", "identify_payload"]
+
+Array = NDArray[np.float64]
+
+SINGULAR = 1e-6
+"""Smallest singular value, relative to the largest, of a combination of parameters that counts as
+determined. The columns have unit length; rounding is 1e-16, and base parameters are above 1e-3."""
+
+LEAST_OWN = 1e-3
+"""Least share of the torques per kg of a load that its moment and inertia cannot cause. Near the
+base they cause all of them, and the share is rounding, 1e-15 at a UR10e's upper arm."""
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A load at a body of an arm.
+
+    Attributes:
+        body: Name of the body.
+        mass: Mass in kg. It is proportional to the recorded torques.
+        centre: Centre of mass (x, y, z) in m, in the frame of the body.
+        half_masses: Mass in kg from the first half of both recordings alone, and from the second.
+        errors: RMS error of the torque of each joint by name, in N m or N: without the load, with
+            the load if the model has none, and with the load in the model.
+    """
+
+    body: str
+    mass: float
+    centre: tuple[float, float, float]
+    half_masses: tuple[float, float]
+    errors: dict[str, tuple[float, float, float]]
+
+
+def identify_payload(
+    robot: str | PathLike[str], without: Rollouts, loaded: Rollouts, body: str
+) -> Payload:
+    """Estimates the load that a robot carries in one of two recordings.
+
+    The robot should move alike in both, slowly enough to be rigid, through various postures.
+    Contacts and joint limits are not part of the equations.
+
+    Args:
+        robot: Path of an MJCF or URDF file whose joints are hinges and slides.
+        without: Rollouts without the load, with the position of every joint in rad or m as a
+            channel, and every command of the file as an action.
+        loaded: Rollouts with it.
+        body: Name of the body that carries it.
+
+    Raises:
+        ModelError: The file is not such a robot, or has no such moving body.
+        DataError: A joint or a command was not recorded, or the recordings are too short.
+    """
+    with quiet():  # Meshes are not needed.
+        model = load_mjcf(robot)
+    if model.nq != model.nv:
+        raise ModelError(f"{robot} has free or ball joints; a payload needs hinges and slides.")
+    dynamics = MujocoInverseDynamics(model)
+    names = element_names(model, "body")
+    moving = [names[number] for number in dynamics.bodies]
+    if body not in moving:
+        raise ModelError(f"{robot} has no moving body {body!r}; {hint(body, moving)}")
+    first = len(INERTIAL) * moving.index(body)
+    columns = slice(first, first + len(INERTIAL))
+    empty, full = (_rows(model, dynamics, rollouts) for rollouts in (without, loaded))
+    _check_mass(full, columns, body)
+    # Joints count by their own errors: without the weights the largest torques alone would.
+    weights = np.ones(model.nv)
+    for _ in range(2):
+        _, *errors = _solve(empty, full, columns, weights)
+        weights = 1.0 / np.maximum(_rms(np.concatenate(errors)), 1e-12)
+    values, *errors = _solve(empty, full, columns, weights)
+    masses = [
+        _solve(before, after, columns, weights)[0][0]
+        for before, after in zip(_halves(empty), _halves(full), strict=True)
+    ]
+    ignored = errors[1] + full[..., columns] @ values
+    kinds = (_rms(errors[0]).tolist(), _rms(ignored).tolist(), _rms(errors[1]).tolist())
+    joints = element_names(model, "joint")
+    mass, *moments = values[:4].tolist()
+    if mass == 0.0:
+        raise DataError(f"The recordings contain no torques, so no load at {body!r} can be found.")
+    centre = (moments[0] / mass, moments[1] / mass, moments[2] / mass)
+    half_masses = (float(masses[0]), float(masses[1]))
+    by_joint = dict(zip(joints, zip(*kinds, strict=True), strict=True))
+    return Payload(body, mass, centre, half_masses, by_joint)
+
+
+def _rows(model: Any, dynamics: MujocoInverseDynamics, rollouts: Rollouts) -> Array:
+    """Returns filtered Y, columns of constant torques, and τ, ``(N, nv, P + nv + 1)``."""
+    joints, commands = element_names(model, "joint"), actuator_names(model)
+    places = _places("channels", rollouts.channel_names, joints)
+    inputs = _places("actions", rollouts.action_names, commands)
+    rollouts = pieces(rollouts)
+    measured = [np.asarray(values)[:, places] for values in rollouts.readings]
+    step = rollouts.time_step
+    of_positions, of_rows = cutoffs(measured, step, Smoothing())
+    parts = []
+    for positions, actions in zip(measured, rollouts.actions, strict=True):
+        motion = differentiate(positions, step, of_positions)
+        held = held_actions(np.asarray(actions)[:, inputs])
+        torques = actuator_forces(model, motion.positions, motion.velocities, held)
+        torques = dynamics.targets(motion.positions, motion.velocities, torques)
+        moving = dynamics.regressors(motion.positions, motion.velocities, motion.accelerations)
+        constant = np.broadcast_to(np.eye(model.nv), (len(moving), model.nv, model.nv))
+        both = np.concatenate((moving, constant, torques[..., None]), axis=-1)
+        parts.append(thin(both, step, of_rows))
+    rows = np.concatenate(parts)
+    needed = 2 * (rows.shape[-1] + len(INERTIAL))
+    if rows.shape[0] * rows.shape[1] < needed:
+        raise TooShortError(
+            f"{rows.shape[0]} independent instants are left of a recording, too few for "
+            f"{rows.shape[-1] - 1} parameters of the arm; record longer rollouts."
+        )
+    return rows
+
+
+def _places(kind: str, present: tuple[str, ...], wanted: list[str]) -> list[int]:
+    """Returns where names stand among those of a recording."""
+    missing = [name for name in wanted if name not in present]
+    if missing:
+        raise DataError(
+            f"A payload needs every joint and command of the robot, but the recording has no "
+            f"{kind} {', '.join(missing)}; rename signals with a mapping."
+        )
+    return [present.index(name) for name in wanted]
+
+
+def _solve(
+    empty: Array, full: Array, columns: slice, weights: Array
+) -> tuple[Array, Array, Array]:
+    """Returns the load's parameters, and the torque errors without and with it, ``(N, nv)``."""
+    absent = np.zeros((*empty.shape[:2], len(INERTIAL)))
+    above = np.concatenate((empty[..., :-1], absent), axis=-1)
+    below = np.concatenate((full[..., :-1], full[..., columns]), axis=-1)
+    matrix = np.concatenate((above, below))
+    torques = np.concatenate((empty[..., -1], full[..., -1]))
+    scaled = (matrix * weights[:, None]).reshape(-1, matrix.shape[-1])
+    lengths = np.linalg.norm(scaled, axis=0)
+    lengths = np.where(lengths > 0.0, lengths, 1.0)
+    target = (torques * weights).reshape(-1)
+    # Combinations that the motion does not determine stay zero; they change no torque.
+    solution = np.linalg.lstsq(scaled / lengths, target, rcond=SINGULAR)[0] / lengths
+    errors = torques - matrix @ solution
+    return solution[-len(INERTIAL) :], errors[: len(empty)], errors[len(empty) :]
+
+
+def _check_mass(full: Array, columns: slice, body: str) -> None:
+    """Raises a DataError if the load's moment and inertia explain all torques of its mass."""
+    load = full[..., columns].reshape(-1, len(INERTIAL))
+    mass, others = load[:, 0], load[:, 1:]
+    rest = mass - others @ np.linalg.lstsq(others, mass, rcond=SINGULAR)[0]
+    if np.linalg.norm(rest) <= LEAST_OWN * np.linalg.norm(mass):
+        raise DataError(
+            f"The motion does not tell the mass of a load at {body!r}, only its moments; name a "
+            "body farther from the base, or move more joints."
+        )
+
+
+def _halves(rows: Array) -> tuple[Array, Array]:
+    middle = len(rows) // 2
+    return rows[:middle], rows[middle:]
+
+
+def _rms(errors: Array) -> Array:
+    return np.sqrt(np.mean(np.square(errors), axis=0))
