@@ -72,3 +72,36 @@ def test_the_driven_rig_of_the_gallery_reads_its_log_and_can_be_simulated():
     inputs = rollouts.inputs(20)
     trajectories = pyro.infer.Predictive(model, num_samples=3)(inputs)["trajectory"]
     assert trajectories.shape[0] == 3 and trajectories.isfinite().all()
+
+
+def test_the_script_of_the_payload_prints_a_load_for_each_link(tmp_path, capsys):
+    joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+    links = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+    bodies = motors = ""
+    for k, (joint, link) in enumerate(zip(joints, links, strict=True)):
+        axis = "1 0 0" if k % 2 else "0 1 0"
+        bodies += f'<body name="{link}_link" pos="0 0 0.2"><joint name="{joint}_joint" '
+        bodies += f'axis="{axis}"/><geom size="0.05" pos="0.02 0.01 0.1"/>'
+        motors += f'<motor name="{joint}_joint_motor" joint="{joint}_joint"/>'
+    robot = tmp_path / "arm.xml"
+    ends = f"{'</body>' * 6}</worldbody><actuator>{motors}</actuator></mujoco>"
+    robot.write_text(f"<mujoco><worldbody>{bodies}{ends}")
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(800)
+    for name in ("unload", "load"):
+        log = pd.DataFrame({"time": time})
+        for k in range(1, 7):
+            noise = rng.normal(0.0, [[1e-4], [1.0]], (2, len(time)))
+            log[f"joint_{k}_position"] = np.sin((1.0 + 0.3 * k) * time) + noise[0]
+            log[f"joint_{k}_current"] = noise[1]
+        log.to_parquet(tmp_path / f"{name}.parquet")
+    gallery = EXAMPLES / "gallery"
+    main = runpy.run_path(str(gallery / "ur10e_payload.py"))["main"]
+    logs = [str(tmp_path / f"{name}.parquet") for name in ("unload", "load")]
+    figure = tmp_path / "payload.png"
+    for gains in ("identified", "published"):
+        mapping = str(gallery / f"ur10e_arm_{gains}_gains.toml")
+        main(str(robot), mapping, *logs, str(figure))
+        assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == [
+            *links[2:]
+        ]
+    assert figure.stat().st_size > 1000
