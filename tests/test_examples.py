@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pyro
 import pytest
+import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.models.pendulum import Pendulum
@@ -72,6 +73,31 @@ def test_the_driven_rig_of_the_gallery_reads_its_log_and_can_be_simulated():
     inputs = rollouts.inputs(20)
     trajectories = pyro.infer.Predictive(model, num_samples=3)(inputs)["trajectory"]
     assert trajectories.shape[0] == 3 and trajectories.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("name", "signal"), [("wrist_pitch", "wrist_flex"), ("pan", "shoulder_pan")]
+)
+def test_a_servo_of_the_gallery_follows_its_goal(name, signal):
+    time = 0.02 * np.arange(300)
+    goal = np.sin(2.0 * time)
+    log = pd.DataFrame({"time": time, f"{signal}_command": goal})
+    log[f"{signal}_position"] = np.sin(2.0 * time - 0.15)
+    log[f"{signal}_velocity"] = 2.0 * np.cos(2.0 * time - 0.15)
+    gallery = EXAMPLES / "gallery"
+    rollouts = npdr.Rollouts.from_dataframe(log, gallery / f"so101_{name}.toml")
+    model = runpy.run_path(str(gallery / "so101_joint.py"))[name]
+    values = {"inertia": 0.03, "damping": 0.75}
+    values |= {"stiffness": 10.5} if name == "wrist_pitch" else {}
+    known = pyro.condition(model, {k: torch.tensor(v) for k, v in values.items()})
+    inputs = rollouts.inputs()
+    trajectory = pyro.infer.Predictive(known, num_samples=1)(inputs)["trajectory"]
+    # Viscous friction makes the joint late by d/K = 0.07 s, and a command is held for 0.02 s; the
+    # hand's weight lowers the wrist by up to W/K = 0.011 rad.
+    late = np.sin(2.0 * (time - 0.75 / 10.5 - 0.01))
+    sag = trajectory[..., 0].flatten().numpy()[100:] - late[-trajectory.shape[-2] :][100:]
+    assert np.abs(sag).max() < 0.02
+    assert (sag.mean() > 0.004) == (name == "wrist_pitch")
 
 
 def test_the_script_of_the_payload_prints_a_load_for_each_link(tmp_path, capsys):
