@@ -146,9 +146,9 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
                     escape(name),
                     escape(parameter + unit),
                     probability,
-                    f"{p['mean']:.4g}",
-                    f"{p['sd']:.2g}",
-                    f"{low:.3g} … {high:.3g}",
+                    number(p["mean"], ".4g"),
+                    number(p["sd"], ".2g"),
+                    f"{number(low, '.3g')} … {number(high, '.3g')}",
                 )
                 name = probability = ""
             for constant, value in row.get("constants", {}).items():

@@ -19,8 +19,9 @@ from torch.distributions.transforms import ComposeTransform
 
 __all__ = ["ReferenceMap", "reference_map"]
 
-# Φ(±8.2) are the last values that float64 distinguishes from 0 and 1.
-_MAX_Z = 8.2
+# Float64 distinguishes Φ(±8.2) from 0 and 1. A half-normal distribution has its quantiles half-way
+# between a probability and 1, which are distinguished up to Φ(8.1).
+_MAX_Z = 8.1
 # Torch has no quantile function for these distributions, but scipy has.
 _SCIPY_QUANTILES = (distributions.Gamma, distributions.Beta)
 

@@ -286,6 +286,8 @@ def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
     assert "hinge.bias was not found" not in shown
     assert "Not compared with alternatives" not in shown
     found["effects"][0]["probability"] = None  # a time limit ended the search
+    # JSON has no infinite mean.
+    found["effects"][0]["parameters"] = {"size": {**strength, "mean": None, "sd": None}}
     show.show_discovery(found, tmp_path)
     assert "Not compared with alternatives: hinge.bias." in " ".join(text.getvalue().split())
 

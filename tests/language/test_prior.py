@@ -206,3 +206,4 @@ def test_values_far_in_a_tail_are_finite(dtype):
         values = reference_map(distribution)(z)
         assert values.dtype == dtype and values.isfinite().all()
         assert (values.diff() > 0).all()
+        assert reference_map(distribution)(100.0 * z).isfinite().all()
