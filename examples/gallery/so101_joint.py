@@ -38,25 +38,24 @@ class Joint(ODESimulator):
         (angle,), (velocity,), ((goal,), (force,), constants) = positions, velocities, others
         servo = constants["goal"]
         torque = (servo.gain * (goal - angle)).clamp(-servo.limit, servo.limit) + force
-        torque = torque + constants["weight"] * torch.cos(angle) - constants["damping"] * velocity
-        return (torque / constants["inertia"],)
+        weight, friction = constants["weight"] * torch.cos(angle), constants["damping"] * velocity
+        return ((torque + weight - friction) / constants["inertia"],)
 
 
 def wrist_pitch(inputs: Inputs) -> Tensor:
-    """The known weight of the hand tells the gain of the servo."""
-    stiffness = pyro.sample("stiffness", dist.LogNormal(2.3, 1.0))  # N m/rad
-    return joint(inputs, stiffness=stiffness, weight=0.117)
+    """The known weight of the hand tells the gain of the servo and the inertia."""
+    return joint(inputs, weight=0.117)
 
 
 def pan(inputs: Inputs) -> Tensor:
-    """The base lifts nothing; its servo is of the same kind, with the gain found at the wrist."""
-    return joint(inputs, stiffness=10.7, weight=0.0)
+    """The base lifts nothing; the known inertia tells the gain of the servo."""
+    return joint(inputs, inertia=0.093)
 
 
 def joint(inputs: Inputs, **known: float | Tensor) -> Tensor:
     """A servo with viscous friction and nothing else."""
-    inertia = pyro.sample("inertia", dist.LogNormal(-3.5, 0.7))  # kg m²
-    damping = pyro.sample("damping", dist.LogNormal(0.0, 1.0))  # N m s/rad
-    return simulate(
-        "trajectory", Joint(), {"inertia": inertia, "damping": damping, **known}, inputs
-    )
+    known["stiffness"] = pyro.sample("stiffness", dist.LogNormal(2.3, 1.0))  # N m/rad
+    if "inertia" not in known:
+        known["inertia"] = pyro.sample("inertia", dist.LogNormal(-3.5, 0.7))  # kg m²
+    known["damping"] = pyro.sample("damping", dist.LogNormal(0.0, 1.0))  # N m s/rad
+    return simulate("trajectory", Joint(), known, inputs)
