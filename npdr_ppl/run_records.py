@@ -21,6 +21,7 @@ __all__ = [
     "ReproductionRecord",
     "RoundRecord",
     "RunDescription",
+    "SurvivingCausesRecord",
     "TrainingRecord",
 ]
 
@@ -192,6 +193,39 @@ class GapRecord(TypedDict, total=False):
     closed: Number
 
 
+class CauseEffectRecord(TypedDict):
+    """An effect of a cause."""
+
+    effect: str
+    port: str
+    constants: dict[str, float]
+
+
+class CauseRecord(TypedDict):
+    """A fitted cause that a recording leaves possible."""
+
+    effects: list[CauseEffectRecord]
+    probability: Number
+    parameters: dict[str, Any]
+    coordinates: list[float]
+    precision: list[list[float]]
+
+
+class SurvivingCausesRecord(TypedDict):
+    """The causes that a recording leaves possible, and the ranges of the recording."""
+
+    version: int
+    causes: list[CauseRecord]
+    separations: list[list[float]]
+    noise: dict[str, float]
+    independent_share: float
+    segment_length: int
+    time_step: float
+    seconds: float
+    actions: dict[str, dict[str, float]]
+    channels: dict[str, dict[str, float]]
+
+
 class DiscoveryRecord(TypedDict, total=False):
     """``discovery.json``; what it has depends on the stage that was reached."""
 
@@ -213,6 +247,7 @@ class DiscoveryRecord(TypedDict, total=False):
     counts: dict[str, dict[str, Number]]
     finer_steps: int
     wider_priors: list[list[str]]
+    surviving_causes: SurvivingCausesRecord | None
     seed: int
     versions: dict[str, str] | None
     model: str | dict[str, Any] | None

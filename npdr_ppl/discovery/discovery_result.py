@@ -17,6 +17,7 @@ from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.discovery.proof.next_experiment import NextExperiment
 from npdr_ppl.discovery.proof.parameter_intervals import Draws, Estimate
 from npdr_ppl.discovery.proof.residual_map import Spot
+from npdr_ppl.discovery.proof.surviving_causes import SurvivingCauses
 from npdr_ppl.discovery.revised_model import revised_source
 from npdr_ppl.discovery.screening.alarm import Alarm
 from npdr_ppl.discovery.screening.encoder_resolution import Count
@@ -67,6 +68,7 @@ class Discovery:
         separation_names: Names of the leading candidates.
         gap: Metrics on the held-out recording; empty without one.
         next_experiment: What to record next, if candidates could not be told apart.
+        causes: The causes that the recording leaves possible, for ``npdr plan``.
         model: The original model.
         revised: The model with the effects.
         parameters: Estimates of all parameters of the revised model, by site.
@@ -99,6 +101,7 @@ class Discovery:
     separation_names: tuple[str, ...]
     gap: dict[str, Gap]
     next_experiment: NextExperiment | None
+    causes: SurvivingCauses
     model: Model
     revised: Callable[..., Any]
     parameters: dict[str, Estimate]
@@ -146,6 +149,7 @@ class Discovery:
             },
             "gap": {name: gap.to_dict() for name, gap in self.gap.items()},
             "next_experiment": self.next_experiment and self.next_experiment.to_dict(),
+            "surviving_causes": self.causes.to_dict(),
             "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
             "counts": {name: count.to_dict() for name, count in self.counts.items()},
             "learned": self.learned and self.learned.to_dict(),

@@ -23,6 +23,7 @@ from npdr_ppl.discovery.proof.parameter_intervals import (
     posterior_draws,
 )
 from npdr_ppl.discovery.proof.residual_map import Spot, worst_windows
+from npdr_ppl.discovery.proof.surviving_causes import surviving_causes
 from npdr_ppl.discovery.recording_repair import Repair, repair
 from npdr_ppl.discovery.screening.encoder_resolution import counts
 from npdr_ppl.discovery.screening.equivalents import equivalents
@@ -397,9 +398,13 @@ class Investigation:
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"
         with self._stage("next experiment"):
-            advice = None
+            advice, doubtful = None, None
             if verdict == "ambiguous":
-                advice = self._advice(most_doubtful(effects, self.settings).effect.name)
+                doubtful = most_doubtful(effects, self.settings).effect.name
+                advice = self._advice(doubtful)
+            elif verdict == "unknown" and effects:
+                doubtful = effects[0].effect.name
+            causes = surviving_causes(search, doubtful)
             self.progress.finish()
         return Discovery(
             verdict=verdict,
@@ -418,6 +423,7 @@ class Investigation:
             separation_names=tuple(c.name for c in self.first.ranking[: SEARCH.num_leading]),
             gap=gap,
             next_experiment=advice,
+            causes=causes,
             model=search.rounds[0].hypothesis.model,
             revised=final.model,
             parameters=every,

@@ -49,16 +49,26 @@ class ExperimentSettings:
             larger than one that the device has already had.
         useful_separation: Separation, in standard deviations of the measurements, from which an
             experiment is useful.
+        most_causes: Greatest number of surviving causes, the likeliest, that are kept for planning
+            the next recording. The number of pairs, and the time of planning, grows with its
+            square.
+        least_probability: Probability from which a cause survives. An effect is named from a
+            probability of 0.9, so ten causes of 0.01 together could prevent it.
+        power_in_band: Share of a command's power below its bandwidth.
     """
 
     seconds: float = 4.0
     safe_share: float = 1.0
     useful_separation: float = 5.0
+    most_causes: int = 4
+    least_probability: float = 0.01
+    power_in_band: float = 0.99
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 0.1, 1000.0, "seconds")
-        check_range(self, 0.0, 1.0, "safe_share")
+        check_range(self, 0.0, 1.0, "safe_share", "least_probability", "power_in_band")
+        check_range(self, 1, 100, "most_causes")
         check_range(self, 0.0, 100.0, "useful_separation")
 
 

@@ -1,0 +1,11 @@
+"""Planning: the next recording, which tells surviving causes apart or narrows parameters.
+
+``limits`` says what the robot may do, ``excitations`` makes commands within limits, ``judging``
+predicts what a recording with them would show, ``search`` improves them. May import: posterior,
+discovery, preparation, models. Start reading at ``plan.py``.
+"""
+
+from npdr_ppl.planning.limits import Limits
+from npdr_ppl.planning.plan import Plan, plan_recording
+
+__all__ = ["Limits", "Plan", "plan_recording"]

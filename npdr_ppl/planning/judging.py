@@ -1,0 +1,276 @@
+"""What a recording would show: simulated motion, separations of causes, information.
+
+As discovery will, the simulated recording is cut into segments with uncertain initial states. Let
+r be the difference between what cause a simulates and what b does, J the derivatives of b by its
+parameters, C the covariance of the residuals with the initial states integrated out, and P the
+precision of b's parameters after the recordings so far. With refitted parameters
+
+    d² = rᵀ C⁻¹ r − gᵀ (Jᵀ C⁻¹ J + P)⁻¹ g,        g = Jᵀ C⁻¹ r
+
+which adds to the squared separation along the recordings so far. The gain of information about the
+parameters of one cause is ½ log det(P⁻¹ (Jᵀ C⁻¹ J + P)).
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npdr_ppl.errors import DataError, NpdrError
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.planning.causes import Cause, Known, prior_of
+from npdr_ppl.planning.limits import Limits
+from npdr_ppl.planning.settings import PLANNING
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.initial_states import InitialStates
+from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.states import estimate_states
+
+__all__ = ["Judge", "Played"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Played:
+    """Candidates and what every cause simulates.
+
+    Attributes:
+        commands: The commands, ``(E, T, A)``.
+        start: Measured values at the start, ``(E, C)``.
+        readings: Simulated measurements after each step, ``(n, E, T, C)``.
+    """
+
+    commands: Array
+    start: Array
+    readings: Array
+
+    def chosen(self, index: Sequence[int]) -> "Played":
+        """Returns some of the candidates."""
+        return Played(self.commands[index], self.start[index], self.readings[:, index])
+
+
+class Judge:
+    """Simulates candidates in every cause and predicts what they would show.
+
+    Args:
+        known: The causes and what is known of them.
+        limits: The limits.
+        seed: Seed of the simulated noise, from which the errors of initial states follow.
+    """
+
+    def __init__(self, known: Known, limits: Limits, seed: int) -> None:
+        self.known = known
+        self.limits = limits
+        self.channels = tuple(limits.channels)
+        self.actions = tuple(limits.actions)
+        self.scale = torch.tensor([c.noise for c in limits.channels.values()]).double()
+        self._options = DataOptions(
+            embedding=None,
+            initial_state="recorded",  # they are set by _starts
+            segment_length="auto" if known.segment_length is None else known.segment_length,
+        )
+        shape = (limits.num_steps + 1, len(self.channels))
+        self._noise = np.random.default_rng(seed).standard_normal(shape) * self.scale.numpy()
+        self._boxes = [_box(cause) for cause in known.causes]
+        self.num_simulated = 0
+        self._start_errors: tuple[Array, ...] | None = None
+
+    def played(self, commands: Array, start: Array) -> Played:
+        """Simulates candidates in every cause; failed simulations are NaN.
+
+        Args:
+            commands: Commands, ``(E, T, A)``.
+            start: Measured values at the start, ``(E, C)``.
+        """
+        inputs = self._inputs(commands, start)
+        made = [self._simulated(box, inputs) for box in self._boxes]
+        self.num_simulated += len(made) * len(commands)
+        return Played(commands, start, np.stack(made))
+
+    def violation(self, played: Played) -> Array:
+        """Returns by how much the worst cause exceeds the limits, ``(E,)``; at most 0 if none.
+
+        It is the greatest ratio of a quantity to its limit, less one; infinite if a simulation
+        fails.
+        """
+        worst = np.full(len(played.commands), -1.0)
+        step = self.limits.time_step
+        for k, channel in enumerate(self.limits.channels.values()):
+            path = self._paths(played)[..., k]
+            rate = np.diff(path) / step
+            acceleration = np.diff(rate) / step
+            is_bounded = math.isfinite(channel.max - channel.min)
+            middle = 0.5 * (channel.min + channel.max) if is_bounded else 0.0
+            for values, least, greatest in (
+                (path - middle, channel.min - middle, channel.max - middle),
+                (rate, -channel.max_rate, channel.max_rate),
+                (acceleration, -channel.max_acceleration, channel.max_acceleration),
+            ):
+                room = (1.0 - PLANNING.margin) * np.array([least, greatest])
+                with np.errstate(invalid="ignore"):
+                    ratio = np.maximum(
+                        values.max((0, -1)) / max(room[1], 1e-300),
+                        values.min((0, -1)) / min(room[0], -1e-300),
+                    )
+                worst = np.maximum(worst, np.nan_to_num(ratio, nan=math.inf) - 1.0)
+        return np.where(np.isfinite(played.readings).all((0, 2, 3)), worst, math.inf)
+
+    def separations(self, played: Played) -> Array:
+        """Returns the squared separations along each candidate alone, ``(E, n, n)``.
+
+        Row a and column b have the distance from what a simulates to what b can imitate.
+        """
+        num = len(self.known.causes)
+        result = np.zeros((len(played.commands), num, num))
+        for a, b in itertools.permutations(range(num), 2):
+            result[:, a, b] = self._separation(played, a, b)
+        return result
+
+    def certainty(self, played: Played) -> Array:
+        """Returns how well each candidate tells the causes apart, ``(E,)``; more is better.
+
+        The probability p of choosing the wrong cause is at most Σ √(p_a p_b) exp(-d²/8) over all
+        pairs (Bhattacharyya 1943). The result is -8 log of this bound: the smallest squared
+        separation, and less if causes are many or likely. A pair that no recording separates
+        does not keep the others from being separated.
+        """
+        num = len(self.known.causes)
+        likely = [cause.probability or 1.0 / num for cause in self.known.causes]
+        terms = [
+            0.5 * math.log(likely[a] * likely[b]) - self._separation(played, a, b) / 8.0
+            for a, b in itertools.combinations(range(num), 2)
+        ]
+        return -8.0 * np.logaddexp.reduce(terms, axis=0)
+
+    def precisions(self, played: Played, cause: int) -> Tensor:
+        """Returns the precision of a cause's coordinates after each candidate, ``(E, d, d)``."""
+        products = self._products(played, cause, cause)
+        return self.known.share * products[:, :-1, :-1] + self.known.causes[cause].precision
+
+    def gains(self, played: Played) -> Array:
+        """Returns the gain of information in nats, averaged over the causes, ``(E,)``."""
+        total = np.zeros(len(played.commands))
+        for index, cause in enumerate(self.known.causes):
+            try:
+                after = torch.linalg.slogdet(self.precisions(played, index)).logabsdet
+            except NpdrError:
+                return np.full(len(played.commands), -math.inf)
+            before = torch.linalg.slogdet(cause.precision).logabsdet
+            total += 0.5 * (after - before).numpy() / len(self.known.causes)
+        return total
+
+    def _separation(self, played: Played, a: int, b: int) -> Array:
+        """Returns the squared separation of b from a along each candidate, ``(E,)``."""
+        try:
+            products = self.known.share * self._products(played, a, b)
+        except NpdrError:
+            return np.full(len(played.commands), -math.inf)
+        information, score = products[:, :-1, :-1], products[:, :-1, -1]
+        solved = torch.linalg.solve(information + self.known.causes[b].precision, score)
+        left = products[:, -1, -1] - (score * solved).sum(-1)
+        return left.clamp_min(0.0).nan_to_num(-math.inf).numpy()
+
+    def _products(self, played: Played, a: int, b: int) -> Tensor:
+        """Returns (J r)ᵀ C⁻¹ (J r) of each candidate, ``(E, d + 1, d + 1)``.
+
+        J are the derivatives of cause b along what a simulates, and r is their difference.
+        """
+        refitted, paths = self.known.causes[b], self._paths(played)[a]
+        segments = SegmentModel(
+            refitted.model,
+            self._recorded(paths, played.commands),
+            self._options,
+            self._starts(paths, played),
+            is_complete=True,
+        )
+        scale = self.scale[[self.channels.index(name) for name in segments.channel_names]]
+        now = segments.linearise(refitted.z, segments.no_offsets, scale, is_rough=True)
+        if not now.is_finite:
+            raise DataError(f"{refitted.name} cannot be simulated along a candidate.")
+        both = torch.cat((now.by_parameters, now.residual[..., None]), dim=-1)
+        joined = replace(now, by_parameters=both)
+        products = joined.by_parameters.mT @ joined.weights()
+        rollout, num = segments.inputs.rollout, len(played.commands)
+        return products.new_zeros(num, *products.shape[1:]).index_add(0, rollout, products)
+
+    def _starts(self, paths: Array, played: Played) -> InitialStates:
+        """Returns the initial states of all segments, with the errors of noisy measurements."""
+        length = self._options.steps(self._recorded(paths[:1], played.commands[:1]))
+        first = np.arange(0, self.limits.num_steps, length)
+        rates = np.gradient(paths, self.limits.time_step, axis=1)
+        rates[:, 0] = 0.0  # at rest
+        errors = self._start_errors
+        if errors is None:
+            noisy = paths[: PLANNING.num_smoothed] + self._noise
+            found = [estimate_states(path, first, self.limits.time_step) for path in noisy]
+            errors = self._start_errors = tuple(
+                np.median(np.concatenate([getattr(part, name) for part in found]), axis=0)
+                for name in ("value_errors", "rate_errors")
+            )
+        values, rates = (part[:, first].reshape(-1, paths.shape[-1]) for part in (paths, rates))
+        return InitialStates(
+            torch.tensor(values),
+            torch.tensor(rates),
+            *(torch.tensor(error).expand(len(values), -1) for error in errors),
+        )
+
+    def _recorded(self, paths: Array, commands: Array) -> Rollouts:
+        """Returns a recording of measurements ``(E, T + 1, C)``."""
+        return Rollouts.from_arrays(
+            list(paths),
+            list(commands),
+            channel_names=self.channels,
+            action_names=self.actions,
+            time_step=self.limits.time_step,
+        )
+
+    def _paths(self, played: Played) -> Array:
+        """Returns the measurements including those at the start, ``(n, E, T + 1, C)``."""
+        num = len(played.readings)
+        start = np.broadcast_to(played.start, (num, *played.start.shape))[:, :, None]
+        return np.concatenate((start, played.readings), axis=2)
+
+    def _inputs(self, commands: Array, start: Array) -> Inputs:
+        """Returns one segment per candidate that starts at rest."""
+        actions, values = torch.tensor(commands), torch.tensor(start)
+        num, steps, _ = commands.shape
+        before = torch.tensor([a.start for a in self.limits.actions.values()]).double()
+        history = min(steps, round(1.0 / self.limits.time_step))
+        return Inputs(
+            actions=actions,
+            action_names=self.actions,
+            initial_readings=values,
+            initial_values=values,
+            channel_names=self.channels,
+            past_actions=before.expand(num, history, -1),
+            time_step=self.limits.time_step,
+            mask=torch.ones(num, steps, dtype=torch.bool),
+            rollout=torch.arange(num),
+            start=torch.zeros(num, dtype=torch.long),
+            initial_rates=torch.zeros_like(values),
+        )
+
+    def _simulated(self, box: SimulatorBlackBox, inputs: Inputs) -> Array:
+        """Returns simulated measurements, ``(E, T, C)``, NaN if the simulation fails."""
+        names = [sensor.name for sensor in box.simulator.sensors]
+        try:
+            simulated = box.simulator.simulate(box.parameters, inputs)
+        except NpdrError:
+            return np.full((*inputs.actions.shape[:2], len(self.channels)), math.nan)
+        simulated = simulated.reshape(inputs.num_segments, inputs.num_steps, len(names)).double()
+        return simulated[..., [names.index(name) for name in self.channels]].numpy()
+
+
+def _box(cause: Cause) -> SimulatorBlackBox:
+    """Returns a cause's simulator with its parameters."""
+    (box,) = prior_of(cause.model).black_boxes_at(cause.z[None]).values()
+    assert isinstance(box, SimulatorBlackBox)
+    return box

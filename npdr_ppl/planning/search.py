@@ -1,0 +1,146 @@
+"""Random search with refinement over excitations, deterministic with its seed."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npdr_ppl.planning.excitations import Candidate, Excitations
+from npdr_ppl.planning.judging import Judge, Played
+from npdr_ppl.planning.settings import PLANNING
+from npdr_ppl.progress import Step
+
+__all__ = ["Found", "search_excitations"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Found:
+    """The result of a search.
+
+    Attributes:
+        best: The best candidate; ``None`` if none was within the limits.
+        value: Its value.
+        first: The first random candidate within the limits: one random recording.
+        num_judged: Number of candidates that were judged.
+        has_stopped: Whether the time limit ended the search.
+    """
+
+    best: Candidate | None
+    value: float
+    first: Candidate | None
+    num_judged: int
+    has_stopped: bool
+
+
+class _Ranked:
+    """The best candidates so far, and the first one."""
+
+    def __init__(self) -> None:
+        self.elites: list[tuple[float, Candidate]] = []
+        self.first: Candidate | None = None
+        self.num_judged = 0
+
+    def add(self, candidates: list[Candidate], values: Array) -> bool:
+        """Adds candidates; returns whether one is better than the best so far."""
+        before = self.elites[0][0] if self.elites else -np.inf
+        if candidates and self.first is None:
+            self.first = candidates[0]
+        self.num_judged += len(candidates)
+        found = [(float(v), c) for v, c in zip(values, candidates, strict=True) if np.isfinite(v)]
+        self.elites = sorted([*self.elites, *found], key=lambda pair: -pair[0])
+        self.elites = self.elites[: PLANNING.elites]
+        return bool(self.elites) and self.elites[0][0] > before
+
+
+def search_excitations(
+    excitations: Excitations,
+    judge: Judge,
+    value_of: Callable[[Played], Array],
+    *,
+    rounds: int,
+    time_limit: float,
+    progress: Step = lambda fraction, status: None,
+) -> Found:
+    """Searches the excitation with the greatest value within the limits.
+
+    Args:
+        excitations: Makes candidates.
+        judge: Simulates them.
+        value_of: Returns the values of candidates, ``(E,)``.
+        rounds: Number of batches, the random ones included.
+        time_limit: Seconds after which no further batch begins.
+        progress: Called with the fraction of the batches that is done.
+    """
+    begin, ranked, step = time.monotonic(), _Ranked(), PLANNING.step
+    has_stopped = False
+    for number in range(rounds):
+        if time.monotonic() - begin > time_limit:
+            has_stopped = True
+            break
+        progress(number / rounds, f"{ranked.num_judged} excitations judged")
+        is_first = number < PLANNING.first_batches or not ranked.elites
+        made = _random(excitations) if is_first else _refined(excitations, ranked.elites, step)
+        candidates, played = _within_limits(excitations, judge, made)
+        values = value_of(played) if candidates else np.zeros(0)
+        if not ranked.add(candidates, values) and not is_first:
+            step = max(PLANNING.least_step, PLANNING.shrink * step)
+    best = ranked.elites[0] if ranked.elites else (float("nan"), None)
+    return Found(best[1], best[0], ranked.first, ranked.num_judged, has_stopped)
+
+
+def _random(excitations: Excitations) -> list[Candidate]:
+    return excitations.random(PLANNING.batch * PLANNING.tried_per_place)
+
+
+def _refined(
+    excitations: Excitations, elites: list[tuple[float, Candidate]], step: float
+) -> list[Candidate]:
+    """Returns candidates close to the best ones, and mixtures of these."""
+    result = []
+    for number in range(PLANNING.batch * PLANNING.tried_per_place):
+        _, parent = elites[number % len(elites)]
+        if number % 4 == 3:
+            _, other = elites[(number + 1) % len(elites)]
+            parent = excitations.mixed(parent, other)
+        # Wide and narrow steps in turn: the best width differs along the search.
+        result.append(excitations.changed(parent, step * (1.0, 0.3)[number % 2]))
+    return result
+
+
+def _within_limits(
+    excitations: Excitations, judge: Judge, made: list[Candidate]
+) -> tuple[list[Candidate], Played]:
+    """Returns the first candidates, at most a batch, whose simulations keep the limits.
+
+    Those that do not are tried once more, weaker.
+    """
+    played = _played(excitations, judge, made)
+    violation = judge.violation(played)
+    good = [k for k in range(len(made)) if violation[k] <= 0.0][: PLANNING.batch]
+    if 2 * len(good) >= PLANNING.batch:
+        return [made[k] for k in good], played.chosen(good)
+    again = [
+        excitations.weaker(made[k], 0.9 / (1.0 + min(violation[k], 3.0)))
+        for k in range(len(made))
+        if violation[k] > 0.0
+    ]
+    weaker = _played(excitations, judge, again)
+    also = [k for k in range(len(again)) if judge.violation(weaker)[k] <= 0.0]
+    also = also[: PLANNING.batch - len(good)]
+    joined = Played(
+        np.concatenate((played.commands[good], weaker.commands[also])),
+        np.concatenate((played.start[good], weaker.start[also])),
+        np.concatenate((played.readings[:, good], weaker.readings[:, also]), axis=1),
+    )
+    return [*(made[k] for k in good), *(again[k] for k in also)], joined
+
+
+def _played(excitations: Excitations, judge: Judge, candidates: list[Candidate]) -> Played:
+    return judge.played(
+        np.stack([excitations.commands(c) for c in candidates]),
+        np.stack([excitations.start(c) for c in candidates]),
+    )

@@ -1,0 +1,67 @@
+"""The numbers of planning, in one validated object."""
+
+import math
+from dataclasses import dataclass
+
+from npdr_ppl.settings import check_range
+
+__all__ = ["PLANNING", "PlanningSettings"]
+
+
+@dataclass(frozen=True)
+class PlanningSettings:
+    """The search for the next recording.
+
+    Attributes:
+        batch: Number of candidates that are judged together.
+        tried_per_place: Number of candidates that are simulated for each one that is judged. A
+            simulation costs little compared with derivatives by all parameters, and most random
+            candidates of a passive joint leave its limits.
+        first_batches: Number of batches of random candidates before the best ones are refined.
+        elites: Number of candidates that are refined side by side.
+        step: First standard deviation of a refinement, relative to the coefficients' own size.
+        shrink: Factor of this step after a round that improved nothing.
+        least_step: Smallest step.
+        amplitudes: Multiples of the greatest permitted amplitude that random candidates have.
+        margin: Share of a limit that simulations keep free, because the robot is not the model.
+        num_draws: Number of prior draws over which information is averaged.
+        num_smoothed: Number of noisy simulated recordings from which the errors of initial states
+            are estimated.
+        relative_noise: Standard deviation of a channel's noise as a share of its rated value, if
+            nothing is known. An encoder of 4096 counts per turn has 0.0004 rad.
+        most_seconds: Longest default duration in seconds.
+        prior_seconds: Default duration without a recording.
+        prior_bandwidth: Default bandwidth in Hz without a recording.
+        useful_separation: Separation, in standard deviations, from which two causes are told
+            apart: the wrong one is then exp(-12.5) times as likely.
+    """
+
+    batch: int = 12
+    tried_per_place: int = 3
+    first_batches: int = 3
+    elites: int = 3
+    step: float = 0.5
+    shrink: float = 0.8
+    least_step: float = 0.05
+    amplitudes: tuple[float, ...] = (1.0, 0.7, 0.45, 0.25, 0.1)
+    margin: float = 0.05
+    num_draws: int = 5
+    num_smoothed: int = 3
+    relative_noise: float = 1e-3
+    most_seconds: float = 10.0
+    prior_seconds: float = 5.0
+    prior_bandwidth: float = 2.0
+    useful_separation: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, 1000, "batch", "tried_per_place", "first_batches", "num_draws")
+        check_range(self, 1, 100, "num_smoothed")
+        check_range(self, 1, self.batch, "elites")
+        check_range(self, 0.0, 1.0, "step", "shrink", "least_step", "amplitudes", "margin")
+        check_range(self, 0.0, 1.0, "relative_noise")
+        check_range(self, 0.1, math.inf, "most_seconds", "prior_seconds", "prior_bandwidth")
+        check_range(self, 0.0, 100.0, "useful_separation")
+
+
+PLANNING = PlanningSettings()
