@@ -10,7 +10,7 @@ in NumPy and in other forms than the package's. Nothing in here imports the pack
 effects but :mod:`hidden_rigs.under_test`, which holds the models to be judged.
 """
 
-from hidden_rigs.cases import CONDITIONS, Case, Condition, cases, make_case, places
+from hidden_rigs.cases import CONDITIONS, Case, Condition, cases, make_case, places, play
 from hidden_rigs.hidden import Hidden
 from hidden_rigs.rig import Place
 from hidden_rigs.rigs import RIGS
@@ -25,4 +25,5 @@ __all__ = [
     "cases",
     "make_case",
     "places",
+    "play",
 ]

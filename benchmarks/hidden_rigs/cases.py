@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hidden_rigs.faults import FAULTS, spoilt
@@ -19,7 +20,7 @@ from npdr_ppl.errors import ModelError
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["CONDITIONS", "Case", "Condition", "cases", "make_case", "places"]
+__all__ = ["CONDITIONS", "Case", "Condition", "cases", "make_case", "places", "play"]
 
 Condition = Literal[
     "null",
@@ -218,6 +219,31 @@ def make_case(
         seed=seed,
         parameters=parameters,
     )
+
+
+def play(case: Case, commands: NDArray[np.float64], *, seed: int) -> Rollouts:
+    """Records one more rollout of a case's rig: commands that start from rest.
+
+    Args:
+        case: The case; its parameters and what is hidden stay.
+        commands: The commands, ``(K, actions)``.
+        seed: Seed of the noise.
+
+    Raises:
+        ModelError: The rig is simulated by MuJoCo, which plays excitations only.
+    """
+    rig = _rig(case.rig)
+    if rig.engine == "mujoco":
+        raise ModelError(f"{rig.name} plays excitations only.")
+    return record(
+        rig,
+        (),
+        parameters=case.parameters,
+        hidden=case.truth,
+        measurement=rig.measurement,
+        seed=derived_seed(seed, case.rig, "played"),
+        played=commands,
+    ).rollouts
 
 
 def _rig(name: str) -> Rig:

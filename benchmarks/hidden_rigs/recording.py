@@ -52,8 +52,9 @@ def record(
     seed: int,
     duration: float | None = None,
     substeps: int | None = None,
+    played: Array | None = None,
 ) -> Recording:
-    """Records one rollout per excitation.
+    """Records one rollout per excitation, or plays commands from a file from rest.
 
     The noise, the excitations and the starts depend on the seed alone.
 
@@ -69,16 +70,23 @@ def record(
         duration: Seconds per rollout; ``None`` for the rig's.
         substeps: Integration steps per sample; ``None`` for the rig's, and ten times those behind
             a gear or a shaft.
+        played: Commands, ``(K, actions)``, that are played in one rollout without the rig's
+            feedback; ``None`` for excitations.
     """
     is_behind_gears = any(h.effect_id in TRANSMISSIONS for h in hidden)
     num_substeps = substeps or rig.substeps * (_FINER_BEHIND_GEARS if is_behind_gears else 1)
     substep = rig.time_step / num_substeps
-    num_steps = round((duration or rig.duration) / rig.time_step)
+    num_steps = (
+        round((duration or rig.duration) / rig.time_step) if played is None else len(played)
+    )
     lead = math.ceil(_LEAD / rig.time_step)
     skew = sum(h.parameters["skew"] for h in hidden if h.effect_id == "clock_skew")
     tail = math.ceil(num_steps * max(skew, 0.0)) + 1
-    wanted = references(rig, excitations, num_steps, tail, seed)
-    num_rollouts = len(excitations)
+    if played is None:
+        wanted = references(rig, excitations, num_steps, tail, seed)
+    else:
+        wanted = np.concatenate((played, np.repeat(played[-1:], tail, axis=0)))[..., None]
+    num_rollouts = wanted.shape[-1]
     plant = Plant(
         rig.mechanics,
         rig.layout,
@@ -89,7 +97,8 @@ def record(
         duration=num_steps * rig.time_step,
         generator=np.random.default_rng(derived_seed(seed, "bursts")),
     )
-    q, v = plant.start(*starts(rig, num_rollouts, is_from_rest, seed))
+    from_rest = is_from_rest or played is not None
+    q, v = plant.start(*starts(rig, num_rollouts, from_rest, seed))
     num_joints = len(rig.layout.joints)
     motion = np.empty(((lead + num_steps + tail) * num_substeps + 1, 2 * num_joints, num_rollouts))
     motion[0] = np.concatenate((q[:num_joints], v[:num_joints]))
@@ -98,7 +107,7 @@ def record(
     for step in range(-lead, num_steps + tail):
         plant.begin_step(step * rig.time_step)
         if step >= 0:
-            commands[step] = commanded(rig, wanted[step], q, v)
+            commands[step] = commanded(rig, wanted[step], q, v) if played is None else wanted[step]
         present = list(commands[step]) if step >= 0 else [np.zeros(num_rollouts)] * len(rig.limits)
         for k in range(num_substeps):
             q, v = plant.advance(q, v, present, step * rig.time_step + k * substep)

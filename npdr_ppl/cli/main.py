@@ -15,6 +15,7 @@ from npdr_ppl.cli import (
     fit,
     listings,
     logs,
+    plan,
     report,
     reproduce,
     train,
@@ -51,6 +52,7 @@ app.command(rich_help_panel="Read logs")(logs.convert)
 app.command(rich_help_panel="Infer parameters")(fit.fit)
 app.command(rich_help_panel="Infer parameters")(compare.compare)
 app.command(rich_help_panel="Find what is missing")(discover.discover)
+app.command(rich_help_panel="Find what is missing")(plan.plan)
 app.command(rich_help_panel="Train policies")(train.train)
 app.command(rich_help_panel="Show results")(report.report)
 app.command(rich_help_panel="Show results")(export.export)

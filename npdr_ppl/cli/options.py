@@ -98,7 +98,9 @@ MappingOption = Annotated[
 ]
 OutOption = Annotated[
     Path,
-    typer.Option(help="Folder for results; file for the rollouts of convert."),
+    typer.Option(
+        help="Folder for results; file for the rollouts of convert and the commands of plan."
+    ),
 ]
 HoldoutOption = Annotated[
     str, typer.Option(help="Rollouts to hold out and to test on, e.g. 3,4; counted from 0.")

@@ -18,6 +18,7 @@ __all__ = [
     "show_discovery",
     "show_fit",
     "show_missing_effect",
+    "show_plan",
     "show_rows",
     "show_training",
 ]
@@ -383,6 +384,49 @@ def show_rows(title: str, result: Mapping[str, Any]) -> None:
     for what in ("skipped", "failed"):
         for method, reason in result.get(what, {}).items():
             _print_reason(console, f"{method} {what}", reason)
+
+
+def show_plan(found: Mapping[str, Any], out: Path) -> None:
+    """Prints the separations or widths before and after a planned recording."""
+    console = _console()
+    table = Table(box=SIMPLE)
+    if found["separations"]:
+        table.title = "Separation of causes, in standard deviations of the measurements"
+        table.add_column("cause", overflow="fold")
+        table.add_column("other cause", overflow="fold")
+        rows = [(pair["one"], pair["other"], pair) for pair in found["separations"]]
+        digits = ".1f"
+    else:
+        table.title = "Standard deviation of parameters, as a share of the prior's"
+        table.add_column("parameter", overflow="fold")
+        rows = [(width["name"], width) for width in found["widths"]]
+        digits = ".3f"
+    for column in ("so far", "with the plan", "with a random recording"):
+        table.add_column(column, justify="right")
+    for *names, values in rows:
+        figures = (values["before"], values["after"], values["random"])
+        table.add_row(*map(escape, names), *(format(figure, digits) for figure in figures))
+    console.print(table)
+    console.print(_told_by_plan(found))
+    start = ", ".join(f"{name} {value:.4g}" for name, value in found["start"].items())
+    console.print(f"Start at rest at {start}.", highlight=False)
+    if found["has_stopped"]:
+        console.print("The time limit ended the search; a longer --time-limit may find more.")
+    console.print(f"The commands for {found['duration']:.4g} s are in {out}", highlight=False)
+
+
+def _told_by_plan(found: Mapping[str, Any]) -> str:
+    """Returns the result in a sentence."""
+    if not found["separations"]:
+        return f"Expected information: {found['information']:.1f} nats."
+    close = [pair for pair in found["separations"] if pair["after"] < found["useful_separation"]]
+    if not close:
+        return "The recording is expected to tell all of these causes apart."
+    pairs = "; ".join(f"{pair['one']} and {pair['other']}" for pair in close)
+    return (
+        f"Below {found['useful_separation']:g} deviations, and perhaps not told apart: "
+        f"{escape(pairs)}."
+    )
 
 
 def _console() -> Console:

@@ -5,7 +5,7 @@ r be the difference between what cause a simulates and what b does, J the deriva
 parameters, C the covariance of the residuals with the initial states integrated out, and P the
 precision of b's parameters after the recordings so far. With refitted parameters
 
-    d² = rᵀ C⁻¹ r − gᵀ (Jᵀ C⁻¹ J + P)⁻¹ g,        g = Jᵀ C⁻¹ r
+    d² = (r − J s)ᵀ C⁻¹ (r − J s),        s = (Jᵀ C⁻¹ J + P)⁻¹ Jᵀ C⁻¹ r
 
 which adds to the squared separation along the recordings so far. The gain of information about the
 parameters of one cause is ½ log det(P⁻¹ (Jᵀ C⁻¹ J + P)).
@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npdr_ppl.discovery.screening.permutation_tests import block_sums
 from npdr_ppl.errors import DataError, NpdrError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.sites import SimulatorBlackBox
@@ -131,28 +132,33 @@ class Judge:
         num = len(self.known.causes)
         result = np.zeros((len(played.commands), num, num))
         for a, b in itertools.permutations(range(num), 2):
-            result[:, a, b] = self._separation(played, a, b)
+            result[:, a, b] = self._separation(played, a, b).sum(0)
         return result
 
     def certainty(self, played: Played) -> Array:
         """Returns how well each candidate tells the causes apart, ``(E,)``; more is better.
 
-        The probability p of choosing the wrong cause is at most Σ √(p_a p_b) exp(-d²/8) over all
-        pairs (Bhattacharyya 1943). The result is -8 log of this bound: the smallest squared
-        separation, and less if causes are many or likely. A pair that no recording separates
-        does not keep the others from being separated.
+        It is minus the log of a bound on the probability of choosing the wrong cause, the sum of
+
+            √(p_a p_b) Π_k (1 + d_k²/8)⁻¹
+
+        over all pairs. With the squared separation d², exp(-d²/8) would bound it (Bhattacharyya
+        1943). But discovery resamples the evidence over blocks k of segments, and trusts little in
+        evidence that few blocks have: E exp(-Σ w_k d_k²/8) with exponential weights w_k. A pair
+        that no recording separates does not keep the others from being separated.
         """
         num = len(self.known.causes)
         likely = [cause.probability or 1.0 / num for cause in self.known.causes]
         terms = [
-            0.5 * math.log(likely[a] * likely[b]) - self._separation(played, a, b) / 8.0
+            0.5 * math.log(likely[a] * likely[b])
+            - np.log1p(self._separation(played, a, b) / 8.0).sum(0)
             for a, b in itertools.combinations(range(num), 2)
         ]
-        return -8.0 * np.logaddexp.reduce(terms, axis=0)
+        return -np.logaddexp.reduce(terms, axis=0)
 
     def precisions(self, played: Played, cause: int) -> Tensor:
         """Returns the precision of a cause's coordinates after each candidate, ``(E, d, d)``."""
-        products = self._products(played, cause, cause)
+        products = self._products(played, cause, cause).sum(1)
         return self.known.share * products[:, :-1, :-1] + self.known.causes[cause].precision
 
     def gains(self, played: Played) -> Array:
@@ -168,18 +174,21 @@ class Judge:
         return total
 
     def _separation(self, played: Played, a: int, b: int) -> Array:
-        """Returns the squared separation of b from a along each candidate, ``(E,)``."""
+        """Returns the squared separation of b from a, ``(blocks, E)``, by block of segments."""
         try:
             products = self.known.share * self._products(played, a, b)
         except NpdrError:
-            return np.full(len(played.commands), -math.inf)
-        information, score = products[:, :-1, :-1], products[:, :-1, -1]
-        solved = torch.linalg.solve(information + self.known.causes[b].precision, score)
-        left = products[:, -1, -1] - (score * solved).sum(-1)
-        return left.clamp_min(0.0).nan_to_num(-math.inf).numpy()
+            return np.full((1, len(played.commands)), -math.inf)
+        whole = products.sum(1)
+        information, score = whole[:, :-1, :-1], whole[:, :-1, -1]
+        shift = torch.linalg.solve(information + self.known.causes[b].precision, score)
+        # The parameters move, and the difference r becomes r − J shift.
+        moved = torch.cat((-shift, torch.ones_like(shift[:, :1])), dim=-1)
+        left = torch.einsum("ei,esij,ej->se", moved, products, moved)
+        return block_sums(left.clamp_min(0.0).nan_to_num(-math.inf)).numpy()
 
     def _products(self, played: Played, a: int, b: int) -> Tensor:
-        """Returns (J r)ᵀ C⁻¹ (J r) of each candidate, ``(E, d + 1, d + 1)``.
+        """Returns (J r)ᵀ C⁻¹ (J r) of each segment of each candidate, ``(E, S, d + 1, d + 1)``.
 
         J are the derivatives of cause b along what a simulates, and r is their difference.
         """
@@ -198,8 +207,7 @@ class Judge:
         both = torch.cat((now.by_parameters, now.residual[..., None]), dim=-1)
         joined = replace(now, by_parameters=both)
         products = joined.by_parameters.mT @ joined.weights()
-        rollout, num = segments.inputs.rollout, len(played.commands)
-        return products.new_zeros(num, *products.shape[1:]).index_add(0, rollout, products)
+        return products.unflatten(0, (len(played.commands), -1))
 
     def _starts(self, paths: Array, played: Played) -> InitialStates:
         """Returns the initial states of all segments, with the errors of noisy measurements."""

@@ -162,7 +162,9 @@ def read_limits(path: Path | None, defaults: Limits) -> Limits:
         return _checked(defaults, "The limits")
     try:
         if path.stat().st_size > MOST_BYTES:
-            raise DataError(f"{path} has more than {MOST_BYTES} bytes, so it is no file of limits.")
+            raise DataError(
+                f"{path} has more than {MOST_BYTES} bytes, so it is no file of limits."
+            )
         content = tomllib.loads(path.read_bytes().decode())
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror}).") from None
@@ -186,9 +188,7 @@ def read_limits(path: Path | None, defaults: Limits) -> Limits:
     return _checked(limits, str(path))
 
 
-def _parts(
-    given: Any, defaults: Mapping[str, Part], section: str, path: Path
-) -> dict[str, Part]:
+def _parts(given: Any, defaults: Mapping[str, Part], section: str, path: Path) -> dict[str, Part]:
     """Returns the limits of a section of a file, by name."""
     if not isinstance(given, dict):
         raise DataError(f"{section} in {path} is no table; write [{section}.NAME].")

@@ -1,9 +1,7 @@
 """Plans the next recording."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +9,7 @@ from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.planning.causes import Known, prior_of
-from npdr_ppl.planning.excitations import Candidate, Excitations
+from npdr_ppl.planning.excitations import Excitations
 from npdr_ppl.planning.judging import Judge, Played
 from npdr_ppl.planning.limits import Limits
 from npdr_ppl.planning.search import Found, search_excitations
@@ -87,17 +85,12 @@ class Plan:
         """The smallest separation after the planned recording; NaN without pairs."""
         return min((pair.after for pair in self.pairs), default=math.nan)
 
-    @property
-    def is_useful(self) -> bool:
-        """Whether the recording is expected to tell all causes apart, or narrows parameters."""
-        return not self.pairs or self.smallest >= PLANNING.useful_separation
-
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values."""
         return {
             "separations": [vars(pair) for pair in self.pairs],
             "smallest_separation": self.smallest if self.pairs else None,
-            "tells_apart": self.is_useful if self.pairs else None,
+            "useful_separation": PLANNING.useful_separation,
             "widths": [vars(width) for width in self.widths],
             "information": self.information if self.widths else None,
             "duration": self.limits.duration,
@@ -185,7 +178,7 @@ def _pairs(known: Known, squares: Array) -> tuple[Pair, ...]:
         known: The causes.
         squares: Squared separations along the planned and the random recording, ``(2, n, n)``.
     """
-    root = np.sqrt(known.separations.square().numpy() + squares)
+    root = np.sqrt(known.separations.square().numpy() + np.maximum(squares, 0.0))
     result = []
     for a, one in enumerate(known.causes):
         for b in range(a + 1, len(known.causes)):

@@ -1,0 +1,204 @@
+"""Ambiguous recordings of hidden rigs: does one planned recording tell the causes apart?
+
+    python benchmarks/planning.py --num 60 --out planning.jsonl
+    python benchmarks/planning.py --summary planning.jsonl
+
+A case is one rollout of a rig of :mod:`hidden_rigs`, with one effect hidden whose strength is a
+part of the rig's typical size. It counts if the verdict of ``discover`` is ``ambiguous`` and the
+hidden effect is among the causes that are left. Then one recording is planned, played on the rig,
+and ``discover`` gets both. So does a random recording within the same limits: the first random
+excitation of the search that keeps them. Told apart means that the verdict names the hidden effect
+or its equivalent. Rows are written as they come, and a run given again continues.
+"""
+
+import argparse
+import itertools
+import json
+import math
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from discovery_rows import has_all, right_sets
+from hidden_rigs import Case, make_case, places, play
+
+import npdr_ppl as npdr
+from npdr_ppl.planning import Plan, plan_recording
+from npdr_ppl.planning.causes import causes_of_run
+from npdr_ppl.planning.limits import default_limits, read_limits
+from npdr_ppl.rollouts import Rollouts
+
+FIRST_SEED = 2000
+"""Seed of the first cases; those of the blind benchmark end before it."""
+
+STRENGTHS = (0.03, 0.1, 0.3)
+"""Multiples of an effect's typical size, in turn: weak effects are ambiguous more often."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One case to be planned for.
+
+    Attributes:
+        rig: Name of the rig.
+        place: Index of the hidden effect among the rig's.
+        strength: Multiple of its typical size.
+        seed: The case's seed.
+    """
+
+    rig: str
+    place: int
+    strength: float
+    seed: int
+
+
+def tasks(rigs: list[str]) -> Iterator[Task]:
+    """Yields cases without end: rigs and effects in turn, then other strengths and seeds."""
+    for number in itertools.count():
+        for place in range(max(len(places(rig, "one")) for rig in rigs)):
+            for rig in rigs:
+                if place < len(places(rig, "one")):
+                    strength = STRENGTHS[(place + number) % len(STRENGTHS)]
+                    yield Task(rig, place, strength, FIRST_SEED + number)
+
+
+def judge(task: Task, rounds: int) -> dict[str, Any]:
+    """Records a case, plans if it is ambiguous, and returns the row."""
+    row: dict[str, Any] = asdict(task)
+    chosen = places(task.rig, "one")[task.place]
+    begin = time.monotonic()
+    try:
+        case = make_case(task.rig, "one", chosen, strength=task.strength, seed=task.seed)
+        row |= {"truth": list(case.names), "alternatives": [list(a) for a in case.alternatives]}
+        first = case.fit[[0]]
+        found = npdr.discover(case.model, first, seed=task.seed, progress=False)
+        row |= {"verdict": found.verdict, "found": _names(found)}
+        row |= {"discover_seconds": time.monotonic() - begin}
+        if found.verdict == "ambiguous":
+            row |= _planned(case, first, found, task, rounds)
+    except npdr.NpdrError as error:  # a failure is a row with its message
+        row["error"] = f"{type(error).__name__}: {error}"[:300]
+    return row
+
+
+def _planned(
+    case: Case, first: Rollouts, found: npdr.Discovery, task: Task, rounds: int
+) -> dict[str, Any]:
+    """Returns what a planned and a random recording tell of an ambiguous case."""
+    with tempfile.TemporaryDirectory() as folder:
+        found.save(Path(folder))
+        known = causes_of_run(Path(folder), case.model)
+    limits = read_limits(None, default_limits(known.causes[0].simulator, known.recorded))
+    begin = time.monotonic()
+    plan = plan_recording(known, limits, rounds=rounds, seed=task.seed)
+    row: dict[str, Any] = {
+        "causes": [cause.name for cause in known.causes],
+        "plan": plan.to_dict(),
+        "plan_seconds": time.monotonic() - begin,
+    }
+    for kind, recording in (("planned", plan.recording), ("random", plan.random)):
+        recorded = play(case, recording.actions[0], seed=task.seed)
+        row[kind] = _told(case, first.concatenate(recorded), task)
+        row[kind]["excess"] = _excess(plan, recorded)
+    return row
+
+
+def _told(case: Case, rollouts: Rollouts, task: Task) -> dict[str, Any]:
+    """Returns the result of a discovery, and whether it names what is hidden."""
+    found = npdr.discover(case.model, rollouts, seed=task.seed, progress=False)
+    row = {
+        "truth": list(case.names),
+        "alternatives": [list(a) for a in case.alternatives],
+        "effects": [finding.to_dict() for finding in found.effects],
+    }
+    is_right = found.verdict == "named" and has_all(row)
+    return {
+        "verdict": found.verdict,
+        "found": _names(found),
+        "is_right": is_right,
+        "is_wrong": found.verdict == "named" and not is_right,
+        "reason": found.reason,
+    }
+
+
+def _excess(plan: Plan, recorded: Rollouts) -> float:
+    """Returns the greatest ratio of a measured value to its limit, less one."""
+    worst = -1.0
+    for k, channel in enumerate(plan.limits.channels.values()):
+        values = recorded.readings[0][:, k]
+        middle, half = 0.5 * (channel.max + channel.min), 0.5 * (channel.max - channel.min)
+        if math.isfinite(half):
+            worst = max(worst, float(abs(values - middle).max()) / half - 1.0)
+    return worst
+
+
+def _names(found: npdr.Discovery) -> dict[str, float]:
+    return {f.effect.name: f.probability for f in found.effects}
+
+
+def is_ambiguous(row: dict[str, Any]) -> bool:
+    """Returns whether a case counts: ambiguous, and the hidden effect is among the causes."""
+    if "plan" not in row:
+        return False
+    left = [set(name.split(" + ")) for name in row["causes"]]
+    return any(right <= names for right in right_sets(row) for names in left)
+
+
+def print_summary(path: Path) -> None:
+    """Prints how many cases each recording tells apart."""
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    used = [row for row in rows if is_ambiguous(row)]
+    print(f"{len(rows)} cases, {len(used)} ambiguous with the hidden effect among the causes")
+    print("| rig | ambiguous | planned tells apart | random tells apart | wrong names |")
+    print("|---|---|---|---|---|")
+    for rig in (*sorted({row["rig"] for row in used}), "all"):
+        own = [row for row in used if rig in ("all", row["rig"])]
+        planned, random = (sum(r[k]["is_right"] for r in own) for k in ("planned", "random"))
+        wrong = [sum(r[k]["is_wrong"] for r in own) for k in ("planned", "random")]
+        print(
+            f"| {rig} | {len(own)} | {planned} ({planned / max(len(own), 1):.0%}) | "
+            f"{random} ({random / max(len(own), 1):.0%}) | {wrong[0]}, {wrong[1]} |"
+        )
+    seconds = sorted(row["plan_seconds"] for row in used)
+    if seconds:
+        print(f"planning: median {seconds[len(seconds) // 2]:.0f} s, most {seconds[-1]:.0f} s")
+
+
+def main() -> None:
+    """Runs the benchmark."""
+    parser = argparse.ArgumentParser(description="Planned against random recordings.")
+    parser.add_argument("--rigs", default="pendulum,furuta,cart_pole,emps")
+    parser.add_argument("--num", type=int, default=60, help="ambiguous cases to plan for")
+    parser.add_argument("--rounds", type=int, default=30, help="batches of the search")
+    parser.add_argument("--most-seconds", type=float, default=math.inf)
+    parser.add_argument("--out", type=Path, default=Path("planning.jsonl"))
+    parser.add_argument("--summary", type=Path, help="only summarise this file")
+    arguments = parser.parse_args()
+    if arguments.summary:
+        print_summary(arguments.summary)
+        return
+    torch.set_num_threads(1)
+    lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
+    rows = [json.loads(line) for line in lines]
+    done = {Task(r["rig"], r["place"], r["strength"], r["seed"]) for r in rows}
+    begin, num = time.monotonic(), sum(map(is_ambiguous, rows))
+    for task in tasks(arguments.rigs.split(",")):
+        if num >= arguments.num or time.monotonic() - begin > arguments.most_seconds:
+            break
+        if task in done:
+            continue
+        row = judge(task, arguments.rounds)
+        num += is_ambiguous(row)
+        with arguments.out.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        told = {k: row[k]["verdict"] for k in ("planned", "random") if k in row}
+        print(f"{task} {row.get('truth')} {row.get('verdict', row.get('error'))} {told}")
+    print_summary(arguments.out)
+
+
+if __name__ == "__main__":
+    main()
