@@ -15,6 +15,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -34,7 +35,7 @@ from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.states import estimate_states
 
-__all__ = ["Judge", "Played"]
+__all__ = ["Judge", "Played", "information_gain"]
 
 Array = NDArray[np.float64]
 
@@ -82,7 +83,29 @@ class Judge:
         self._noise = np.random.default_rng(seed).standard_normal(shape) * self.scale.numpy()
         self._boxes = [_box(cause) for cause in known.causes]
         self.num_simulated = 0
+        self.batch, self._every = self._work()
         self._start_errors: tuple[Array, ...] | None = None
+
+    def _work(self) -> tuple[int, int]:
+        """Returns how many candidates are judged together, and each how many-th segment is."""
+        num, limits = len(self.known.causes), self.limits
+        comparisons = num if self.known.is_prior else num * (num - 1) // 2
+        runs = 1 + max(len(cause.z) for cause in self.known.causes) + len(self.channels)
+        steps = max(1, comparisons) * runs * limits.num_steps
+        num_segments = len(self._first_steps)
+        most = max(1, num_segments // PLANNING.fewest_segments)
+        every = min(most, -(-PLANNING.batch * steps // PLANNING.most_steps))
+        batch = min(PLANNING.batch, max(2, every * PLANNING.most_steps // steps))
+        return batch, every
+
+    @cached_property
+    def _first_steps(self) -> NDArray[np.int64]:
+        """The step at which each segment of a candidate begins, ``(S,)``."""
+        shape = (1, self.limits.num_steps)
+        empty = self._recorded(
+            np.zeros((1, shape[1] + 1, len(self.channels))), np.zeros((*shape, len(self.actions)))
+        )
+        return np.arange(0, self.limits.num_steps, self._options.steps(empty))
 
     def played(self, commands: Array, start: Array) -> Played:
         """Simulates candidates in every cause; failed simulations are NaN.
@@ -132,7 +155,7 @@ class Judge:
         num = len(self.known.causes)
         result = np.zeros((len(played.commands), num, num))
         for a, b in itertools.permutations(range(num), 2):
-            result[:, a, b] = self._separation(played, a, b).sum(0)
+            result[:, a, b] = self._separation(played, a, b, every=1).sum(0)
         return result
 
     def certainty(self, played: Played) -> Array:
@@ -147,18 +170,24 @@ class Judge:
         evidence that few blocks have: E exp(-Σ w_k d_k²/8) with exponential weights w_k. A pair
         that no recording separates does not keep the others from being separated.
         """
-        num = len(self.known.causes)
+        num, every = len(self.known.causes), self._every
         likely = [cause.probability or 1.0 / num for cause in self.known.causes]
         terms = [
             0.5 * math.log(likely[a] * likely[b])
-            - np.log1p(self._separation(played, a, b) / 8.0).sum(0)
+            - every * np.log1p(self._separation(played, a, b, every=every) / 8.0).sum(0)
             for a, b in itertools.combinations(range(num), 2)
         ]
         return -np.logaddexp.reduce(terms, axis=0)
 
-    def precisions(self, played: Played, cause: int) -> Tensor:
-        """Returns the precision of a cause's coordinates after each candidate, ``(E, d, d)``."""
-        products = self._products(played, cause, cause).sum(1)
+    def precisions(self, played: Played, cause: int, *, every: int = 1) -> Tensor:
+        """Returns the precision of a cause's coordinates after each candidate, ``(E, d, d)``.
+
+        Args:
+            played: The candidates.
+            cause: Index of the cause.
+            every: Each how many-th segment is simulated; it stands for the others.
+        """
+        products = every * self._products(played, cause, cause, every=every).sum(1)
         return self.known.share * products[:, :-1, :-1] + self.known.causes[cause].precision
 
     def gains(self, played: Played) -> Array:
@@ -166,20 +195,19 @@ class Judge:
         total = np.zeros(len(played.commands))
         for index, cause in enumerate(self.known.causes):
             try:
-                after = torch.linalg.slogdet(self.precisions(played, index)).logabsdet
+                after = self.precisions(played, index, every=self._every)
             except NpdrError:
                 return np.full(len(played.commands), -math.inf)
-            before = torch.linalg.slogdet(cause.precision).logabsdet
-            total += 0.5 * (after - before).numpy() / len(self.known.causes)
+            total += information_gain(cause.precision, after).numpy() / len(self.known.causes)
         return total
 
-    def _separation(self, played: Played, a: int, b: int) -> Array:
+    def _separation(self, played: Played, a: int, b: int, *, every: int) -> Array:
         """Returns the squared separation of b from a, ``(blocks, E)``, by block of segments."""
         try:
-            products = self.known.share * self._products(played, a, b)
+            products = self.known.share * self._products(played, a, b, every=every)
         except NpdrError:
             return np.full((1, len(played.commands)), -math.inf)
-        whole = products.sum(1)
+        whole = every * products.sum(1)
         information, score = whole[:, :-1, :-1], whole[:, :-1, -1]
         shift = torch.linalg.solve(information + self.known.causes[b].precision, score)
         # The parameters move, and the difference r becomes r − J shift.
@@ -187,8 +215,8 @@ class Judge:
         left = torch.einsum("ei,esij,ej->se", moved, products, moved)
         return block_sums(left.clamp_min(0.0).nan_to_num(-math.inf)).numpy()
 
-    def _products(self, played: Played, a: int, b: int) -> Tensor:
-        """Returns (J r)ᵀ C⁻¹ (J r) of each segment of each candidate, ``(E, S, d + 1, d + 1)``.
+    def _products(self, played: Played, a: int, b: int, *, every: int) -> Tensor:
+        """Returns (J r)ᵀ C⁻¹ (J r) of segments of each candidate, ``(E, S, d + 1, d + 1)``.
 
         J are the derivatives of cause b along what a simulates, and r is their difference.
         """
@@ -197,9 +225,12 @@ class Judge:
             refitted.model,
             self._recorded(paths, played.commands),
             self._options,
-            self._starts(paths, played),
+            self._starts(paths),
             is_complete=True,
         )
+        chosen = torch.arange(segments.inputs.num_segments).unflatten(0, (len(paths), -1))
+        # Those in the middle of the parts: at the beginning nothing moves.
+        segments = segments.along(chosen[:, every // 2 :: every].flatten())
         scale = self.scale[[self.channels.index(name) for name in segments.channel_names]]
         now = segments.linearise(refitted.z, segments.no_offsets, scale, is_rough=True)
         if not now.is_finite:
@@ -209,10 +240,9 @@ class Judge:
         products = joined.by_parameters.mT @ joined.weights()
         return products.unflatten(0, (len(played.commands), -1))
 
-    def _starts(self, paths: Array, played: Played) -> InitialStates:
+    def _starts(self, paths: Array) -> InitialStates:
         """Returns the initial states of all segments, with the errors of noisy measurements."""
-        length = self._options.steps(self._recorded(paths[:1], played.commands[:1]))
-        first = np.arange(0, self.limits.num_steps, length)
+        first = self._first_steps
         rates = np.gradient(paths, self.limits.time_step, axis=1)
         rates[:, 0] = 0.0  # at rest
         errors = self._start_errors
@@ -275,6 +305,11 @@ class Judge:
             return np.full((*inputs.actions.shape[:2], len(self.channels)), math.nan)
         simulated = simulated.reshape(inputs.num_segments, inputs.num_steps, len(names)).double()
         return simulated[..., [names.index(name) for name in self.channels]].numpy()
+
+
+def information_gain(before: Tensor, after: Tensor) -> Tensor:
+    """Returns ½ log det(P⁻¹ P'), in nats, ``(E,)``, of precisions P and P', ``(E, d, d)``."""
+    return 0.5 * (torch.linalg.slogdet(after).logabsdet - torch.linalg.slogdet(before).logabsdet)
 
 
 def _box(cause: Cause) -> SimulatorBlackBox:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.planning.causes import Known, prior_of
 from npdr_ppl.planning.excitations import Excitations
-from npdr_ppl.planning.judging import Judge, Played
+from npdr_ppl.planning.judging import Judge, Played, information_gain
 from npdr_ppl.planning.limits import Limits
 from npdr_ppl.planning.search import Found, search_excitations
 from npdr_ppl.planning.settings import PLANNING
@@ -160,15 +160,11 @@ def plan_recording(
         np.stack([excitations.start(c) for c in both]),
     )
     planned, random = (_recording(judge, played, k) for k in range(2))
-    return Plan(
-        planned,
-        _pairs(known, judge.separations(played)) if separates else (),
-        () if separates else _widths(known, judge, played),
-        math.nan if separates else float(judge.gains(played)[0]),
-        limits,
-        found,
-        random,
-    )
+    if separates:
+        pairs = _pairs(known, judge.separations(played))
+        return Plan(planned, pairs, (), math.nan, limits, found, random)
+    widths, information = _widths(known, judge, played)
+    return Plan(planned, (), widths, information, limits, found, random)
 
 
 def _pairs(known: Known, squares: Array) -> tuple[Pair, ...]:
@@ -188,14 +184,14 @@ def _pairs(known: Known, squares: Array) -> tuple[Pair, ...]:
     return tuple(result)
 
 
-def _widths(known: Known, judge: Judge, played: Played) -> tuple[Width, ...]:
-    """Returns the widths of the parameters, averaged over the causes."""
-    before, after = [], []
+def _widths(known: Known, judge: Judge, played: Played) -> tuple[tuple[Width, ...], float]:
+    """Returns the widths of the parameters and the information, averaged over the causes."""
+    before, after, gains = [], [], []
     for index, cause in enumerate(known.causes):
+        precision = judge.precisions(played, index)
         before.append(cause.precision.inverse().diagonal().sqrt().numpy())
-        after.append(
-            judge.precisions(played, index).inverse().diagonal(dim1=-2, dim2=-1).sqrt().numpy()
-        )
+        after.append(precision.inverse().diagonal(dim1=-2, dim2=-1).sqrt().numpy())
+        gains.append(float(information_gain(cause.precision, precision)[0]))
     prior = prior_of(known.causes[0].model)
     names = [
         site.name if width == 1 else f"{site.name}[{k}]"
@@ -204,10 +200,11 @@ def _widths(known: Known, judge: Judge, played: Played) -> tuple[Width, ...]:
         for k in range(width)
     ]
     mean_before, mean_after = np.mean(before, axis=0), np.mean(after, axis=0)
-    return tuple(
+    widths = tuple(
         Width(name, *map(float, (mean_before[k], mean_after[0, k], mean_after[1, k])))
         for k, name in enumerate(names)
     )
+    return widths, float(np.mean(gains))
 
 
 def _recording(judge: Judge, played: Played, index: int) -> Rollouts:

@@ -72,18 +72,25 @@ def search_excitations(
         judge: Simulates them.
         value_of: Returns the values of candidates, ``(E,)``.
         rounds: Number of batches, the random ones included.
-        time_limit: Seconds after which no further batch begins.
+        time_limit: Seconds after which no further batch would end.
         progress: Called with the fraction of the batches that is done.
     """
     begin, ranked, step = time.monotonic(), _Ranked(), PLANNING.step
+    num = judge.batch * PLANNING.tried_per_place
     has_stopped = False
     for number in range(rounds):
-        if time.monotonic() - begin > time_limit:
+        spent = time.monotonic() - begin
+        # Another batch takes as long as those before.
+        if number and spent * (1.0 + 1.0 / number) > time_limit:
             has_stopped = True
             break
         progress(number / rounds, f"{ranked.num_judged} excitations judged")
         is_first = number < PLANNING.first_batches or not ranked.elites
-        made = _random(excitations) if is_first else _refined(excitations, ranked.elites, step)
+        made = (
+            excitations.random(num)
+            if is_first
+            else _refined(excitations, ranked.elites, step, num)
+        )
         candidates, played = _within_limits(excitations, judge, made)
         values = value_of(played) if candidates else np.zeros(0)
         if not ranked.add(candidates, values) and not is_first:
@@ -92,16 +99,12 @@ def search_excitations(
     return Found(best[1], best[0], ranked.first, ranked.num_judged, has_stopped)
 
 
-def _random(excitations: Excitations) -> list[Candidate]:
-    return excitations.random(PLANNING.batch * PLANNING.tried_per_place)
-
-
 def _refined(
-    excitations: Excitations, elites: list[tuple[float, Candidate]], step: float
+    excitations: Excitations, elites: list[tuple[float, Candidate]], step: float, num: int
 ) -> list[Candidate]:
     """Returns candidates close to the best ones, and mixtures of these."""
     result = []
-    for number in range(PLANNING.batch * PLANNING.tried_per_place):
+    for number in range(num):
         _, parent = elites[number % len(elites)]
         if number % 4 == 3:
             _, other = elites[(number + 1) % len(elites)]
@@ -120,8 +123,8 @@ def _within_limits(
     """
     played = _played(excitations, judge, made)
     violation = judge.violation(played)
-    good = [k for k in range(len(made)) if violation[k] <= 0.0][: PLANNING.batch]
-    if 2 * len(good) >= PLANNING.batch:
+    good = [k for k in range(len(made)) if violation[k] <= 0.0][: judge.batch]
+    if 2 * len(good) >= judge.batch:
         return [made[k] for k in good], played.chosen(good)
     again = [
         excitations.weaker(made[k], 0.9 / (1.0 + min(violation[k], 3.0)))
@@ -130,7 +133,7 @@ def _within_limits(
     ]
     weaker = _played(excitations, judge, again)
     also = [k for k in range(len(again)) if judge.violation(weaker)[k] <= 0.0]
-    also = also[: PLANNING.batch - len(good)]
+    also = also[: judge.batch - len(good)]
     joined = Played(
         np.concatenate((played.commands[good], weaker.commands[also])),
         np.concatenate((played.start[good], weaker.start[also])),

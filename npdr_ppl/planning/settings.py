@@ -13,7 +13,11 @@ class PlanningSettings:
     """The search for the next recording.
 
     Attributes:
-        batch: Number of candidates that are judged together.
+        batch: Number of candidates that are judged together, fewer if a simulation has many steps.
+        most_steps: Greatest number of simulated steps for the derivatives of a batch. With an arm
+            of seven joints at 1 kHz in MuJoCo, a million takes 6 s on one core.
+        fewest_segments: Number of segments of each candidate that are judged at least during the
+            search; the result is judged with all.
         tried_per_place: Number of candidates that are simulated for each one that is judged. A
             simulation costs little compared with derivatives by all parameters, and most random
             candidates of a passive joint leave its limits.
@@ -37,6 +41,8 @@ class PlanningSettings:
     """
 
     batch: int = 12
+    most_steps: int = 1_000_000
+    fewest_segments: int = 8
     tried_per_place: int = 3
     first_batches: int = 3
     elites: int = 3
@@ -55,6 +61,7 @@ class PlanningSettings:
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, math.inf, "most_steps", "fewest_segments")
         check_range(self, 1, 1000, "batch", "tried_per_place", "first_batches", "num_draws")
         check_range(self, 1, 100, "num_smoothed")
         check_range(self, 1, self.batch, "elites")
