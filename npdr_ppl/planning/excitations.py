@@ -80,7 +80,7 @@ class Excitations:
         """Returns the measured values at the start, ``(C,)``, in the channels' units."""
         low = np.array([c.start_min for c in self.limits.channels.values()])
         high = np.array([c.start_max for c in self.limits.channels.values()])
-        return low + candidate.start * (high - low)
+        return np.clip(low + candidate.start * (high - low), low, high)  # after rounding
 
     def random(self, number: int) -> list[Candidate]:
         """Returns candidates of random shapes, in turn with other amplitudes."""

@@ -5,7 +5,7 @@ r be the difference between what cause a simulates and what b does, J the deriva
 parameters, C the covariance of the residuals with the initial states integrated out, and P the
 precision of b's parameters after the recordings so far. With refitted parameters
 
-    d² = (r − J s)ᵀ C⁻¹ (r − J s),        s = (Jᵀ C⁻¹ J + P)⁻¹ Jᵀ C⁻¹ r
+    d² = (r − J s)ᵀ C⁻¹ (r − J s) + sᵀ P s,        s = (Jᵀ C⁻¹ J + P)⁻¹ Jᵀ C⁻¹ r
 
 which adds to the squared separation along the recordings so far. The gain of information about the
 parameters of one cause is ½ log det(P⁻¹ (Jᵀ C⁻¹ J + P)).
@@ -15,7 +15,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -29,7 +28,7 @@ from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.planning.causes import Cause, Known, prior_of
 from npdr_ppl.planning.limits import Limits
 from npdr_ppl.planning.settings import PLANNING
-from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.data_options import DataOptions, default_segment_length
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
@@ -58,6 +57,15 @@ class Played:
         """Returns some of the candidates."""
         return Played(self.commands[index], self.start[index], self.readings[:, index])
 
+    @classmethod
+    def joined(cls, parts: Sequence["Played"]) -> "Played":
+        """Returns the candidates of several parts, in their order."""
+        return cls(
+            np.concatenate([part.commands for part in parts]),
+            np.concatenate([part.start for part in parts]),
+            np.concatenate([part.readings for part in parts], axis=1),
+        )
+
 
 class Judge:
     """Simulates candidates in every cause and predicts what they would show.
@@ -74,10 +82,11 @@ class Judge:
         self.channels = tuple(limits.channels)
         self.actions = tuple(limits.actions)
         self.scale = torch.tensor([c.noise for c in limits.channels.values()]).double()
+        # Short recordings have shorter segments, but here several are judged together.
         self._options = DataOptions(
             embedding=None,
             initial_state="recorded",  # they are set by _starts
-            segment_length="auto" if known.segment_length is None else known.segment_length,
+            segment_length=known.segment_length or self._default_length(),
         )
         shape = (limits.num_steps + 1, len(self.channels))
         self._noise = np.random.default_rng(seed).standard_normal(shape) * self.scale.numpy()
@@ -98,14 +107,22 @@ class Judge:
         batch = min(PLANNING.batch, max(2, every * PLANNING.most_steps // steps))
         return batch, every
 
-    @cached_property
+    def _default_length(self) -> int:
+        """Returns the steps of a segment with which one such recording would be cut."""
+        steps = self.limits.num_steps
+        return default_segment_length(
+            self._recorded(
+                np.zeros((1, steps + 1, len(self.channels))),
+                np.zeros((1, steps, len(self.actions))),
+            )
+        )
+
+    @property
     def _first_steps(self) -> NDArray[np.int64]:
         """The step at which each segment of a candidate begins, ``(S,)``."""
-        shape = (1, self.limits.num_steps)
-        empty = self._recorded(
-            np.zeros((1, shape[1] + 1, len(self.channels))), np.zeros((*shape, len(self.actions)))
-        )
-        return np.arange(0, self.limits.num_steps, self._options.steps(empty))
+        length = self._options.segment_length
+        assert isinstance(length, int)
+        return np.arange(0, self.limits.num_steps, length)
 
     def played(self, commands: Array, start: Array) -> Played:
         """Simulates candidates in every cause; failed simulations are NaN.
@@ -209,10 +226,14 @@ class Judge:
             return np.full((1, len(played.commands)), -math.inf)
         whole = every * products.sum(1)
         information, score = whole[:, :-1, :-1], whole[:, :-1, -1]
-        shift = torch.linalg.solve(information + self.known.causes[b].precision, score)
+        precision = self.known.causes[b].precision
+        shift = torch.linalg.solve(information + precision, score)
         # The parameters move, and the difference r becomes r − J shift.
         moved = torch.cat((-shift, torch.ones_like(shift[:, :1])), dim=-1)
         left = torch.einsum("ei,esij,ej->se", moved, products, moved)
+        # Moved parameters fit the recordings so far less well, nearly evenly.
+        before = torch.einsum("ei,ij,ej->e", shift, precision, shift)
+        left = left + before / (every * len(left))
         return block_sums(left.clamp_min(0.0).nan_to_num(-math.inf)).numpy()
 
     def _products(self, played: Played, a: int, b: int, *, every: int) -> Tensor:
@@ -220,17 +241,12 @@ class Judge:
 
         J are the derivatives of cause b along what a simulates, and r is their difference.
         """
-        refitted, paths = self.known.causes[b], self._paths(played)[a]
-        segments = SegmentModel(
-            refitted.model,
-            self._recorded(paths, played.commands),
-            self._options,
-            self._starts(paths),
-            is_complete=True,
-        )
-        chosen = torch.arange(segments.inputs.num_segments).unflatten(0, (len(paths), -1))
-        # Those in the middle of the parts: at the beginning nothing moves.
-        segments = segments.along(chosen[:, every // 2 :: every].flatten())
+        refitted, made = self.known.causes[b], self.known.causes[a]
+        segments = self._segments(refitted, played, a, every)
+        if a != b:
+            # From the same initial states, so that a cause does not differ from itself.
+            own = self._segments(made, played, a, every)
+            segments.observed = own.simulate(made.z[None], own.no_offsets[None])[0]
         scale = self.scale[[self.channels.index(name) for name in segments.channel_names]]
         now = segments.linearise(refitted.z, segments.no_offsets, scale, is_rough=True)
         if not now.is_finite:
@@ -239,6 +255,20 @@ class Judge:
         joined = replace(now, by_parameters=both)
         products = joined.by_parameters.mT @ joined.weights()
         return products.unflatten(0, (len(played.commands), -1))
+
+    def _segments(self, cause: Cause, played: Played, a: int, every: int) -> SegmentModel:
+        """Returns a cause along segments of what cause a simulates."""
+        paths = self._paths(played)[a]
+        segments = SegmentModel(
+            cause.model,
+            self._recorded(paths, played.commands),
+            self._options,
+            self._starts(paths),
+            is_complete=True,
+        )
+        chosen = torch.arange(segments.inputs.num_segments).unflatten(0, (len(paths), -1))
+        # Those in the middle of the parts: at the beginning nothing moves.
+        return segments.along(chosen[:, every // 2 :: every].flatten())
 
     def _starts(self, paths: Array) -> InitialStates:
         """Returns the initial states of all segments, with the errors of noisy measurements."""

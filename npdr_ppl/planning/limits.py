@@ -253,7 +253,7 @@ def _check_keys(content: Mapping[str, Any], known: Any, place: str) -> None:
 def _number(value: Any, name: str, *, least: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
         raise DataError(f"{name} is {value!r}, which is not a number.")
-    if value <= least:
+    if value <= least and math.isfinite(least):
         raise DataError(f"{name} is {value:g}; it must be above {least:g}.")
     return float(value)
 

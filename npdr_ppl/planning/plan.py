@@ -149,6 +149,11 @@ def plan_recording(
     found = search_excitations(
         excitations, judge, value_of, rounds=rounds, time_limit=time_limit, progress=progress
     )
+    if found.best is None and found.first is not None:
+        raise DataError(
+            "The causes cannot be simulated in short segments of any excitation; the model may "
+            "need smaller integration steps."
+        )
     if found.best is None or found.first is None:
         raise DataError(
             f"None of {judge.num_simulated // len(known.causes)} simulated excitations kept the "

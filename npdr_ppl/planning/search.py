@@ -119,27 +119,25 @@ def _within_limits(
 ) -> tuple[list[Candidate], Played]:
     """Returns the first candidates, at most a batch, whose simulations keep the limits.
 
-    Those that do not are tried once more, weaker.
+    As long as half a batch is missing, those that do not are tried again, weaker.
     """
-    played = _played(excitations, judge, made)
-    violation = judge.violation(played)
-    good = [k for k in range(len(made)) if violation[k] <= 0.0][: judge.batch]
-    if 2 * len(good) >= judge.batch:
-        return [made[k] for k in good], played.chosen(good)
-    again = [
-        excitations.weaker(made[k], 0.9 / (1.0 + min(violation[k], 3.0)))
-        for k in range(len(made))
-        if violation[k] > 0.0
-    ]
-    weaker = _played(excitations, judge, again)
-    also = [k for k in range(len(again)) if judge.violation(weaker)[k] <= 0.0]
-    also = also[: judge.batch - len(good)]
-    joined = Played(
-        np.concatenate((played.commands[good], weaker.commands[also])),
-        np.concatenate((played.start[good], weaker.start[also])),
-        np.concatenate((played.readings[:, good], weaker.readings[:, also]), axis=1),
-    )
-    return [*(made[k] for k in good), *(again[k] for k in also)], joined
+    kept: list[Candidate] = []
+    parts: list[Played] = []
+    for _ in range(PLANNING.most_weaker):
+        played = _played(excitations, judge, made)
+        violation = judge.violation(played)
+        room = judge.batch - len(kept)
+        good = [k for k in range(len(made)) if violation[k] <= 0.0][:room]
+        kept += [made[k] for k in good]
+        parts.append(played.chosen(good))
+        made = [
+            excitations.weaker(made[k], 0.9 / (1.0 + min(violation[k], 4.0)))
+            for k in range(len(made))
+            if violation[k] > 0.0
+        ]
+        if 2 * len(kept) >= judge.batch or not made:
+            break
+    return kept, Played.joined(parts)
 
 
 def _played(excitations: Excitations, judge: Judge, candidates: list[Candidate]) -> Played:

@@ -21,6 +21,8 @@ class PlanningSettings:
         tried_per_place: Number of candidates that are simulated for each one that is judged. A
             simulation costs little compared with derivatives by all parameters, and most random
             candidates of a passive joint leave its limits.
+        most_weaker: How often a batch is simulated, each time weaker, until half of it keeps the
+            limits. Each time makes it up to five times weaker.
         first_batches: Number of batches of random candidates before the best ones are refined.
         elites: Number of candidates that are refined side by side.
         step: First standard deviation of a refinement, relative to the coefficients' own size.
@@ -44,6 +46,7 @@ class PlanningSettings:
     most_steps: int = 1_000_000
     fewest_segments: int = 8
     tried_per_place: int = 3
+    most_weaker: int = 4
     first_batches: int = 3
     elites: int = 3
     step: float = 0.5
@@ -62,7 +65,9 @@ class PlanningSettings:
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, math.inf, "most_steps", "fewest_segments")
-        check_range(self, 1, 1000, "batch", "tried_per_place", "first_batches", "num_draws")
+        check_range(
+            self, 1, 1000, "batch", "tried_per_place", "most_weaker", "first_batches", "num_draws"
+        )
         check_range(self, 1, 100, "num_smoothed")
         check_range(self, 1, self.batch, "elites")
         check_range(self, 0.0, 1.0, "step", "shrink", "least_step", "amplitudes", "margin")

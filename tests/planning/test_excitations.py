@@ -1,0 +1,94 @@
+"""Excitations: within the limits of the commands, band-limited, at rest at both ends."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from npdr_ppl.planning.excitations import Excitations
+from npdr_ppl.planning.limits import ActionLimits, ChannelLimits, Limits
+
+LIMITS = Limits(
+    4.0,
+    3.0,
+    0.005,
+    {
+        "torque": ActionLimits(-1.0, 2.0, max_rate=8.0, max_acceleration=60.0, start=0.5),
+        "goal": ActionLimits(0.0, 0.3),
+    },
+    {"angle": ChannelLimits(-1.0, 1.0, start_min=-0.2, start_max=0.4, noise=1e-3)},
+)
+
+
+@pytest.fixture
+def excitations():
+    return Excitations(LIMITS, np.random.default_rng(0))
+
+
+@pytest.fixture
+def candidates(excitations):
+    first = excitations.random(40)
+    changed = [excitations.changed(candidate, 0.5) for candidate in first]
+    mixed = [excitations.mixed(a, b) for a, b in zip(first, changed, strict=True)]
+    return [*first, *changed, *mixed]
+
+
+def test_commands_keep_their_limits(excitations, candidates):
+    for candidate in candidates:
+        commands = excitations.commands(candidate)
+        assert commands.shape == (800, 2)
+        for column, action in zip(commands.T, LIMITS.actions.values(), strict=True):
+            rate = np.diff(column) / LIMITS.time_step
+            assert column.min() >= action.min - 1e-9 and column.max() <= action.max + 1e-9
+            assert np.abs(rate).max() <= action.max_rate * (1.0 + 1e-9)
+            assert np.abs(np.diff(rate)).max() / LIMITS.time_step <= action.max_acceleration * (
+                1.0 + 1e-9
+            )
+
+
+def test_the_strongest_command_reaches_a_limit(excitations):
+    (candidate,) = excitations.random(1)
+    goal = excitations.commands(replace(candidate, amplitudes=np.ones(2)))[:, 1]
+    assert goal.max() == pytest.approx(0.3) or goal.min() == pytest.approx(0.0)
+
+
+def test_commands_are_in_the_band(excitations, candidates):
+    frequencies = np.fft.rfftfreq(800, LIMITS.time_step)
+    for candidate in candidates:
+        commands = excitations.commands(candidate)
+        power = np.abs(np.fft.rfft(commands - commands.mean(0), axis=0)) ** 2
+        # The window of 1/6 s at both ends widens the band a little.
+        outside = power[frequencies > 2.0 * LIMITS.bandwidth].sum(0)
+        assert (outside <= 0.01 * power.sum(0) + 1e-12).all()
+
+
+def test_commands_begin_and_end_at_rest(excitations, candidates):
+    for candidate in candidates:
+        commands = excitations.commands(candidate)
+        for row in (commands[0], commands[-1]):
+            assert row == pytest.approx([0.5, 0.0], abs=1e-9)
+
+
+def test_starts_are_in_their_range(excitations, candidates):
+    starts = np.array([excitations.start(candidate) for candidate in candidates])
+    assert starts.min() >= -0.2 and starts.max() <= 0.4
+    assert np.ptp(starts) > 0.5
+
+
+def test_the_seed_decides_everything(excitations):
+    other = Excitations(LIMITS, np.random.default_rng(0))
+    for one, two in zip(excitations.random(8), other.random(8), strict=True):
+        assert np.array_equal(excitations.commands(one), other.commands(two))
+
+
+def test_a_limit_on_acceleration_makes_commands_weaker():
+    steady = replace(
+        LIMITS,
+        actions={"goal": ActionLimits(-1.0, 1.0, max_acceleration=1.0)},
+    )
+    strong = replace(LIMITS, actions={"goal": ActionLimits(-1.0, 1.0)})
+    weak, usual = (Excitations(ls, np.random.default_rng(1)) for ls in (steady, strong))
+    (one,), (two,) = weak.random(1), usual.random(1)
+    assert np.abs(weak.commands(one)).max() < 0.2 * np.abs(usual.commands(two)).max()
+    assert math.isclose(np.abs(usual.commands(two)).max(), 1.0)

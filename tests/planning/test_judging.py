@@ -1,0 +1,111 @@
+"""Predicted separations and information, against closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from npdr_ppl.planning.causes import Known
+from npdr_ppl.planning.excitations import Excitations
+from npdr_ppl.planning.judging import Judge, information_gain
+from npdr_ppl.planning.limits import ChannelLimits
+
+
+def candidates(limits, number=4):
+    excitations = Excitations(limits, np.random.default_rng(0))
+    made = excitations.random(number)
+    return (
+        np.stack([excitations.commands(c) for c in made]),
+        np.stack([excitations.start(c) for c in made]),
+    )
+
+
+def shifted(known, by):
+    """The first cause, and the same with other parameters, both known as well as before."""
+    first = known.causes[0]
+    causes = (first, replace(first, z=first.z + by))
+    return Known(causes, torch.zeros(2, 2), share=0.5)
+
+
+def test_a_cause_with_other_parameters_imitates_what_the_precision_permits(surviving):
+    known, limits = surviving
+    width = known.causes[0].precision.inverse().diagonal().sqrt()
+    by = 0.3 * width
+    judge = Judge(shifted(known, by), limits, seed=0)
+    played = judge.played(*candidates(limits))
+    found = judge.separations(played)[:, 0, 1]
+    before = known.causes[0].precision
+    # In a linear model the difference is J times the shift. Both recordings together determine
+    # the parameters as a mean of two estimates with these precisions, a shift apart.
+    for index, after in enumerate(judge.precisions(played, 1)):
+        covariance = before.inverse() + (after - before).inverse()
+        expected = float(by @ covariance.inverse() @ by)
+        assert found[index] == pytest.approx(expected, rel=0.05)
+
+
+def test_a_cause_is_not_separated_from_itself(surviving):
+    known, limits = surviving
+    judge = Judge(shifted(known, 0.0), limits, seed=0)
+    assert judge.separations(judge.played(*candidates(limits))) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_less_noise_separates_more(surviving):
+    known, limits = surviving
+    channels = {n: replace(c, noise=0.5 * c.noise) for n, c in limits.channels.items()}
+    squares = []
+    for allowed in (limits, replace(limits, channels=channels)):
+        judge = Judge(known, allowed, seed=0)
+        squares.append(judge.separations(judge.played(*candidates(limits))))
+    different = ~np.eye(len(known.causes), dtype=bool)
+    assert (squares[1] > squares[0])[:, different].all()
+
+
+def test_certainty_is_that_of_the_pairs(surviving):
+    known, limits = surviving
+    judge = Judge(known, limits, seed=0)
+    played = judge.played(*candidates(limits))
+    certain = judge.certainty(played)
+    assert certain.shape == (4,)
+    # Nothing is learned from standing still.
+    still = judge.played(np.zeros_like(played.commands), played.start)
+    assert (certain > judge.certainty(still)).all()
+
+
+def test_information_of_a_gaussian():
+    before, after = torch.eye(2).double(), torch.diag(torch.tensor([4.0, 9.0])).double()
+    assert float(information_gain(before, after[None])[0]) == pytest.approx(np.log(6.0))
+
+
+def test_information_grows_with_the_motion(unrecorded):
+    known, limits = unrecorded
+    judge = Judge(known, limits, seed=0)
+    commands, start = candidates(limits)
+    weak, strong = (judge.gains(judge.played(f * commands, start)) for f in (0.1, 1.0))
+    assert (strong > weak).all() and (weak > 0.0).all()
+
+
+@pytest.mark.parametrize("name", ["min", "max", "max_rate", "max_acceleration"])
+def test_a_limit_that_the_motion_exceeds_is_a_violation(name, unrecorded):
+    known, limits = unrecorded
+    free = {name: ChannelLimits(noise=c.noise) for name, c in limits.channels.items()}
+    limits = replace(limits, channels=free)
+    judge = Judge(known, limits, seed=0)
+    played = judge.played(*candidates(limits))
+    path = np.concatenate((np.zeros_like(played.readings[:, :, :1]), played.readings), axis=2)
+    angle = path[..., 0]
+    rate = np.diff(angle) / limits.time_step
+    acceleration = np.diff(rate) / limits.time_step
+    greatest = {
+        "min": angle.min((0, 2)),
+        "max": angle.max((0, 2)),
+        "max_rate": np.abs(rate).max((0, 2)),
+        "max_acceleration": np.abs(acceleration).max((0, 2)),
+    }[name]
+    assert (judge.violation(played) <= 0.0).all()
+    for factor, is_kept in ((1.1, True), (1.01, False)):  # a margin of a twentieth is kept
+        channel = ChannelLimits(noise=1e-3)
+        channel = replace(channel, **{name: factor * float(greatest[0])})
+        narrow = replace(limits, channels=limits.channels | {"angle": channel})
+        violation = Judge(known, narrow, seed=0).violation(played)
+        assert (violation[0] <= 0.0) == is_kept

@@ -1,0 +1,91 @@
+"""Limits: defaults, files, and sentences about bad ones."""
+
+import dataclasses
+
+import pytest
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.planning.limits import default_limits, read_limits
+
+BAD = {
+    "duration = ": "is not valid TOML",
+    "speed = 1": "has 'speed'; known are",
+    "duration = 'long'": "duration in .* is 'long', which is not a number",
+    "duration = -1": r"it must be above 0",
+    "duration = 0.1": "at least 50 are needed",
+    "bandwidth = 1e3": "half the sampling rate",
+    "bandwidth = 0.01": "one period of the duration",
+    "actions = 1": r"write \[actions.NAME\]",
+    "[actions]\ntorque = 3": "is no table of limits",
+    "[actions.force]\nmax = 1": "has 'force'; known are torque",
+    "[actions.torque]\nlargest = 1": "has 'largest'; known are",
+    "[actions.torque]\nmin = 9": "min of torque must be below max",
+    "[actions.torque]\nmin = -inf": "write min and max below",
+    "[actions.torque]\nmax = true": "which is not a number",
+    "[actions.torque]\nmax_rate = 0": "it must be above 0",
+    "[actions.torque]\nstart = 40": "start of torque is not between",
+    "[channels.angle]\nmin = 9\nmax = 1": "min of angle must be below max",
+    "[channels.angle]\nstart_min = 0.5": "start_min of angle is above its start_max",
+    "[channels.angle]\nstart_min = -20": "angle may start outside its min and max",
+    "[channels.angle]\nnoise = nan": "which is not a number",
+}
+
+
+@pytest.mark.parametrize("text", BAD)
+def test_a_bad_file_gets_one_sentence(text, unrecorded, tmp_path):
+    file = tmp_path / "limits.toml"
+    file.write_text(text)
+    with pytest.raises(DataError, match=BAD[text]) as raised:
+        read_limits(file, unrecorded[1])
+    assert "\n" not in str(raised.value)
+
+
+def test_a_file_that_is_not_there_is_named(unrecorded, tmp_path):
+    with pytest.raises(DataError, match="limits.toml cannot be read"):
+        read_limits(tmp_path / "limits.toml", unrecorded[1])
+
+
+def test_printed_limits_are_read_back(surviving, tmp_path):
+    limits = surviving[1]
+    file = tmp_path / "limits.toml"
+    file.write_text(limits.toml({"angle": "rad"}))
+    read = read_limits(file, limits)
+    for name, channel in limits.channels.items():
+        given, found = dataclasses.astuple(channel), dataclasses.astuple(read.channels[name])
+        assert found == pytest.approx(given, rel=1e-5)
+    assert read.num_steps == limits.num_steps
+
+
+def test_what_a_file_does_not_name_keeps_its_default(surviving, tmp_path):
+    file = tmp_path / "limits.toml"
+    file.write_text("[channels.velocity]\nmax_rate = 3.0\n")
+    read, limits = read_limits(file, surviving[1]), surviving[1]
+    assert read.channels["velocity"].max_rate == 3.0
+    assert read.channels["velocity"].max == limits.channels["velocity"].max
+    assert read.actions == limits.actions
+
+
+def test_a_narrower_command_moves_the_command_at_rest_inside(surviving, tmp_path):
+    file = tmp_path / "limits.toml"
+    file.write_text("[actions.torque]\nmin = 1.0\nmax = 2.0\n")
+    assert read_limits(file, surviving[1]).actions["torque"].start == 1.0
+
+
+def test_the_limits_of_a_recording_are_its_ranges(ambiguous, surviving):
+    case, _ = ambiguous
+    limits, recorded = surviving[1], case.fit[[0]]
+    assert limits.actions["torque"].max == recorded.actions[0].max()
+    assert limits.channels["angle"].min == recorded.readings[0][:, 0].min()
+    assert limits.duration == pytest.approx(5.0)
+    # Its multisine has frequencies up to 2 Hz.
+    assert 0.3 < limits.bandwidth < 2.2
+
+
+def test_without_a_recording_the_model_declares_them(unrecorded):
+    known, limits = unrecorded
+    torque = known.causes[0].simulator.actions[0]
+    assert (limits.actions["torque"].min, limits.actions["torque"].max) == (
+        torque.lower,
+        torque.upper,
+    )
+    assert default_limits(known.causes[0].simulator, None) == limits
