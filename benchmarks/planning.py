@@ -7,8 +7,12 @@ A case is one rollout of a rig of :mod:`hidden_rigs`, with one effect hidden who
 part of the rig's typical size. It counts if the verdict of ``discover`` is ``ambiguous`` and the
 hidden effect is among the causes that are left. Then one recording is planned, played on the rig,
 and ``discover`` gets both. So does a random recording within the same limits: the first random
-excitation of the search that keeps them. Told apart means that the verdict names the hidden effect
-or its equivalent. Rows are written as they come, and a run given again continues.
+excitation of the search that keeps them. The limits are the rig's greatest commands, twice the
+positions and velocities of the first rollout, three times its bandwidth, and any pose from which
+the rig's rollouts are let go. A case counts if a cause is left that a recording of the rig can
+tell from the hidden effect. Told apart means that no such cause is left: the verdict names the
+hidden effect or what no recording tells from it, or only these are left. Rows are written as they
+come, and a run given again continues.
 """
 
 import argparse
@@ -18,22 +22,28 @@ import math
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from discovery_rows import has_all, right_sets
-from hidden_rigs import Case, make_case, places, play
+from hidden_rigs import RIGS, Case, make_case, places, play
 
 import npdr_ppl as npdr
 from npdr_ppl.planning import Plan, plan_recording
-from npdr_ppl.planning.causes import causes_of_run
-from npdr_ppl.planning.limits import default_limits, read_limits
+from npdr_ppl.planning.causes import Known, causes_of_run
+from npdr_ppl.planning.limits import ActionLimits, Limits, default_limits
 from npdr_ppl.rollouts import Rollouts
 
 FIRST_SEED = 2000
 """Seed of the first cases; those of the blind benchmark end before it."""
+
+TIMES_RANGE, TIMES_BAND = 2.0, 3.0
+"""Limits as multiples of the first recording's positions and velocities, and of its bandwidth."""
+
+NAMED = 0.05
+"""Probability from which a cause is left, as in the verdict."""
 
 STRENGTHS = (0.03, 0.1, 0.3)
 """Multiples of an effect's typical size, in turn: weak effects are ambiguous more often."""
@@ -92,7 +102,7 @@ def _planned(
     with tempfile.TemporaryDirectory() as folder:
         found.save(Path(folder))
         known = causes_of_run(Path(folder), case.model)
-    limits = read_limits(None, default_limits(known.causes[0].simulator, known.recorded))
+    limits = _limits(case, known)
     begin = time.monotonic()
     plan = plan_recording(known, limits, rounds=rounds, seed=task.seed)
     row: dict[str, Any] = {
@@ -101,10 +111,34 @@ def _planned(
         "plan_seconds": time.monotonic() - begin,
     }
     for kind, recording in (("planned", plan.recording), ("random", plan.random)):
-        recorded = play(case, recording.actions[0], seed=task.seed)
+        start = recording.readings[0][0]
+        recorded = play(case, recording.actions[0], start, seed=task.seed)
         row[kind] = _told(case, first.concatenate(recorded), task)
         row[kind]["excess"] = _excess(plan, recorded)
     return row
+
+
+def _limits(case: Case, known: Known) -> Limits:
+    """Returns what a rig may do."""
+    rig = RIGS[case.rig]
+    found = default_limits(known.causes[0].simulator, known.recorded)
+    spread = dict(zip(rig.layout.positions, rig.start_spread, strict=True))
+    channels = {
+        name: replace(
+            channel,
+            min=-TIMES_RANGE * max(-channel.min, channel.max, spread.get(name, 0.0)),
+            max=TIMES_RANGE * max(-channel.min, channel.max, spread.get(name, 0.0)),
+            start_min=-spread.get(name, 0.0),
+            start_max=spread.get(name, 0.0),
+        )
+        for name, channel in found.channels.items()
+    }
+    actions = {
+        name: ActionLimits(-limit, limit)
+        for name, limit in zip(rig.layout.actions, rig.limits, strict=True)
+    }
+    bandwidth = TIMES_BAND * rig.band.upper
+    return replace(found, bandwidth=bandwidth, actions=actions, channels=channels)
 
 
 def _told(case: Case, rollouts: Rollouts, task: Task) -> dict[str, Any]:
@@ -116,6 +150,15 @@ def _told(case: Case, rollouts: Rollouts, task: Task) -> dict[str, Any]:
         "effects": [finding.to_dict() for finding in found.effects],
     }
     is_right = found.verdict == "named" and has_all(row)
+    if found.verdict == "ambiguous":
+        # What is left may be what no recording tells from the hidden effect.
+        right = set().union(*right_sets(row))
+        left = [
+            {n for n, p in f.alternatives.items() if p >= NAMED}
+            for f in found.effects
+            if f.can_be_named
+        ]
+        is_right = all(names <= right for names in left)
     return {
         "verdict": found.verdict,
         "found": _names(found),
@@ -141,11 +184,12 @@ def _names(found: npdr.Discovery) -> dict[str, float]:
 
 
 def is_ambiguous(row: dict[str, Any]) -> bool:
-    """Returns whether a case counts: ambiguous, and the hidden effect is among the causes."""
+    """Returns whether a case counts: the hidden effect and another one are among the causes."""
     if "plan" not in row:
         return False
     left = [set(name.split(" + ")) for name in row["causes"]]
-    return any(right <= names for right in right_sets(row) for names in left)
+    are_right = [any(right <= names for right in right_sets(row)) for names in left]
+    return any(are_right) and not all(are_right)
 
 
 def print_summary(path: Path) -> None:

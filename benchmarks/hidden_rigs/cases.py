@@ -221,12 +221,15 @@ def make_case(
     )
 
 
-def play(case: Case, commands: NDArray[np.float64], *, seed: int) -> Rollouts:
-    """Records one more rollout of a case's rig: commands that start from rest.
+def play(
+    case: Case, commands: NDArray[np.float64], start: NDArray[np.float64], *, seed: int
+) -> Rollouts:
+    """Records one more rollout of a case's rig, which is released at rest.
 
     Args:
         case: The case; its parameters and what is hidden stay.
         commands: The commands, ``(K, actions)``.
+        start: Where it is released: values of its sensors, positions first.
         seed: Seed of the noise.
 
     Raises:
@@ -242,7 +245,7 @@ def play(case: Case, commands: NDArray[np.float64], *, seed: int) -> Rollouts:
         hidden=case.truth,
         measurement=rig.measurement,
         seed=derived_seed(seed, case.rig, "played"),
-        played=commands,
+        played=(commands, start[: len(rig.layout.positions)]),
     ).rollouts
 
 

@@ -52,9 +52,9 @@ def record(
     seed: int,
     duration: float | None = None,
     substeps: int | None = None,
-    played: Array | None = None,
+    played: tuple[Array, Array] | None = None,
 ) -> Recording:
-    """Records one rollout per excitation, or plays commands from a file from rest.
+    """Records one rollout per excitation, or plays commands in one.
 
     The noise, the excitations and the starts depend on the seed alone.
 
@@ -71,13 +71,14 @@ def record(
         substeps: Integration steps per sample; ``None`` for the rig's, and ten times those behind
             a gear or a shaft.
         played: Commands, ``(K, actions)``, that are played in one rollout without the rig's
-            feedback; ``None`` for excitations.
+            feedback, and the positions, ``(joints,)``, in which it is held until then; ``None``
+            for excitations.
     """
     is_behind_gears = any(h.effect_id in TRANSMISSIONS for h in hidden)
     num_substeps = substeps or rig.substeps * (_FINER_BEHIND_GEARS if is_behind_gears else 1)
     substep = rig.time_step / num_substeps
     num_steps = (
-        round((duration or rig.duration) / rig.time_step) if played is None else len(played)
+        round((duration or rig.duration) / rig.time_step) if played is None else len(played[0])
     )
     lead = math.ceil(_LEAD / rig.time_step)
     skew = sum(h.parameters["skew"] for h in hidden if h.effect_id == "clock_skew")
@@ -85,7 +86,8 @@ def record(
     if played is None:
         wanted = references(rig, excitations, num_steps, tail, seed)
     else:
-        wanted = np.concatenate((played, np.repeat(played[-1:], tail, axis=0)))[..., None]
+        after = np.repeat(played[0][-1:], tail, axis=0)
+        wanted = np.concatenate((played[0], after))[..., None]
     num_rollouts = wanted.shape[-1]
     plant = Plant(
         rig.mechanics,
@@ -97,8 +99,10 @@ def record(
         duration=num_steps * rig.time_step,
         generator=np.random.default_rng(derived_seed(seed, "bursts")),
     )
-    from_rest = is_from_rest or played is not None
-    q, v = plant.start(*starts(rig, num_rollouts, from_rest, seed))
+    positions, velocities = starts(rig, num_rollouts, is_from_rest, seed)
+    if played is not None:
+        positions = played[1][:, None]
+    q, v = plant.start(positions, velocities)
     num_joints = len(rig.layout.joints)
     motion = np.empty(((lead + num_steps + tail) * num_substeps + 1, 2 * num_joints, num_rollouts))
     motion[0] = np.concatenate((q[:num_joints], v[:num_joints]))
@@ -110,6 +114,10 @@ def record(
             commands[step] = commanded(rig, wanted[step], q, v) if played is None else wanted[step]
         present = list(commands[step]) if step >= 0 else [np.zeros(num_rollouts)] * len(rig.limits)
         for k in range(num_substeps):
+            if step < 0 and played is not None:
+                row += 1
+                motion[row] = motion[0]
+                continue
             q, v = plant.advance(q, v, present, step * rig.time_step + k * substep)
             row += 1
             motion[row, :num_joints] = q[:num_joints]

@@ -37,10 +37,10 @@ def plan(
         typer.Option("--print-limits", help="Print the limits as TOML, to edit them, and end."),
     ] = False,
     effect: EffectOption = None,
-    rounds: Annotated[
+    batches: Annotated[
         int, typer.Option(min=1, help="Batches of excitations that are tried.")
     ] = 30,
-    time_limit: Annotated[
+    search_time: Annotated[
         float,
         typer.Option(
             min=1.0,
@@ -89,8 +89,8 @@ def plan(
         found = plan_recording(
             known,
             allowed,
-            rounds=rounds,
-            time_limit=time_limit,
+            rounds=batches,
+            time_limit=search_time,
             seed=seed,
             progress=report.stage("plan", may_end_early=True),
         )

@@ -411,7 +411,7 @@ def show_plan(found: Mapping[str, Any], out: Path) -> None:
     start = ", ".join(f"{name} {value:.4g}" for name, value in found["start"].items())
     console.print(f"Start at rest at {start}.", highlight=False)
     if found["has_stopped"]:
-        console.print("The time limit ended the search; a longer --time-limit may find more.")
+        console.print("The time limit ended the search; a longer --search-time may find more.")
     console.print(f"The commands for {found['duration']:.4g} s are in {out}", highlight=False)
 
 

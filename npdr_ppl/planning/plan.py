@@ -157,7 +157,7 @@ def plan_recording(
     if found.best is None or found.first is None:
         raise DataError(
             f"None of {judge.num_simulated // len(known.causes)} simulated excitations kept the "
-            "limits; allow more position, speed or acceleration, or a longer --time-limit."
+            "limits; allow more position, speed or acceleration, or search longer."
         )
     both = [found.best, found.first]
     played = judge.played(

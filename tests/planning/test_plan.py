@@ -127,7 +127,7 @@ def test_the_command_writes_commands_to_play(ambiguous, tmp_path):
     model = tmp_path / "model.py"
     model.write_text(MODEL)
     out = tmp_path / "next.csv"
-    words = "plan", folder, f"{model}:model", "--out", out, "--rounds", 4
+    words = "plan", folder, f"{model}:model", "--out", out, "--batches", 4
     code, text, err = run_for_module(*words)
     assert code == 0, err
     assert "with the plan" in text and "hinge.presliding_friction" in text
@@ -141,7 +141,7 @@ def test_the_command_plans_without_a_run_and_prints_json(tmp_path):
     limits = tmp_path / "limits.toml"
     limits.write_text("duration = 2.0\n[channels.angle]\nmin = -0.5\nmax = 0.5\n")
     out = tmp_path / "first.csv"
-    words = "--limits", limits, "--out", out, "--rounds", 4, "--json"
+    words = "--limits", limits, "--out", out, "--batches", 4, "--json"
     code, text, err = run_for_module("plan", "pendulum", *words)
     assert code == 0, err
     found = json.loads(text)
