@@ -8,8 +8,8 @@ part of the rig's typical size. It counts if the verdict of ``discover`` is ``am
 hidden effect is among the causes that are left. Then one recording is planned, played on the rig,
 and ``discover`` gets both. So does a random recording within the same limits: the first random
 excitation of the search that keeps them. The limits are the rig's greatest commands, twice the
-positions and velocities of the first rollout, three times its bandwidth, and any pose from which
-the rig's rollouts are let go. A case counts if a cause is left that a recording of the rig can
+positions, velocities and length of the first rollout, three times its bandwidth, and any pose from
+which the rig's rollouts are let go. A case counts if a cause is left that a recording of the rig can
 tell from the hidden effect. Told apart means that no such cause is left: the verdict names the
 hidden effect or what no recording tells from it, or only these are left. Rows are written as they
 come, and a run given again continues.
@@ -39,13 +39,14 @@ from npdr_ppl.rollouts import Rollouts
 FIRST_SEED = 2000
 """Seed of the first cases; those of the blind benchmark end before it."""
 
-TIMES_RANGE, TIMES_BAND = 2.0, 3.0
-"""Limits as multiples of the first recording's positions and velocities, and of its bandwidth."""
+TIMES_RANGE, TIMES_BAND, TIMES_LONGER = 2.0, 3.0, 2.0
+"""Limits as multiples of the first recording's positions and velocities, and of its bandwidth and
+length."""
 
 NAMED = 0.05
 """Probability from which a cause is left, as in the verdict."""
 
-STRENGTHS = (0.03, 0.1, 0.3)
+STRENGTHS = (0.05, 0.1, 0.2)
 """Multiples of an effect's typical size, in turn: weak effects are ambiguous more often."""
 
 
@@ -138,7 +139,13 @@ def _limits(case: Case, known: Known) -> Limits:
         for name, limit in zip(rig.layout.actions, rig.limits, strict=True)
     }
     bandwidth = TIMES_BAND * rig.band.upper
-    return replace(found, bandwidth=bandwidth, actions=actions, channels=channels)
+    return replace(
+        found,
+        duration=TIMES_LONGER * rig.duration,
+        bandwidth=bandwidth,
+        actions=actions,
+        channels=channels,
+    )
 
 
 def _told(case: Case, rollouts: Rollouts, task: Task) -> dict[str, Any]:
