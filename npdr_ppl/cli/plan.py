@@ -47,7 +47,7 @@ def plan(
             help="Seconds after which no further batch is tried. The result then depends on the "
             "speed of the machine.",
         ),
-    ] = 90.0,
+    ] = 75.0,
     seed: SeedOption = 0,
     as_json: AsJson = False,
     quiet: Quiet = False,

@@ -9,10 +9,11 @@ from hidden_rigs import make_case
 
 import npdr_ppl as npdr
 from npdr_ppl.errors import DataError
+from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.planning import plan_recording
-from npdr_ppl.planning.causes import causes_of_run
+from npdr_ppl.planning.causes import causes_of_run, prior_of
 from npdr_ppl.planning.judging import Judge
-from npdr_ppl.planning.limits import ChannelLimits
+from npdr_ppl.planning.limits import ChannelLimits, default_limits, read_limits
 from tests.helpers.command_line import run_for_module
 
 MODEL = """
@@ -77,6 +78,37 @@ def test_a_discovery_keeps_what_rebuilds_its_causes(ambiguous, surviving):
     assert known.causes[0].probability == pytest.approx(max(c.probability for c in known.causes))
     for cause in known.causes:
         assert (np.linalg.eigvalsh(cause.precision.numpy()) >= 1.0 - 1e-9).all()
+
+
+@pytest.fixture
+def fitted(tmp_path):
+    """A finished fit of the zoo's pendulum, of which only the parameters matter here."""
+    parameters = {
+        "mass": {"mean": 1.0, "sd": 0.1, "hdi_94": [0.8, 1.2]},
+        "length": {"mean": 0.9, "sd": 0.01, "hdi_94": [0.88, 0.92]},
+    }
+    found = {"backend": "snpe-c", "parameters": parameters, "finer_steps": 0}
+    (tmp_path / "fit.json").write_text(json.dumps(found))
+    return tmp_path
+
+
+def test_a_plan_after_a_fit_begins_with_its_posterior(fitted):
+    known = causes_of_run(fitted, pendulum)
+    (cause,) = known.causes
+    values = prior_of(pendulum).to_parameters(cause.z[None])
+    assert [float(values[n]) for n in ("mass", "length")] == pytest.approx([1.0, 0.9])
+    # The priors are uniform on (0.3, 1.7): a density of 1/1.4 against a normal one of 0.4.
+    width = cause.precision.inverse().diagonal().sqrt()
+    assert width[0] == pytest.approx(0.1 / 1.4 / 0.3989, rel=0.05)
+    limits = read_limits(None, default_limits(cause.simulator, None))
+    found = plan_recording(known, limits, rounds=2)
+    for narrowed, before in zip(found.widths, width.tolist(), strict=True):
+        assert narrowed.after < narrowed.before == pytest.approx(before)
+
+
+def test_a_fit_of_another_model_gets_a_sentence(fitted):
+    with pytest.raises(DataError, match="is a parameter of only one of model"):
+        causes_of_run(fitted, make_case("emps", "null", (), seed=1).model)
 
 
 def changed_run(folder, tmp_path, change):
