@@ -118,33 +118,46 @@ def default_limits(simulator: Simulator, recorded: Mapping[str, Any] | None) -> 
         DataError: A command has no limits.
     """
     if recorded is not None:
-        return Limits(
-            min(float(recorded["seconds"]), PLANNING.most_seconds),
-            max((a["bandwidth"] for a in recorded["actions"].values()), default=1.0),
-            float(recorded["time_step"]),
-            {
-                name: ActionLimits(a["min"], a["max"], a["max_rate"], start=_inside(0.0, a))
-                if not simulator.is_goal(name)
-                else ActionLimits(a["min"], a["max"], a["max_rate"], start=a["start_min"])
-                for name, a in recorded["actions"].items()
-            },
-            {
-                name: ChannelLimits(
-                    c["min"],
-                    c["max"],
-                    start_min=0.0 if _is_rate(simulator, name) else c["start_min"],
-                    start_max=0.0 if _is_rate(simulator, name) else c["start_max"],
-                    noise=recorded["noise"].get(name, math.nan),
-                )
-                for name, c in recorded["channels"].items()
-            },
-        )
+        return _of_recording(simulator, recorded)
     return Limits(
         PLANNING.prior_seconds,
         PLANNING.prior_bandwidth,
         simulator.time_step,
         {a.name: ActionLimits(a.lower, a.upper) for a in simulator.actions},
         {s.name: _declared(simulator, s) for s in simulator.sensors},
+    )
+
+
+def _of_recording(simulator: Simulator, recorded: Mapping[str, Any]) -> Limits:
+    """Returns the ranges of a recording, of those columns that the model has."""
+    actions = {}
+    for action in simulator.actions:
+        kept = recorded["actions"][action.name]
+        # A goal begins where the servo is; a force begins at zero.
+        start = kept["start_min"] if simulator.is_goal(action.name) else _inside(0.0, kept)
+        actions[action.name] = ActionLimits(
+            kept["min"], kept["max"], kept["max_rate"], start=start
+        )
+    channels = {}
+    for sensor in simulator.sensors:
+        if sensor.name in recorded["channels"]:
+            kept = recorded["channels"][sensor.name]
+            is_rate = sensor.rate_of is not None
+            channels[sensor.name] = ChannelLimits(
+                kept["min"],
+                kept["max"],
+                start_min=0.0 if is_rate else kept["start_min"],
+                start_max=0.0 if is_rate else kept["start_max"],
+                noise=recorded["noise"].get(sensor.name, math.nan),
+            )
+    duration = min(float(recorded["seconds"]), PLANNING.most_seconds)
+    bandwidths = [recorded["actions"][name]["bandwidth"] for name in actions]
+    return Limits(
+        duration,
+        max(1.0 / duration, *bandwidths),
+        float(recorded["time_step"]),
+        actions,
+        channels,
     )
 
 
@@ -260,10 +273,6 @@ def _number(value: Any, name: str, *, least: float) -> float:
 
 def _inside(value: float, ends: Mapping[str, float]) -> float:
     return min(max(value, ends["min"]), ends["max"])
-
-
-def _is_rate(simulator: Simulator, name: str) -> bool:
-    return any(c.name == name and c.rate_of for c in (*simulator.sensors, *simulator.states))
 
 
 def _declared(simulator: Simulator, sensor: Channel) -> ChannelLimits:

@@ -81,6 +81,14 @@ def test_the_limits_of_a_recording_are_its_ranges(ambiguous, surviving):
     assert 0.3 < limits.bandwidth < 2.2
 
 
+def test_columns_that_the_model_lacks_have_no_limits(surviving):
+    known, limits = surviving
+    recorded = dict(known.recorded)
+    recorded["channels"] = recorded["channels"] | {"temperature": recorded["channels"]["angle"]}
+    recorded["actions"] = recorded["actions"] | {"fan": recorded["actions"]["torque"]}
+    assert default_limits(known.causes[0].simulator, recorded) == limits
+
+
 def test_without_a_recording_the_model_declares_them(unrecorded):
     known, limits = unrecorded
     torque = known.causes[0].simulator.actions[0]
