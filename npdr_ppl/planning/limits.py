@@ -154,7 +154,7 @@ def _of_recording(simulator: Simulator, recorded: Mapping[str, Any]) -> Limits:
     bandwidths = [recorded["actions"][name]["bandwidth"] for name in actions]
     return Limits(
         duration,
-        max(1.0 / duration, *bandwidths),
+        max([1.0 / duration, *bandwidths]),
         float(recorded["time_step"]),
         actions,
         channels,

@@ -1,7 +1,7 @@
 """An ambiguous discovery of a hidden pendulum."""
 
 import pytest
-from hidden_rigs import make_case
+from hidden_rigs import RIGS, make_case
 
 import npdr_ppl as npdr
 from npdr_ppl.planning.causes import causes_of_prior, causes_of_run
@@ -29,7 +29,7 @@ def surviving(ambiguous):
 
 
 @pytest.fixture(scope="session")
-def unrecorded(ambiguous):
+def unrecorded():
     """Draws of the pendulum's prior, and the limits that the model declares."""
-    known = causes_of_prior(ambiguous[0].model, seed=0)
+    known = causes_of_prior(RIGS["pendulum"].model, seed=0)
     return known, read_limits(None, default_limits(known.causes[0].simulator, None))

@@ -28,6 +28,7 @@ def shifted(known, by):
     return Known(causes, torch.zeros(2, 2), share=0.5)
 
 
+@pytest.mark.slow
 def test_a_cause_with_other_parameters_imitates_what_the_precision_permits(surviving):
     known, limits = surviving
     width = known.causes[0].precision.inverse().diagonal().sqrt()
@@ -44,12 +45,14 @@ def test_a_cause_with_other_parameters_imitates_what_the_precision_permits(survi
         assert found[index] == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_cause_is_not_separated_from_itself(surviving):
     known, limits = surviving
     judge = Judge(shifted(known, 0.0), limits, seed=0)
     assert judge.separations(judge.played(*candidates(limits))) == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_less_noise_separates_more(surviving):
     known, limits = surviving
     channels = {n: replace(c, noise=0.5 * c.noise) for n, c in limits.channels.items()}
@@ -61,6 +64,7 @@ def test_less_noise_separates_more(surviving):
     assert (squares[1] > squares[0])[:, different].all()
 
 
+@pytest.mark.slow
 def test_certainty_is_that_of_the_pairs(surviving):
     known, limits = surviving
     judge = Judge(known, limits, seed=0)

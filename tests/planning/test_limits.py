@@ -45,6 +45,7 @@ def test_a_file_that_is_not_there_is_named(unrecorded, tmp_path):
         read_limits(tmp_path / "limits.toml", unrecorded[1])
 
 
+@pytest.mark.slow
 def test_printed_limits_are_read_back(surviving, tmp_path):
     limits = surviving[1]
     file = tmp_path / "limits.toml"
@@ -56,6 +57,7 @@ def test_printed_limits_are_read_back(surviving, tmp_path):
     assert read.num_steps == limits.num_steps
 
 
+@pytest.mark.slow
 def test_what_a_file_does_not_name_keeps_its_default(surviving, tmp_path):
     file = tmp_path / "limits.toml"
     file.write_text("[channels.velocity]\nmax_rate = 3.0\n")
@@ -65,12 +67,14 @@ def test_what_a_file_does_not_name_keeps_its_default(surviving, tmp_path):
     assert read.actions == limits.actions
 
 
+@pytest.mark.slow
 def test_a_narrower_command_moves_the_command_at_rest_inside(surviving, tmp_path):
     file = tmp_path / "limits.toml"
     file.write_text("[actions.torque]\nmin = 1.0\nmax = 2.0\n")
     assert read_limits(file, surviving[1]).actions["torque"].start == 1.0
 
 
+@pytest.mark.slow
 def test_the_limits_of_a_recording_are_its_ranges(ambiguous, surviving):
     case, _ = ambiguous
     limits, recorded = surviving[1], case.fit[[0]]
@@ -81,6 +85,7 @@ def test_the_limits_of_a_recording_are_its_ranges(ambiguous, surviving):
     assert 0.3 < limits.bandwidth < 2.2
 
 
+@pytest.mark.slow
 def test_columns_that_the_model_lacks_have_no_limits(surviving):
     known, limits = surviving
     recorded = dict(known.recorded)

@@ -16,6 +16,8 @@ from npdr_ppl.planning.judging import Judge
 from npdr_ppl.planning.limits import ChannelLimits, default_limits, read_limits
 from tests.helpers.command_line import run_for_module
 
+pytestmark = pytest.mark.slow
+
 MODEL = """
 from hidden_rigs.under_test import pendulum as model
 """
