@@ -16,6 +16,7 @@ __all__ = [
     "IterationRecord",
     "MemoryRecord",
     "OutcomeRecord",
+    "OverlayRecord",
     "PolicyRecord",
     "PreparationRecord",
     "ReproductionRecord",
@@ -251,6 +252,35 @@ class DiscoveryRecord(TypedDict, total=False):
     seed: int
     versions: dict[str, str] | None
     model: str | dict[str, Any] | None
+
+
+class OverlaidRollout(TypedDict):
+    """A rollout in ``overlays.json``: points by channel and series, errors by model."""
+
+    rollout: int
+    time: list[float]
+    channels: dict[str, dict[str, list[Number]]]
+    misfit: dict[str, dict[str, Number]]
+
+
+class ResidualMapRecord(TypedDict):
+    """Residuals of a rollout in ``overlays.json``, a row of cells per channel."""
+
+    rollout: int
+    seconds: float
+    before: list[list[Number]]
+    after: list[list[Number]]
+
+
+class OverlayRecord(TypedDict):
+    """``overlays.json``."""
+
+    is_held_out: bool
+    restart_seconds: float
+    channels: list[str]
+    units: dict[str, str]
+    rollouts: list[OverlaidRollout]
+    maps: list[ResidualMapRecord]
 
 
 class ExcitationRecord(TypedDict):

@@ -6,6 +6,7 @@
     revised_model.py    the model with the effects that were missing
     learned_effect.py   the law that was learned, if the catalogue has none that explains
     draws.safetensors   draws of its posterior, by parameter
+    overlays.json       measurements and simulations over time, thinned, for the report
     fits/               the fits that an unfinished discovery has finished
 
 A discovery that was killed leaves no ``discovery.json``, and continues when it is run again: it

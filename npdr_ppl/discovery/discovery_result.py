@@ -15,6 +15,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.result import Learned
 from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.discovery.proof.next_experiment import NextExperiment
+from npdr_ppl.discovery.proof.overlays import Overlays
 from npdr_ppl.discovery.proof.parameter_intervals import Draws, Estimate
 from npdr_ppl.discovery.proof.residual_map import Spot
 from npdr_ppl.discovery.proof.surviving_causes import SurvivingCauses
@@ -75,6 +76,7 @@ class Discovery:
         draws: Draws of the revised model's posterior.
         counts: Encoder resolution by channel, where there is one, and the share of the revised
             model's residual variance that rounding to it causes.
+        overlays: Measurements and simulations of the held-out rollouts, or else of the recording.
         search: The course of the search.
         settings: Settings of the search.
         seed: Seed of all random numbers.
@@ -107,6 +109,7 @@ class Discovery:
     parameters: dict[str, Estimate]
     draws: Draws
     counts: dict[str, Count]
+    overlays: Overlays
     search: Search
     settings: DiscoveryOptions
     seed: int
@@ -198,6 +201,7 @@ class Discovery:
                 temporary.write_text(learned, encoding="utf-8")
         with replacing(folder / "revised_model.py") as temporary:
             temporary.write_text(self.source(), encoding="utf-8")
+        write_json(folder / "overlays.json", self.overlays.to_dict())
         save_tensors(folder / DRAWS, self.sample(NUM_DRAWS, seed=self.seed))
 
     def sample(self, num: int, *, seed: int = 0) -> dict[str, Tensor]:
@@ -209,7 +213,7 @@ class Discovery:
         """
         with seeded(seed, "discovery", "draws"):
             z = self.draws.smoothed().resampled(num)
-        values = self.search.final.segments.prior.to_parameters(z)
+        values = self.final.segments.prior.to_parameters(z)
         return {n: v.double().flatten() for n, v in values.items() if v[0].numel() == 1}
 
     def plot(self, axes: Any = None) -> Any:

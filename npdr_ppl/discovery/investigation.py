@@ -16,6 +16,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.result import Learned, learn
 from npdr_ppl.discovery.proof.held_out_gap import Gap, prove
 from npdr_ppl.discovery.proof.next_experiment import NextExperiment, next_experiment
+from npdr_ppl.discovery.proof.overlays import Overlays, overlay
 from npdr_ppl.discovery.proof.parameter_intervals import (
     Draws,
     Estimate,
@@ -313,6 +314,20 @@ class Investigation:
                 report=self.progress.say,
             )
 
+    def _overlays(self, final: Hypothesis) -> Overlays:
+        """The held-out rollouts, or else the recording, and simulations of them."""
+        shown = self.rollouts if self.holdout is None else self.holdout
+        with self._stage("simulate"):
+            self.progress.say("simulating the recording")
+            return overlay(
+                self.given,
+                final,
+                self.start,
+                shown,
+                self._data_options,
+                is_held_out=self.holdout is not None,
+            )
+
     def _advice(self, name: str) -> NextExperiment | None:
         """Returns the experiment that would separate the likeliest alternatives to an effect."""
         search = self.search
@@ -429,6 +444,7 @@ class Investigation:
             parameters=every,
             draws=self._draws(final),
             counts=counts(final, self.rollouts),
+            overlays=self._overlays(final),
             search=search,
             settings=self.settings,
             seed=self.seed,

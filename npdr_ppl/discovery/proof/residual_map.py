@@ -3,14 +3,23 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.states import measurement_noise
 
-__all__ = ["Spot", "standardised", "worst_windows"]
+__all__ = [
+    "Spot",
+    "noise_of",
+    "residuals_by_rollout",
+    "standardised",
+    "thinned",
+    "worst_windows",
+]
 
 NUM_SPOTS = 10
 
@@ -105,3 +114,49 @@ def _region(hypothesis: Hypothesis, row: int) -> str:
 def _range(values: Tensor) -> str:
     low, high = float(torch.amin(values)), float(torch.amax(values))
     return f"{low:.3g} to {high:.3g}"
+
+
+def noise_of(hypothesis: Hypothesis) -> Tensor:
+    """Returns the standard deviation of each channel's measurement noise, ``(C,)``."""
+    segments = hypothesis.segments
+    series = [o[m] for o, m in zip(segments.observed, segments.inputs.mask, strict=True)]
+    return measurement_noise(series).clamp_min(1e-9)
+
+
+def residuals_by_rollout(hypothesis: Hypothesis, noise: Tensor) -> dict[int, NDArray[np.float64]]:
+    """Returns |residual| in units of noise, ``(T, C)`` by rollout; NaN outside the segments.
+
+    Args:
+        hypothesis: The fitted model.
+        noise: Standard deviation of each channel's noise, ``(C,)``.
+    """
+    segments, fit = hypothesis.segments, hypothesis.fit
+    residual = segments.residuals(fit.z[None], fit.offsets[None], noise)[0]
+    z = residual.unflatten(-1, (-1, len(noise))).abs()
+    inputs = segments.inputs
+    starts, counts = inputs.start.tolist(), inputs.mask.sum(-1).tolist()
+    found = {}
+    for rollout in inputs.rollout.unique().tolist():
+        rows = torch.nonzero(inputs.rollout == rollout)[:, 0].tolist()
+        length = max(starts[row] + counts[row] for row in rows)
+        values = np.full((length, len(noise)), np.nan)
+        for row in rows:
+            values[starts[row] : starts[row] + counts[row]] = z[row, : counts[row]].numpy()
+        found[rollout] = values
+    return found
+
+
+def thinned(values: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+    """Returns the root mean square over the steps of each cell, ``(cells, C)``.
+
+    Args:
+        values: Values by step, ``(T, C)``; NaN where there is none.
+        most: Greatest number of cells.
+    """
+    width = -(-len(values) // most)
+    padding = -len(values) % width
+    padded = np.concatenate((values, np.full((padding, values.shape[1]), np.nan)))
+    cells = padded.reshape(-1, width, values.shape[1])
+    count = np.isfinite(cells).sum(1)
+    total = np.nansum(cells**2, axis=1)
+    return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))

@@ -3,18 +3,20 @@
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.proof.residual_map import Spot
+from npdr_ppl.discovery.proof.residual_map import (
+    Spot,
+    noise_of,
+    residuals_by_rollout,
+    thinned,
+)
 from npdr_ppl.drawing.theme import COLORS, theme
-from npdr_ppl.rollouts.states import measurement_noise
 
 __all__ = ["plot_residual_map"]
 
@@ -26,8 +28,6 @@ MOST_COLUMNS = 500
 
 QUIETEST = 1.0
 """Residuals below one standard deviation of the measurement noise have the same colour."""
-
-Array = NDArray[np.float64]
 
 
 def plot_residual_map(
@@ -45,8 +45,8 @@ def plot_residual_map(
     if after is not None and after is not before:
         columns["the revised model"] = after
     shown = _shown(before, where)
-    noise = _noise(before)
-    maps = [_by_rollout(hypothesis, noise) for hypothesis in columns.values()]
+    noise = noise_of(before)
+    maps = [residuals_by_rollout(hypothesis, noise) for hypothesis in columns.values()]
     loudest = max(float(np.nanquantile(found[row], 0.995)) for found in maps for row in shown)
     norm = LogNorm(QUIETEST, max(10.0 * QUIETEST, loudest))
     step = before.segments.inputs.time_step
@@ -58,7 +58,7 @@ def plot_residual_map(
         for column, (title, found) in enumerate(zip(columns, maps, strict=True)):
             axes[0, column].set_title(title)
             for axis, rollout in zip(axes[:, column], shown, strict=True):
-                z = _thinned(found[rollout])
+                z = thinned(found[rollout], MOST_COLUMNS)
                 edges = np.linspace(0.0, len(found[rollout]) * step, len(z) + 1)
                 image = axis.pcolormesh(
                     edges, np.arange(len(names) + 1), z.T, norm=norm, cmap="magma_r",
@@ -100,40 +100,3 @@ def _shown(hypothesis: Hypothesis, where: Sequence[Spot]) -> list[int]:
     every = hypothesis.segments.inputs.rollout.unique().tolist()
     loud = list(dict.fromkeys(spot.rollout for spot in where))
     return sorted([*loud, *(r for r in every if r not in loud)][:MOST_ROLLOUTS])
-
-
-def _noise(hypothesis: Hypothesis) -> torch.Tensor:
-    """Returns the standard deviation of the measurement noise, ``(C,)``."""
-    segments = hypothesis.segments
-    series = [o[m] for o, m in zip(segments.observed, segments.inputs.mask, strict=True)]
-    return measurement_noise(series).clamp_min(1e-9)
-
-
-def _by_rollout(hypothesis: Hypothesis, noise: torch.Tensor) -> dict[int, Array]:
-    """Returns |residual| in units of noise, ``(T, C)`` by rollout; NaN outside the segments."""
-    segments, fit = hypothesis.segments, hypothesis.fit
-    residual = segments.residuals(fit.z[None], fit.offsets[None], noise)[0]
-    z = residual.unflatten(-1, (-1, len(noise))).abs()
-    inputs = segments.inputs
-    found = {}
-    for rollout in inputs.rollout.unique().tolist():
-        rows = torch.nonzero(inputs.rollout == rollout)[:, 0].tolist()
-        starts = inputs.start.tolist()
-        counts = inputs.mask.sum(-1).tolist()
-        length = max(starts[row] + counts[row] for row in rows)
-        values = np.full((length, len(noise)), np.nan)
-        for row in rows:
-            values[starts[row] : starts[row] + counts[row]] = z[row, : counts[row]].numpy()
-        found[rollout] = values
-    return found
-
-
-def _thinned(values: Array) -> Array:
-    """Returns the root mean square over the steps of each cell, ``(cells, C)``."""
-    width = -(-len(values) // MOST_COLUMNS)
-    padding = -len(values) % width
-    padded = np.concatenate((values, np.full((padding, values.shape[1]), np.nan)))
-    cells = padded.reshape(-1, width, values.shape[1])
-    count = np.isfinite(cells).sum(1)
-    total = np.nansum(cells**2, axis=1)
-    return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))

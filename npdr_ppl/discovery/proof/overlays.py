@@ -1,0 +1,251 @@
+"""A recording and the simulations of it by three models, for pictures and reports."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.proof.residual_map import noise_of, residuals_by_rollout, thinned
+from npdr_ppl.errors import NpdrError
+from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.segment_model import SegmentModel
+from npdr_ppl.rollouts import Rollouts, stitch
+
+__all__ = ["Overlay", "Overlays", "ResidualMap", "overlay"]
+
+RESTART_SECONDS = 2.0
+"""Time in s after which a simulation starts again from the measurement. It is ten times the
+default segment of the search, so that differences grow until they are visible. Without restarts, a
+pendulum that swings over leaves the measurement after a few seconds with any parameters."""
+
+MOST_ROLLOUTS = 3
+"""Maximum number of rollouts that are kept; those that the fitted model misses most come first."""
+
+MOST_POINTS = 600
+"""Maximum number of points of a series, more than a page is wide in CSS pixels: a longer one keeps
+the smallest and the largest value of each of half as many stretches."""
+
+MOST_CELLS = 120
+"""Maximum number of cells of a residual map along time; each is about 7 CSS pixels wide."""
+
+MODELS = ("nominal", "fitted", "revised")
+"""The middle of the priors; the original model's closest fit; that of the revised model."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """One rollout and simulations of it.
+
+    Attributes:
+        rollout: Index of the rollout.
+        time: Seconds from the rollout's beginning, ``(T,)``.
+        measured: Measurements, ``(T, C)``.
+        simulated: Simulations by model, ``(T, C)`` each; not finite where one failed.
+        misfit: Root-mean-square error of each model by channel, in the channel's unit.
+    """
+
+    rollout: int
+    time: Array
+    measured: Array
+    simulated: dict[str, Array]
+    misfit: dict[str, dict[str, float]]
+
+    def to_dict(self, channels: Sequence[str]) -> dict[str, Any]:
+        """Returns JSON-serialisable values, thinned to ``MOST_POINTS`` points.
+
+        Args:
+            channels: Names of the C channels.
+        """
+        series = {"measured": self.measured, **self.simulated}
+        time = _every_second(self.time, -(-2 * len(self.time) // MOST_POINTS))
+        return {
+            "rollout": self.rollout,
+            "time": _rounded(time),
+            "channels": {
+                channel: {name: _rounded(_extremes(v[:, k])) for name, v in series.items()}
+                for k, channel in enumerate(channels)
+            },
+            "misfit": self.misfit,
+        }
+
+
+@dataclass(frozen=True)
+class ResidualMap:
+    """Residuals of a rollout by channel and time, in standard deviations of the noise.
+
+    Attributes:
+        rollout: Index of the rollout.
+        seconds: Duration in s.
+        before: Root mean square of the original model's residuals by cell, ``(cells, C)``.
+        after: The same of the revised model.
+    """
+
+    rollout: int
+    seconds: float
+    before: Array
+    after: Array
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns JSON-serialisable values, with one row per channel."""
+        return {
+            "rollout": self.rollout,
+            "seconds": self.seconds,
+            "before": [_rounded(row) for row in self.before.T],
+            "after": [_rounded(row) for row in self.after.T],
+        }
+
+
+@dataclass(frozen=True)
+class Overlays:
+    """Pictures of a recording: what was measured and what the models make of it.
+
+    Attributes:
+        is_held_out: Whether the models were not fitted to these rollouts.
+        channels: Names of the channels.
+        units: Their units by name.
+        rollouts: The rollouts that the fitted model misses most.
+        maps: Residuals along the recording that was searched.
+    """
+
+    is_held_out: bool
+    channels: tuple[str, ...]
+    units: dict[str, str]
+    rollouts: tuple[Overlay, ...]
+    maps: tuple[ResidualMap, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns JSON-serialisable values, the content of ``overlays.json``."""
+        return {
+            "is_held_out": self.is_held_out,
+            "restart_seconds": RESTART_SECONDS,
+            "channels": list(self.channels),
+            "units": self.units,
+            "rollouts": [shown.to_dict(self.channels) for shown in self.rollouts],
+            "maps": [shown.to_dict() for shown in self.maps],
+        }
+
+
+def overlay(
+    before: Hypothesis,
+    after: Hypothesis,
+    searched: Hypothesis,
+    rollouts: Rollouts,
+    options: DataOptions,
+    *,
+    is_held_out: bool,
+) -> Overlays:
+    """Simulates a recording with the nominal, the fitted and the revised model.
+
+    Every simulation starts again from the measurement after ``RESTART_SECONDS``, or at the end of
+    a rollout or stretch.
+
+    Args:
+        before: The original model, fitted.
+        after: The revised model, fitted.
+        searched: The original model as the search began, along the recording of the residual map.
+        rollouts: The rollouts to simulate.
+        options: How recordings are prepared.
+        is_held_out: Whether these rollouts were not used to fit the models.
+    """
+    steps = max(2, round(RESTART_SECONDS / rollouts.time_step))
+    options = replace(options, segment_length=min(steps, max(rollouts.lengths)))
+    nominal = torch.zeros_like(before.fit.z)
+    models = dict(
+        zip(MODELS, ((before, nominal), (before, before.fit.z), (after, after.fit.z)), strict=True)
+    )
+    segments = SegmentModel(before.model, rollouts, options, is_complete=True)
+    series = {
+        name: _simulated(hypothesis, z, rollouts, options)
+        for name, (hypothesis, z) in models.items()
+    }
+    measured = [s.double().numpy() for s in rollouts.series(segments.channel_names)]
+    channels = segments.channel_names
+    found = []
+    for place, values in enumerate(measured):
+        shown = {name: made[place] for name, made in series.items() if made is not None}
+        if any(made.shape != values.shape for made in shown.values()):
+            continue
+        time = np.arange(len(values), dtype=np.float64) * rollouts.time_step
+        misfit = {name: _misfit(made, values, channels) for name, made in shown.items()}
+        found.append(Overlay(place, time, values, shown, misfit))
+    found.sort(key=lambda one: _missed(one, measured), reverse=True)
+    units = {s.name: s.unit for s in segments.measured}
+    maps = _maps(searched, after)
+    return Overlays(is_held_out, channels, units, tuple(found[:MOST_ROLLOUTS]), maps)
+
+
+def _simulated(
+    hypothesis: Hypothesis, z: Tensor, rollouts: Rollouts, options: DataOptions
+) -> list[Array] | None:
+    """Returns the simulated series ``(T, C)`` of each rollout; ``None`` if the simulator fails."""
+    try:
+        segments = SegmentModel(hypothesis.model, rollouts, options, is_complete=True)
+        made = segments.simulate(z[None], segments.no_offsets[None])[0].double()
+    except NpdrError:
+        return None
+    return [s.numpy() for s in stitch(made, segments.inputs, segments.channel_names)]
+
+
+def _misfit(made: Array, measured: Array, channels: Sequence[str]) -> dict[str, float]:
+    error = np.sqrt(np.mean((made - measured) ** 2, axis=0))
+    return dict(zip(channels, error.tolist(), strict=True))
+
+
+def _missed(one: Overlay, measured: Sequence[Array]) -> float:
+    """Returns the fitted model's error in a rollout, relative to each channel's range."""
+    low = np.min([values.min(0) for values in measured], axis=0)
+    high = np.max([values.max(0) for values in measured], axis=0)
+    errors = np.array(list(one.misfit.get("fitted", {}).values()))
+    if not len(errors) or not np.isfinite(errors).all():
+        return float("inf")
+    return float((errors / np.maximum(high - low, 1e-12)).mean())
+
+
+def _maps(before: Hypothesis, after: Hypothesis) -> tuple[ResidualMap, ...]:
+    noise = noise_of(before)
+    found = [residuals_by_rollout(hypothesis, noise) for hypothesis in (before, after)]
+    step = before.segments.inputs.time_step
+    loud = sorted(found[0], key=lambda r: -float(np.nanmean(found[0][r] ** 2)))[:MOST_ROLLOUTS]
+    return tuple(
+        ResidualMap(
+            rollout,
+            len(found[0][rollout]) * step,
+            *(thinned(values[rollout], MOST_CELLS) for values in found),
+        )
+        for rollout in loud
+    )
+
+
+def _extremes(values: Array) -> Array:
+    """Returns the two extreme values of each stretch, in the order in which they occur."""
+    width = -(-2 * len(values) // MOST_POINTS)
+    if width <= 2:
+        return _every_second(values, width)
+    padded = np.concatenate([values, np.repeat(values[-1:], -len(values) % width)])
+    rows = padded.reshape(-1, width)
+    # What is not finite is no extreme; a stretch without any finite value stays a gap.
+    is_known = np.isfinite(rows)
+    lowest = np.where(is_known, rows, np.inf).argmin(1)
+    highest = np.where(is_known, rows, -np.inf).argmax(1)
+    ends = np.sort(np.stack([lowest, highest], 1), axis=1)
+    return np.take_along_axis(rows, ends, 1).ravel()
+
+
+def _every_second(values: Array, width: int) -> Array:
+    """Returns the first and the middle value of each stretch; all values of a short series."""
+    if width <= 2:
+        return values[:: max(1, width // 2)] if len(values) > MOST_POINTS else values
+    starts = np.arange(0, len(values), width)
+    return values[np.stack([starts, np.minimum(starts + width // 2, len(values) - 1)], 1).ravel()]
+
+
+def _rounded(values: Array) -> list[float | None]:
+    """Returns numbers of five digits; ``None`` for what is not finite."""
+    return [float(f"{v:.5g}") if np.isfinite(v) else None for v in values.tolist()]
