@@ -1,6 +1,6 @@
 """Content of a report, independent of its layout; each kind of run fills it in."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -8,8 +8,10 @@ __all__ = [
     "ChartPart",
     "CodePart",
     "DiffPart",
+    "DrawingPart",
     "Explained",
     "FindingsPart",
+    "FoldedPart",
     "Headline",
     "KeyFigure",
     "Part",
@@ -19,6 +21,7 @@ __all__ = [
     "TablePart",
     "TextPart",
     "Tone",
+    "unfolded",
 ]
 
 Tone = Literal["good", "warn", "bad", "plain"]
@@ -96,6 +99,22 @@ class ChartPart:
 
 
 @dataclass(frozen=True)
+class DrawingPart:
+    """A drawing of :mod:`npdr_ppl.drawing`, which needs no script.
+
+    Attributes:
+        html: The drawing. Its texts are escaped; nothing else may be put here.
+        caption: What it shows and how to read it.
+        is_wide: Whether it takes the larger part of a row that it shares with another drawing.
+    """
+
+    html: str
+    caption: str = ""
+    is_wide: bool = False
+    kind: str = field(default="drawing", init=False)
+
+
+@dataclass(frozen=True)
 class CodePart:
     """Source text."""
 
@@ -147,15 +166,54 @@ class FindingsPart:
     kind: str = field(default="findings", init=False)
 
 
-Part = TextPart | TablePart | ChartPart | CodePart | DiffPart | PicturePart | FindingsPart
+@dataclass(frozen=True)
+class FoldedPart:
+    """Parts that a click unfolds.
+
+    Attributes:
+        summary: What is inside.
+        parts: The parts.
+    """
+
+    summary: str
+    parts: "Sequence[Part]"
+    kind: str = field(default="folded", init=False)
+
+
+Part = (
+    TextPart
+    | TablePart
+    | ChartPart
+    | DrawingPart
+    | CodePart
+    | DiffPart
+    | PicturePart
+    | FindingsPart
+    | FoldedPart
+)
+
+
+def unfolded(parts: Sequence[Part]) -> Iterator[Part]:
+    """Yields parts, and those inside folded ones."""
+    for part in parts:
+        yield part
+        if isinstance(part, FoldedPart):
+            yield from unfolded(part.parts)
 
 
 @dataclass(frozen=True)
 class Section:
-    """A chapter of the page."""
+    """A chapter of the page.
+
+    Attributes:
+        title: Heading.
+        parts: Content.
+        is_folded: Whether a click unfolds it: for what few readers need, such as source text.
+    """
 
     title: str
     parts: Sequence[Part]
+    is_folded: bool = False
 
 
 @dataclass(frozen=True)
@@ -168,6 +226,7 @@ class Report:
         verdict: Main result, at the top.
         figures: Key figures, below the verdict.
         sections: All other content.
+        lead: What the first screen shows below the verdict: at most a wide and a narrow drawing.
     """
 
     kind: str
@@ -175,3 +234,4 @@ class Report:
     verdict: Headline
     figures: Sequence[KeyFigure]
     sections: Sequence[Section]
+    lead: Sequence[DrawingPart] = ()

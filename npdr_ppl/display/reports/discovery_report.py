@@ -3,108 +3,139 @@
 Everything except ``verdict`` is optional: a search that found no gap has no effects to report.
 """
 
-import base64
-import difflib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from npdr_ppl.display.reports.charts import ChartPart, bars_chart, layout_of, rounded
 from npdr_ppl.display.reports.content import (
-    CodePart,
-    DiffPart,
+    DrawingPart,
+    FoldedPart,
     Headline,
     KeyFigure,
     Part,
-    PicturePart,
     Report,
     Section,
     TablePart,
     TextPart,
 )
+from npdr_ppl.display.reports.effect_parts import effects_section, estimates_section
+from npdr_ppl.display.reports.next_steps import next_section
+from npdr_ppl.display.reports.overlay_parts import (
+    lead_curve,
+    read_overlays,
+    recording_section,
+    where_section,
+)
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
+from npdr_ppl.display.reports.revision_parts import pictures_section, revision_section
+from npdr_ppl.drawing.bars_html import METRICS, gap_bars
+from npdr_ppl.drawing.effect_names import effect_label, in_words
 from npdr_ppl.drawing.numbers import number
-from npdr_ppl.drawing.theme import SERIES
-from npdr_ppl.run_files import read_bytes, read_json, read_text
+from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import DiscoveryRecord
 
-__all__ = ["discovery_report"]
+__all__ = ["discovery_report", "discovery_verdict"]
 
-MAX_PICTURE_BYTES = 700_000
-"""Maximum total size of the pictures on a page in base64 characters, so that the page stays
-small; larger ones are only named."""
-
-
-MAX_COMPARED = 100_000
-"""Maximum number of characters of two models that are compared; this takes up to a second."""
+MOST_NAMED = 3
+"""Maximum number of effects that the headline names; of more, only the number is given."""
 
 
 def discovery_report(folder: Path) -> Report:
     """Reads the results of ``npdr discover``.
 
     Args:
-        folder: Folder with ``discovery.json``, and possibly ``revised_model.py`` and figures.
+        folder: Folder with ``discovery.json``, and possibly ``overlays.json``,
+            ``revised_model.py`` and figures.
     """
     result = read_json(folder / "discovery.json", DiscoveryRecord)
     description = run_description(folder) | {
         name: result.get(name) for name in ("model", "seed", "versions") if name in result
     }
-    effects = result.get("effects") or []
+    overlays = read_overlays(folder)
+    gap = result.get("gap") or {}
+    verdict = discovery_verdict(result)
     sections = [
-        Section("Gap on held-out rollouts", _gap(result.get("gap") or {})),
-        Section("Effects", _effects(effects, result.get("ranking") or [])),
-        Section("Where", _where(result.get("where") or [])),
-        *_next(result.get("next_experiment")),
-        *_revision(folder, description),
-        *_pictures(folder),
+        next_section(result, said=verdict.sentence),
+        effects_section(result.get("effects") or [], result.get("ranking") or []),
+        *recording_section(overlays),
+        where_section(overlays, result.get("where") or []),
+        Section("Gap on held-out rollouts", _gap(gap)),
+        *estimates_section(result.get("parameters") or {}),
+        *_preparation(result),
+        *revision_section(folder, description),
+        *pictures_section(folder),
         *source_section(description),
         provenance_section(description, folder),
     ]
-    return Report(
-        "discover",
-        "Search for the missing effect",
-        _verdict(result, effects),
-        _key_figures(result, effects),
-        sections,
-    )
+    curves = lead_curve(overlays)
+    bars = gap_bars(gap)
+    lead = [curves] if curves is not None else []
+    if bars:
+        lead.append(DrawingPart(bars, "Error on held-out rollouts, before and after."))
+    model = description.get("model")
+    name = model.get("name") if isinstance(model, Mapping) else None
+    title = "Search for the missing effect" + (f": {name}" if name else "")
+    return Report("discover", title, verdict, _key_figures(result), sections, lead)
 
 
-def _verdict(result: Mapping[str, Any], effects: list[Any]) -> Headline:
-    word = str(result["verdict"])
+def discovery_verdict(result: Mapping[str, Any]) -> Headline:
+    """Returns the verdict of ``discovery.json`` in one sentence."""
+    word = str(result.get("verdict", "no verdict"))
+    effects = result.get("effects") or []
     large = [
         effect
         for effect in effects
         if not effect.get("is_minor") and all((effect.get("in_halves") or {}).values())
     ] or effects
-    best = _named(large[0]) if large else "an effect"
-    others = ", ".join(_named(effect) for effect in large[1:])
+    labels = [effect_label(effect) for effect in large]
     p_value = number((result.get("alarm") or {}).get("p_value"))
     gained = _gained(result.get("gap") or {})
+    reason = in_words(str(result.get("reason") or ""))
     verdicts = {
         "none": Headline(
-            "no effect is missing",
+            "No effect is missing",
             f"The present model explains the recording (alarm: p = {p_value}).",
             "good",
         ),
-        "named": Headline(f"missing: {best}", gained, "good"),
+        "named": Headline(f"Missing: {_listed(labels) or 'an effect'}", gained, "good"),
         "ambiguous": Headline(
-            f"missing: {best}, or another",
-            f"These data do not distinguish it from {others or 'its equivalents'}. {gained}",
+            f"Missing: {labels[0] if labels else 'an effect'}, or another cause",
+            f"The recording does not show which. {gained}",
             "warn",
         ),
         "unknown": Headline(
-            "something unknown is missing",
-            str(result.get("reason") or "No effect of the catalogue explains the recording."),
+            "Something unknown is missing",
+            _shortened(reason, effects) or "No effect of the catalogue explains the recording.",
             "bad",
         ),
     }
-    return verdicts.get(word, Headline(word, str(result.get("reason", ""))))
+    return verdicts.get(word, Headline(word, reason))
+
+
+def _shortened(reason: str, effects: list[Any]) -> str:
+    """Returns a reason; without the list of effects if there are many, for the table has them."""
+    if len(effects) <= MOST_NAMED:
+        return reason
+    start = "The best explanation so far is "
+    head, found, rest = reason.partition(start)
+    if not found:
+        return reason
+    tail = rest.split("; ", 1)[-1] if "; " in rest else ""
+    return f"{head}The best explanation so far has {len(effects)} effects; {tail}"
+
+
+def _listed(labels: list[str]) -> str:
+    if len(labels) > MOST_NAMED:
+        return f"{labels[0]}, and {len(labels) - 1} more effects"
+    return (
+        ", and ".join((", ".join(labels[:-1]), labels[-1])) if len(labels) > 1 else "".join(labels)
+    )
 
 
 def _gained(gap: Mapping[str, Any]) -> str:
     """Returns a sentence about the gain of the revised model on held-out rollouts."""
     closed = [
-        f"{values['closed']:.0%} in {metric}"
+        f"{min(values['closed'], 1.0):.0%} in {METRICS.get(metric, metric)}"
         for metric, values in gap.items()
         if values.get("closed") is not None
     ]
@@ -113,37 +144,37 @@ def _gained(gap: Mapping[str, Any]) -> str:
     return f"Of the gap on held-out rollouts it closes {', '.join(closed)}."
 
 
-def _key_figures(result: Mapping[str, Any], effects: list[Any]) -> list[KeyFigure]:
-    alarm = result.get("alarm") or {}
+def _key_figures(result: Mapping[str, Any]) -> list[KeyFigure]:
+    alarm, remainder = result.get("alarm") or {}, result.get("remainder") or {}
     fired = alarm.get("fired")
-    word = "–" if fired is None else "fired" if fired else "silent"
-    figures = [KeyFigure("Alarm", word, f"p = {number(alarm.get('p_value'))}")]
-    if effects:
+    word = "–" if fired is None else "something is missing" if fired else "nothing is missing"
+    figures = [KeyFigure("Alarm, original model", word, f"p = {number(alarm.get('p_value'))}")]
+    if remainder and result.get("effects"):
+        left = number(remainder.get("unexplained"), ".0%")
         figures.append(
             KeyFigure(
-                "Probability", number(effects[0].get("probability"), ".0%"), _named(effects[0])
+                "Misfit left after the revision", left, f"p = {number(remainder['p_value'])}"
             )
         )
     for metric, values in (result.get("gap") or {}).items():
+        if metric != "rmse":
+            continue
         shown = f"{number(values.get('before'))} → {number(values.get('after'))}"
-        figures.append(
-            KeyFigure(f"Gap closed, {metric}", number(values.get("closed"), ".0%"), shown)
-        )
+        note = "held-out rollouts, relative to each channel's range"
+        figures.append(KeyFigure("RMSE", shown, note))
+    seconds = sum(v for v in (result.get("seconds") or {}).values() if v is not None)
+    if seconds:
+        figures.append(KeyFigure("Time", f"{seconds:.0f} s"))
     return figures
-
-
-def _with_sd(value: Mapping[str, Any]) -> str:
-    """Returns a mean with its standard deviation."""
-    return f"{number(value.get('mean'), '.4g')} ± {number(value.get('sd'), '.2g')}"
 
 
 def _gap(gap: Mapping[str, Any]) -> list[Part]:
     if not gap:
-        return [TextPart("No gap was measured.")]
+        return [TextPart("No gap was measured: give held-out rollouts with --holdout.")]
     names = ("before", "after", "noise_floor")
     rows = [
         [
-            metric,
+            METRICS.get(metric, metric),
             *(number(values.get(name)) for name in names),
             number(values.get("closed"), ".0%"),
         ]
@@ -151,179 +182,18 @@ def _gap(gap: Mapping[str, Any]) -> list[Part]:
     ]
     caption = (
         "Closed: share of the distance from before to the noise floor, the error of the revised "
-        "model on a recording that it simulated itself."
+        "model on a recording that it simulated itself. By chance a model can be below the floor."
     )
-    columns = ("metric", "before", "after", "noise floor", "closed")
-    parts: list[Part] = [TablePart(columns, rows, caption)]
-    # Metrics have different scales, so each is drawn relative to its value before.
-    data: list[dict[str, Any]] = []
-    for name, color in zip(names, SERIES, strict=False):
-        shares = {
-            metric: values[name] / values["before"]
-            for metric, values in gap.items()
-            if values.get("before") and values.get(name) is not None
-        }
-        label = name.replace("_", " ")
-        data.append(
-            {
-                "type": "bar",
-                "name": label,
-                "marker": {"color": color},
-                "x": list(shares),
-                "y": rounded(list(shares.values())),
-            }
-        )
-    layout = layout_of("", "relative to before") | {"barmode": "group"}
-    parts.append(ChartPart("gap", "Error on held-out rollouts, relative to before.", data, layout))
-    return parts
+    return [TablePart(("metric", "before", "after", "noise floor", "closed"), rows, caption)]
 
 
-def _effects(effects: list[Any], ranking: list[Any]) -> list[Part]:
-    if not effects:
-        return [TextPart("No effect was added.")]
-    rows = [
-        [
-            _named(effect),
-            number(effect.get("probability"), ".0%"),
-            number(effect.get("share"), ".0%") + (" (small)" if effect.get("is_minor") else ""),
-            ", ".join(map(str, effect.get("equivalent_to") or [])) or "–",
-        ]
-        for effect in effects
-    ]
-    columns = ("effect", "probability", "share of the misfit", "not distinguishable from")
-    caption = "Small effects are in the revised model, but are not named."
-    is_any_small = any(effect.get("is_minor") for effect in effects)
-    parts: list[Part] = [TablePart(columns, rows, caption if is_any_small else "")]
-    parameters = [
-        [
-            f"{_named(effect)}, {name}",
-            number(row.get("mean"), ".4g"),
-            number(row.get("sd"), ".2g"),
-            " … ".join(number(bound, ".4g") for bound in row.get("hdi_94") or []) or "–",
-            str(row.get("unit", "")),
-        ]
-        for effect in effects
-        for name, row in (effect.get("parameters") or {}).items()
-    ]
-    parameters += [
-        [f"{_named(effect)}, {name}", number(value, ".4g"), "–", "–", ""]
-        for effect in effects
-        for name, value in (effect.get("constants") or {}).items()
-    ]
-    if parameters:
-        columns = ("parameter", "mean", "sd", "94 % interval", "unit")
-        parts.append(TablePart(columns, parameters, "Parameters of the effects."))
-    repeated = [
-        [f"{_named(effect)}, {name}", str(part.get("part")), _with_sd(value)]
-        for effect in effects
-        for part in effect.get("parts") or []
-        for name, value in (part.get("strengths") or {}).items()
-    ]
-    if repeated:
-        caption = "Found again? Strengths in the two parts of the recording that differ most."
-        parts.append(TablePart(("strength", "part", "mean ± sd"), repeated, caption))
-    searched = [
-        [_named(effect), *("yes" if is_in else "no" for is_in in halves.values())]
-        for effect in effects
-        if (halves := effect.get("in_halves") or {})
-    ]
-    if searched:
-        names = next(e["in_halves"] for e in effects if e.get("in_halves"))
-        caption = "Found by a search of only half of the recording?"
-        parts.append(TablePart(("effect", *names), searched, caption))
-    scored = {
-        _named(e): float(e["probability"])
-        for e in ranking or effects
-        if isinstance(e, Mapping) and e.get("probability") is not None
-    }
-    if scored:
-        caption = "Probability of each tested candidate."
-        parts.append(
-            bars_chart(
-                "probability", {"probability": scored}, title="probability", caption=caption
-            )
-        )
-    return parts
-
-
-def _where(where: list[Any]) -> list[Part]:
-    if not where:
-        return [TextPart("No window deviates significantly.")]
-    rows = [
-        [
-            str(place.get("channel", "–")),
-            str(place.get("rollout", "–")),
-            _span(place.get("time_span", place.get("time"))),
-            _words(place.get("region", "–")),
-            number(place.get("z"), ".1f"),
-        ]
-        for place in where
-    ]
-    columns = ("channel", "rollout", "time [s]", "region", "z")
-    caption = "Windows with the largest deviation of the model; z in standard deviations."
-    return [TablePart(columns, rows, caption)]
-
-
-def _next(experiment: Any) -> list[Section]:
-    if not experiment:
-        return []
-    if not isinstance(experiment, Mapping):
-        return [Section("Next experiment", [TextPart(_words(experiment))])]
-    rows = [[str(name), _words(value)] for name, value in experiment.items()]
-    caption = "A recording that would distinguish the remaining candidates."
-    return [Section("Next experiment", [TablePart(("item", "value"), rows, caption, "prose")])]
-
-
-def _revision(folder: Path, description: Mapping[str, Any]) -> list[Section]:
-    """Returns the revised model, as a diff if the previous model is known."""
-    file = folder / "revised_model.py"
-    if not file.exists():
-        return []
-    revised = read_text(file)
-    model = description.get("model")
-    before = model.get("source") if isinstance(model, Mapping) else model
-    is_long = len(revised) + len(str(before)) > MAX_COMPARED
-    if not isinstance(before, str) or not before.strip() or is_long:
-        return [Section("Revised model", [CodePart(revised, "revised_model.py, for MODEL")])]
-    lines = difflib.unified_diff(
-        before.splitlines(), revised.splitlines(), "model", "revised_model.py", lineterm=""
-    )
-    caption = "Changes to the model; revised_model.py can be used as MODEL."
-    return [Section("Revised model", [DiffPart(list(lines), caption)])]
-
-
-def _pictures(folder: Path) -> list[Section]:
-    parts: list[Part] = []
-    left_out, size = [], 0
-    for file in sorted(folder.glob("*.png")):
-        if size + file.stat().st_size * 4 / 3 > MAX_PICTURE_BYTES:
-            left_out.append(file.name)
-            continue
-        content = base64.b64encode(read_bytes(file)).decode("ascii")
-        size += len(content)
-        caption = file.stem.replace("_", " ")
-        parts.append(PicturePart(f"data:image/png;base64,{content}", caption))
-    if left_out:
-        parts.append(TextPart(f"Too large for this page: {', '.join(left_out)}."))
-    return [Section("Figures", parts)] if parts else []
-
-
-def _named(effect: Any) -> str:
-    if not isinstance(effect, Mapping):
-        return str(effect)
-    port = effect.get("port")
-    return f"{effect.get('effect', 'effect')} at {port}" if port else str(effect.get("effect"))
-
-
-def _span(value: Any) -> str:
-    if isinstance(value, list) and len(value) == 2:
-        return f"{number(value[0])} … {number(value[1])}"
-    return _words(value) if value is not None else "–"
-
-
-def _words(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_words(item)}" for key, item in value.items())
-    if isinstance(value, list):
-        return ", ".join(_words(item) for item in value)
-    return number(value) if isinstance(value, float) else str(value)
+def _preparation(result: Mapping[str, Any]) -> list[Section]:
+    """Returns how the recording was read, its faults and what was done about them."""
+    preparation = result.get("preparation") or {}
+    problems = [str(text) for text in result.get("data_problems") or []]
+    remarks = [str(text) for text in result.get("remarks") or []]
+    sentence = str(preparation.get("sentence") or "")
+    parts: list[Part] = [TextPart(text) for text in (sentence, *problems) if text]
+    if remarks:
+        parts.append(FoldedPart("How the recording was read", [TextPart(t) for t in remarks]))
+    return [Section("Recording and preparation", parts)] if parts else []

@@ -44,7 +44,8 @@ def source_section(description: Mapping[str, Any]) -> list[Section]:
     text = model.get("source") if isinstance(model, Mapping) else model
     if not isinstance(text, str) or not text.strip():
         return []
-    return [Section("Model", [CodePart(text.rstrip(), "Source of the model in this run.")])]
+    part = CodePart(text.rstrip(), "Source of the model in this run.")
+    return [Section("Model", [part], is_folded=True)]
 
 
 def provenance_section(description: Mapping[str, Any], folder: Path) -> Section:
@@ -70,9 +71,11 @@ def provenance_section(description: Mapping[str, Any], folder: Path) -> Section:
         rows.append(["SHA-256 of the features of the data", str(fingerprint)])
     rows += [[f"SHA-256 of {f.relative_to(folder)}", checksum(f)] for f in data_files(folder)]
     if not rows:
-        return Section("Provenance", [TextPart("The run did not record its origin.")])
+        parts = [TextPart("The run did not record its origin.")]
+        return Section("Provenance", parts, is_folded=True)
     caption = "Settings and files that are needed to reproduce this result."
-    return Section("Provenance", [TablePart(("item", "value"), rows, caption, "prose")])
+    table = TablePart(("item", "value"), rows, caption, "prose")
+    return Section("Provenance", [table], is_folded=True)
 
 
 def checksum(path: Path) -> str:

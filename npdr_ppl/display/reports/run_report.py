@@ -9,11 +9,12 @@ from typing import Any
 
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.display.reports.comparison_report import comparison_report
-from npdr_ppl.display.reports.content import ChartPart, Report
+from npdr_ppl.display.reports.content import ChartPart, Report, unfolded
 from npdr_ppl.display.reports.demo_report import demo_report
 from npdr_ppl.display.reports.discovery_report import discovery_report
 from npdr_ppl.display.reports.fit_report import fit_report
 from npdr_ppl.display.reports.training_report import training_report
+from npdr_ppl.drawing.page_style import drawing_style
 from npdr_ppl.errors import DataError
 from npdr_ppl.run_files import reading_back
 
@@ -80,8 +81,9 @@ def _is_begun(run: Path) -> bool:
 def render(report: Report) -> str:
     """Returns the page as HTML.
 
-    The template engine escapes every text. Only the style, the script and Plotly, which come with
-    the packages, are inserted unchanged. The script gets its data as JSON.
+    The template engine escapes every text. Only the style, the script, Plotly, which come with the
+    packages, and drawings, which escape their own texts, are inserted unchanged. The script gets
+    its data as JSON.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
@@ -97,7 +99,7 @@ def render(report: Report) -> str:
     charts: dict[str, Any] = {
         part.name: {"data": part.data, "layout": part.layout}
         for section in report.sections
-        for part in section.parts
+        for part in unfolded(section.parts)
         if isinstance(part, ChartPart)
     }
     loader = environment.loader
@@ -109,7 +111,7 @@ def render(report: Report) -> str:
     return environment.get_template("report.html").render(
         report=report,
         charts=charts,
-        style=style,
+        style=style + Markup(drawing_style()),
         script=script,
         plotly=Markup(get_plotlyjs()) if charts else "",
     )

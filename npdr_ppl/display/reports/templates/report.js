@@ -1,6 +1,16 @@
 "use strict";
 (() => {
-  const charts = JSON.parse(document.getElementById("charts").textContent);
+  // A link to a folded section unfolds it.
+  const unfold = () => {
+    const target = location.hash && document.getElementById(location.hash.slice(1));
+    if (target && target.querySelector("details")) target.querySelector("details").open = true;
+  };
+  addEventListener("hashchange", unfold);
+  unfold();
+
+  const source = document.getElementById("charts");
+  if (!source) return;
+  const charts = JSON.parse(source.textContent);
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   const shade = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
@@ -29,7 +39,14 @@
     const options = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
     Plotly.react(element, inked(data), themed(layout), options);
   };
-  const drawAll = () => document.querySelectorAll("[data-chart]").forEach(draw);
+  const all = () => [...document.querySelectorAll("[data-chart]")];
+  const drawAll = () => all().forEach(draw);
   drawAll();
   dark.addEventListener("change", drawAll);
+  // Inside what is folded a chart has no width; on paper it has another one, and is black on white.
+  const resize = (charts) => charts.filter((c) => c.offsetWidth).forEach((c) => Plotly.Plots.resize(c));
+  document.querySelectorAll("details").forEach((details) => details.addEventListener("toggle", () => {
+    resize([...details.querySelectorAll("[data-chart]")]);
+  }));
+  window.matchMedia("print").addEventListener("change", () => { drawAll(); resize(all()); });
 })();

@@ -1,0 +1,176 @@
+"""The effects that a discovery found: a short table, and details behind a click."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from npdr_ppl.display.reports.content import (
+    DrawingPart,
+    FoldedPart,
+    Part,
+    Section,
+    TablePart,
+    TextPart,
+)
+from npdr_ppl.drawing.bars_html import named_bars
+from npdr_ppl.drawing.effect_names import effect_label, effect_title, in_words
+from npdr_ppl.drawing.numbers import number
+
+__all__ = ["effects_section", "estimates_section"]
+
+MOST_ALTERNATIVES = 3
+"""Maximum number of causes that are listed beside an effect; of more, only the number is given."""
+
+MOST_BARS = 12
+"""Maximum number of candidates in a drawing."""
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def effects_section(effects: Rows, ranking: Rows) -> Section:
+    """Returns the effects in words, with their parameters and alternatives."""
+    if not effects:
+        parts: list[Part] = [TextPart("No effect was added.")]
+        return Section("Effects", parts + _tested(ranking))
+    rows = [
+        [
+            effect_label(effect),
+            number(effect.get("probability"), ".0%"),
+            number(effect.get("share"), ".0%") + (" (small)" if effect.get("is_minor") else ""),
+            _others(effect.get("equivalent_to") or []),
+        ]
+        for effect in effects
+    ]
+    columns = ("effect", "probability", "share of the misfit", "could also be")
+    is_any_small = any(effect.get("is_minor") for effect in effects)
+    caption = "Small effects are in the revised model, but are not named." if is_any_small else ""
+    folded = [*_parameters(effects), *_repeated(effects), *_halves(effects)]
+    parts = [TablePart(columns, rows, caption)]
+    if folded:
+        parts.append(
+            FoldedPart("Parameters of the effects, and whether each was repeated", folded)
+        )
+    return Section("Effects", parts + _alternatives(effects) + _tested(ranking))
+
+
+def estimates_section(parameters: Mapping[str, Any]) -> list[Section]:
+    """Returns the parameters of the revised model that are no effect's."""
+    rows = [
+        [
+            f"{name.replace('_', ' ')}{_unit(row)}",
+            number(row.get("mean"), ".4g"),
+            number(row.get("sd"), ".2g"),
+            _interval(row),
+        ]
+        for name, row in parameters.items()
+        if "." not in name
+    ]
+    if not rows:
+        return []
+    columns = ("parameter", "mean", "sd", "94 % interval")
+    return [
+        Section("Parameters of the model", [TablePart(columns, rows, "In the revised model.")])
+    ]
+
+
+def _others(names: Sequence[Any]) -> str:
+    words = [str(name).replace("_", " ") for name in names]
+    more = len(words) - MOST_ALTERNATIVES
+    shown = ", ".join(words[:MOST_ALTERNATIVES])
+    return f"{shown} and {more} more" if more > 0 else shown or "–"
+
+
+def _parameters(effects: Rows) -> list[Part]:
+    rows = [
+        [
+            f"{_named(effect)}: {name.replace('_', ' ')}{_unit(row)}",
+            number(row.get("mean"), ".4g"),
+            number(row.get("sd"), ".2g"),
+            _interval(row),
+        ]
+        for effect in effects
+        for name, row in (effect.get("parameters") or {}).items()
+    ]
+    rows += [
+        [f"{_named(effect)}: {name.replace('_', ' ')}", number(value, ".4g"), "–", "–"]
+        for effect in effects
+        for name, value in (effect.get("constants") or {}).items()
+    ]
+    columns = ("parameter", "mean", "sd", "94 % interval")
+    return [TablePart(columns, rows, "Parameters of the effects.")] if rows else []
+
+
+def _repeated(effects: Rows) -> list[Part]:
+    rows = [
+        [
+            f"{_named(effect)}: {name.replace('_', ' ')}",
+            str(part.get("part")),
+            f"{number(value.get('mean'), '.4g')} ± {number(value.get('sd'), '.2g')}",
+        ]
+        for effect in effects
+        for part in effect.get("parts") or []
+        for name, value in (part.get("strengths") or {}).items()
+    ]
+    caption = "Found again? Strengths in the two parts of the recording that differ most."
+    return [TablePart(("strength", "part", "mean ± sd"), rows, caption)] if rows else []
+
+
+def _halves(effects: Rows) -> list[Part]:
+    rows = [
+        [_named(effect), *("yes" if is_in else "no" for is_in in halves.values())]
+        for effect in effects
+        if (halves := effect.get("in_halves") or {})
+    ]
+    if not rows:
+        return []
+    names = next(e["in_halves"] for e in effects if e.get("in_halves"))
+    caption = "Found by a search of only half of the recording?"
+    return [TablePart(("effect", *names), rows, caption)]
+
+
+def _alternatives(effects: Rows) -> list[Part]:
+    """Returns the probabilities of each effect and of what could replace it."""
+    parts: list[Part] = []
+    for effect in effects:
+        found = {
+            (in_words(name) if name else "nothing"): float(p)
+            for name, p in (effect.get("alternatives") or {}).items()
+            if p is not None
+        }
+        if len(found) > 1:
+            best = dict(sorted(found.items(), key=lambda item: -item[1])[:MOST_BARS])
+            caption = f"Probabilities of the causes instead of {_named(effect)}."
+            parts.append(DrawingPart(named_bars(best, most=1.0), caption))
+    return [FoldedPart("What else each effect could be", parts)] if parts else []
+
+
+def _tested(ranking: Rows) -> list[Part]:
+    """Returns the candidates for the original model, each alone."""
+    scored = {
+        _named(row): float(row[key])
+        for row in ranking
+        for key in ("separation", "probability")
+        if row.get(key) is not None
+    }
+    if not scored:
+        return []
+    best = dict(sorted(scored.items(), key=lambda item: -item[1])[:MOST_BARS])
+    caption = (
+        "How clearly each candidate alone would improve the original model, the clearest first"
+    )
+    is_separation = any(row.get("separation") is not None for row in ranking)
+    caption += ", in standard deviations of the measurements." if is_separation else "."
+    drawing = named_bars(best, spec=".3g" if is_separation else ".0%")
+    return [FoldedPart("Candidates that were tested", [DrawingPart(drawing, caption)])]
+
+
+def _named(effect: Mapping[str, Any]) -> str:
+    return effect_title(str(effect.get("effect", "effect")), str(effect.get("port") or ""))
+
+
+def _unit(row: Mapping[str, Any]) -> str:
+    unit = row.get("unit") or ""
+    return f" [{unit}]" if unit not in ("", "1") else ""
+
+
+def _interval(row: Mapping[str, Any]) -> str:
+    return " … ".join(number(bound, ".4g") for bound in row.get("hdi_94") or []) or "–"
