@@ -12,10 +12,18 @@ __all__ = ["report"]
 
 
 def report(
-    run: Annotated[Path, typer.Argument(help="Folder that was passed as --out.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN...", help="Folder that was passed as --out; several are compared."
+        ),
+    ],
     file: Annotated[
         Path | None,
-        typer.Option(help="File to write; report.html in the run's folder by default."),
+        typer.Option(
+            help="File to write; report.html in the run's folder by default, runs.html here for "
+            "several runs."
+        ),
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -26,11 +34,17 @@ def report(
     The report begins with the verdict and the key numbers. Charts, diagnostics in plain language,
     the model's source and the steps to reproduce the result follow.
 
-    Example: npdr report fit --file fit.html
-    """
-    from npdr_ppl.display.reports import write_report
+    Several runs of the same model are shown side by side: parameters with intervals, effects found
+    in each, gaps, and whether they agree.
 
-    path = write_report(run, file)
+    Examples: npdr report fit --file fit.html; npdr report monday tuesday --file week.html
+    """
+    from npdr_ppl.display.reports import write_report, write_runs_report
+
+    if len(runs) > 1:
+        path = write_runs_report(runs, file or Path("runs.html"))
+    else:
+        path = write_report(runs[0], file)
     if as_json:
         typer.echo(json.dumps({"report": str(path)}))
     elif not quiet:

@@ -7,7 +7,7 @@ from typing import Any
 
 from npdr_ppl.drawing.numbers import number
 
-__all__ = ["METRICS", "gap_bars", "named_bars"]
+__all__ = ["METRICS", "gap_bars", "interval_bars", "named_bars"]
 
 METRICS = {
     "rmse": "RMSE",
@@ -84,3 +84,30 @@ def _closed(share: Any) -> str:
     if share < 0.0:
         return ": the gap has grown"
     return f": {min(share, 1.0):.0%} of the gap closed"
+
+
+def interval_bars(rows: Mapping[str, tuple[float, float, float]], words: Mapping[str, str]) -> str:
+    """Draws intervals of one quantity below each other, to see whether they overlap.
+
+    Args:
+        rows: Lower end, middle and upper end by name; all finite.
+        words: Text at the right of each, by the same names.
+    """
+    low, high = min(row[0] for row in rows.values()), max(row[2] for row in rows.values())
+    margin = 0.05 * max(high - low, 1e-12)
+    low, high = low - margin, high + margin
+
+    def place(value: float) -> float:
+        return 100.0 * (value - low) / (high - low)
+
+    parts = []
+    for name, (begin, middle, end) in rows.items():
+        # An interval that is narrower than a line stays visible.
+        width = max(place(end) - place(begin), 0.5)
+        bar = f'<div class="span" style="left:{place(begin):.1f}%;width:{width:.1f}%"></div>'
+        dot = f'<div class="dot" style="left:{place(middle):.1f}%"></div>'
+        parts.append(
+            f'<span>{escape(name)}</span><div class="track">{bar}{dot}</div>'
+            f"<span>{escape(words[name])}</span>"
+        )
+    return f'<div class="gaps names">{"".join(parts)}</div>'

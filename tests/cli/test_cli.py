@@ -81,10 +81,25 @@ def test_report_writes_one_file(monkeypatch, capsys, tmp_path):
     code, text, _ = run(monkeypatch, capsys, "report", tmp_path, "--file", page)
     assert code == 0
     assert str(page) in text
-    assert "no effect is missing" in page.read_text()
+    assert "No effect is missing" in page.read_text()
     code, _, err = run(monkeypatch, capsys, "report", tmp_path / "absent")
     assert code == 2
     assert err.count("\n") == 1
+
+
+def test_report_compares_several_runs(monkeypatch, capsys, tmp_path):
+    for name in ("monday", "tuesday"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "discovery.json").write_text('{"verdict": "none"}')
+    page = tmp_path / "page.html"
+    folders = tmp_path / "monday", tmp_path / "tuesday"
+    code, text, _ = run(monkeypatch, capsys, "report", *folders, "--file", page)
+    assert code == 0
+    assert str(page) in text
+    assert "The runs agree" in page.read_text()
+    code, _, err = run(monkeypatch, capsys, "report", *folders, tmp_path / "monday")
+    assert code == 2
+    assert err.count("\n") == 1 and "given twice" in err
 
 
 @pytest.mark.slow

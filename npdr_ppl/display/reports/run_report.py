@@ -3,7 +3,7 @@
 The file contains its style, its script and Plotly.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,13 @@ from npdr_ppl.display.reports.content import ChartPart, Report, unfolded
 from npdr_ppl.display.reports.demo_report import demo_report
 from npdr_ppl.display.reports.discovery_report import discovery_report
 from npdr_ppl.display.reports.fit_report import fit_report
+from npdr_ppl.display.reports.runs_report import runs_report
 from npdr_ppl.display.reports.training_report import training_report
 from npdr_ppl.drawing.page_style import drawing_style
 from npdr_ppl.errors import DataError
 from npdr_ppl.run_files import reading_back
 
-__all__ = ["MAX_BYTES", "read_run", "render", "write_report"]
+__all__ = ["MAX_BYTES", "read_run", "render", "write_report", "write_runs_report"]
 
 MAX_BYTES = 6_000_000
 """Maximum size of a page in bytes, so that it can be sent by e-mail."""
@@ -66,8 +67,24 @@ def write_report(run: Path, out: Path | None = None) -> Path:
         run: Folder of the run.
         out: The file; ``report.html`` in that folder if ``None``.
     """
-    page = render(read_run(run))
-    path = run / "report.html" if out is None else out
+    return _written(read_run(run), run / "report.html" if out is None else out)
+
+
+def write_runs_report(runs: Sequence[Path], out: Path) -> Path:
+    """Writes several runs side by side as one HTML file, and returns its path.
+
+    Args:
+        runs: Folders of ``npdr fit``, ``discover`` or ``train``.
+        out: The file.
+
+    Raises:
+        DataError: The runs have nothing in common, or a folder is not that of a run.
+    """
+    return _written(runs_report(runs), out)
+
+
+def _written(report: Report, path: Path) -> Path:
+    page = render(report)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
