@@ -15,7 +15,12 @@ import npdr_ppl
 
 ROOT = Path(__file__).parents[1]
 LINKED = ("models", "inference", "policies")
-DATA_FILES = ("py.typed", "models/furuta.xml", "display/reports/templates/report.html", "drawing/drawings.css")
+DATA_FILES = (
+    "py.typed",
+    "models/furuta.xml",
+    "display/reports/templates/report.html",
+    "drawing/drawings.css",
+)
 
 
 def packages():
