@@ -238,7 +238,7 @@ class Discovery:
     def _repr_html_(self) -> str:
         from npdr_ppl.discovery.discovery_view import discovery_html
 
-        return discovery_html(self.verdict, self.reason, self.effects, self.gap)
+        return discovery_html(self.to_dict(), self.overlays.to_dict())
 
     def __repr__(self) -> str:
         found = ", ".join(

@@ -1,4 +1,4 @@
-"""How a discovery appears in a notebook: a table of findings and two small drawings."""
+"""How a discovery appears in a notebook: verdict, curves, gap, effects; and two drawings."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,9 +6,15 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from npdr_ppl.discovery.finding import Finding
+from npdr_ppl.discovery.headline import headline
 from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.discovery.proof.settings import GAP
+from npdr_ppl.drawing.bars_html import gap_bars
+from npdr_ppl.drawing.effect_names import effect_title
 from npdr_ppl.drawing.html import table
+from npdr_ppl.drawing.numbers import number
+from npdr_ppl.drawing.overlay_html import lead_html
+from npdr_ppl.drawing.page_style import styled
 from npdr_ppl.drawing.panels import panels
 from npdr_ppl.drawing.theme import COLORS
 
@@ -127,38 +133,45 @@ def draw_gap(axis: "Axes", metric: str, gap: Gap) -> None:
     axis.set_title(title if closed is None else f"{title}: {closed:.0%} closed")
 
 
-def discovery_html(
-    verdict: str, reason: str, effects: Sequence[Finding], gap: Mapping[str, Gap]
-) -> str:
-    """Returns verdict, findings and gap as HTML."""
-    parts = [f"<div><strong>Discovery: {escape(verdict)}</strong><p>{escape(reason)}</p>"]
+def discovery_html(result: Mapping[str, Any], overlays: Mapping[str, Any]) -> str:
+    """Returns verdict, curves, gap and effects as HTML, as the report begins.
+
+    Args:
+        result: Content of ``discovery.json``.
+        overlays: Content of ``overlays.json``.
+    """
+    word, sentence = headline(result)
+    verdict = f"<small>verdict: {escape(str(result['verdict']))}</small>"
+    parts = [f"<p><b>{escape(word)}</b><br>{escape(sentence)}<br>{verdict}</p>"]
+    if drawn := lead_html(overlays):
+        parts.append(f"<div>{escape(drawn[1])}</div>{drawn[0]}")
+    parts.append(gap_bars(result.get("gap") or {}))
+    effects = result.get("effects") or []
     if effects:
         rows = [row for found in effects for row in _effect_rows(found)]
-        head = ["effect", "probability", "parameter", "estimate", "indistinguishable from"]
+        head = ["effect", "probability", "parameter", "estimate", "could also be"]
         parts.append(table(head, rows))
-    if gap:
-        rows = [
-            [
-                metric,
-                f"{values.before:.4g}",
-                f"{values.after:.4g}",
-                "–" if values.noise_floor is None else f"{values.noise_floor:.4g}",
-                "–" if values.closed is None else f"{values.closed:.0%}",
-            ]
-            for metric, values in gap.items()
-        ]
-        parts.append(table(["held out", "before", "after", "noise floor", "closed"], rows))
-    return "".join([*parts, "</div>"])
+    return styled("".join(parts))
 
 
-def _effect_rows(found: Finding) -> list[list[str]]:
+def _effect_rows(found: Mapping[str, Any]) -> list[list[str]]:
     """Returns a row per parameter of an effect; the first one has what concerns the effect."""
     values = [
-        (name, f"{p.mean:.4g} ± {p.sd:.2g} {'' if p.unit == '1' else p.unit}")
-        for name, p in found.parameters.items()
+        (name.replace("_", " "), _estimate(row))
+        for name, row in (found.get("parameters") or {}).items()
     ]
-    values += [(name, f"{value:.4g}") for name, value in found.effect.constants.items()]
+    values += [(name, f"{v:.4g}") for name, v in (found.get("constants") or {}).items()]
     rows = [["", "", name, value, ""] for name, value in values or [("–", "–")]]
-    rows[0][:2] = found.effect.name, f"{found.probability:.0%}" if found.is_compared else "–"
-    rows[0][-1] = ", ".join(found.equivalent_to) or "–"
+    rows[0][:2] = (
+        effect_title(str(found["effect"]), str(found["port"])),
+        number(found.get("probability"), ".0%"),
+    )
+    others = found.get("equivalent_to") or []
+    rows[0][-1] = ", ".join(str(name).replace("_", " ") for name in others) or "–"
     return rows
+
+
+def _estimate(row: Mapping[str, Any]) -> str:
+    unit = row.get("unit") or ""
+    words = f"{number(row.get('mean'), '.4g')} ± {number(row.get('sd'), '.2g')}"
+    return words if unit in ("", "1") else f"{words} {unit}"

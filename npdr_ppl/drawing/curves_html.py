@@ -94,12 +94,11 @@ def _panel(
 ) -> list[str]:
     """Returns the labels on the left, and the curves."""
     low, high = bounds
-    ticks = _ticks(low, high, most=4)
     # A label at the edge would overlap what is above or below the drawing.
     room = LABEL_ROOM * (high - low) / height
-    ticks = [t for t in ticks if low + room <= t <= high - room]
+    ticks = _ticks(low + room, high - room, most=8 if kind == "error" else 5)
     if kind == "error":
-        ticks = [ticks[0], 0.0, ticks[-1]] if len(ticks) > 2 else ticks
+        ticks = [ticks[0], 0.0, ticks[-1]]
     places = [(height * (1.0 - (t - low) / (high - low)), t) for t in ticks]
     lines = "".join(f"M0 {y:.1f}H{WIDTH}" for y, _ in places)
     paths = "".join(

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from npdr_ppl.drawing.columns import scalar_columns
 from npdr_ppl.drawing.html import facts, table
 from npdr_ppl.drawing.marginal import draw_marginal
+from npdr_ppl.drawing.page_style import styled
 from npdr_ppl.drawing.panels import panels
 from npdr_ppl.posterior.density_mixture import DensityMixture
 from npdr_ppl.posterior.parameter_units import parameter_units
@@ -47,7 +48,7 @@ def posterior_html(posterior: DensityMixture) -> str:
         },
     )
     columns = ("parameter", "unit", "mean", "sd", "central 94 %", "contraction")
-    return head + table(columns, rows)
+    return styled(head + table(columns, rows))
 
 
 def plot_posterior(

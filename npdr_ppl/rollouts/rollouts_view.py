@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.drawing.html import facts, table
+from npdr_ppl.drawing.page_style import styled
 from npdr_ppl.drawing.panels import panels
 from npdr_ppl.drawing.theme import SERIES
 from npdr_ppl.rollouts.recording import Recording
@@ -36,7 +37,7 @@ def rollouts_html(rollouts: Recording) -> str:
             values = values[np.isfinite(values)]
             span = [f"{v:.4g}" for v in (values.min(), values.max())] if len(values) else ["–"] * 2
             rows.append([name, kind, unit or "–", *span])
-    return head + table(("channel", "kind", "unit", "least", "greatest"), rows)
+    return styled(head + table(("channel", "kind", "unit", "least", "greatest"), rows))
 
 
 def plot_rollouts(rollouts: Recording, axes: Any = None) -> NDArray[Any]:

@@ -9,6 +9,8 @@ from hidden_rigs import make_case
 import npdr_ppl as npdr
 from npdr_ppl.discovery.proof.parameter_intervals import Estimate
 from npdr_ppl.models.effects import QuadraticDrag
+from npdr_ppl.run_files import read_json
+from npdr_ppl.run_records import OverlayRecord
 
 
 @pytest.mark.slow
@@ -22,6 +24,8 @@ def test_saving_writes_json_with_the_documented_names(tmp_path):
     assert {"alarm", "where", "effects", "ranking", "gap", "next_experiment"} <= set(written)
     assert {"before", "after", "noise_floor", "closed"} == set(written["gap"]["rmse"])
     assert {"rollout", "time_span", "channel", "region", "z"} == set(written["where"][0])
+    overlays = read_json(tmp_path / "overlays.json", OverlayRecord)
+    assert overlays["channels"] == ["angle", "velocity"] and overlays["is_held_out"]
 
 
 def test_an_infinite_estimate_is_null_in_json():

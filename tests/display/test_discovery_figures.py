@@ -15,7 +15,7 @@ from npdr_ppl.errors import ShapeError
 from npdr_ppl.models.effects.forces import Bias
 from npdr_ppl.models.effects.friction import CoulombFriction
 from npdr_ppl.models.pendulum import pendulum
-from tests.helpers.discovery_recording import FRICTION, MISSING, pendulum_recording
+from tests.helpers.discovery_recording import FRICTION, pendulum_recording
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,24 @@ def test_a_discovery_shows_itself_in_a_notebook(found):
     with pytest.raises(ShapeError, match="4 panels"):
         found.plot(axes[:2])
     html = found._repr_html_()
-    assert MISSING in html and "named" in html and "N m" in html
+    assert "Missing: dry friction at hinge" in html and "verdict: named" in html
+    assert 'class="revised"' in html and "of the gap closed" in html and "N m" in html
+
+
+@pytest.mark.slow
+def test_the_held_out_rollout_is_simulated_better_after_the_revision(found):
+    (one,) = found.overlays.rollouts
+    held_out = pendulum_recording()[[3]]
+    assert found.overlays.is_held_out
+    assert np.array_equal(one.measured, held_out.readings[0][:-1])
+    for channel in ("angle", "velocity"):
+        errors = [one.misfit[name][channel] for name in ("nominal", "fitted", "revised")]
+        assert errors[0] > errors[1] > 5 * errors[2]
+    # The simulation begins again at the measurement every 2 s, a hundred steps.
+    jump = np.abs(one.simulated["fitted"] - one.measured)[:, 0]
+    assert jump[99] > 5 * jump[100]
+    for shown in found.overlays.maps:
+        assert shown.before.max() > 3 * shown.after.max()
 
 
 @pytest.mark.slow

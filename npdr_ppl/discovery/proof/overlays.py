@@ -194,7 +194,9 @@ def _simulated(
 
 
 def _misfit(made: Array, measured: Array, channels: Sequence[str]) -> dict[str, float]:
-    error = np.sqrt(np.mean((made - measured) ** 2, axis=0))
+    # A simulation that failed is infinite or not a number, and so is its error.
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.sqrt(np.mean((made - measured) ** 2, axis=0))
     return dict(zip(channels, error.tolist(), strict=True))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from npdr_ppl.discovery.headline import headline
 from npdr_ppl.display.reports.content import (
     DrawingPart,
     FoldedPart,
@@ -17,6 +18,7 @@ from npdr_ppl.display.reports.content import (
     Section,
     TablePart,
     TextPart,
+    Tone,
 )
 from npdr_ppl.display.reports.effect_parts import effects_section, estimates_section
 from npdr_ppl.display.reports.next_steps import next_section
@@ -29,15 +31,18 @@ from npdr_ppl.display.reports.overlay_parts import (
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
 from npdr_ppl.display.reports.revision_parts import pictures_section, revision_section
 from npdr_ppl.drawing.bars_html import METRICS, gap_bars
-from npdr_ppl.drawing.effect_names import effect_label, in_words
 from npdr_ppl.drawing.numbers import number
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import DiscoveryRecord
 
 __all__ = ["discovery_report", "discovery_verdict"]
 
-MOST_NAMED = 3
-"""Maximum number of effects that the headline names; of more, only the number is given."""
+TONES: Mapping[str, Tone] = {
+    "none": "good",
+    "named": "good",
+    "ambiguous": "warn",
+    "unknown": "bad",
+}
 
 
 def discovery_report(folder: Path) -> Report:
@@ -80,68 +85,7 @@ def discovery_report(folder: Path) -> Report:
 
 def discovery_verdict(result: Mapping[str, Any]) -> Headline:
     """Returns the verdict of ``discovery.json`` in one sentence."""
-    word = str(result.get("verdict", "no verdict"))
-    effects = result.get("effects") or []
-    large = [
-        effect
-        for effect in effects
-        if not effect.get("is_minor") and all((effect.get("in_halves") or {}).values())
-    ] or effects
-    labels = [effect_label(effect) for effect in large]
-    p_value = number((result.get("alarm") or {}).get("p_value"))
-    gained = _gained(result.get("gap") or {})
-    reason = in_words(str(result.get("reason") or ""))
-    verdicts = {
-        "none": Headline(
-            "No effect is missing",
-            f"The present model explains the recording (alarm: p = {p_value}).",
-            "good",
-        ),
-        "named": Headline(f"Missing: {_listed(labels) or 'an effect'}", gained, "good"),
-        "ambiguous": Headline(
-            f"Missing: {labels[0] if labels else 'an effect'}, or another cause",
-            f"The recording does not show which. {gained}",
-            "warn",
-        ),
-        "unknown": Headline(
-            "Something unknown is missing",
-            _shortened(reason, effects) or "No effect of the catalogue explains the recording.",
-            "bad",
-        ),
-    }
-    return verdicts.get(word, Headline(word, reason))
-
-
-def _shortened(reason: str, effects: list[Any]) -> str:
-    """Returns a reason; without the list of effects if there are many, for the table has them."""
-    if len(effects) <= MOST_NAMED:
-        return reason
-    start = "The best explanation so far is "
-    head, found, rest = reason.partition(start)
-    if not found:
-        return reason
-    tail = rest.split("; ", 1)[-1] if "; " in rest else ""
-    return f"{head}The best explanation so far has {len(effects)} effects; {tail}"
-
-
-def _listed(labels: list[str]) -> str:
-    if len(labels) > MOST_NAMED:
-        return f"{labels[0]}, and {len(labels) - 1} more effects"
-    return (
-        ", and ".join((", ".join(labels[:-1]), labels[-1])) if len(labels) > 1 else "".join(labels)
-    )
-
-
-def _gained(gap: Mapping[str, Any]) -> str:
-    """Returns a sentence about the gain of the revised model on held-out rollouts."""
-    closed = [
-        f"{min(values['closed'], 1.0):.0%} in {METRICS.get(metric, metric)}"
-        for metric, values in gap.items()
-        if values.get("closed") is not None
-    ]
-    if not closed:
-        return "The gain on held-out rollouts was not measured."
-    return f"Of the gap on held-out rollouts it closes {', '.join(closed)}."
+    return Headline(*headline(result), TONES.get(str(result.get("verdict")), "plain"))
 
 
 def _key_figures(result: Mapping[str, Any]) -> list[KeyFigure]:

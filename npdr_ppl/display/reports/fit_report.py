@@ -45,8 +45,8 @@ def fit_report(folder: Path) -> Report:
         decision_verdict(diagnosis),
         _key_figures(result, diagnosis),
         [
-            Section("Parameters", _parameters(result, diagnosis, data)),
             *_recording(folder, data),
+            Section("Parameters", _parameters(result, diagnosis, data)),
             Section("Diagnostics", [FindingsPart(findings(diagnosis))]),
             *source_section(description),
             provenance_section(description, folder),

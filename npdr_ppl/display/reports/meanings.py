@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from npdr_ppl.display.reports.content import Explained, Headline, Tone
+from npdr_ppl.drawing.effect_names import in_words
 from npdr_ppl.drawing.numbers import number
 from npdr_ppl.posterior.diagnostics import Decision, Thresholds
 
@@ -30,7 +31,8 @@ _TONES: Mapping[str, Tone] = {
 def decision_verdict(diagnosis: Mapping[str, Any]) -> Headline:
     """Returns the verdict of a diagnosis, in the format of ``fit.json``."""
     word = str(diagnosis.get("decision", "no decision"))
-    return Headline(word, str(diagnosis.get("reason", "")), _TONES.get(word, "plain"))
+    reason = in_words(str(diagnosis.get("reason", ""))).replace("`", "")
+    return Headline(word, reason, _TONES.get(word, "plain"))
 
 
 def findings(diagnosis: Mapping[str, Any]) -> list[Explained]:

@@ -1,6 +1,5 @@
 """Measured and simulated curves, and maps of residuals, from ``overlays.json``."""
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -14,20 +13,14 @@ from npdr_ppl.display.reports.content import (
     TablePart,
     TextPart,
 )
-from npdr_ppl.drawing.curves_html import curve, keys
 from npdr_ppl.drawing.heat_html import heat_levels, heat_map, heat_scale
 from npdr_ppl.drawing.numbers import number
+from npdr_ppl.drawing.overlay_html import channel_html, lead_html, legend_html, rollout_words
 from npdr_ppl.errors import DataError
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import OverlayRecord
 
 __all__ = ["lead_curve", "read_overlays", "recording_section", "where_section"]
-
-LEAD_HEIGHT = 150
-"""Height in CSS pixels of the drawing at the top, so that verdict, curves and bars fit on a screen
-of 1280 by 800."""
-
-MODELS = ("nominal", "fitted", "revised")
 
 
 def read_overlays(folder: Path) -> OverlayRecord | None:
@@ -49,21 +42,8 @@ def read_overlays(folder: Path) -> OverlayRecord | None:
 
 def lead_curve(overlays: OverlayRecord | None) -> DrawingPart | None:
     """Returns the channel on which the revision helps most, as the drawing of the first screen."""
-    if overlays is None or not overlays["rollouts"]:
-        return None
-    one = overlays["rollouts"][0]
-    channel = max(one["channels"], key=lambda name: _gain(one["misfit"], name), default=None)
-    if channel is None:
-        return None
-    is_revised = _is_revised(one["channels"][channel])
-    caption = (
-        f"{channel.replace('_', ' ')} of {_rollout_words(one, overlays)}, measured and simulated"
-        + (" before and after the revision" if is_revised else "")
-        + ". A simulation begins again at the measurement every "
-        + f"{overlays['restart_seconds']:g} s."
-    )
-    drawing = _drawn(one, channel, overlays, height=LEAD_HEIGHT)
-    return DrawingPart(_keys(one) + drawing, caption, is_wide=True) if drawing else None
+    found = None if overlays is None else lead_html(overlays)
+    return None if found is None else DrawingPart(*found, is_wide=True)
 
 
 def recording_section(overlays: OverlayRecord | None) -> list[Section]:
@@ -78,9 +58,9 @@ def recording_section(overlays: OverlayRecord | None) -> list[Section]:
         )
     ]
     for place, one in enumerate(overlays["rollouts"]):
-        every = "".join(_drawn(one, name, overlays) for name in one["channels"])
-        drawings = _keys(one) + every
-        part = DrawingPart(drawings, f"{_rollout_words(one, overlays).capitalize()}.")
+        every = "".join(channel_html(one, name, overlays) for name in one["channels"])
+        drawings = legend_html(one) + every
+        part = DrawingPart(drawings, f"{rollout_words(one, overlays).capitalize()}.")
         parts.append(part if place == 0 else FoldedPart(f"Rollout {one['rollout']}", [part]))
     return [Section("Measured and simulated", parts)]
 
@@ -109,48 +89,6 @@ def where_section(overlays: OverlayRecord | None, where: Sequence[Mapping[str, A
         parts.append(FoldedPart(summary, [_windows(where)]) if maps else _windows(where))
         parts.append(FoldedPart("States and commands in these windows", [_regions(where)]))
     return Section("Where", parts or [TextPart("No window deviates significantly.")])
-
-
-def _drawn(one: Any, channel: str, overlays: OverlayRecord, **look: Any) -> str:
-    series = dict(one["channels"][channel])
-    if not _is_revised(series):
-        series.pop("revised", None)
-    unit = overlays["units"].get(channel, "")
-    errors = [
-        f"{name} {number(one['misfit'][name].get(channel))}"
-        for name in MODELS
-        if name in series and name in one["misfit"]
-    ]
-    note = f"RMSE: {', '.join(errors)}" if errors else ""
-    words = channel.replace("_", " ")
-    title = f"{words} [{unit}]" if unit else words
-    return curve(one["time"], series, title=title, note=note, **look)
-
-
-def _keys(one: Any) -> str:
-    """Returns the legend of a rollout."""
-    channels = one["channels"].values()
-    shown = {name for series in channels for name in series}
-    if not any(map(_is_revised, channels)):
-        shown.discard("revised")
-    return keys([name for name in ("measured", *MODELS) if name in shown])
-
-
-def _is_revised(series: Mapping[str, Any]) -> bool:
-    """Returns whether the revised model differs from the fitted one."""
-    return "revised" in series and series.get("revised") != series.get("fitted")
-
-
-def _gain(misfit: Mapping[str, Mapping[str, Any]], channel: str) -> float:
-    """Returns by what factor the revision lowers a channel's error."""
-    before, after = (misfit.get(name, {}).get(channel) for name in ("fitted", "revised"))
-    if before is None or after is None or not math.isfinite(before) or after <= 0.0:
-        return 0.0
-    return before / after
-
-
-def _rollout_words(one: Mapping[str, Any], overlays: OverlayRecord) -> str:
-    return f"{'held-out ' if overlays['is_held_out'] else ''}rollout {one['rollout']}"
 
 
 def _windows(where: Sequence[Mapping[str, Any]]) -> TablePart:

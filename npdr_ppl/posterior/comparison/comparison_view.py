@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from npdr_ppl.drawing.html import facts, table
 from npdr_ppl.drawing.numbers import number
+from npdr_ppl.drawing.page_style import styled
 from npdr_ppl.drawing.panels import panels
 from npdr_ppl.drawing.theme import COLORS, SERIES
 from npdr_ppl.posterior.comparison.comparison_rows import Row
@@ -49,8 +50,9 @@ def comparison_html(
     columns = ("backend", "elpd", "weight", "RMSE", "CRPS", "r̂", "seconds", "decision")
     failed = {label: row.error for label, row in rows.items() if row.error is not None}
     shown = table(columns, shown_rows)
-    return f"<div><strong>Comparison, the best first</strong>{shown}</div>" + (
-        facts("Failed", failed) if failed else ""
+    return styled(
+        f"<div><strong>Comparison, the best first</strong>{shown}</div>"
+        + (facts("Failed", failed) if failed else "")
     )
 
 

@@ -1,0 +1,80 @@
+"""The result of a discovery in a sentence, for reports and notebooks."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from npdr_ppl.drawing.bars_html import METRICS
+from npdr_ppl.drawing.effect_names import effect_label, in_words
+from npdr_ppl.drawing.numbers import number
+
+__all__ = ["headline"]
+
+MOST_NAMED = 3
+"""Maximum number of effects that the headline names; of more, only the number is given."""
+
+
+def headline(result: Mapping[str, Any]) -> tuple[str, str]:
+    """Returns the verdict in a few words, and a sentence that says what it rests on.
+
+    Args:
+        result: Content of ``discovery.json``.
+    """
+    word = str(result.get("verdict", "no verdict"))
+    effects = result.get("effects") or []
+    large = [
+        effect
+        for effect in effects
+        if not effect.get("is_minor") and all((effect.get("in_halves") or {}).values())
+    ] or effects
+    labels = [effect_label(effect) for effect in large]
+    p_value = number((result.get("alarm") or {}).get("p_value"))
+    gained = _gained(result.get("gap") or {})
+    reason = in_words(str(result.get("reason") or ""))
+    best = labels[0] if labels else "an effect"
+    why = _shortened(reason, len(effects))
+    verdicts = {
+        "none": (
+            "No effect is missing",
+            f"The present model explains the recording (alarm: p = {p_value}).",
+        ),
+        "named": (f"Missing: {_listed(labels) or 'an effect'}", gained),
+        "ambiguous": (
+            f"Missing: {best}, or another cause",
+            f"The recording does not show which. {gained}",
+        ),
+        "unknown": (
+            "Something unknown is missing",
+            why or "No effect of the catalogue explains the recording.",
+        ),
+    }
+    return verdicts.get(word, (word, reason))
+
+
+def _shortened(reason: str, num_effects: int) -> str:
+    """Returns a reason; without the list of effects if there are many, for the table has them."""
+    start = "The best explanation so far is "
+    head, found, rest = reason.partition(start)
+    if not found or num_effects <= MOST_NAMED:
+        return reason
+    tail = rest.split("; ", 1)[-1] if "; " in rest else ""
+    return f"{head}The best explanation so far has {num_effects} effects; {tail}"
+
+
+def _listed(labels: Sequence[str]) -> str:
+    if len(labels) > MOST_NAMED:
+        return f"{labels[0]}, and {len(labels) - 1} more effects"
+    if len(labels) > 1:
+        return f"{', '.join(labels[:-1])}, and {labels[-1]}"
+    return "".join(labels)
+
+
+def _gained(gap: Mapping[str, Any]) -> str:
+    """Returns a sentence about the gain of the revised model on held-out rollouts."""
+    closed = [
+        f"{min(values['closed'], 1.0):.0%} in {METRICS.get(metric, metric)}"
+        for metric, values in gap.items()
+        if values.get("closed") is not None
+    ]
+    if not closed:
+        return "The gain on held-out rollouts was not measured."
+    return f"Of the gap on held-out rollouts it closes {', '.join(closed)}."

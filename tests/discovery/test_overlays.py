@@ -1,0 +1,52 @@
+"""Series for reports: thinned without losing peaks, and safe where a simulation failed."""
+
+import json
+
+import numpy as np
+
+from npdr_ppl.discovery.proof.overlays import MOST_POINTS, Overlay, ResidualMap
+from npdr_ppl.run_files import plain
+
+CHANNELS = ("angle", "velocity")
+
+
+def overlay(num, simulated):
+    measured = np.stack([np.sin(np.arange(num) / 50.0), np.zeros(num)], 1)
+    return Overlay(4, 0.002 * np.arange(num), measured, {"fitted": simulated}, {})
+
+
+def test_a_short_series_is_kept_as_it_is():
+    shown = overlay(300, np.ones((300, 2))).to_dict(CHANNELS)
+    assert len(shown["time"]) == 300
+    assert shown["channels"]["velocity"]["fitted"] == [1.0] * 300
+
+
+def test_a_long_series_keeps_a_peak_of_one_sample():
+    num = 20_011
+    simulated = np.zeros((num, 2))
+    simulated[12_345, 1] = 7.0
+    shown = overlay(num, simulated).to_dict(CHANNELS)
+    series = shown["channels"]["velocity"]["fitted"]
+    assert max(series) == 7.0
+    assert MOST_POINTS / 2 < len(series) <= MOST_POINTS + 2
+    lengths = {len(v) for channel in shown["channels"].values() for v in channel.values()}
+    assert lengths == {len(shown["time"])}
+    assert shown["time"] == sorted(shown["time"])
+    assert abs(shown["time"][series.index(7.0)] - 12_345 * 0.002) < 2 * num * 0.002 / MOST_POINTS
+
+
+def test_where_a_simulation_failed_is_nothing():
+    for num in (300, 20_000):
+        simulated = np.ones((num, 2))
+        simulated[num // 2 :] = np.nan
+        simulated[0] = np.inf
+        shown = overlay(num, simulated).to_dict(CHANNELS)
+        series = shown["channels"]["angle"]["fitted"]
+        assert series[-1] is None and 1.0 in series
+        json.dumps(plain(shown), allow_nan=False)
+
+
+def test_a_map_has_a_row_per_channel():
+    cells = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])
+    shown = ResidualMap(0, 6.0, cells, cells).to_dict()
+    assert shown["before"] == [[1.0, 3.0, 5.0], [2.0, None, 6.0]]
