@@ -57,6 +57,9 @@ MOST_PORTS = 2
 """Maximum number of channels of a group that are listed by name; of more, only the number."""
 
 _FORCE = re.compile(r"_(torque|force)$")
+_CHANNEL = re.compile(r"(?<![\w./-])[A-Za-z0-9]+(?:_[A-Za-z0-9]+)+(?![\w/(]|\.\w)")
+"""A name with underscores that is no file, option or call."""
+
 _SHARES = ("error", "skew")
 """Parameters that are relative errors; they are shown in per cent."""
 
@@ -115,10 +118,11 @@ def quantity(value: float, unit: str, *, is_share: bool = False) -> str:
 
 
 def in_words(text: str) -> str:
-    """Returns a sentence with the names of effects in words in place of ``port.effect``."""
+    """Returns a sentence with words in place of ``port.effect`` and ``joint_6_velocity``."""
     ids = "|".join(sorted(map(re.escape, TITLES), key=len, reverse=True))
     found = re.compile(rf"([\w,]+)\.({ids})\b")
-    return found.sub(lambda m: effect_title(m.group(2), m.group(1)), text)
+    text = found.sub(lambda m: effect_title(m.group(2), m.group(1)), text)
+    return _CHANNEL.sub(lambda m: m.group().replace("_", " "), text)
 
 
 def _where(port: str) -> str:

@@ -1,29 +1,17 @@
-"""Reports in a browser: charts are drawn, nothing is complained of, cut off or overlapping.
-
-A Chromium is looked for in ``NPDR_CHROMIUM``, where ``.ci/install_chromium`` puts it, where
-Playwright puts its own, and on the path.
-"""
-
-import os
-import shutil
-from pathlib import Path
+"""Reports in a browser: charts are drawn, nothing is complained of, cut off or overlapping."""
 
 import pytest
+from report_layout import SHEET, UNFOLD, WIDTHS, all_faults, chromium, layout_faults
 
 from npdr_ppl.display.reports import write_report, write_runs_report
 from tests.helpers.arm_discovery import write_arm_discovery
-from tests.helpers.page_layout import UNFOLD, layout_faults
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
-INSTALLED = Path(__file__).parents[2] / ".venv" / "chromium"
-ON_PATH = ("chromium", "chromium-browser", "google-chrome")
 KINDS = ("fit", "compare", "train", "discover", "arm", "several")
-WIDTHS = (320, 390, 768, 1280)
-"""CSS pixels of a small phone, a phone, a tablet and a laptop."""
 
-SHEET = 680
-"""Width in CSS pixels of an A4 page between margins of 15 mm."""
+SMALL = 320
+"""CSS pixels of a small phone."""
 
 DRAWN = """() => {
   const charts = [...document.querySelectorAll("[data-chart]")];
@@ -33,27 +21,12 @@ DRAWN = """() => {
 }"""
 
 
-def find_chromium(own):
-    """Returns the browser's path, or None."""
-    candidates = [os.environ.get("NPDR_CHROMIUM"), INSTALLED / "chromium", own]
-    candidates += [shutil.which(name) for name in ON_PATH]
-    return next((str(path) for path in candidates if path and Path(path).is_file()), None)
-
-
 @pytest.fixture(scope="module")
 def browser():
-    with sync_api.sync_playwright() as playwright:
-        path = find_chromium(playwright.chromium.executable_path)
-        if path is None:
+    with chromium() as found:
+        if found is None:
             pytest.skip("there is no Chromium; .ci/install_chromium gets one")
-        libraries = [str(INSTALLED / "lib"), os.environ.get("LD_LIBRARY_PATH", "")]
-        chromium = playwright.chromium.launch(
-            executable_path=path,
-            args=["--no-sandbox", "--headless=shell", "--disable-gpu"],
-            env={**os.environ, "LD_LIBRARY_PATH": ":".join(filter(None, libraries))},
-        )
-        yield chromium
-        chromium.close()
+        yield found
 
 
 @pytest.fixture(scope="module")
@@ -93,34 +66,25 @@ def opened(browser, pages):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_nothing_is_cut_off_at_any_width(opened, kind):
-    page = opened(kind)
-    found = []
-    for is_open in (False, True):
-        if is_open:
-            page.evaluate(UNFOLD)
-        for width in WIDTHS:
-            page.set_viewport_size({"width": width, "height": 800})
-            for scheme, paper in (("light", "rgb(255, 255, 255)"), ("dark", "rgb(13, 17, 23)")):
-                page.emulate_media(color_scheme=scheme)
-                page.wait_for_timeout(150)  # Plotly draws again.
-                shown = page.evaluate("getComputedStyle(document.body).backgroundColor")
-                assert shown == paper
-                found += [(width, scheme, is_open, fault) for fault in layout_faults(page)]
-    assert not found
+def test_nothing_is_cut_off_at_any_width_or_on_paper(opened, kind):
+    assert not all_faults(opened(kind), (SMALL, *WIDTHS))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_printed_page_is_white_and_fits_the_sheet(opened, kind):
-    page = opened(kind)
-    page.evaluate(UNFOLD)
-    page.set_viewport_size({"width": SHEET, "height": 960})
-    page.emulate_media(media="print", color_scheme="dark")
-    page.wait_for_timeout(300)
-    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-    assert not layout_faults(page, paper=SHEET)
-    assert page.pdf(format="A4").startswith(b"%PDF")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_page_has_the_readers_colours_and_prints_on_white(opened, scheme):
+    page = opened("fit")
+    shade = "getComputedStyle(document.body).backgroundColor"
+    page.emulate_media(color_scheme=scheme)
+    assert page.evaluate(shade) == (
+        "rgb(13, 17, 23)" if scheme == "dark" else "rgb(255, 255, 255)"
+    )
+    page.emulate_media(media="print", color_scheme=scheme)
+    page.wait_for_timeout(300)  # Plotly draws again.
+    assert page.evaluate(shade) == "rgb(255, 255, 255)"
+    ink = page.locator("[data-chart] .xtick text").first.evaluate("e => getComputedStyle(e).fill")
+    assert ink == "rgb(27, 31, 36)", "the chart's text is black on paper"
+    assert page.pdf(format="A4", width=f"{SHEET}px").startswith(b"%PDF")
 
 
 @pytest.mark.slow

@@ -53,6 +53,12 @@ def test_names_inside_a_sentence_become_words():
     text = "Missing: hinge.coulomb_friction and voltage.input_delay. The model lacks 0.5."
     words = "Missing: dry friction at hinge and voltage delay. The model lacks 0.5."
     assert in_words(text) == words
+    assert in_words("The strongest sign is arm_2: arm_2_velocity.") == (
+        "The strongest sign is arm 2: arm 2 velocity."
+    )
+    assert in_words("Use revised_model.py or rollouts/x_1.nc.") == (
+        "Use revised_model.py or rollouts/x_1.nc."
+    )
     assert effect_title("payload", "") == "additional payload"
     assert quantity(2.5, "s") == "2.5 s"
 

@@ -16,13 +16,14 @@ from npdr_ppl.display.reports.content import (
 )
 from npdr_ppl.display.reports.discovery_report import discovery_report
 from npdr_ppl.display.reports.training_report import training_report
+from npdr_ppl.drawing.effect_names import effect_label
 from npdr_ppl.drawing.numbers import number
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import DemoRecord
 
 __all__ = ["demo_report"]
 
-SHARED = ("Effects", "Where", "Revised model")
+SHARED = ("Effects", "Measured and simulated", "Where", "Revised model")
 """Sections that are taken from the report on the discovery."""
 
 
@@ -54,7 +55,7 @@ def demo_report(folder: Path) -> Report:
 def _verdict(result: Mapping[str, Any]) -> Headline:
     before, after = result["returns"].values()
     gain = f"The return on the rig changed from {before:.0f} to {after:.0f}."
-    names = ", ".join(f"{row['effect']} at {row['port']}" for row in result["effects"])
+    names = ", ".join(map(effect_label, result["effects"]))
     if not names:
         return Headline("nothing was found", f"Discovery named no missing effect. {gain}", "warn")
     succeeds = after >= result["success"]

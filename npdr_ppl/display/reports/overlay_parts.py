@@ -59,7 +59,7 @@ def recording_section(overlays: OverlayRecord | None) -> list[Section]:
     ]
     for place, one in enumerate(overlays["rollouts"]):
         every = "".join(channel_html(one, name, overlays) for name in one["channels"])
-        drawings = legend_html(one) + every
+        drawings = f'{legend_html(one)}<div class="many">{every}</div>'
         part = DrawingPart(drawings, f"{rollout_words(one, overlays).capitalize()}.")
         parts.append(part if place == 0 else FoldedPart(f"Rollout {one['rollout']}", [part]))
     return [Section("Measured and simulated", parts)]

@@ -22,6 +22,7 @@ from npdr_ppl.display.reports.content import (
 from npdr_ppl.display.reports.fit_report import parameters_table
 from npdr_ppl.display.reports.meanings import findings
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
+from npdr_ppl.drawing.effect_names import in_words
 from npdr_ppl.drawing.numbers import number
 from npdr_ppl.loop.policy_check import NextStep
 from npdr_ppl.rollouts import Rollouts
@@ -135,6 +136,7 @@ def _decisions(records: Records) -> list[Explained]:
                 if did
                 else str(decision.get("reason", ""))
             )
+            meaning = in_words(meaning).replace("`", "")
             result.append(Explained(f"Iteration {index}", word, tone, meaning))
         for check in record.get("checks") or []:
             word = str(check["decision"])
