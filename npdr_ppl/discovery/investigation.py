@@ -315,7 +315,7 @@ class Investigation:
             )
 
     def _overlays(self, final: Hypothesis) -> Overlays:
-        """The held-out rollouts, or else the recording, and simulations of them."""
+        """Returns the held-out rollouts, or else the recording, and simulations of them."""
         shown = self.rollouts if self.holdout is None else self.holdout
         with self._stage("simulate"):
             self.progress.say("simulating the recording")
