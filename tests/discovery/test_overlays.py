@@ -3,9 +3,11 @@
 import json
 
 import numpy as np
+import pytest
 
-from npdr_ppl.discovery.proof.overlays import MOST_POINTS, Overlay, ResidualMap
-from npdr_ppl.run_files import plain
+from npdr_ppl.discovery.proof.overlays import MOST_POINTS, Overlay, Overlays, ResidualMap
+from npdr_ppl.run_files import plain, read_json, write_json
+from npdr_ppl.run_records import OverlayRecord
 
 CHANNELS = ("angle", "velocity")
 
@@ -44,6 +46,23 @@ def test_where_a_simulation_failed_is_nothing():
         series = shown["channels"]["angle"]["fitted"]
         assert series[-1] is None and 1.0 in series
         json.dumps(plain(shown), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("num_channels", "num_rollouts", "points"),
+    [(2, 3, 500), (14, 3, 400), (60, 2, 150), (400, 1, 40)],
+)
+def test_the_file_of_any_robot_can_be_read_back(tmp_path, num_channels, num_rollouts, points):
+    channels = tuple(f"joint_{k}" for k in range(num_channels))
+    values = np.ones((5_000, num_channels))
+    simulated = dict.fromkeys(("nominal", "fitted", "revised"), values)
+    one = Overlay(0, 0.002 * np.arange(5_000), values, simulated, {})
+    units = dict.fromkeys(channels, "rad")
+    found = Overlays(True, channels, units, (one, one, one), ()).to_dict()
+    write_json(tmp_path / "overlays.json", found)
+    read = read_json(tmp_path / "overlays.json", OverlayRecord)
+    assert len(read["rollouts"]) == num_rollouts
+    assert len(read["rollouts"][0]["time"]) >= points
 
 
 def test_a_map_has_a_row_per_channel():

@@ -13,6 +13,7 @@ from npdr_ppl.display.reports.content import DiffPart, FindingsPart, unfolded
 from npdr_ppl.display.reports.meanings import findings
 from npdr_ppl.display.reports.run_report import MAX_BYTES
 from npdr_ppl.errors import DataError
+from tests.helpers.arm_discovery import write_arm_discovery
 
 KINDS = ("fit", "compare", "train", "discover")
 
@@ -138,6 +139,36 @@ def test_an_effect_that_a_half_does_not_show_is_no_headline(runs, tmp_path):
 def test_a_discovery_of_little_is_shown_too(tmp_path, verdict):
     (tmp_path / "discovery.json").write_text(json.dumps({"verdict": verdict}))
     assert verdict in write_report(tmp_path).read_text() or verdict != "unknown"
+
+
+def test_changed_curves_are_refused_with_a_sentence(tmp_path):
+    write_arm_discovery(tmp_path / "arm")
+    file = tmp_path / "arm" / "overlays.json"
+    whole = file.read_text()
+    for change, sentence in (
+        (lambda found: found["rollouts"][0]["time"].pop(), "differ in length"),
+        (lambda found: found.pop("maps"), "missing required field"),
+        (lambda found: found["maps"][0].update(before=[[1.0] * 900_000]), "too many values"),
+        (lambda found: found["units"].update(joint_1=3), "Expected `?str"),
+    ):
+        found = json.loads(whole)
+        change(found)
+        file.write_text(json.dumps(found))
+        with pytest.raises(DataError, match=sentence):
+            write_report(tmp_path / "arm")
+
+
+def test_an_arms_rows_are_short_and_name_effects_in_words(tmp_path):
+    write_arm_discovery(tmp_path / "arm")
+    report = read_run(tmp_path / "arm")
+    effects = next(s for s in report.sections if s.title == "Effects").parts[0]
+    assert effects.rows[0][0] == "motor joint 1 gain error, -5 %"
+    # A row of four cells of this length has at most two lines on a page of 60 rem.
+    assert max(len(cell) for row in effects.rows for cell in row) < 70
+    assert len(report.verdict.word) + len(report.verdict.sentence) < 250
+    page = write_report(tmp_path / "arm").read_text()
+    first = page[: page.index("<section")]
+    assert "actuator_gain" not in first and 'class="revised"' in first
 
 
 @pytest.mark.parametrize(

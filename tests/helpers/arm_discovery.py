@@ -11,7 +11,7 @@ MOTORS = [f"motor_{joint}" for joint in JOINTS]
 def write_arm_discovery(folder):
     """Writes ``discovery.json``, ``overlays.json`` and ``revised_model.py``."""
     folder.mkdir()
-    effects = [_effect("actuator_gain", motor, "error", -0.05 * k, "1", 0.5 / (k + 1))
+    effects = [_effect("actuator_gain", motor, "error", -0.05 * (k + 1), "1", 0.5 / (k + 1))
                for k, motor in enumerate(MOTORS)]  # fmt: skip
     lag = "joint_6,joint_6_velocity"
     effects.append(_effect("sensor_low_pass", lag, "time_constant", 0.0028, "s", 0.01))

@@ -33,6 +33,13 @@ the smallest and the largest value of each of half as many stretches."""
 MOST_CELLS = 120
 """Maximum number of cells of a residual map along time; each is about 7 CSS pixels wide."""
 
+MOST_NUMBERS = 80_000
+"""Maximum number of points of all curves, which a robot of many channels shares; and twice the
+maximum of cells of all maps. ``overlays.json`` may have 200 000 values to be read back."""
+
+FEWEST_POINTS = 150
+"""Least number of points of a series with which a second rollout is kept."""
+
 MODELS = ("nominal", "fitted", "revised")
 """The middle of the priors; the original model's closest fit; that of the revised model."""
 
@@ -57,19 +64,19 @@ class Overlay:
     simulated: dict[str, Array]
     misfit: dict[str, dict[str, float]]
 
-    def to_dict(self, channels: Sequence[str]) -> dict[str, Any]:
-        """Returns JSON-serialisable values, thinned to ``MOST_POINTS`` points.
+    def to_dict(self, channels: Sequence[str], most: int = MOST_POINTS) -> dict[str, Any]:
+        """Returns JSON-serialisable values, thinned.
 
         Args:
             channels: Names of the C channels.
+            most: Greatest number of points of a series.
         """
         series = {"measured": self.measured, **self.simulated}
-        time = _every_second(self.time, -(-2 * len(self.time) // MOST_POINTS))
         return {
             "rollout": self.rollout,
-            "time": _rounded(time),
+            "time": _rounded(_thinned_time(self.time, most)),
             "channels": {
-                channel: {name: _rounded(_extremes(v[:, k])) for name, v in series.items()}
+                channel: {name: _rounded(_extremes(v[:, k], most)) for name, v in series.items()}
                 for k, channel in enumerate(channels)
             },
             "misfit": self.misfit,
@@ -122,12 +129,15 @@ class Overlays:
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values, the content of ``overlays.json``."""
+        lines = max(1, len(self.channels) * (len(MODELS) + 1))
+        kept = max(1, min(len(self.rollouts), MOST_NUMBERS // (lines * FEWEST_POINTS)))
+        points = max(2, min(MOST_POINTS, MOST_NUMBERS // (lines * kept)))
         return {
             "is_held_out": self.is_held_out,
             "restart_seconds": RESTART_SECONDS,
             "channels": list(self.channels),
             "units": self.units,
-            "rollouts": [shown.to_dict(self.channels) for shown in self.rollouts],
+            "rollouts": [one.to_dict(self.channels, points) for one in self.rollouts[:kept]],
             "maps": [shown.to_dict() for shown in self.maps],
         }
 
@@ -214,22 +224,23 @@ def _maps(before: Hypothesis, after: Hypothesis) -> tuple[ResidualMap, ...]:
     noise = noise_of(before)
     found = [residuals_by_rollout(hypothesis, noise) for hypothesis in (before, after)]
     step = before.segments.inputs.time_step
+    cells = max(2, min(MOST_CELLS, MOST_NUMBERS // (4 * MOST_ROLLOUTS * len(noise))))
     loud = sorted(found[0], key=lambda r: -float(np.nanmean(found[0][r] ** 2)))[:MOST_ROLLOUTS]
     return tuple(
         ResidualMap(
             rollout,
             len(found[0][rollout]) * step,
-            *(thinned(values[rollout], MOST_CELLS) for values in found),
+            *(thinned(values[rollout], cells) for values in found),
         )
         for rollout in loud
     )
 
 
-def _extremes(values: Array) -> Array:
+def _extremes(values: Array, most: int) -> Array:
     """Returns the two extreme values of each stretch, in the order in which they occur."""
-    width = -(-2 * len(values) // MOST_POINTS)
-    if width <= 2:
-        return _every_second(values, width)
+    width = _stretch(len(values), most)
+    if width == 1:
+        return values
     padded = np.concatenate([values, np.repeat(values[-1:], -len(values) % width)])
     rows = padded.reshape(-1, width)
     # What is not finite is no extreme; a stretch without any finite value stays a gap.
@@ -240,12 +251,19 @@ def _extremes(values: Array) -> Array:
     return np.take_along_axis(rows, ends, 1).ravel()
 
 
-def _every_second(values: Array, width: int) -> Array:
-    """Returns the first and the middle value of each stretch; all values of a short series."""
-    if width <= 2:
-        return values[:: max(1, width // 2)] if len(values) > MOST_POINTS else values
-    starts = np.arange(0, len(values), width)
-    return values[np.stack([starts, np.minimum(starts + width // 2, len(values) - 1)], 1).ravel()]
+def _thinned_time(time: Array, most: int) -> Array:
+    """Returns the times of the first and the middle value of each stretch."""
+    width = _stretch(len(time), most)
+    if width == 1:
+        return time
+    starts = np.arange(0, len(time), width)
+    middles = np.minimum(starts + width // 2, len(time) - 1)
+    return time[np.stack([starts, middles], 1).ravel()]
+
+
+def _stretch(num: int, most: int) -> int:
+    """Returns the number of values of which two are kept; 1 if all are."""
+    return 1 if num <= most else max(2, -(-2 * num // most))
 
 
 def _rounded(values: Array) -> list[float | None]:
