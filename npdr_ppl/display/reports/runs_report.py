@@ -187,8 +187,8 @@ def _findings(runs: Runs, shared: Mapping[str, Any], apart: Sequence[str]) -> li
                 "Recordings",
                 "the same",
                 "warn",
-                "All runs used the same recordings. Their agreement shows that seeds and settings "
-                "do not matter, but not that another recording gives the same result.",
+                "All runs used the same recordings, so that only seeds and settings are compared. "
+                "Whether another recording gives the same result is not known.",
             )
         )
     models = {run.model for run in runs if run.model}
