@@ -15,7 +15,7 @@ def report(
     runs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="RUN...", help="Folder that was passed as --out; several are compared."
+            metavar="RUN", help="Folder that was passed as --out; several are compared."
         ),
     ],
     file: Annotated[
@@ -37,7 +37,7 @@ def report(
     Several runs of the same model are shown side by side: parameters with intervals, effects found
     in each, gaps, and whether they agree.
 
-    Examples: npdr report fit --file fit.html; npdr report monday tuesday --file week.html
+    Example: npdr report monday tuesday --file week.html
     """
     from npdr_ppl.display.reports import write_report, write_runs_report
 
