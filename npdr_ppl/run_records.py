@@ -241,6 +241,7 @@ class DiscoveryRecord(TypedDict, total=False):
     remainder: Alarm | None
     effects: list[EffectRecord] | None
     halves: dict[str, list[str]]
+    learned: dict[str, Any] | None
     ranking: list[dict[str, Any]] | None
     where: list[dict[str, Any]] | None
     gap: dict[str, GapRecord] | None

@@ -46,8 +46,16 @@ def headline(result: Mapping[str, Any]) -> tuple[str, str]:
             "Something unknown is missing",
             why or "No effect of the catalogue explains the recording.",
         ),
+        "learned": (f"Learned: {_laws(result) or 'a law'}", gained),
     }
     return verdicts.get(word, (word, reason))
+
+
+def _laws(result: Mapping[str, Any]) -> str:
+    """Returns the learned laws in words: the first one, and how many more there are."""
+    laws = (result.get("learned") or {}).get("laws") or []
+    texts = [f"{law['with_numbers']} {law['unit']} at {law['port']}" for law in laws]
+    return texts[0] + (f", and {len(texts) - 1} more" if len(texts) > 1 else "") if texts else ""
 
 
 def _shortened(reason: str, num_effects: int) -> str:

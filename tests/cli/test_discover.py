@@ -266,6 +266,26 @@ def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, t
     assert "way" not in shown
 
 
+def test_a_learned_law_is_printed_with_its_checks(monkeypatch, tmp_path):
+    text = StringIO()
+    monkeypatch.setattr(show, "_console", lambda: Console(file=text, width=100))
+    law = {"port": "hinge", "with_numbers": "− 0.02 v³", "unit": "N m"}
+    found = {
+        "data_problems": [], "verdict": "learned", "reason": "Learned.", "effects": [], "gap": {},
+        "remainder": {"fired": False, "unexplained": 0.0}, "counts": {}, "next_experiment": None,
+        "learned": {
+            "offered": True, "laws": [law], "depends_on": {"hinge": {"v": 1.0}},
+            "alike": {"hinge": {"effect": "hinge.quadratic_drag", "correlation": 0.93}},
+            "checks": [{"where": "the first half", "before": 12.5, "after": 1.25}],
+        },
+    }  # fmt: skip
+    show.show_discovery(found, tmp_path)
+    shown = " ".join(text.getvalue().split())
+    assert "hinge − 0.02 v³ N m" in shown and "the first half 12.5 1.25" in shown
+    assert "Explained misfit lost at hinge without v 100%." in shown
+    assert "hinge.quadratic_drag, correlation 0.93" in shown
+
+
 def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
     text = StringIO()
     monkeypatch.setattr(show, "_console", lambda: Console(file=text, width=100))

@@ -135,7 +135,34 @@ def test_an_effect_that_a_half_does_not_show_is_no_headline(runs, tmp_path):
     assert "Found by a search of only half of the recording?" in text
 
 
-@pytest.mark.parametrize("verdict", ["none", "named", "ambiguous", "unknown"])
+def test_a_learned_law_is_the_headline_and_is_shown_where_it_was_checked(tmp_path):
+    law = {
+        "port": "hinge",
+        "unit": "N m",
+        "formula": "c₁ v³",
+        "with_numbers": "− 0.02 v³",
+        "constants": {"c1": {"value": -0.02, "unit": "N m/(rad/s)³"}},
+        "ranges": {"v": [-3.0, 4.0]},
+    }
+    learned = {
+        "offered": True,
+        "laws": [law],
+        "checks": [{"where": "the held-out rollouts", "before": 12.5, "after": 1.5}],
+        "depends_on": {"hinge": {"v": 0.99, "q": 0.0}},
+        "alike": {"hinge": {"effect": "hinge.quadratic_drag", "correlation": 0.93}},
+    }
+    content = {"verdict": "learned", "reason": "Learned.", "learned": learned}
+    (tmp_path / "discovery.json").write_text(json.dumps(content))
+    assert read_run(tmp_path).verdict.word == "Learned: − 0.02 v³ N m at hinge"
+    text = write_report(tmp_path).read_text()
+    for part in ("N m/(rad/s)³", "the held-out rollouts", "12.5", "v 99%", "correlation 0.93"):
+        assert part in text
+    content = {"verdict": "unknown", "learned": learned | {"offered": False}}
+    (tmp_path / "discovery.json").write_text(json.dumps(content))
+    assert "Learned law, not offered" in write_report(tmp_path).read_text()
+
+
+@pytest.mark.parametrize("verdict", ["none", "named", "ambiguous", "unknown", "learned"])
 def test_a_discovery_of_little_is_shown_too(tmp_path, verdict):
     (tmp_path / "discovery.json").write_text(json.dumps({"verdict": verdict}))
     assert verdict in write_report(tmp_path).read_text() or verdict != "unknown"

@@ -21,6 +21,7 @@ from npdr_ppl.display.reports.content import (
     Tone,
 )
 from npdr_ppl.display.reports.effect_parts import effects_section, estimates_section
+from npdr_ppl.display.reports.learned_parts import learned_section
 from npdr_ppl.display.reports.next_steps import next_section
 from npdr_ppl.display.reports.overlay_parts import (
     lead_curve,
@@ -42,6 +43,7 @@ TONES: Mapping[str, Tone] = {
     "named": "good",
     "ambiguous": "warn",
     "unknown": "bad",
+    "learned": "good",
 }
 
 
@@ -62,6 +64,7 @@ def discovery_report(folder: Path) -> Report:
     sections = [
         next_section(result, said=verdict.sentence),
         effects_section(result.get("effects") or [], result.get("ranking") or []),
+        *learned_section(result.get("learned") or {}),
         *recording_section(overlays),
         where_section(overlays, result.get("where") or []),
         Section("Gap on held-out rollouts", _gap(gap)),

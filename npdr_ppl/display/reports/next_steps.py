@@ -41,12 +41,19 @@ STEPS: Mapping[str, tuple[str, Tone, str]] = {
         "do not rely on the revised model",
         "bad",
         "It explains only a part, or its explanation is doubtful. Repair faults of the recording "
-        "first; otherwise add an effect of your own, or change the model.",
+        "first; otherwise learn a law with --learn, or add an effect of your own.",
+    ),
+    "learned": (
+        "read the law, and use the revised model",
+        "good",
+        "learned_effect.py has the formula and the range for which it was learned. It may be "
+        "wrong beyond that range.",
     ),
 }
 """What to do, its rating and its reason, by verdict."""
 
 COMMANDS: Mapping[str, str] = {
+    "learned": "npdr fit revised_model.py:revised_model --data RECORDING --out fit",
     "named": "npdr fit revised_model.py:revised_model --data RECORDING --out fit",
     "ambiguous": "npdr discover MODEL --data RECORDING_AND_NEW_ONE --out discovery_2",
 }
