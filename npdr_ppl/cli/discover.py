@@ -47,6 +47,13 @@ class LastStage(StrEnum):
     PROVE = "prove"
 
 
+class LawSymmetry(StrEnum):
+    """Symmetry of a learned law under mirrored motion and commands."""
+
+    ODD = "odd"
+    EVEN = "even"
+
+
 def discover(
     model: ModelArgument,
     data: DataOption,
@@ -87,6 +94,13 @@ def discover(
             "--learn",
             help="If no effect explains the recording, learn a law, and write it as an effect.",
         ),
+    ] = False,
+    symmetry: Annotated[
+        LawSymmetry | None,
+        typer.Option(help="Symmetry of a learned law: odd like friction, or even."),
+    ] = None,
+    passive: Annotated[
+        bool, typer.Option("--passive", help="A learned law only takes energy, as friction does.")
     ] = False,
     time_limit: Annotated[
         float | None,
@@ -138,6 +152,8 @@ def discover(
         false_alarm_rate=false_alarm_rate,
         repeat=repeat,
         learn=learn,
+        symmetry=None if symmetry is None else symmetry.value,
+        is_passive=passive,
         time_limit=time_limit,
     )
     folder = DiscoveryFolder(out)

@@ -1,6 +1,7 @@
 """Settings of a search for missing effects."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.effects import Effect
@@ -24,6 +25,10 @@ class DiscoveryOptions:
         repeat: Whether both halves of the recording are searched, too. An effect that is not found
             in both is not named. This takes about twice as long.
         learn: Whether a law is learned if no effect of the catalogue explains the recording.
+        symmetry: Symmetry of a law that is learned: ``"odd"`` if mirrored motion and commands
+            mirror it, ``"even"`` if they do not change it, ``None`` if it may have none.
+        is_passive: Whether a law that is learned takes energy from its joint at every moment, as
+            friction does.
         time_limit: Seconds after which no further effect is searched; ``None`` for no limit. The
             running step is finished. Then the effects found so far are compared with their
             alternatives, and the posterior and the held-out gap are computed. The verdict is
@@ -36,6 +41,8 @@ class DiscoveryOptions:
     confidence: float = 0.9
     repeat: bool = False
     learn: bool = False
+    symmetry: Literal["odd", "even"] | None = None
+    is_passive: bool = False
     time_limit: float | None = None
 
     def __post_init__(self) -> None:
@@ -46,6 +53,10 @@ class DiscoveryOptions:
         """
         if self.max_effects < 0:
             raise DataError(f"max_effects must not be negative, got {self.max_effects}.")
+        if self.symmetry not in (None, "odd", "even"):
+            raise DataError(f"symmetry is 'odd', 'even' or None, got {self.symmetry!r}.")
+        if not self.learn and (self.symmetry is not None or self.is_passive):
+            raise DataError("symmetry and is_passive are those of a learned law; set learn=True.")
         for name in ("false_alarm_rate", "confidence"):
             value = getattr(self, name)
             if not 0.0 < value < 1.0:

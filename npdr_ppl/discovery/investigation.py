@@ -13,6 +13,7 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery
 from npdr_ppl.discovery.finding import Finding
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.learning.assumptions import Assumptions
 from npdr_ppl.discovery.learning.result import Learned, learn
 from npdr_ppl.discovery.proof.held_out_gap import Gap, prove
 from npdr_ppl.discovery.proof.next_experiment import NextExperiment, next_experiment
@@ -311,6 +312,7 @@ class Investigation:
                 candidates_at(self.start, self.settings),
                 holdout=holdout,
                 options=options,
+                assumptions=Assumptions(self.settings.symmetry, self.settings.is_passive),
                 report=self.progress.say,
             )
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.learning.assumptions import Assumptions
 from npdr_ppl.discovery.learning.law import Law, module_source
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion, motion_at_ports
 from npdr_ppl.discovery.learning.regression import (
@@ -22,7 +23,11 @@ from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
 
-__all__ = ["PortFormulas", "effects_of", "formulas_by_port", "law_of"]
+__all__ = ["NO_ASSUMPTIONS", "PortFormulas", "effects_of", "formulas_by_port", "law_of"]
+
+
+NO_ASSUMPTIONS = Assumptions()
+"""Any law."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +50,21 @@ class PortFormulas:
         return self.products.motion
 
 
-def formulas_by_port(hypothesis: Hypothesis) -> list[PortFormulas]:
+def formulas_by_port(
+    hypothesis: Hypothesis, assumptions: Assumptions = NO_ASSUMPTIONS
+) -> list[PortFormulas]:
     """Returns the formulas at each port, the port with the least error first.
 
     Args:
         hypothesis: The fitted model.
+        assumptions: What is known about the law.
     """
     projection = Projection(hypothesis)
     result = []
     for motion in motion_at_ports(hypothesis):
-        terms = terms_at(motion)
+        terms = assumptions.applied_to(terms_at(motion), motion)
+        if not terms:
+            continue
         if motion.responses is None:
             known = _sensor_responses(hypothesis, motion, terms)
             if known is None:
@@ -69,6 +79,7 @@ def formulas_by_port(hypothesis: Hypothesis) -> list[PortFormulas]:
         if motion.responses is not None:
             front += _with_harmonics(products, terms, front)
             front = [_refined(products, formula) for formula in pareto_front(front)]
+        front = [formula for formula in front if assumptions.agrees(formula, motion)]
         result.append(PortFormulas(products, equations, pareto_front(front)))
     return sorted(result, key=lambda port: min(f.error for f in port.front))
 

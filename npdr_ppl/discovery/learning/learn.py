@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.learning.assumptions import Assumptions
 from npdr_ppl.discovery.learning.formulas import (
+    NO_ASSUMPTIONS,
     PortFormulas,
     effects_of,
     formulas_by_port,
@@ -55,6 +57,8 @@ def learned_model(
     trials: Trials,
     start: Hypothesis,
     report: Callable[[str], None] = lambda _: None,
+    *,
+    assumptions: Assumptions = NO_ASSUMPTIONS,
 ) -> LearnedModel | None:
     """Learns the laws that a fitted model misses.
 
@@ -62,6 +66,7 @@ def learned_model(
         trials: Fits of the model.
         start: The fitted model.
         report: Called with a sentence about each step.
+        assumptions: What is known about the laws.
 
     Returns:
         ``None`` if no law predicts parts of the recording better than the model without one.
@@ -70,7 +75,7 @@ def learned_model(
     first: list[PortFormulas] = []
     for _ in range(LEARNING.most_laws):
         report("comparing formulas at every port")
-        ports = formulas_by_port(current)
+        ports = formulas_by_port(current, assumptions)
         first = first or ports
         chosen = [(port, simplest(port.front)) for port in ports]
         chosen = [(port, formula) for port, formula in chosen if _improves(port, formula)]

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.learning.assumptions import Assumptions
 from npdr_ppl.discovery.learning.curves import Curve, curves
-from npdr_ppl.discovery.learning.formulas import PortFormulas
+from npdr_ppl.discovery.learning.formulas import NO_ASSUMPTIONS, PortFormulas
 from npdr_ppl.discovery.learning.law import Law, module_source
 from npdr_ppl.discovery.learning.learn import LearnedModel, learned_model
 from npdr_ppl.discovery.learning.proof import Check, checks
@@ -145,6 +146,7 @@ def learn(
     *,
     holdout: Rollouts | None = None,
     options: DataOptions | None = None,
+    assumptions: Assumptions = NO_ASSUMPTIONS,
     report: Callable[[str], None] = lambda _: None,
 ) -> Learned | None:
     """Learns the laws that a model misses, and checks them.
@@ -156,9 +158,10 @@ def learn(
         candidates: Effects to compare the laws with.
         holdout: A held-out recording, which is not used to choose.
         options: How the held-out recording is cut into segments.
+        assumptions: What is known about the laws.
         report: Called with a sentence about each step.
     """
-    tried = [learned_model(trials, start, report) for start in starts]
+    tried = [learned_model(trials, start, report, assumptions=assumptions) for start in starts]
     found = [model for model in tried if model is not None]
     if not found:
         return None

@@ -7,24 +7,10 @@ import torch
 
 from npdr_ppl.discovery.learning.formulas import effects_of
 from npdr_ppl.discovery.learning.law import Law, module_source
-from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 from npdr_ppl.discovery.learning.terms import terms_at, with_harmonics
 from npdr_ppl.language.channels import Port
 from npdr_ppl.language.effect_context import Joint, Start
-
-
-def made_up(kind, **values):
-    """Motion at a port with random values, in two segments of ten steps."""
-    units = {"q": "rad", "v": "rad/s", "tau": "N m", "t": "s", "u": "N m", "y": "rad"}
-    generator = torch.Generator().manual_seed(0)
-    motion = {
-        name: size * torch.randn(2, 10, generator=generator, dtype=torch.float64)
-        for name, size in values.items()
-    }
-    motion["t"] = motion["t"].abs()
-    port = Port("hinge", kind, "N m", rated=2.0)
-    edges = torch.arange(11)
-    return PortMotion(port, motion, {name: units[name] for name in motion}, None, edges)
+from tests.helpers.port_motions import COMMAND, JOINT, SENSOR
 
 
 def law_with(motion, term):
@@ -32,11 +18,6 @@ def law_with(motion, term):
     coefficients = tuple(0.3 + 0.1 * k for k in range(num))
     ranges = {name: (float(x.min()), float(x.max())) for name, x in motion.values.items()}
     return Law(motion.port, (term,), coefficients, (1.0,) * num, ranges, motion.units)
-
-
-JOINT = made_up("force", q=1.5, v=3.0, tau=1.0, t=2.0)
-COMMAND = made_up("action", u=1.0, t=2.0)
-SENSOR = made_up("sensor", y=1.5, t=2.0)
 
 
 def waves_with_harmonics(motion):
