@@ -24,6 +24,7 @@ from discovery import SEEDS, Task, _case, _catalogue, tasks
 from hidden_rigs import RIGS, Case, make_case
 from hidden_rigs.force_laws import FORCE_LAWS
 from hidden_rigs.friction_laws import DRY_LAWS
+from learning_rivals import rival_misfits
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import Hypothesis
@@ -82,6 +83,7 @@ def _described(case: Case, learned: LearnedModel) -> dict[str, Any]:
         "floor": floor,
         "closed": (before - after) / (before - floor),
         "checks": [c.to_dict() for c in checks(learned, case.holdout, options)],
+        "rivals": rival_misfits(learned.start, case.fit, along, scale),
         "force_error": _force_error(case, learned),
         "closed_on_fit": _closed_on_fit(learned, quiet),
     }
@@ -136,6 +138,10 @@ def summarise(rows: list[dict[str, Any]]) -> None:
             print(f"  error of the force: median {statistics.median(forces):.1%} of {len(forces)}")
         worse = [r for r in made if r.get("after", 0.0) > r.get("before", 0.0)]
         print(f"  worse than before on the other excitation: {len(worse)}")
+        for rival in ("pysindy", "gp"):
+            own = [r for r in made if rival in r.get("rivals", {})]
+            better = sum(r["after"] < r["rivals"][rival] for r in own)
+            print(f"  lower misfit on the other excitation than {rival}: {better} of {len(own)}")
         offered = [r for r in made if r.get("offered")]
         if any("offered" in r for r in made):
             print(f"  offered: {len(offered)}; of these worse: {sum(r in worse for r in offered)}")
