@@ -158,14 +158,18 @@ def _binds(statement: ast.stmt, text: str) -> Iterator[tuple[str, str]]:
 
 def _changes(statement: ast.stmt) -> set[str]:
     """Returns the names whose values a top-level statement may change without binding them."""
+    if isinstance(statement, _DEFINITIONS):
+        return set()
     targets: list[ast.expr] = []
-    if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Call):
-        if isinstance(statement.value.func, ast.Attribute):
-            targets = [statement.value.func]
-    elif isinstance(statement, ast.Assign):
-        targets = statement.targets
-    elif isinstance(statement, ast.AugAssign | ast.AnnAssign):
-        targets = [statement.target]
+    # A loop, a condition or a context may change a name in any of its own statements.
+    for part in ast.walk(statement):
+        if isinstance(part, ast.Expr) and isinstance(part.value, ast.Call):
+            if isinstance(part.value.func, ast.Attribute):
+                targets.append(part.value.func)
+        elif isinstance(part, ast.Assign):
+            targets += part.targets
+        elif isinstance(part, ast.AugAssign | ast.AnnAssign):
+            targets.append(part.target)
     roots = set()
     for target in targets:
         while isinstance(target, ast.Attribute | ast.Subscript):

@@ -19,6 +19,9 @@ SLOPE = 2.0
 """A docstring."""
 TABLE = [1]
 TABLE.append(2)
+for number in (3, 4):
+    if number > 3:
+        TABLE.append(number)
 UNUSED = os.path.join("a", "b")
 
 try:
@@ -58,7 +61,7 @@ def test_an_excerpt_has_what_a_name_needs_and_no_more():
     text = text_of(part)
     scope = {}
     exec(text.replace("x: Decimal", "x"), scope)
-    assert scope["Law"]().force(1.0) > 0.0 and scope["TABLE"] == [1, 2]
+    assert scope["Law"]().force(1.0) > 0.0 and scope["TABLE"] == [1, 2, 4]
     assert part.futures == ("annotations",)
     assert '# How steep it is.\n# In 1/m.\nSLOPE = 2.0\n"""A docstring."""\n' in text
     for other in ("UNUSED", "unused", "json", "print", "__main__", "os"):
