@@ -104,8 +104,12 @@ def class_file(cls: type[Any]) -> Path | None:
 
     It is found in worker processes, too, to which a class is sent as code without its module.
     """
-    functions = filter(inspect.isfunction, vars(cls).values())
-    paths = (Path(function.__code__.co_filename) for function in functions)
+    # A decorator may have put a function of another file around that of the class.
+    functions = map(inspect.unwrap, filter(inspect.isfunction, vars(cls).values()))
+    own = [f.__code__.co_filename for f in functions if f.__module__ == cls.__module__]
+    # A class may have no function of its own.
+    module = getattr(sys.modules.get(cls.__module__), "__file__", None)
+    paths = map(Path, [*own, *([module] if module else [])])
     # A relative path is that of code made from a text, not of a file.
     return next((path for path in paths if path.is_absolute() and path.is_file()), None)
 

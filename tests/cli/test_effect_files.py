@@ -142,6 +142,16 @@ def test_files_of_the_same_name_do_not_collide(tmp_path):
         assert cloudpickle.loads(cloudpickle.dumps(effect)).force(*values).item() == force
 
 
+def test_the_file_of_a_class_is_found_without_a_function_and_behind_a_decorator(tmp_path):
+    file = tmp_path / "law.py"
+    decorated = CUBIC.replace("    def force(", "    @torch.no_grad()\n    def force(")
+    soft = 'class Soft(LearnedHinge):\n    id = "soft"\n'
+    file.write_text(f"{decorated.replace('POWER = 3', 'import torch')}\n\n{soft}")
+    module = load_python_file(file)
+    for cls in (module.LearnedHinge, module.Soft):
+        assert class_file(cls) == file
+
+
 def test_a_file_is_loaded_again_only_if_it_changed(tmp_path):
     file = tmp_path / "json.py"
     file.write_text(CUBIC)
