@@ -91,9 +91,10 @@ def check_declared(cls: type[Effect], path: Path) -> None:
     label = f"{cls.__name__} in {path}"
     if missing:
         raise ModelError(f"{label} does not define {', '.join(missing)}; every effect has to.")
-    if not cls.id.isidentifier():
+    if not cls.id.isidentifier() or cls.id.startswith("_"):
         raise ModelError(
-            f"{label} has the id {cls.id!r}; it may have letters, digits and underscores only."
+            f"{label} has the id {cls.id!r}; it may have letters, digits and underscores only, "
+            "and begins with a letter."
         )
     if not cls.parameters or not all(isinstance(p, Parameter) for p in cls.parameters):
         raise ModelError(f"{label} has to list at least one Parameter in its parameters.")

@@ -69,7 +69,8 @@ MESSAGES = {
     "ends.py@hinge": "ends.py cannot be loaded: SystemExit: 3.",
     "nameless.py@hinge": "Nameless in nameless.py does not define id",
     "half.py@hinge": "Half in half.py does not define default_priors",
-    "dotted.py@hinge": "has the id 'a.b'; it may have letters, digits and underscores only.",
+    "dotted.py@hinge": "has the id 'a.b'; it may have letters, digits and underscores only,",
+    "hidden.py@hinge": "has the id '_law'; it may have letters, digits and underscores only, and",
     "taken.py@hinge": "has the id 'spring' of another effect of `npdr effects`; change the id",
     "hinge.baias": "did you mean 'bias'?",
 }
@@ -87,6 +88,7 @@ def wrong_files(folder):
     half = CUBIC.replace("default_priors", "other").replace("LearnedHinge", "Half")
     (folder / "half.py").write_text(half)
     (folder / "taken.py").write_text(CUBIC.replace('"learned_hinge"', '"spring"'))
+    (folder / "hidden.py").write_text(CUBIC.replace('"learned_hinge"', '"_law"'))
     (folder / "dotted.py").write_text(CUBIC.replace('"learned_hinge"', '"a.b"'))
 
 
