@@ -78,11 +78,22 @@ def _listed(labels: Sequence[str]) -> str:
 
 def _gained(gap: Mapping[str, Any]) -> str:
     """Returns a sentence about the gain of the revised model on held-out rollouts."""
-    closed = [
-        f"{min(values['closed'], 1.0):.0%} in {METRICS.get(metric, metric)}"
+    if not gap:
+        return "The gain on held-out rollouts was not measured."
+    shares = {
+        METRICS.get(metric, metric): values["closed"]
         for metric, values in gap.items()
         if values.get("closed") is not None
-    ]
-    if not closed:
-        return "The gain on held-out rollouts was not measured."
-    return f"Of the gap on held-out rollouts it closes {', '.join(closed)}."
+    }
+    if not shares:
+        return "On held-out rollouts the original model has hardly any gap to close."
+    closed = [f"{min(share, 1.0):.0%} in {name}" for name, share in shares.items() if share >= 0.0]
+    grown = [name for name, share in shares.items() if share < 0.0]
+    sentences = []
+    if closed:
+        sentences.append(
+            f"Of the gap on held-out rollouts the revised model closes {', '.join(closed)}."
+        )
+    if grown:
+        sentences.append(f"The error on held-out rollouts has grown in {', '.join(grown)}.")
+    return " ".join(sentences)
