@@ -94,7 +94,8 @@ def interval_bars(rows: Mapping[str, tuple[float, float, float]], words: Mapping
         words: Text at the right of each, by the same names.
     """
     low, high = min(row[0] for row in rows.values()), max(row[2] for row in rows.values())
-    margin = 0.05 * max(high - low, 1e-12)
+    # Equal values without a width would leave no range to draw in.
+    margin = 0.05 * max(high - low, 1e-9 * max(abs(low), abs(high)), 1e-12)
     low, high = low - margin, high + margin
 
     def place(value: float) -> float:

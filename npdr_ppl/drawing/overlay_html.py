@@ -88,8 +88,8 @@ def legend_html(one: Mapping[str, Any]) -> str:
 
 
 def rollout_words(one: Mapping[str, Any], overlays: Overlays) -> str:
-    """Returns a rollout's name."""
-    return f"{'held-out ' if overlays['is_held_out'] else ''}rollout {one['rollout']}"
+    """Returns a rollout's name; those held out are counted from 0 by themselves."""
+    return f"rollout {one['rollout']}{' of those held out' if overlays['is_held_out'] else ''}"
 
 
 def _is_revised(series: Mapping[str, Any]) -> bool:

@@ -8,6 +8,7 @@ from npdr_ppl.drawing.bars_html import gap_bars, interval_bars, named_bars
 from npdr_ppl.drawing.curves_html import curve
 from npdr_ppl.drawing.effect_names import TITLES, effect_label, effect_title, in_words, quantity
 from npdr_ppl.drawing.heat_html import FIRST, SHADES, heat_levels, heat_map
+from npdr_ppl.drawing.overlay_html import rollout_words
 from npdr_ppl.models.effects.registry import BUILT_IN
 
 
@@ -93,6 +94,16 @@ def test_the_gap_says_what_was_closed():
     above = gap_bars({"rmse": gap["rmse"] | {"after": 0.04, "closed": 1.07}})
     assert "100% of the gap" in above, "a model below the floor is not better than the true one"
     assert gap_bars({"rmse": {"before": None, "after": float("nan")}}) == ""
+
+
+def test_equal_intervals_without_a_width_are_drawn():
+    html = interval_bars(dict.fromkeys("ab", (1e6, 1e6, 1e6)), {"a": "x", "b": "y"})
+    assert html.count('class="dot" style="left:50.0%"') == 2
+
+
+def test_a_held_out_rollout_is_not_taken_for_one_of_the_whole_recording():
+    assert rollout_words({"rollout": 0}, {"is_held_out": True}) == "rollout 0 of those held out"
+    assert rollout_words({"rollout": 2}, {"is_held_out": False}) == "rollout 2"
 
 
 def test_cells_of_a_map_have_the_shade_of_their_residual():

@@ -54,14 +54,15 @@ def recording_section(overlays: OverlayRecord | None) -> list[Section]:
         TextPart(
             "Nominal: the middle of the priors. Fitted: the original model with its closest "
             "parameters. Revised: with the effects that were found. The lower drawings show "
-            "simulation minus measurement."
+            "simulation minus measurement. Rollouts are counted from 0, those held out by "
+            "themselves."
         )
     ]
     for place, one in enumerate(overlays["rollouts"]):
         every = "".join(channel_html(one, name, overlays) for name in one["channels"])
         drawings = f'{legend_html(one)}<div class="many">{every}</div>'
         part = DrawingPart(drawings, f"{rollout_words(one, overlays).capitalize()}.")
-        parts.append(part if place == 0 else FoldedPart(f"Rollout {one['rollout']}", [part]))
+        parts.append(part if place == 0 else FoldedPart(part.caption.removesuffix("."), [part]))
     return [Section("Measured and simulated", parts)]
 
 
