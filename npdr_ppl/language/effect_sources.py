@@ -17,6 +17,9 @@ from npdr_ppl.python_files import class_file, class_name, is_importable
 
 __all__ = ["EffectSources", "sources_of"]
 
+_TEXTS = ("STRING", "FSTRING_MIDDLE", "TSTRING_MIDDLE")
+"""Kinds of tokens inside which spaces mean something; f-strings have theirs from Python 3.12."""
+
 _OWN_NAMES = ("revised_model", "PRIORS", "CLOSEST_FIT")
 """Names that a revised model's file defines itself."""
 
@@ -111,7 +114,7 @@ def _indented(text: str) -> Iterator[str]:
     """Returns lines with four more spaces in front, but not those inside of a text."""
     inside: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type == tokenize.STRING:
+        if tokenize.tok_name[token.type] in _TEXTS:
             inside |= set(range(token.start[0] + 1, token.end[0] + 1))
     for number, line in enumerate(text.split("\n"), start=1):
         yield f"    {line}" if line and number not in inside else line
