@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from npdr_ppl.discovery.proof.settings import EXPERIMENT
 from npdr_ppl.display.reports.content import (
     CodePart,
     DrawingPart,
@@ -35,7 +36,8 @@ STEPS: Mapping[str, tuple[str, Tone, str]] = {
         "record again",
         "warn",
         "The revised model has the likeliest cause. It predicts well under a similar excitation, "
-        "but possibly not under another. Record the experiment below and search both recordings.",
+        "but possibly not under another. Record what npdr plan designs, and search both "
+        "recordings together.",
     ),
     "unknown": (
         "do not rely on the revised model",
@@ -55,7 +57,8 @@ STEPS: Mapping[str, tuple[str, Tone, str]] = {
 COMMANDS: Mapping[str, str] = {
     "learned": "npdr fit revised_model.py:revised_model --data RECORDING --out fit",
     "named": "npdr fit revised_model.py:revised_model --data RECORDING --out fit",
-    "ambiguous": "npdr discover MODEL --data RECORDING_AND_NEW_ONE --out discovery_2",
+    "ambiguous": "npdr plan RUN MODEL --out next.csv\n"
+    "npdr discover MODEL --data RECORDING --data NEW_RECORDING --out discovery_2",
 }
 
 
@@ -102,7 +105,8 @@ def _experiment(experiment: Any) -> list[Part]:
         }
         caption = (
             "Smallest distance between the causes under each excitation, in standard deviations "
-            "of the measurements; above 5 the recording tells them apart."
+            f"of the measurements; above {EXPERIMENT.useful_separation:g} the recording tells "
+            "them apart."
         )
         parts.append(DrawingPart(named_bars(bars, spec=".3g"), caption))
     skipped = ("excitation", "separated_by", "separations", "amplitude")

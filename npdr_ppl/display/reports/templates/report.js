@@ -3,7 +3,8 @@
   // A link to a folded section unfolds it.
   const unfold = () => {
     const target = location.hash && document.getElementById(location.hash.slice(1));
-    if (target && target.querySelector("details")) target.querySelector("details").open = true;
+    const heading = target && target.querySelector("summary > h2");
+    if (heading) heading.closest("details").open = true;
   };
   addEventListener("hashchange", unfold);
   unfold();
