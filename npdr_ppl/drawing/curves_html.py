@@ -47,15 +47,17 @@ def curve(
     series: Mapping[str, Series],
     *,
     title: str,
+    errors: Mapping[str, Series] | None = None,
     note: str = "",
     height: int = HEIGHT,
 ) -> str:
-    """Draws one channel over time, and below it the errors of the simulations.
+    """Draws one channel over time, and below it the errors of simulations.
 
     Args:
         time: Seconds, ``(T,)``.
         series: ``measured`` and simulations by name, ``(T,)`` each; ``None`` for a missing value.
         title: Name and unit of the channel.
+        errors: Simulation minus measurement by name, ``(T,)`` each.
         note: Text behind the title.
         height: Height of the upper drawing in CSS pixels.
     """
@@ -63,12 +65,6 @@ def curve(
         return ""
     span = time[0], max(time[-1], time[0] + 1e-9)
     bounds = _bounds(series)
-    errors = {
-        name: [None if v is None or m is None else v - m for v, m in zip(
-            values, series["measured"], strict=True)]
-        for name, values in series.items()
-        if name in ("fitted", "revised")
-    }  # fmt: skip
     order = [name for name in ("nominal", "fitted", "revised", "measured") if name in series]
     # The measurement is the widest curve and lies below the revised model's, which may cover it.
     order.sort(key=("nominal", "measured", "fitted", "revised").index)

@@ -58,20 +58,23 @@ def channel_html(
         overlays: The content of ``overlays.json``.
         height: Height in CSS pixels, if not the usual one.
     """
-    series = dict(one["channels"][channel])
-    if not _is_revised(series):
-        series.pop("revised", None)
+    found = one["channels"][channel]
+    names = [name for name in ("measured", *MODELS) if name in found]
+    if not _is_revised(found) and "revised" in names:
+        names.remove("revised")
+    series = {name: found[name] for name in names}
+    errors = {name: found[f"{name}_error"] for name in names if f"{name}_error" in found}
     unit = overlays["units"].get(channel, "")
-    errors = [
+    sizes = [
         f"{name} {number(one['misfit'][name].get(channel))}"
         for name in MODELS
         if name in series and name in one["misfit"]
     ]
-    note = f"RMSE: {', '.join(errors)}" if errors else ""
+    note = f"RMSE: {', '.join(sizes)}" if sizes else ""
     words = channel.replace("_", " ")
     title = f"{words} [{unit}]" if unit else words
     look = {} if height is None else {"height": height}
-    return curve(one["time"], series, title=title, note=note, **look)
+    return curve(one["time"], series, title=title, errors=errors, note=note, **look)
 
 
 def legend_html(one: Mapping[str, Any]) -> str:

@@ -37,6 +37,27 @@ def test_a_long_series_keeps_a_peak_of_one_sample():
     assert abs(shown["time"][series.index(7.0)] - 12_345 * 0.002) < 2 * num * 0.002 / MOST_POINTS
 
 
+def test_errors_are_those_of_the_same_time_however_long_the_series_is():
+    num, late = 60_000, 2
+    time = 0.001 * np.arange(num)
+    measured = np.sin(2 * np.pi * 3.0 * time)[:, None]
+    fitted = np.sin(2 * np.pi * 3.0 * (time - 0.001 * late))[:, None]
+    one = Overlay(0, time, measured, {"fitted": fitted, "nominal": fitted}, {})
+    channel = one.to_dict(("angle",))["channels"]["angle"]
+    errors = np.array(channel["fitted_error"])
+    assert abs(errors).max() == pytest.approx(abs(fitted - measured).max())
+    assert set(channel) == {"measured", "fitted", "nominal", "fitted_error"}
+
+
+def test_small_errors_of_large_values_are_kept():
+    measured = np.linspace(3.0, 3.1, 50)[:, None]
+    one = Overlay(0, np.arange(50.0), measured, {"fitted": measured + 2e-5}, {})
+    channel = one.to_dict(("angle",))["channels"]["angle"]
+    assert channel["fitted_error"] == pytest.approx([2e-5] * 50)
+    shown = np.array(channel["fitted"]) - np.array(channel["measured"])
+    assert shown == pytest.approx(np.full(50, 2e-5), rel=1e-2)
+
+
 def test_where_a_simulation_failed_is_nothing():
     for num in (300, 20_000):
         simulated = np.ones((num, 2))

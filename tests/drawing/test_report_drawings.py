@@ -73,6 +73,16 @@ def test_a_curve_lies_where_its_values_are():
     assert [len(piece) for piece in points(html, "fitted")] == [1, 1], "a gap interrupts the line"
 
 
+def test_errors_are_drawn_below_the_curves():
+    series = {"measured": [0.0, 1.0], "fitted": [0.5, 0.5]}
+    html = curve([0.0, 1.0], series, title="angle", errors={"fitted": [0.5, -0.5]})
+    upper, lower = html.split('<svg class="error"')
+    assert 'class="measured"' in upper and 'class="measured"' not in lower
+    ((first, last),) = points(lower, "fitted")
+    assert first[1] < last[1], "positive errors are higher up"
+    assert 'class="error"' not in curve([0.0, 1.0], series, title="angle")
+
+
 def test_a_simulation_that_runs_away_leaves_the_measurement_visible():
     series = {"measured": [0.0, 1.0, 0.0], "nominal": [0.0, 1e6, -1e6]}
     (measured,) = points(curve([0.0, 1.0, 2.0], series, title="angle"), "measured")

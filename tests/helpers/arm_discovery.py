@@ -78,6 +78,8 @@ def _overlays():
                         for v, t in zip(measured, time, strict=True)],
             "fitted": [1.1 * v + 0.05 for v in measured],
             "revised": [1.01 * v for v in measured],
+            "fitted_error": [0.1 * v + 0.05 for v in measured],
+            "revised_error": [0.01 * v for v in measured],
         }  # fmt: skip
     misfit = {name: dict.fromkeys(CHANNELS, e) for name, e in (("fitted", 0.1), ("revised", 0.01))}
     rollouts = [{"rollout": k, "time": time, "channels": channels, "misfit": misfit}

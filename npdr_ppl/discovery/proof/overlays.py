@@ -33,15 +33,23 @@ the smallest and the largest value of each of half as many stretches."""
 MOST_CELLS = 120
 """Maximum number of cells of a residual map along time; each is about 7 CSS pixels wide."""
 
-MOST_NUMBERS = 80_000
-"""Maximum number of points of all curves, which a robot of many channels shares; and twice the
-maximum of cells of all maps. ``overlays.json`` may have 200 000 values to be read back."""
+MOST_NUMBERS = 120_000
+"""Maximum number of points of all curves, which a robot of many channels shares; and three times
+the maximum of cells of all maps. ``overlays.json`` may have 200 000 values to be read back."""
 
 FEWEST_POINTS = 150
 """Least number of points of a series with which a second rollout is kept."""
 
 MODELS = ("nominal", "fitted", "revised")
 """The middle of the priors; the original model's closest fit; that of the revised model."""
+
+WITH_ERRORS = ("fitted", "revised")
+"""Models whose errors are kept beside their simulations. They are thinned by themselves: the
+difference of two thinned series would be that of measurements at different times."""
+
+DIGITS = 8
+"""Significant digits of the values: an angle of 3 rad keeps errors of 1e-7 rad, below the
+resolution of encoders."""
 
 Array = NDArray[np.float64]
 
@@ -72,6 +80,11 @@ class Overlay:
             most: Greatest number of points of a series.
         """
         series = {"measured": self.measured, **self.simulated}
+        series |= {
+            f"{name}_error": self.simulated[name] - self.measured
+            for name in WITH_ERRORS
+            if name in self.simulated
+        }
         return {
             "rollout": self.rollout,
             "time": _rounded(_thinned_time(self.time, most)),
@@ -129,7 +142,7 @@ class Overlays:
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values, the content of ``overlays.json``."""
-        lines = max(1, len(self.channels) * (len(MODELS) + 1))
+        lines = max(1, len(self.channels) * (1 + len(MODELS) + len(WITH_ERRORS)))
         kept = max(1, min(len(self.rollouts), MOST_NUMBERS // (lines * FEWEST_POINTS)))
         points = max(2, min(MOST_POINTS, MOST_NUMBERS // (lines * kept)))
         return {
@@ -224,7 +237,7 @@ def _maps(before: Hypothesis, after: Hypothesis) -> tuple[ResidualMap, ...]:
     noise = noise_of(before)
     found = [residuals_by_rollout(hypothesis, noise) for hypothesis in (before, after)]
     step = before.segments.inputs.time_step
-    cells = max(2, min(MOST_CELLS, MOST_NUMBERS // (4 * MOST_ROLLOUTS * len(noise))))
+    cells = max(2, min(MOST_CELLS, MOST_NUMBERS // (6 * MOST_ROLLOUTS * len(noise))))
     loud = sorted(found[0], key=lambda r: -float(np.nanmean(found[0][r] ** 2)))[:MOST_ROLLOUTS]
     return tuple(
         ResidualMap(
@@ -267,5 +280,5 @@ def _stretch(num: int, most: int) -> int:
 
 
 def _rounded(values: Array) -> list[float | None]:
-    """Returns numbers of five digits; ``None`` for what is not finite."""
-    return [float(f"{v:.5g}") if np.isfinite(v) else None for v in values.tolist()]
+    """Returns numbers of ``DIGITS`` digits; ``None`` for what is not finite."""
+    return [float(f"{v:.{DIGITS}g}") if np.isfinite(v) else None for v in values.tolist()]
