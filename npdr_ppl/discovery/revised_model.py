@@ -16,6 +16,7 @@ from npdr_ppl.language.layers import layers
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors, wider_sites
 from npdr_ppl.python_files import is_importable
+from npdr_ppl.python_text import plain, quoted
 
 __all__ = ["revised_source"]
 
@@ -67,7 +68,7 @@ def revised_source(
         lines += _added(effect, sources.names)
     lines += ["", "# Parameters of the closest fit to the recording."]
     lines += ["CLOSEST_FIT = {"]
-    lines += [f'    "{site}": {value:.6g},' for site, value in fitted.items()]
+    lines += [f"    {quoted(site)}: {value:.6g}," for site, value in fitted.items()]
     return "\n".join([*lines, "}", ""])
 
 
@@ -97,7 +98,8 @@ def _added(effect: Effect, names: Mapping[type[Effect], str]) -> list[str]:
     for name, prior in effect.given_priors.items():
         written = _distribution(prior)
         if written is None:
-            lines.append(f"# The prior given to {effect.name}.{name} has no source: put it here.")
+            site = plain(f"{effect.name}.{name}")
+            lines.append(f"# The prior given to {site} has no source: put it here.")
         else:
             priors.append(f'    "{name}": {written},')
     own, shown = names.get(type(effect), type(effect).__name__), repr(effect)

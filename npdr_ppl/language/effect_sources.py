@@ -14,6 +14,7 @@ from pathlib import Path
 from npdr_ppl.excerpts import Excerpt, bound_names, excerpt, import_lines
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.python_files import class_file, class_name, is_importable
+from npdr_ppl.python_text import plain
 
 __all__ = ["EffectSources", "sources_of"]
 
@@ -84,7 +85,7 @@ def _copy(
     result.head = _with_futures(result.head, part.futures)
     if not part.collides_with(taken):
         result.imports |= set(part.imports)
-        result.blocks += ["", "", f"# From {file.name}.", part.body]
+        result.blocks += ["", "", f"# From {plain(file.name)}.", part.body]
         taken |= part.bound
         return
     function = _free(f"_effects_of_{file.stem}", taken)
@@ -98,7 +99,7 @@ def _copy(
 
 def _function(name: str, part: Excerpt, returned: Sequence[str], file: str) -> list[str]:
     """Returns the lines of a function inside which an excerpt has names of its own."""
-    doc = f'    """Returns the effects of {file}, whose names mean something else here."""'
+    doc = f'    """Returns the effects of {plain(file)}, whose names mean something else here."""'
     imports = "\n".join(import_lines(set(part.imports)))
     body = [
         *_indented(imports),
@@ -122,7 +123,7 @@ def _indented(text: str) -> Iterator[str]:
 
 def _free(name: str, taken: dict[str, str]) -> str:
     """Returns a name, with a number behind it if it is taken."""
-    name = "".join(c if c.isalnum() else "_" for c in name)
+    name = "".join(c if f"a{c}".isidentifier() else "_" for c in name)
     number, free = 2, name
     while free in taken:
         number, free = number + 1, f"{name}_{number}"

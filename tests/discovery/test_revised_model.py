@@ -24,6 +24,13 @@ def test_the_revised_source_is_a_model_with_the_effects(tmp_path):
     assert [effect.name for effect, _ in model.effects] == ["hinge.quadratic_drag", "hinge.bias"]
 
 
+def test_the_name_of_a_parameter_does_not_become_code(tmp_path):
+    site = 'a": __import__("sys").exit(3), "b'
+    path = tmp_path / "revised_model.py"
+    path.write_text(revised_source(pendulum, (), {site: 1.0}))
+    assert runpy.run_path(str(path))["CLOSEST_FIT"] == {site: 1.0}
+
+
 def test_the_revised_source_keeps_finer_steps(tmp_path):
     path = tmp_path / "revised_model.py"
     finest = npdr.with_finer_steps(npdr.with_finer_steps(pendulum))

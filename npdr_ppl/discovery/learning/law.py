@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from npdr_ppl.discovery.learning.terms import SYMBOLS, Term
 from npdr_ppl.language.channels import Port
+from npdr_ppl.python_text import plain, quoted
 
 __all__ = ["Constant", "Law", "class_source", "module_source"]
 
@@ -63,15 +64,12 @@ class Law:
     @property
     def class_name(self) -> str:
         """Name of its class."""
-        words = "".join(c if c.isalnum() else " " for c in self.port.name).split()
-        return "Learned" + "".join(word.capitalize() for word in words)
+        return "Learned" + "".join(word.capitalize() for word in _words(self.port.name))
 
     @property
     def id(self) -> str:
         """Its id as an effect."""
-        return "learned_" + "_".join(
-            "".join(c if c.isalnum() else " " for c in self.port.name).split()
-        )
+        return "learned_" + "_".join(_words(self.port.name))
 
     @property
     def uses(self) -> frozenset[str]:
@@ -147,6 +145,11 @@ def _with_numbers(formula: str, values: Mapping[str, str]) -> str:
     return formula
 
 
+def _words(name: str) -> list[str]:
+    """Returns the parts of a name that may be in a name of Python, without underscores."""
+    return "".join(c if c != "_" and f"a{c}".isidentifier() else " " for c in name).split()
+
+
 def _subscript(number: int) -> str:
     return str(number).translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
 
@@ -171,7 +174,14 @@ def module_source(laws: Sequence[Law], about: str) -> str:
     bases = sorted({_BASES[law.port.kind] for law in laws})
     has_hats = any(term.is_spline for law in laws for term in law.terms)
     head = [f"{law.class_name} at {law.port.name}: {law.formula_with_numbers}" for law in laws]
-    doc = "\n".join(["Laws that `npdr discover --learn` found.", "", *head, "", about.strip()])
+    lines = [
+        "Laws that `npdr discover --learn` found.",
+        "",
+        *head,
+        "",
+        *about.strip().splitlines(),
+    ]
+    doc = "\n".join(map(plain, lines))
     has_shapes = any(c.is_shape for law in laws for c in law.constants)
     lines = [
         f'"""{doc}',
@@ -208,8 +218,8 @@ def class_source(law: Law) -> str:
         f"class {law.class_name}({_BASES[kind]}):",
         f'    """{law.formula}',
         "",
-        f"    A law at {law.port.name} in {law.port.unit}, of "
-        + ", ".join(f"{SYMBOLS[u]} in {law.units[u]}" for u in sorted(uses))
+        f"    A law at {plain(law.port.name)} in {plain(law.port.unit)}, of "
+        + ", ".join(f"{SYMBOLS[u]} in {plain(law.units[u])}" for u in sorted(uses))
         + ".",
         "    It was learned for "
         + ", ".join(
@@ -222,8 +232,8 @@ def class_source(law: Law) -> str:
         f'    id = "{law.id}"',
         "    parameters = (",
         *(
-            f'        Parameter("{c.name}", "{c.unit}", {c.value if c.is_shape else 0.0:.6g}, '
-            f'"{c.text}"),'
+            f'        Parameter("{c.name}", {quoted(c.unit)}, '
+            f'{c.value if c.is_shape else 0.0:.6g}, "{c.text}"),'
             for c in constants
         ),
         "    )",

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from npdr_ppl.engines.mujoco.callbacks.python_file import plain, quoted
 from npdr_ppl.engines.mujoco.fields import actuated_joint, element_names, servo_gains
 from npdr_ppl.engines.mujoco.randomised import Field, RandomisedFields
+from npdr_ppl.python_text import plain, quoted
 
 __all__ = ["isaac_lab_file"]
 

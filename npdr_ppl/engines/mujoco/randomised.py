@@ -12,14 +12,13 @@ from torch import Tensor
 from npdr_ppl.engines.mujoco.callbacks.python_file import (
     effects_class,
     has_dry_friction,
-    plain,
     python_source,
-    quoted,
 )
 from npdr_ppl.engines.mujoco.effects_in_file import file_assignments, is_in_file, why_not
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.python_text import plain, quoted
 
 __all__ = ["Field", "RandomisedFields", "gymnasium_file", "randomised_fields"]
 

@@ -95,6 +95,17 @@ def test_a_file_says_the_law_its_units_and_where_it_was_learned():
     assert "From a test." in source
 
 
+@pytest.mark.parametrize(
+    "name", ['a"""; raise SystemExit; """', "a\\", "x²", 'a"\nraise SystemExit\n"']
+)
+def test_the_name_of_a_port_does_not_become_code(name):
+    term = next(t for t in terms_at(JOINT) if t.key == "v")
+    law = replace(law_with(JOINT, term), port=Port(name, "force", 'N"m'))
+    (effect,), _ = effects_of([law])
+    assert effect.port == name and effect.parameters[0].unit.startswith('N"m')
+    compile(module_source([law], f"Of {name}."), "learned_effect.py", "exec")
+
+
 def test_laws_at_two_ports_are_two_classes_of_one_file():
     term = next(t for t in terms_at(JOINT) if t.key == "v")
     law = law_with(JOINT, term)

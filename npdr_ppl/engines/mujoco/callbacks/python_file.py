@@ -1,8 +1,6 @@
 """Writes laws, with the values that were identified, as one Python file."""
 
 import ast
-import json
-import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +11,7 @@ from npdr_ppl.engines.mujoco.callbacks import command_laws, joint_laws, runner, 
 from npdr_ppl.engines.mujoco.channels import Reading
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.language.effects import Effect, ForceEffect, SensorEffect
+from npdr_ppl.python_text import plain, quoted
 
 __all__ = [
     "LAWS",
@@ -20,9 +19,7 @@ __all__ = [
     "callback_file",
     "effects_class",
     "has_dry_friction",
-    "plain",
     "python_source",
-    "quoted",
 ]
 
 LAWS: dict[str, type] = {
@@ -168,16 +165,6 @@ def effects_class(
     template = _CLASS_WITH_VALUES if default else _CLASS
     lines += [template.format(laws=laws, substeps=substeps, default=default)]
     return "\n".join(lines)
-
-
-def plain(text: str) -> str:
-    """Returns a text for comments and docstrings: on one line, and without quotes."""
-    return " ".join(re.sub(r'["\\]', "'", text).split())
-
-
-def quoted(name: str | int) -> str:
-    """Returns a name as Python."""
-    return json.dumps(name, ensure_ascii=False)
 
 
 def channels_of(simulator: MujocoMechanism) -> dict[str, runner.Channel]:
