@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.proof.surviving_causes import VERSION
-from npdr_ppl.errors import DataError, NpdrError
+from npdr_ppl.errors import DataError, ModelError, NpdrError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import (
     add_effect,
@@ -107,7 +107,10 @@ def causes_of_run(run: Path, model: Callable[..., Any]) -> Known:
     revised = _revised(
         model, int(found.get("finer_steps") or 0), found.get("wider_priors") or [], run
     )
-    causes = tuple(_cause(revised, part, run) for part in record["causes"])
+    laws = {
+        law["effect"]: law["formula"] for law in (found.get("learned") or {}).get("laws") or []
+    }
+    causes = tuple(_cause(revised, part, run, laws) for part in record["causes"])
     separations = torch.tensor(record["separations"], dtype=torch.float64)
     if not causes or separations.shape != (len(causes), len(causes)):
         raise DataError(f"{run} keeps causes and separations that do not fit together.")
@@ -186,9 +189,11 @@ def _revised(
     return model
 
 
-def _cause(model: Callable[..., Any], part: Mapping[str, Any], run: Path) -> Cause:
-    """Returns a stored cause of a model."""
-    effects = [_effect(described, run) for described in part["effects"]]
+def _cause(
+    model: Callable[..., Any], part: Mapping[str, Any], run: Path, laws: Mapping[str, str]
+) -> Cause:
+    """Returns a stored cause of a model; ``laws`` are the learned formulas by effect."""
+    effects = [_effect(described, run, laws) for described in part["effects"]]
     for effect in effects:
         model = add_effect(model, effect)
     try:
@@ -205,8 +210,22 @@ def _cause(model: Callable[..., Any], part: Mapping[str, Any], run: Path) -> Cau
     return Cause(name, model, z, precision, part["probability"])
 
 
-def _effect(described: Mapping[str, Any], run: Path) -> Effect:
-    effect = effect_class(described["effect"])(described["port"])
+def _effect(described: Mapping[str, Any], run: Path, laws: Mapping[str, str]) -> Effect:
+    name = described["effect"]
+    file = run / "learned_effect.py" if name in laws else "FILE.py"
+    try:
+        cls = effect_class(name)
+    except ModelError:
+        raise DataError(
+            f"{run} has the effect {name!r} of a file, which a plan needs among the added ones; "
+            f"give `npdr effects --add {file}` first."
+        ) from None
+    if name in laws and cls.law != laws[name]:
+        raise DataError(
+            f"{run} learned the law {laws[name]}, but the added effect {name!r} has another, "
+            f"{cls.law}; give `npdr effects --remove {name}` and `npdr effects --add {file}`."
+        )
+    effect = cls(described["port"])
     constants = dict(described["constants"])
     if constants != effect.constants and effect.has_ripples:
         effect = effect.with_ripples(int(constants["order"]))

@@ -55,6 +55,23 @@ def test_an_effect_of_one_run_only_is_reported(tmp_path):
     assert report.verdict.sentence == "Not every search found torque delay."
 
 
+def test_laws_of_other_formulas_are_other_effects(tmp_path):
+    runs = [search(tmp_path / name, effects=(), data=name) for name in "ab"]
+    for run, formula in zip(runs, ("c₁ v³", "c₁ v|v|"), strict=True):
+        content = json.loads((run / "discovery.json").read_text())
+        law = {"port": "hinge", "effect": "learned_hinge", "formula": formula, "unit": "N m"}
+        law["with_numbers"] = formula.replace("c₁", "0.1")
+        content["learned"] = {"offered": True, "laws": [law]}
+        row = content["parameters"]["mass"]
+        content["parameters"]["hinge.learned_hinge.c1"] = row
+        (run / "discovery.json").write_text(json.dumps(content))
+    report = runs_report(runs)
+    assert report.verdict.sentence == (
+        "Not every search found learned law c₁ v³ at hinge, learned law c₁ v|v| at hinge."
+    )
+    assert findings(report)["Parameters"] == "1 of 1 agree"
+
+
 def test_agreement_on_the_same_recording_comes_with_a_warning(tmp_path):
     report = runs_report([search(tmp_path / "a"), search(tmp_path / "b")])
     assert findings(report)["Recordings"] == "the same"

@@ -47,6 +47,7 @@ class RunSummary:
         parameters: Scalar parameters by name.
         effects: Entries of ``effects`` in ``discovery.json``; ``None`` if nothing was searched.
         gap: Metrics before and after, as in ``discovery.json``.
+        laws: Formulas of learned laws, by port and effect as in ``"hinge.learned_hinge"``.
         data: Checksums of the recordings; empty if not known.
         seed: Seed as text.
     """
@@ -58,6 +59,7 @@ class RunSummary:
     parameters: dict[str, Estimate]
     effects: Sequence[Mapping[str, Any]] | None = None
     gap: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    laws: Mapping[str, str] = field(default_factory=dict)
     data: tuple[str, ...] = ()
     seed: str = "–"
 
@@ -93,13 +95,18 @@ def summary(folder: Path, label: str) -> RunSummary:
 
 def _discovery(folder: Path, label: str) -> RunSummary:
     result = read_json(folder / "discovery.json", DiscoveryRecord)
+    learned = result.get("learned") or {}
+    laws = (learned.get("laws") or []) if learned.get("offered") else []
+    # A law is another effect if it has another formula, although its id is that of the port.
+    found = [{"effect": f"learned law {law['formula']}", "port": law["port"]} for law in laws]
     return RunSummary(
         label,
         "discover",
         verdict=discovery_verdict(result).word,
         parameters=_estimates(result.get("parameters") or {}, {}),
-        effects=result.get("effects") or [],
+        effects=[*(result.get("effects") or []), *found],
         gap=result.get("gap") or {},
+        laws={f"{law['port']}.{law['effect']}": law["formula"] for law in laws},
         **_origin(folder),
     )
 

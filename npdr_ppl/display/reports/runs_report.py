@@ -94,13 +94,24 @@ def disagreement(estimates: Sequence[Estimate]) -> float:
 
 
 def _shared(runs: Runs) -> dict[str, dict[str, Estimate]]:
-    """Returns the parameters that at least two runs estimate, by name and run."""
+    """Returns the parameters that at least two runs estimate, by name and run.
+
+    Those of a learned law are not shared with a law of another formula at the same port.
+    """
+    formulas: dict[str, set[str]] = {}
+    for run in runs:
+        for effect, formula in run.laws.items():
+            formulas.setdefault(effect, set()).add(formula)
     names = dict.fromkeys(name for run in runs for name in run.parameters)
     rows = {
         name: {run.label: run.parameters[name] for run in runs if name in run.parameters}
         for name in names
     }
-    return {name: found for name, found in rows.items() if len(found) > 1}
+    return {
+        name: found
+        for name, found in rows.items()
+        if len(found) > 1 and len(formulas.get(name.rpartition(".")[0], ())) < 2
+    }
 
 
 def _verdict(runs: Runs, shared: Mapping[str, Any], apart: Sequence[str]) -> Headline:
