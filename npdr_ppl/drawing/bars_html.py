@@ -41,7 +41,10 @@ def gap_bars(gap: Mapping[str, Mapping[str, Any]]) -> str:
             parts.append(_row(word, kind, value, most, target))
     if not parts:
         return ""
-    key = '<div class="keys"><span>┊ noise floor: error of a perfect model</span></div>'
+    words = "noise floor: error of a perfect model"
+    if "coverage" in gap:
+        words += f"; of the coverage: {TARGET:.0%}, its target"
+    key = f'<div class="keys"><span>┊ {words}</span></div>'
     return f'<div class="gaps">{"".join(parts)}</div>{key}'
 
 

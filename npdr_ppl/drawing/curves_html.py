@@ -149,7 +149,8 @@ def _bounds(series: Mapping[str, Series]) -> tuple[float, float]:
     measured = _known(series["measured"])
     low, high = min(measured), max(measured)
     size = max(high - low, 1e-9 * max(abs(low), abs(high)), 1e-12)
-    room = 0.5 * (MOST_OF_RANGE - 1.0) * size
+    # A constant measurement, as of a joint that is held, has no range to compare with.
+    room = 0.5 * (MOST_OF_RANGE - 1.0) * size if high > low else math.inf
     every = [v for values in series.values() for v in _known(values)]
     low, high = max(min(every), low - room), min(max(every), high + room)
     margin = MARGIN * max(high - low, size)

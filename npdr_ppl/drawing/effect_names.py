@@ -15,7 +15,7 @@ TITLES = {
     "asymmetric_coulomb_friction": "dry friction of unequal directions at {joint}",
     "backlash": "backlash at {joint}",
     "bias": "constant force at {joint}",
-    "clock_skew": "{where} clock error",
+    "clock_skew": "clock error",
     "cogging": "cogging at {joint}",
     "contact": "other contact of {where}",
     "coulomb_friction": "dry friction at {joint}",

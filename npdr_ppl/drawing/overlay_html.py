@@ -7,13 +7,14 @@ from typing import Any
 from npdr_ppl.drawing.curves_html import curve, keys
 from npdr_ppl.drawing.numbers import number
 
-__all__ = ["channel_html", "lead_html", "legend_html", "rollout_words"]
+__all__ = ["MODELS", "channel_html", "lead_html", "legend_html", "rollout_words"]
 
 LEAD_HEIGHT = 150
 """Height in CSS pixels of the drawing at the top, so that verdict, curves and bars fit on a screen
 of 1280 by 800."""
 
 MODELS = ("nominal", "fitted", "revised")
+"""The middle of the priors; the original model's closest fit; that of the revised model."""
 
 Overlays = Mapping[str, Any]
 """The content of ``overlays.json``."""

@@ -95,6 +95,18 @@ def test_a_constant_or_absent_channel_is_drawn_without_an_error():
     assert curve([], {"measured": []}, title="angle") == ""
 
 
+def test_a_simulation_that_leaves_a_constant_measurement_is_visible():
+    series = {"measured": [2.0, 2.0], "fitted": [2.0, 2.5]}
+    ((first, last),) = points(curve([0.0, 1.0], series, title="angle"), "fitted")
+    assert 0.0 < last[1] < first[1] < 140.0
+
+
+def test_the_mark_of_the_coverage_is_its_target():
+    coverage = {"coverage": {"before": 0.5, "after": 0.88, "noise_floor": None}}
+    assert "of the coverage: 90%" in gap_bars(coverage)
+    assert "coverage" not in gap_bars({"rmse": {"before": 0.2, "after": 0.1}})
+
+
 def test_the_gap_says_what_was_closed():
     gap = {"rmse": {"before": 0.2, "after": 0.06, "noise_floor": 0.05, "closed": 0.93}}
     html = gap_bars(gap)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.proof.residual_map import noise_of, residuals_by_rollout, thinned
+from npdr_ppl.drawing.overlay_html import MODELS
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
@@ -40,9 +41,6 @@ the maximum of cells of all maps. ``overlays.json`` may have 200 000 values to b
 FEWEST_POINTS = 150
 """Least number of points of a series with which a second rollout is kept."""
 
-MODELS = ("nominal", "fitted", "revised")
-"""The middle of the priors; the original model's closest fit; that of the revised model."""
-
 WITH_ERRORS = ("fitted", "revised")
 """Models whose errors are kept beside their simulations. They are thinned by themselves: the
 difference of two thinned series would be that of measurements at different times."""
@@ -60,7 +58,8 @@ class Overlay:
 
     Attributes:
         rollout: Index of the rollout.
-        time: Seconds from the rollout's beginning, ``(T,)``.
+        time: Seconds from the rollout's beginning, ``(T,)``; stretches that were left out as
+            unusable take no time.
         measured: Measurements, ``(T, C)``.
         simulated: Simulations by model, ``(T, C)`` each; not finite where one failed.
         misfit: Root-mean-square error of each model by channel, in the channel's unit.

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from npdr_ppl.display.reports.content import Part, Section, TablePart, TextPart
+from npdr_ppl.drawing.effect_names import in_words
 from npdr_ppl.drawing.numbers import number
 
 __all__ = ["learned_section"]
@@ -54,9 +55,8 @@ def _law(law: Mapping[str, Any], learned: Mapping[str, Any]) -> list[Part]:
     like = (learned.get("alike") or {}).get(port)
     if like:
         correlation = number(like.get("correlation"), ".2f")
+        effect = in_words(str(like.get("effect")))
         parts.append(
-            TextPart(
-                f"Most similar in the catalogue: {like.get('effect')}, correlation {correlation}."
-            )
+            TextPart(f"Most similar in the catalogue: {effect}, correlation {correlation}.")
         )
     return parts
