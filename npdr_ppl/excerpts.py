@@ -1,14 +1,19 @@
 """The part of a Python file that some of its names need, to be copied into another file.
 
+Names and other texts of a user's file become part of such files only by :func:`quoted` and
+:func:`plain`.
+
 A file is split into its top-level statements. Those that define a needed name, and the names that
 these use in turn, are kept in their order; imports are kept apart, so that they can be merged.
 """
 
 import ast
+import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["Excerpt", "bound_names", "excerpt", "import_lines"]
+__all__ = ["Excerpt", "bound_names", "excerpt", "import_lines", "plain", "quoted"]
 
 _DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 
@@ -223,3 +228,13 @@ def _joined(statements: list[ast.stmt], text: str) -> str:
         parts += lines[max(first - 1, done) : end]
         last, done = statement, max(done, end)
     return "\n".join(parts)
+
+
+def plain(text: str) -> str:
+    """Returns a text for comments and docstrings: on one line, and without quotes."""
+    return " ".join(re.sub(r'["\\]', "'", text).split())
+
+
+def quoted(name: str | int) -> str:
+    """Returns a name as Python."""
+    return json.dumps(name, ensure_ascii=False)

@@ -1,13 +1,18 @@
-"""A learned law, and the source of the effect that has it."""
+"""A learned law, and the source of the effect that has it.
+
+Names and units of a robot's file become code only by :func:`~npdr_ppl.excerpts.quoted` and
+:func:`~npdr_ppl.excerpts.plain`: the code is executed.
+"""
 
 import re
 import textwrap
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from npdr_ppl.discovery.learning.terms import SYMBOLS, Term
+from npdr_ppl.excerpts import plain, quoted
 from npdr_ppl.language.channels import Port
-from npdr_ppl.python_text import plain, quoted
 
 __all__ = ["Constant", "Law", "class_source", "module_source"]
 
@@ -63,13 +68,14 @@ class Law:
 
     @property
     def class_name(self) -> str:
-        """Name of its class."""
-        return "Learned" + "".join(word.capitalize() for word in _words(self.port.name))
+        """Name of its class; another one at every port."""
+        name = _identifier(self.port.name)
+        return "Learned" + re.sub(r"(?:^|_)([A-Za-z])", lambda m: m[1].upper(), name)
 
     @property
     def id(self) -> str:
         """Its id as an effect."""
-        return "learned_" + "_".join(_words(self.port.name))
+        return f"learned_{_identifier(self.port.name)}"
 
     @property
     def uses(self) -> frozenset[str]:
@@ -133,6 +139,18 @@ class Law:
         return " ".join(parts).removeprefix("+ ")
 
 
+def _identifier(name: str) -> str:
+    """Returns a name of ASCII letters and digits, separated by ``_``.
+
+    A name that has other characters ends with a checksum, so that ``"knee-1"`` and ``"knee_1"``
+    stay apart.
+    """
+    if re.fullmatch("[a-z0-9]+(_[a-z0-9]+)*", name):
+        return name
+    words = re.findall("[A-Za-z0-9]+", name)
+    return "_".join([*words, f"{zlib.crc32(name.encode()):08x}"])
+
+
 _LETTERS = {"wave_number": "k", "speed": "vₛ", "edge": "e", "time_constant": "T", "scale": "s"}
 
 
@@ -174,14 +192,8 @@ def module_source(laws: Sequence[Law], about: str) -> str:
     bases = sorted({_BASES[law.port.kind] for law in laws})
     has_hats = any(term.is_spline for law in laws for term in law.terms)
     head = [f"{law.class_name} at {law.port.name}: {law.formula_with_numbers}" for law in laws]
-    lines = [
-        "Laws that `npdr discover --learn` found.",
-        "",
-        *head,
-        "",
-        *about.strip().splitlines(),
-    ]
-    doc = "\n".join(map(plain, lines))
+    lines = [*head, "", *about.strip().splitlines()]
+    doc = "\n".join(["Laws that `npdr discover --learn` found.", "", *map(plain, lines)])
     has_shapes = any(c.is_shape for law in laws for c in law.constants)
     lines = [
         f'"""{doc}',
@@ -214,13 +226,12 @@ def class_source(law: Law) -> str:
     """Returns the source of the class of an effect with a law."""
     constants, uses = law.constants, law.uses
     kind = law.port.kind
+    known = ", ".join(f"{SYMBOLS[u]} in {law.units[u]}" for u in sorted(uses))
     lines = [
         f"class {law.class_name}({_BASES[kind]}):",
         f'    """{law.formula}',
         "",
-        f"    A law at {plain(law.port.name)} in {plain(law.port.unit)}, of "
-        + ", ".join(f"{SYMBOLS[u]} in {plain(law.units[u])}" for u in sorted(uses))
-        + ".",
+        "    " + plain(f"A law at {law.port.name} in {law.port.unit}, of {known}."),
         "    It was learned for "
         + ", ".join(
             f"{SYMBOLS[u]} from {law.ranges[u][0]:.4g} to {law.ranges[u][1]:.4g}"
@@ -233,7 +244,8 @@ def class_source(law: Law) -> str:
         "    parameters = (",
         *(
             f'        Parameter("{c.name}", {quoted(c.unit)}, '
-            f'{c.value if c.is_shape else 0.0:.6g}, "{c.text}"),'
+            f"{c.value if c.is_shape else 0.0:.6g}, "
+            f'"{c.text}"),'
             for c in constants
         ),
         "    )",

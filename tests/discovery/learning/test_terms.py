@@ -111,4 +111,29 @@ def test_laws_at_two_ports_are_two_classes_of_one_file():
     law = law_with(JOINT, term)
     other = replace(law, port=Port("second joint", "force", "N m"))
     effects, _ = effects_of([law, other])
-    assert [effect.id for effect in effects] == ["learned_hinge", "learned_second_joint"]
+    assert effects[0].id == "learned_hinge"
+    assert effects[1].id.startswith("learned_second_joint_")
+
+
+def test_ports_whose_names_differ_only_in_signs_have_their_own_laws():
+    terms = {term.key: term for term in terms_at(JOINT)}
+    names = ("left_knee", "left-knee", "left knee", "Left_Knee", "leftKnee", "joint²", "1")
+    keys = ("1", "q", "v", "v²", "v³", "q²", "q³")
+    laws = [
+        replace(law_with(JOINT, terms[key]), port=Port(name, "force", "N m"))
+        for name, key in zip(names, keys, strict=True)
+    ]
+    effects, _ = effects_of(laws)
+    assert [effect.law for effect in effects] == [law.formula for law in laws]
+    assert len({effect.id for effect in effects}) == len(names)
+
+
+@pytest.mark.parametrize("end", ['"""', "\\", '\\"""', "\\N"])
+def test_names_and_units_of_a_robot_do_not_become_code(end):
+    name = f'hinge{end}\nraise SystemExit("ran")\n{end}'
+    term = next(t for t in terms_at(JOINT) if t.key == "v")
+    law = replace(law_with(JOINT, term), port=Port(name, "force", f'N m"{end}'))
+    law = replace(law, units={**law.units, "v": f"rad/s{end}\nraise SystemExit\n"})
+    (effect,), _ = effects_of([law])
+    assert effect.port == name
+    assert effect.parameters[0].unit.startswith(f'N m"{end}')
