@@ -151,15 +151,12 @@ def _identifier(name: str) -> str:
     return "_".join([*words, f"{zlib.crc32(name.encode()):08x}"])
 
 
-_LETTERS = {"wave_number": "k", "speed": "vₛ", "edge": "e", "time_constant": "T", "scale": "s"}
+_LETTERS = {"wave_number": "k", "speed": "vₛ", "edge": "e", "time_constant": "T"}
 
 
 def _with_numbers(formula: str, values: Mapping[str, str]) -> str:
     for name, value in values.items():
-        letter = _LETTERS[name]
-        formula = formula.replace(f"({letter} q", f"({value} q").replace(f"/{letter}", f"/{value}")
-        formula = formula.replace(f"±{letter}", f"±{value}").replace(f"− {letter}", f"− {value}")
-        formula = formula.replace(f"> {letter}", f"> {value}")
+        formula = re.sub(rf"(?<!\w){_LETTERS[name]}(?!\w)", value, formula)
     return formula
 
 

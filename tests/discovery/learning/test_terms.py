@@ -1,5 +1,6 @@
 """Every term is the same law along the recorded motion and in the file of the learned effect."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -137,3 +138,10 @@ def test_names_and_units_of_a_robot_do_not_become_code(end):
     (effect,), _ = effects_of([law])
     assert effect.port == name
     assert effect.parameters[0].unit.startswith(f'N m"{end}')
+
+
+@pytest.mark.parametrize("motion", [JOINT, COMMAND, SENSOR])
+def test_numbers_take_the_place_of_all_letters_of_constants(motion):
+    for term in [*terms_at(motion), *waves_with_harmonics(motion)]:
+        text = law_with(motion, term).formula_with_numbers
+        assert not set(re.findall(r"\w+", text)) & {"k", "vₛ", "e", "T"}, text
