@@ -98,11 +98,12 @@ def _drawn_laws(model: LearnedModel) -> list[tuple[Law, ...]]:
     projection = Projection(fitted)
     precision = projection.parameter_information_by_segment.sum(0) * fitted.share
     precision = precision + torch.eye(len(precision), dtype=torch.float64)
-    factor = torch.linalg.cholesky(torch.linalg.inv(precision))
+    # Of the precision, not of its inverse, which rounding errors can make indefinite.
+    factor = torch.linalg.cholesky(precision)
     generator = torch.Generator().manual_seed(0)
     shape = LEARNING.num_drawn_laws, len(precision)
     normal = torch.randn(shape, generator=generator, dtype=torch.float64)
-    z = fitted.fit.z + normal @ factor.mT
+    z = fitted.fit.z + torch.linalg.solve_triangular(factor.mT, normal.mT, upper=True).mT
     parameters = fitted.segments.prior.to_parameters(z)
     return [
         tuple(with_values(law, _one(parameters, k)) for law in model.laws) for k in range(len(z))
