@@ -36,18 +36,36 @@ class PortFormulas:
 
     Attributes:
         products: Products of the responses at the port.
-        equations: Products of the terms.
+        terms: The terms that were compared.
+        weights: Weights of the responses in each term's columns, ``(S, P, k)`` each; ``None`` if
+            they follow from the motion.
+        penalty: Reduction of the misfit that the best of so many spurious coefficients brings.
         front: The best formula of each number of terms.
     """
 
     products: PortProducts
-    equations: NormalEquations
+    terms: list[Term]
+    weights: list[Tensor] | None
+    penalty: float
     front: list[Formula]
 
     @property
     def motion(self) -> PortMotion:
         """The motion at the port."""
         return self.products.motion
+
+    def equations(self) -> NormalEquations:
+        """Returns the products of the terms, which are not kept: a joint has 100 MB of them."""
+        return _equations(self.products, self.terms, self.weights)
+
+
+def _equations(
+    products: PortProducts, terms: Sequence[Term], weights: Sequence[Tensor] | None = None
+) -> NormalEquations:
+    if weights is None:
+        motion = products.motion
+        weights = [motion.columns(term.values(motion)) for term in terms]
+    return products.equations(terms, weights)
 
 
 def formulas_by_port(
@@ -69,18 +87,18 @@ def formulas_by_port(
             known = _sensor_responses(hypothesis, motion, terms)
             if known is None:
                 continue
-            responses, values = known
+            responses, weights = known
         else:
-            responses = motion.responses
-            values = [motion.columns(term.values(motion)) for term in terms]
+            responses, weights = motion.responses, None
         products = PortProducts(projection, motion, responses)
-        equations = products.equations(terms, values)
-        front = equations.front()
+        equations = _equations(products, terms, weights)
+        penalty, front = equations.penalty, equations.front()
+        del equations
         if motion.responses is not None:
             front += _with_harmonics(products, terms, front)
             front = [_refined(products, formula) for formula in pareto_front(front)]
         front = [formula for formula in front if assumptions.agrees(formula, motion)]
-        result.append(PortFormulas(products, equations, pareto_front(front)))
+        result.append(PortFormulas(products, terms, weights, penalty, pareto_front(front)))
     return sorted(result, key=lambda port: min(f.error for f in port.front))
 
 
@@ -89,7 +107,7 @@ def _refined(products: PortProducts, formula: Formula) -> Formula:
 
     Each constant is varied in smaller and smaller steps, and the others are kept.
     """
-    motion, best = products.motion, formula
+    best = formula
     step = LEARNING.shape_step
     while step > LEARNING.finest_shape_step:
         before = best
@@ -100,8 +118,7 @@ def _refined(products: PortProducts, formula: Formula) -> Formula:
                     shapes = list(terms[index].shapes)
                     shapes[place] = replace(shapes[place], value=factor * shapes[place].value)
                     terms[index] = replace(terms[index], shapes=tuple(shapes))
-                    values = [motion.columns(t.values(motion)) for t in terms]
-                    equations = products.equations(terms, values)
+                    equations = _equations(products, terms)
                     if len(equations.terms) == len(terms):
                         found = equations.all_terms
                         if found.misfit < best.misfit:
@@ -121,9 +138,7 @@ def _with_harmonics(
         return []
     chosen = [term for term in terms if not term.shapes and term not in found]
     chosen += [*found, *waves]
-    motion = products.motion
-    values = [motion.columns(term.values(motion)) for term in chosen]
-    return products.equations(chosen, values).front()[1:]
+    return _equations(products, chosen).front()[1:]
 
 
 def _sensor_responses(

@@ -50,7 +50,7 @@ class LearnedModel:
         """Returns what its laws and the effects beside them cost, in units of the misfit."""
         beside = sum(len(effect.parameters) for effect in self.start.effects)
         own = sum(term.cost for law in self.laws for term in law.terms)
-        return max(port.equations.penalty for port in self.ports) * (own + beside)
+        return max(port.penalty for port in self.ports) * (own + beside)
 
 
 def learned_model(
@@ -106,7 +106,7 @@ def learned_model(
 def _improves(port: PortFormulas, formula: Formula) -> bool:
     """Returns whether a formula predicts the folds better than chance does."""
     less = port.front[0].error - formula.error
-    return bool(formula.terms) and less > port.equations.penalty
+    return bool(formula.terms) and less > port.penalty
 
 
 def _together(laws: Sequence[Law], new: Law) -> tuple[Law, ...]:

@@ -197,8 +197,11 @@ def _dependence(port: PortFormulas) -> dict[str, float]:
     if none <= best:
         return {}
     result = {}
+    equations = port.equations()
     for symbol in port.motion.values:
-        without = port.equations.without_terms(symbol).front()
+        # Harmonics are only in the port's own formulas.
+        without = [f for f in port.front if all(symbol not in term.uses for term in f.terms)]
+        without += equations.without_terms(symbol).front()
         lost = min(formula.error for formula in without) - best
         result[symbol] = min(1.0, max(0.0, lost / (none - best)))
     return dict(sorted(result.items(), key=lambda item: -item[1]))
