@@ -157,6 +157,7 @@ def _sensor_responses(
     ones = (1.0,) * sum(len(term.columns) for term in terms)
     ranges = {name: (0.0, 1.0) for name in motion.values}
     every = Law(motion.port, tuple(terms), ones, ones, ranges, motion.units)
+    every = every.apart_from({effect.id for effect in segments.simulator.effects})
     (effect,), start = effects_of([every])
     sizes = torch.cat([term.values(motion).square().mean((0, 1)).sqrt() for term in terms])
     num = len(sizes)

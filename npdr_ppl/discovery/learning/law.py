@@ -7,8 +7,9 @@ Names and units of a robot's file become code only by :func:`~npdr_ppl.excerpts.
 import re
 import textwrap
 import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
 
 from npdr_ppl.discovery.learning.terms import SYMBOLS, Term
 from npdr_ppl.excerpts import plain, quoted
@@ -57,6 +58,7 @@ class Law:
         spreads: Standard deviation of the prior of each coefficient.
         ranges: Least and greatest value of each variable that was visited.
         units: Units of the variables.
+        number: Tells it from other learned effects at ports of this name.
     """
 
     port: Port
@@ -65,17 +67,33 @@ class Law:
     spreads: tuple[float, ...]
     ranges: Mapping[str, tuple[float, float]]
     units: Mapping[str, str]
+    number: int = 1
 
     @property
     def class_name(self) -> str:
         """Name of its class; another one at every port."""
         name = _identifier(self.port.name)
-        return "Learned" + re.sub(r"(?:^|_)([A-Za-z])", lambda m: m[1].upper(), name)
+        words = re.sub(r"(?:^|_)([A-Za-z])", lambda m: m[1].upper(), name)
+        return f"Learned{words}{self._end}"
 
     @property
     def id(self) -> str:
         """Its id as an effect."""
-        return f"learned_{_identifier(self.port.name)}"
+        return f"learned_{_identifier(self.port.name)}{self._end}"
+
+    @property
+    def _end(self) -> str:
+        # No port's name has two of these signs after another.
+        return "" if self.number == 1 else f"__{self.number}"
+
+    def apart_from(self, ids: Collection[str]) -> "Law":
+        """Returns the law with an id that is none of others.
+
+        Args:
+            ids: Ids of other effects.
+        """
+        numbered = (replace(self, number=number) for number in count(1))
+        return next(law for law in numbered if law.id not in ids)
 
     @property
     def uses(self) -> frozenset[str]:

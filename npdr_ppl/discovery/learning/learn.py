@@ -26,6 +26,7 @@ from npdr_ppl.discovery.search.evidence import closest
 from npdr_ppl.discovery.search.rounds import explained
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.settings import VERDICT
+from npdr_ppl.models.effects import candidate_effects
 
 __all__ = ["LearnedModel", "learned_model", "with_values"]
 
@@ -72,6 +73,9 @@ def learned_model(
         ``None`` if no law predicts parts of the recording better than the model without one.
     """
     current, laws = start, ()
+    # An added effect may come from an earlier search, and have the name of the port as well.
+    others = (*start.simulator.effects, *candidate_effects(start.simulator))
+    ids = {effect.id for effect in others}
     first: list[PortFormulas] = []
     for _ in range(LEARNING.most_laws):
         report("comparing formulas at every port")
@@ -82,7 +86,7 @@ def learned_model(
         chosen.sort(key=lambda pair: pair[1].error)
         tried: list[tuple[Hypothesis, tuple[Law, ...]]] = []
         for port, formula in chosen[: LEARNING.num_fitted]:
-            new = law_of(port, formula)
+            new = law_of(port, formula).apart_from(ids)
             report(f"fitting {new.formula} at {new.port.name}")
             together = _together(laws, new)
             effects, values = effects_of(together)

@@ -382,7 +382,9 @@ def _product(motion: PortMotion, *factors: _Factor, is_dry: bool = False) -> Ter
     columns: list[str] = []
     formulas: list[str] = []
     for parts in product(*(zip(f.columns, f.formulas, strict=True) for f in factors)):
-        code = [c if " " not in c else f"({c})" for c, _ in parts if c != "1.0"]
+        code = [c for c, _ in parts if c != "1.0"]
+        if len(code) > 1:
+            code = [c if " " not in c else f"({c})" for c in code]
         text = [f for _, f in parts if f]
         columns.append(" * ".join(code) or "1.0")
         formulas.append(" · ".join([*text, "sign v"] if is_dry else text) or "1")

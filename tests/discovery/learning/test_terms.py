@@ -145,3 +145,11 @@ def test_numbers_take_the_place_of_all_letters_of_constants(motion):
     for term in [*terms_at(motion), *waves_with_harmonics(motion)]:
         text = law_with(motion, term).formula_with_numbers
         assert not set(re.findall(r"\w+", text)) & {"k", "vₛ", "e", "T"}, text
+
+
+def test_a_law_has_another_name_than_effects_that_are_known():
+    law = law_with(JOINT, next(t for t in terms_at(JOINT) if t.key == "v"))
+    assert law.apart_from(set()).id == "learned_hinge"
+    other = law.apart_from({"learned_hinge", "learned_hinge__2"})
+    effects, _ = effects_of([law, other])
+    assert [effect.id for effect in effects] == ["learned_hinge", "learned_hinge__3"]
