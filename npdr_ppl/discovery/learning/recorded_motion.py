@@ -11,6 +11,7 @@ from torch.distributions import Distribution
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.settings import LEARNING
+from npdr_ppl.discovery.screening.latent_force import Pulse
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Joint, Start
@@ -44,44 +45,6 @@ class _Recorder(ForceEffect):
         return memory
 
 
-class _ForcePulse(ForceEffect):
-    """A constant force at a joint during a part of each segment."""
-
-    id = "learning_pulse"
-    parameters = (
-        Parameter("height", "{port}", 0.0, "force during the pulse"),
-        Parameter("begin", "s", 0.0, "when it begins, from the segment's start"),
-        Parameter("end", "s", 0.0, "when it ends"),
-    )
-
-    def default_priors(self, port: Port) -> dict[str, Distribution]:
-        """Returns priors that are not used: pulses are never inferred."""
-        return {p.name: dist.Normal(0.0, port.rated) for p in self.parameters}
-
-    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:
-        """Returns the time since the segment's start, in the middle of the first step."""
-        return torch.full_like(start.time, 0.5 * start.time_step)
-
-    def force(
-        self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
-    ) -> Tensor:
-        """Returns the height during the pulse."""
-        return parameters["height"] * (
-            (memory >= parameters["begin"]) & (memory < parameters["end"])
-        )
-
-    def next_memory(
-        self,
-        position: Tensor,
-        velocity: Tensor,
-        parameters: Mapping[str, Tensor],
-        memory: Any,
-        time_step: float,
-    ) -> Tensor:
-        """Returns the time one step later."""
-        return memory + time_step
-
-
 class _CommandPulse(ActionEffect):
     """A constant addition to a command during a part of each segment.
 
@@ -91,7 +54,7 @@ class _CommandPulse(ActionEffect):
     """
 
     id = "learning_pulse"
-    parameters = _ForcePulse.parameters
+    parameters = Pulse.parameters
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Returns priors that are not used: pulses are never inferred."""
@@ -215,7 +178,7 @@ def _pulsed(
 ) -> Tensor | None:
     """Returns readings with a pulse in each part, ``(P, S, K, C)``; ``None`` if it cannot be."""
     fit, inputs = hypothesis.fit, segments.inputs
-    pulse = _ForcePulse(port.name)
+    pulse = Pulse(port.name)
     if port.kind != "force":
         pulse = _CommandPulse(port.name, inputs.start * inputs.time_step)
     seconds = edges.double() * inputs.time_step
