@@ -164,6 +164,8 @@ def main() -> None:
     if options.summary:
         summarise([json.loads(line) for line in options.summary.read_text().splitlines()])
         return
+    if options.out is None:
+        parser.error("--out FILE or --summary FILE is needed")
     seeds = [SEEDS["test"][options.first_seed + k] for k in range(options.num_seeds)]
     rigs = [name for name in options.rigs.split(",") if name in RIGS]
     wanted = [float(d) for d in options.separations.split(",")]

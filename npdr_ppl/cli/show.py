@@ -203,7 +203,7 @@ def _show_learned(console: Console, learned: Mapping[str, Any]) -> None:
     table.add_column("law", overflow="fold")
     table.add_column("unit", no_wrap=True)
     for law in learned["laws"]:
-        table.add_row(escape(law["port"]), escape(law["with_numbers"]), law["unit"])
+        table.add_row(escape(law["port"]), escape(law["with_numbers"]), escape(law["unit"]))
     console.print(table)
     for law in learned["laws"]:
         port = law["port"]
