@@ -1,4 +1,8 @@
-"""Whether a learned law helps on measurements that it was not fitted to."""
+"""Whether a learned law helps on measurements that it was not fitted to.
+
+The terms of the law are chosen from the whole recording, and its constants are fitted to one half
+at a time. So the halves check the constants, and only held-out rollouts check the terms as well.
+"""
 
 from dataclasses import dataclass
 
@@ -21,7 +25,7 @@ __all__ = ["Check", "checks", "misfit"]
 
 @dataclass(frozen=True)
 class Check:
-    """The misfit of measurements to which neither of two models was fitted.
+    """The misfit of measurements to which the constants of neither of two models were fitted.
 
     Attributes:
         where: Which measurements.

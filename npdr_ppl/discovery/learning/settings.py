@@ -12,7 +12,8 @@ class LearningSettings:
     """How a law is learned.
 
     Attributes:
-        num_parts: Parts of each segment in each of which a pulse tells what a force does.
+        num_parts: Number of equal parts of each segment. A pulse in each of them shows how the
+            measurements respond to a force there.
         pulse_height: Height of a pulse, as a fraction of the port's rated value. It is small,
             because the response is a derivative.
         num_folds: Parts of the recording each of which is predicted from the others.
@@ -62,9 +63,13 @@ class LearningSettings:
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, 1000, "num_parts", "num_folds", "beam", "most_terms")
-        check_range(self, 1, 1000, "num_waves", "num_shapes", "num_knots")
+        check_range(self, 1, 1000, "num_shapes", "num_knots")
         check_range(self, 1, 1000, "fewest_waves", "most_per_turn", "num_harmonics")
-        check_range(self, 0.0, 1000.0, "pulse_height", "prior_spread")
+        check_range(self, 1, 1000, "num_waves", "most_laws", "num_fitted", "num_drawn_laws")
+        check_range(self, 2, 1000, "num_bins")
+        check_range(self, 0.0, 1000.0, "pulse_height", "prior_spread", "largest_wave_number")
+        check_range(self, 0.0, 1.0, "negligible")
+        check_range(self, 1e-6, 0.5, "shape_step", "finest_shape_step")
 
 
 LEARNING = LearningSettings()
