@@ -403,7 +403,7 @@ class Investigation:
                 )
                 unexplained = _unexplained(search)
                 final = learned.model.hypothesis
-                reason = f"No effect of the catalogue explains the recording. {learned.reason}"
+                reason = f"No effect that was searched explains the recording. {learned.reason}"
                 every = estimates(final, self._draws(final), _units(final))
                 kept = {effect.name for effect in learned.model.start.effects}
                 effects = [found for found in effects if found.effect.name in kept]
