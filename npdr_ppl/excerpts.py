@@ -8,12 +8,10 @@ these use in turn, are kept in their order; imports are kept apart, so that they
 """
 
 import ast
-import json
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-__all__ = ["Excerpt", "bound_names", "excerpt", "import_lines", "plain", "quoted"]
+__all__ = ["Excerpt", "bound_names", "excerpt", "import_lines"]
 
 _DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
 
@@ -228,13 +226,3 @@ def _joined(statements: list[ast.stmt], text: str) -> str:
         parts += lines[max(first - 1, done) : end]
         last, done = statement, max(done, end)
     return "\n".join(parts)
-
-
-def plain(text: str) -> str:
-    """Returns a text for comments and docstrings: on one line, and without quotes."""
-    return " ".join(re.sub(r'["\\]', "'", text).split())
-
-
-def quoted(name: str | int) -> str:
-    """Returns a name as Python."""
-    return json.dumps(name, ensure_ascii=False)

@@ -8,7 +8,7 @@ import pyro.distributions
 from torch import Tensor
 from torch.distributions import Distribution
 
-from npdr_ppl.excerpts import import_lines, plain, quoted
+from npdr_ppl.excerpts import import_lines
 from npdr_ppl.language.effect_sources import sources_of
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps, num_finer_steps

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from itertools import count
 
 from npdr_ppl.discovery.learning.terms import SYMBOLS, Term
-from npdr_ppl.excerpts import plain, quoted
 from npdr_ppl.language.channels import Port
+from npdr_ppl.python_text import plain, quoted
 
 __all__ = ["Constant", "Law", "class_source", "module_source"]
 
@@ -176,11 +176,6 @@ def _with_numbers(formula: str, values: Mapping[str, str]) -> str:
     for name, value in values.items():
         formula = re.sub(rf"(?<!\w){_LETTERS[name]}(?!\w)", value, formula)
     return formula
-
-
-def _words(name: str) -> list[str]:
-    """Returns the parts of a name that may be in a name of Python, without underscores."""
-    return "".join(c if c != "_" and f"a{c}".isidentifier() else " " for c in name).split()
 
 
 def _subscript(number: int) -> str:

@@ -10,7 +10,6 @@ from typing import Any
 from npdr_ppl.engines.mujoco.callbacks import command_laws, joint_laws, runner, sensor_laws
 from npdr_ppl.engines.mujoco.channels import Reading
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
-from npdr_ppl.excerpts import plain, quoted
 from npdr_ppl.language.effects import Effect, ForceEffect, SensorEffect
 from npdr_ppl.python_text import plain, quoted
 
