@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from npdr_ppl.engines.mujoco import MujocoSimulator
+from npdr_ppl.engines.mujoco.callbacks.command_laws import InputDelay as InputDelayLaw
 from npdr_ppl.engines.mujoco.callbacks.python_file import LAWS
+from npdr_ppl.engines.mujoco.callbacks.sensor_laws import SensorDelay as SensorDelayLaw
 from npdr_ppl.engines.mujoco.export import export_mjcf
 from npdr_ppl.models.effects import (
     ActuatorGain,
@@ -95,6 +97,22 @@ def test_refined_steps_are_taken(arm, tmp_path):
     assert error <= MOST_IN_PYTHON
     coarse, *_ = difference(simulator, values, tmp_path)
     assert coarse <= MOST_IN_PYTHON
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.0137])
+@pytest.mark.parametrize("is_rate", [False, True])
+def test_a_delay_is_the_same_in_shorter_steps_than_those_of_the_reset(delay, is_rate):
+    sensor, command = SensorDelayLaw("x", delay), InputDelayLaw("motor", delay)
+    sensor.reset(1.0, 0.01, is_rate)
+    command.settle(1.0, 0.01)
+    step = 0.002
+    for number in range(1, 30):
+        time = number * step
+        # A position that rests, and then moves at 3 rad/s.
+        measured = sensor.read(1.0 + 3.0 * time, time, step)
+        if not -step < time - delay < step:  # where the parabola meets the kink
+            assert measured == pytest.approx(1.0 + 3.0 * max(time - delay, 0.0))
+        assert command.act(1.0, step)[0] == pytest.approx(1.0)
 
 
 def test_at_least_thirty_effects_can_be_taken_home():

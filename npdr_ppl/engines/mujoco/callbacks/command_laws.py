@@ -17,6 +17,7 @@ __all__ = [
     "ServoDeadBand",
     "ServoLaw",
     "SupplySag",
+    "lengthened",
     "remaining",
 ]
 
@@ -63,6 +64,16 @@ def remaining(time_constant: float, step: float) -> float:
     return math.exp(-step / max(time_constant, step / 1000.0))
 
 
+def lengthened(past: deque[float], length: int) -> deque[float]:
+    """Returns past values, the newest first, with at least a length.
+
+    The oldest value is repeated: before it, nothing had changed. Steps that are shorter than those
+    for which the past was made need more of it.
+    """
+    missing = length - len(past)
+    return deque([*past, *([past[-1]] * missing)], maxlen=length) if missing > 0 else past
+
+
 @dataclass
 class InputDelay(CommandLaw):
     """u(t − d) with a delay that need not be a whole number of steps."""
@@ -78,8 +89,9 @@ class InputDelay(CommandLaw):
 
     def act(self, command: float, step: float) -> tuple[float, float]:
         """Returns the command of the delayed step."""
-        self.past.appendleft(command)
         whole = math.floor(self.delay / step)
+        self.past = lengthened(self.past, whole + 2)
+        self.past.appendleft(command)
         share = self.delay / step - whole
         later = self.past[whole]
         rise = share * (later - self.past[whole + 1])

@@ -82,7 +82,8 @@ class LawRunner:
         Args:
             data: The ``mujoco.MjData``.
             commands: One per actuator, shape ``(nu,)``.
-            substeps: Engine steps per control step, if it differs from the recording's.
+            substeps: Engine steps per control step, if it differs from the recording's; the same
+                during a rollout.
         """
         count = substeps or self.substeps
         step = count * float(self.model.opt.timestep)

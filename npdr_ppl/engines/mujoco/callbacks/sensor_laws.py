@@ -4,7 +4,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
-from npdr_ppl.engines.mujoco.callbacks.command_laws import remaining
+from npdr_ppl.engines.mujoco.callbacks.command_laws import lengthened, remaining
 
 __all__ = [
     "ClockSkew",
@@ -126,8 +126,9 @@ class SensorDelay(SensorLaw):
 
     def read(self, value: float, time: float, step: float) -> float:
         """Returns the value a time d earlier."""
-        self.past.appendleft(value)
         steps = self.delay / step
+        self.past = lengthened(self.past, math.floor(steps) + 3)
+        self.past.appendleft(value)
         return sum(self.weight(steps - j) * earlier for j, earlier in enumerate(self.past))
 
     def weight(self, age: float) -> float:
