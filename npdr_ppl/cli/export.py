@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import keyword
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
@@ -160,7 +161,7 @@ def _draws(
     from npdr_ppl.posterior.randomisation import for_gymnasium, for_isaac_lab
     from npdr_ppl.posterior.run_draws import run_draws
 
-    if not to.stem.isidentifier():
+    if not to.stem.isidentifier() or keyword.iskeyword(to.stem):
         raise DataError(f"{to.name} cannot be imported; choose a name such as my_robot.py.")
     drawn = run_draws(run, num)
     write = for_gymnasium if kind is Kind.GYMNASIUM else for_isaac_lab

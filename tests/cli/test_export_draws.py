@@ -252,6 +252,31 @@ def test_events_of_isaac_lab_have_the_arguments_that_it_takes(draws, monkeypatch
     assert len(found.gravity.params["gravity_distribution_params"][0]) == 3
 
 
+def test_events_of_isaac_lab_are_those_of_the_robot_under_their_own_names(
+    draws, tmp_path, monkeypatch
+):
+    text = (tmp_path / "arm.xml").read_text().replace('"elbow"', '"shoul-der"')
+    text = text.replace('"shoulder"', '"shoul_der"')
+    floor = '<geom name="floor" type="plane" size="1 1 1" pos="0 0 -3"/>'
+    (tmp_path / "arm.xml").write_text(text.replace("<worldbody>", f"<worldbody>{floor}"))
+    model = (tmp_path / "arm_model.py").read_text().replace("geom palm", "geom floor")
+    model = model.replace('"damping": "joint shoulder', '"damping": "joint shoul_der')
+    model = model.replace('"density": "option density"', '"other": "joint shoul-der damping"')
+    (tmp_path / "arm_model.py").write_text(model)
+    write_fit(tmp_path / "two", {n: MEANS[n] for n in ("mass", "damping", "kp", "centre", "grip")}
+              | {"other": 0.3})  # fmt: skip
+    words = "export", "two", MODEL, "--to", "events.py", "--as", "isaac-lab"
+    code, text, err = run_for_module(*words, "--json")
+    assert code == 0, err
+    reason = json.loads(text)["left_out"]["geom_friction of floor"]
+    assert reason == "it belongs to the world, not to the robot"
+    isaac_lab_stub.install(monkeypatch)
+    found = vars(runpy.run_path("events.py")["EventCfg"])
+    gains = [term for name, term in found.items() if name.endswith(("gains", "gains_"))]
+    named = {term.params["asset_cfg"].joint_names for term in gains}
+    assert named == {"shoul-der", "shoul_der"}
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -260,6 +285,7 @@ def test_events_of_isaac_lab_have_the_arguments_that_it_takes(draws, monkeypatch
         (("fit", MODEL, "--to", "x.py"), "Add --as gymnasium or --as isaac-lab"),
         (("fit", MODEL, "--to", "x.yaml", "--as", "gymnasium"), "its ending has to be .py"),
         (("fit", MODEL, "--to", "a-b.py", "--as", "gymnasium"), "cannot be imported"),
+        (("fit", MODEL, "--to", "class.py", "--as", "gymnasium"), "cannot be imported"),
         (("fit", "--to", "x.py", "--as", "gymnasium"), "Give the model of the run"),
         (("old", "--to", "x.yaml"), "has no posterior.nc"),
         (("other", "--to", "x.yaml"), "has no draws of lost; it is of another run"),

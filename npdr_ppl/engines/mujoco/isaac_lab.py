@@ -24,8 +24,8 @@ __all__ = ["isaac_lab_file"]
 
 Array = NDArray[np.float64]
 
-MASS = 0.94
-"""Probability of a range, that of the intervals elsewhere."""
+PROBABILITY = 0.94
+"""Share of the draws that a range holds: that of the intervals of fits and discoveries."""
 
 _JOINT = {
     ("dof_frictionloss", 0): "friction_distribution_params",
@@ -90,8 +90,14 @@ def isaac_lab_file(
             own = terms.setdefault(f"{key}_parameters", _joint(name))
             own.arguments[_JOINT[array, component]] = repr(_ends(values))
         elif (array, component) == ("geom_friction", 0):
-            body = model.body(int(model.geom(name).bodyid[0])).name
-            terms[f"body_{body}_material"] = _material(model, body, columns)
+            number = int(model.geom(name).bodyid[0])
+            body = model.body(number).name
+            if number == 0:
+                refused[f"{array} of {name}"] = "it belongs to the world, not to the robot"
+            elif not body:
+                refused[f"{array} of {name}"] = "its body has no name in the robot's file"
+            else:
+                terms[f"body_{body}_material"] = _material(model, body, columns)
         elif array == "gravity":
             terms["gravity"] = _gravity(model, columns)
         elif array == "body_inertia" and ("body_mass", kind, name, 0) in columns:
@@ -111,7 +117,7 @@ def _exactly(name: str) -> str:
 
 def _ends(values: Array) -> tuple[float, float]:
     """Returns the ends of the central range of some draws."""
-    low, high = np.quantile(values, [0.5 - MASS / 2.0, 0.5 + MASS / 2.0])
+    low, high = np.quantile(values, [0.5 - PROBABILITY / 2.0, 0.5 + PROBABILITY / 2.0])
     return float(f"{low:.6g}"), float(f"{high:.6g}")
 
 
@@ -243,9 +249,13 @@ def _text(
     terms: Mapping[str, _Term], refused: Mapping[str, str], *, module: str, robot: str
 ) -> str:
     lines = [_HEAD.format(module=module, robot=plain(robot))]
+    taken: set[str] = set()
     for name, term in terms.items():
         lines += textwrap.wrap(term.note, 90, initial_indent="    # ", subsequent_indent="    # ")
         safe = re.sub(r"\W", "_", name, flags=re.ASCII)
+        while safe in taken:  # left-leg and left_leg
+            safe += "_"
+        taken.add(safe)
         lines += [f"    {safe} = EventTerm(", f"        func=mdp.{term.function},"]
         lines += [f'        mode="{term.mode}",', "        params={"]
         if term.asset is not None:
