@@ -54,10 +54,7 @@ class Excitations:
         self._generator = generator
         num, duration = limits.num_steps, limits.num_steps * limits.time_step
         time = np.arange(num) * limits.time_step
-        # One period more than the window needs, as the window itself widens the band.
         self.num_waves = max(1, math.floor(limits.bandwidth * duration))
-        phase = 2.0 * np.pi * np.outer(np.arange(1, self.num_waves + 1), time / duration)
-        self._basis = np.concatenate((np.sin(phase), np.cos(phase)))
         ramp = min(0.25 * duration, 0.5 / limits.bandwidth)
         rise = np.clip(np.minimum(time, time[-1] - time) / ramp, 0.0, 1.0)
         self._window = 0.5 - 0.5 * np.cos(np.pi * rise)
@@ -72,7 +69,7 @@ class Excitations:
             self.limits.actions.values(),
             strict=True,
         ):
-            shape = self._window * (row @ self._basis)
+            shape = self._window * self._series(row)
             columns.append(action.start + share * self._greatest(shape, action) * shape)
         return np.stack(columns, axis=-1)
 
@@ -155,7 +152,17 @@ class Excitations:
             size = size * (generator.random(num) < generator.choice((0.3, 1.0)))
             size[int(generator.integers(num))] += 1e-3
             return np.concatenate((size * np.sin(phase), size * np.cos(phase)))
-        return 2.0 / len(self._time) * (self._basis @ self._drawn(kind))
+        found = np.fft.rfft(self._drawn(kind))[1 : num + 1]
+        return 2.0 / len(self._time) * np.concatenate((-found.imag, found.real))
+
+    def _series(self, coefficients: Array) -> Array:
+        """Returns a Fourier series of coefficients ``(2 K,)``, ``(T,)``."""
+        num, steps = self.num_waves, len(self._time)
+        spectrum = np.zeros(steps // 2 + 1, dtype=complex)
+        spectrum[1 : num + 1] = coefficients[num:] - 1j * coefficients[:num]
+        if 2 * num == steps:
+            spectrum[-1] *= 2.0  # irfft counts half the sampling rate once, other waves twice
+        return 0.5 * steps * np.fft.irfft(spectrum, steps)
 
     def _drawn(self, kind: str) -> Array:
         """Returns a shape with all frequencies, ``(T,)``, of which a series keeps the band."""

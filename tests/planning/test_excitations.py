@@ -47,6 +47,22 @@ def test_commands_keep_their_limits(excitations, candidates):
             )
 
 
+@pytest.mark.parametrize("bandwidth", [3.0, 100.0])
+def test_commands_are_the_series_of_their_coefficients(bandwidth):
+    # 100 Hz is half the sampling rate.
+    limits = replace(LIMITS, bandwidth=bandwidth, actions={"goal": ActionLimits(-1.0, 1.0)})
+    made = Excitations(limits, np.random.default_rng(0))
+    num, time = made.num_waves, np.arange(800) / 800
+    phase = 2.0 * np.pi * np.outer(np.arange(1, num + 1), time)
+    window = np.minimum(np.arange(800), 799 - np.arange(800)) * limits.time_step * 2.0 * bandwidth
+    window = np.sin(0.5 * np.pi * np.minimum(window, 1.0)) ** 2
+    for candidate in made.random(12):
+        sines, cosines = np.split(candidate.coefficients[0], 2)
+        wanted = window * (sines @ np.sin(phase) + cosines @ np.cos(phase))
+        found = made.commands(candidate)[:, 0]
+        assert found == pytest.approx(np.abs(found).max() * wanted / np.abs(wanted).max())
+
+
 def test_the_strongest_command_reaches_a_limit(excitations):
     (candidate,) = excitations.random(1)
     goal = excitations.commands(replace(candidate, amplitudes=np.ones(2)))[:, 1]
