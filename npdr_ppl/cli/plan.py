@@ -83,6 +83,8 @@ def plan(
     allowed = read_limits(limits, defaults)
     if out.suffix.lower() != ".csv":
         raise DataError(f"{out} is no .csv file; npdr plan writes its commands as CSV.")
+    if not out.parent.is_dir():
+        raise DataError(f"{out.parent} is no folder; create it first.")
     if out.exists():
         raise DataError(f"{out} exists already; choose another name or remove it first.")
     with reporter(False if quiet or as_json else None) as report:

@@ -74,6 +74,11 @@ class Judge:
         known: The causes and what is known of them.
         limits: The limits.
         seed: Seed of the simulated noise, from which the errors of initial states follow.
+
+    Attributes:
+        batch: Number of candidates that are judged together.
+        num_simulated: Number of simulations so far.
+        failure: The last message of a simulator that failed; empty if none did.
     """
 
     def __init__(self, known: Known, limits: Limits, seed: int) -> None:
@@ -92,6 +97,7 @@ class Judge:
         self._noise = np.random.default_rng(seed).standard_normal(shape) * self.scale.numpy()
         self._boxes = [_box(cause) for cause in known.causes]
         self.num_simulated = 0
+        self.failure = ""
         self.batch, self._every = self._work()
         self._start_errors: tuple[Array, ...] | None = None
 
@@ -150,12 +156,15 @@ class Judge:
             acceleration = np.diff(rate) / step
             is_bounded = math.isfinite(channel.max - channel.min)
             middle = 0.5 * (channel.min + channel.max) if is_bounded else 0.0
-            for values, least, greatest in (
-                (path - middle, channel.min - middle, channel.max - middle),
-                (rate, -channel.max_rate, channel.max_rate),
-                (acceleration, -channel.max_acceleration, channel.max_acceleration),
+            starts = np.array([channel.start_min, channel.start_max]) - middle
+            for values, least, greatest, (first, last) in (
+                (path - middle, channel.min - middle, channel.max - middle, starts),
+                (rate, -channel.max_rate, channel.max_rate, (0.0, 0.0)),
+                (acceleration, -channel.max_acceleration, channel.max_acceleration, (0.0, 0.0)),
             ):
                 room = (1.0 - PLANNING.margin) * np.array([least, greatest])
+                # A pose from which it may start keeps the limits, also without a margin.
+                room = min(room[0], first), max(room[1], last)
                 with np.errstate(invalid="ignore"):
                     ratio = np.maximum(
                         values.max((0, -1)) / max(room[1], 1e-300),
@@ -189,12 +198,13 @@ class Judge:
         """
         num, every = len(self.known.causes), self._every
         likely = [cause.probability or 1.0 / num for cause in self.known.causes]
-        terms = [
-            0.5 * math.log(likely[a] * likely[b])
-            - every * np.log1p(self._separation(played, a, b, every=every) / 8.0).sum(0)
-            for a, b in itertools.combinations(range(num), 2)
-        ]
-        return -np.logaddexp.reduce(terms, axis=0)
+        with np.errstate(invalid="ignore"):  # of candidates that cannot be judged
+            terms = [
+                0.5 * math.log(likely[a] * likely[b])
+                - every * np.log1p(self._separation(played, a, b, every=every) / 8.0).sum(0)
+                for a, b in itertools.combinations(range(num), 2)
+            ]
+            return -np.logaddexp.reduce(terms, axis=0)
 
     def precisions(self, played: Played, cause: int, *, every: int = 1) -> Tensor:
         """Returns the precision of a cause's coordinates after each candidate, ``(E, d, d)``.
@@ -331,7 +341,8 @@ class Judge:
         names = [sensor.name for sensor in box.simulator.sensors]
         try:
             simulated = box.simulator.simulate(box.parameters, inputs)
-        except NpdrError:
+        except NpdrError as error:
+            self.failure = str(error)
             return np.full((*inputs.actions.shape[:2], len(self.channels)), math.nan)
         simulated = simulated.reshape(inputs.num_segments, inputs.num_steps, len(names)).double()
         return simulated[..., [names.index(name) for name in self.channels]].numpy()

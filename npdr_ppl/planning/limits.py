@@ -17,6 +17,10 @@ __all__ = ["ActionLimits", "ChannelLimits", "Limits", "default_limits", "read_li
 MOST_BYTES = 1_000_000
 """Longest file in bytes; a robot of a hundred joints needs a hundredth of it."""
 
+MOST_STEPS = 100_000
+"""Greatest number of commands of a recording: 100 s at 1 kHz. The simulations of a batch with 14
+channels and four causes then take 1.6 GB of memory."""
+
 Part = TypeVar("Part", "ActionLimits", "ChannelLimits")
 
 
@@ -92,9 +96,10 @@ class Limits:
             units: Units by command and channel, for the comments.
         """
         lines = [
-            f"duration = {self.duration:.6g}  # s",
-            f"bandwidth = {self.bandwidth:.6g}  # Hz",
-            f"time_step = {self.time_step:.6g}  # s",
+            # With all digits: a rounded bandwidth may be less than one period of the duration.
+            f"duration = {float(self.duration)!r}  # s",
+            f"bandwidth = {float(self.bandwidth)!r}  # Hz",
+            f"time_step = {float(self.time_step)!r}  # s",
         ]
         for section, parts in (("actions", self.actions), ("channels", self.channels)):
             for name, part in parts.items():
@@ -135,9 +140,9 @@ def _of_recording(simulator: Simulator, recorded: Mapping[str, Any]) -> Limits:
         kept = recorded["actions"][action.name]
         # A goal begins where the servo is; a force begins at zero.
         start = kept["start_min"] if simulator.is_goal(action.name) else _inside(0.0, kept)
-        actions[action.name] = ActionLimits(
-            kept["min"], kept["max"], kept["max_rate"], start=start
-        )
+        # A command that was constant has no rate, which a file could not name.
+        rate = kept["max_rate"] or math.inf
+        actions[action.name] = ActionLimits(kept["min"], kept["max"], rate, start=start)
     channels = {}
     for sensor in simulator.sensors:
         if sensor.name in recorded["channels"]:
@@ -232,17 +237,28 @@ def _checked(limits: Limits, place: str) -> Limits:
                 f"{place}: {name} has no greatest command; write min and max below "
                 f"[actions.{name}]."
             )
-        if not action.min < action.max:
-            raise DataError(f"{place}: min of {name} must be below max.")
+        if action.min > action.max:
+            raise DataError(f"{place}: min of {name} is above its max.")
         if not action.min <= action.start <= action.max:
             raise DataError(f"{place}: start of {name} is not between its min and max.")
     for name, channel in limits.channels.items():
         if not channel.min < channel.max:
-            raise DataError(f"{place}: min of {name} must be below max.")
+            raise DataError(
+                f"{place}: min of {name} must be below max, {channel.max:g}; write both below "
+                f"[channels.{name}]."
+            )
+        for key in ("start_min", "start_max", "noise"):
+            if math.isinf(getattr(channel, key)):
+                raise DataError(f"{place}: {key} of {name} must be finite.")
         if channel.start_min > channel.start_max:
             raise DataError(f"{place}: start_min of {name} is above its start_max.")
         if channel.start_min < channel.min or channel.start_max > channel.max:
             raise DataError(f"{place}: {name} may start outside its min and max.")
+    if limits.duration / limits.time_step > MOST_STEPS:
+        raise DataError(
+            f"{place}: a duration of {limits.duration:g} s has more than {MOST_STEPS} steps of "
+            f"{limits.time_step:g} s; plan a shorter recording."
+        )
     if limits.num_steps < 50:
         raise DataError(
             f"{place}: a duration of {limits.duration:g} s has {limits.num_steps} steps of "

@@ -158,6 +158,7 @@ def plan_recording(
         raise DataError(
             f"None of {judge.num_simulated // len(known.causes)} simulated excitations kept the "
             "limits; allow more position, speed or acceleration, or search longer."
+            + (f" A simulation failed: {judge.failure}" if judge.failure else "")
         )
     both = [found.best, found.first]
     played = judge.played(

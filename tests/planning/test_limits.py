@@ -2,9 +2,12 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.planning.excitations import Excitations
+from npdr_ppl.planning.judging import Judge, Played
 from npdr_ppl.planning.limits import default_limits, read_limits
 
 BAD = {
@@ -13,13 +16,15 @@ BAD = {
     "duration = 'long'": "duration in .* is 'long', which is not a number",
     "duration = -1": r"it must be above 0",
     "duration = 0.1": "at least 50 are needed",
+    "duration = inf": "more than 100000 steps",
+    "time_step = 1e-6": "more than 100000 steps",
     "bandwidth = 1e3": "half the sampling rate",
     "bandwidth = 0.01": "one period of the duration",
     "actions = 1": r"write \[actions.NAME\]",
     "[actions]\ntorque = 3": "is no table of limits",
     "[actions.force]\nmax = 1": "has 'force'; known are torque",
     "[actions.torque]\nlargest = 1": "has 'largest'; known are",
-    "[actions.torque]\nmin = 9": "min of torque must be below max",
+    "[actions.torque]\nmin = 9": "min of torque is above its max",
     "[actions.torque]\nmin = -inf": "write min and max below",
     "[actions.torque]\nmax = true": "which is not a number",
     "[actions.torque]\nmax_rate = 0": "it must be above 0",
@@ -28,6 +33,8 @@ BAD = {
     "[channels.angle]\nstart_min = 0.5": "start_min of angle is above its start_max",
     "[channels.angle]\nstart_min = -20": "angle may start outside its min and max",
     "[channels.angle]\nnoise = nan": "which is not a number",
+    "[channels.angle]\nnoise = inf": "noise of angle must be finite",
+    "[channels.angle]\nmin = -inf\nstart_min = -inf": "start_min of angle must be finite",
 }
 
 
@@ -55,6 +62,56 @@ def test_printed_limits_are_read_back(surviving, tmp_path):
         given, found = dataclasses.astuple(channel), dataclasses.astuple(read.channels[name])
         assert found == pytest.approx(given, rel=1e-5)
     assert read.num_steps == limits.num_steps
+
+
+def recorded(**changes):
+    """Ranges of a pendulum's recording."""
+    still = {"min": 0.0, "max": 0.0, "start_min": 0.0, "start_max": 0.0}
+    torque = still | {"min": -1.0, "max": 1.0, "max_rate": 20.0, "bandwidth": 1.0}
+    angle = still | {"min": -0.9, "max": 1.0, "start_min": 1.0, "start_max": 1.0}
+    ranges = {
+        "actions": {"torque": torque | changes.pop("torque", {})},
+        "channels": {"angle": angle, "velocity": still | {"min": -6.0, "max": 6.0}},
+        "noise": {"angle": 0.002, "velocity": 0.01},
+        "time_step": 0.02,
+        "seconds": 5.0,
+    }
+    return ranges | changes
+
+
+def test_the_slowest_band_is_read_back_as_printed(unrecorded, tmp_path):
+    # One period in 7 s is 0.142857142… Hz, more than its first six digits.
+    simulator = unrecorded[0].causes[0].simulator
+    slow = default_limits(simulator, recorded(seconds=7.0, torque={"bandwidth": 0.0}))
+    file = tmp_path / "limits.toml"
+    file.write_text(slow.toml({}))
+    assert read_limits(file, unrecorded[1]) == slow
+
+
+def test_a_command_that_was_constant_stays_constant(unrecorded, tmp_path):
+    simulator = unrecorded[0].causes[0].simulator
+    constant = {"min": 0.5, "max": 0.5, "start_min": 0.5, "max_rate": 0.0, "bandwidth": 0.0}
+    held = default_limits(simulator, recorded(torque=constant))
+    file = tmp_path / "limits.toml"
+    file.write_text(held.toml({}))
+    assert read_limits(file, held) == held
+    made = Excitations(held, np.random.default_rng(0))
+    for candidate in made.random(5):
+        assert (made.commands(candidate) == 0.5).all()
+
+
+def test_a_robot_may_start_at_the_end_of_its_range(unrecorded):
+    known, _ = unrecorded
+    limits = read_limits(None, default_limits(known.causes[0].simulator, recorded()))
+    judge = Judge(known, limits, seed=0)
+    shape = len(known.causes), 1, limits.num_steps, 2
+    for side, is_kept in ((0.0, True), (-0.84, True), (-0.88, False), (-1.0, False)):
+        # From the greatest angle that was recorded to the other side, slowly.
+        readings = np.zeros(shape)
+        readings[..., 0] = np.linspace(1.0, side, limits.num_steps)
+        played = Played(np.zeros((1, limits.num_steps, 1)), np.array([[1.0, 0.0]]), readings)
+        # A margin of 5 % of half the range of 1.9 rad is kept where it does not start.
+        assert (judge.violation(played)[0] <= 0.0) == is_kept
 
 
 @pytest.mark.slow

@@ -71,6 +71,17 @@ def test_impossible_limits_get_a_sentence(unrecorded):
         plan_recording(known, limits, rounds=2)
 
 
+def test_a_simulator_that_fails_is_quoted(unrecorded, monkeypatch):
+    known, limits = unrecorded
+
+    def fails(*_):
+        raise npdr.NpdrError("The spring broke.")
+
+    monkeypatch.setattr(type(known.causes[0].simulator), "simulate", fails)
+    with pytest.raises(DataError, match=r"A simulation failed: The spring broke\."):
+        plan_recording(known, limits, rounds=1)
+
+
 def test_a_discovery_keeps_what_rebuilds_its_causes(ambiguous, surviving):
     _, folder = ambiguous
     known, _ = surviving
@@ -201,6 +212,7 @@ def test_the_command_prints_limits(tmp_path):
         (["no_run", "pendulum"], "is no folder of a finished npdr fit or npdr discover"),
         (["one", "two", "pendulum"], "takes a run and a model"),
         (["pendulum", "--out", "next.txt"], "is no .csv file"),
+        (["pendulum", "--out", "nowhere/next.csv"], "nowhere is no folder; create it first"),
         (["pendulum", "--limits", "nowhere.toml"], "nowhere.toml cannot be read"),
     ],
 )
