@@ -17,8 +17,9 @@ from npdr_ppl.discovery.proof.settings import EXPERIMENT
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.rounds import Search
+from npdr_ppl.rollouts.recording import Recording
 
-__all__ = ["VERSION", "SurvivingCauses", "surviving_causes"]
+__all__ = ["VERSION", "SurvivingCauses", "ranges", "surviving_causes"]
 
 VERSION = 1
 """Version of the format; raised when a reader of the former one would misread it."""
@@ -56,16 +57,7 @@ class SurvivingCauses:
             "segment_length": segments.inputs.num_steps,
             "time_step": rollouts.time_step,
             "seconds": max(rollouts.lengths) * rollouts.time_step,
-            "actions": {
-                name: _range_of_commands(
-                    [part[:, k] for part in rollouts.usable_actions], rollouts.time_step
-                )
-                for k, name in enumerate(rollouts.action_names)
-            },
-            "channels": {
-                name: _range_of_readings([part[:, k] for part in rollouts.usable_readings])
-                for k, name in enumerate(rollouts.channel_names)
-            },
+            **ranges(rollouts),
         }
 
     def separations(self) -> Array:
@@ -143,19 +135,47 @@ def _described(hypothesis: Hypothesis, probability: float) -> dict[str, Any]:
     }
 
 
-def _range_of_commands(series: Sequence[Array], time_step: float) -> dict[str, float]:
+def ranges(rollouts: Recording) -> dict[str, Any]:
+    """Returns the ranges of the commands and of the measurements of a recording, by name."""
+    is_start, step = _starts(rollouts), rollouts.time_step
+    commands, readings = rollouts.usable_actions, rollouts.usable_readings
+    return {
+        "actions": {
+            name: _range_of_commands([part[:, k] for part in commands], is_start, step)
+            for k, name in enumerate(rollouts.action_names)
+        },
+        "channels": {
+            name: _range_of_readings([part[:, k] for part in readings], is_start)
+            for k, name in enumerate(rollouts.channel_names)
+        },
+    }
+
+
+def _starts(rollouts: Recording) -> list[bool]:
+    """Returns which usable stretches begin with their rollout; all, if none does.
+
+    Behind a gap the robot is in motion, so it cannot start there.
+    """
+    found = [begin == 0 for spans in rollouts.spans for begin, _ in spans]
+    return found if any(found) else [True] * len(found)
+
+
+def _range_of_commands(
+    series: Sequence[Array], is_start: Sequence[bool], time_step: float
+) -> dict[str, float]:
     """Returns the least and the greatest command, its greatest rate and its bandwidth in Hz."""
     rates = np.concatenate([np.diff(part) for part in series]) / time_step
     return {
-        **_range_of_readings(series),
+        **_range_of_readings(series, is_start),
         "max_rate": float(np.abs(rates).max(initial=0.0)),
         "bandwidth": max(_bandwidth(part, time_step) for part in series),
     }
 
 
-def _range_of_readings(series: Sequence[Array]) -> dict[str, float]:
+def _range_of_readings(series: Sequence[Array], is_start: Sequence[bool]) -> dict[str, float]:
     """Returns the least and the greatest value, and those at the start of a rollout."""
-    every, first = np.concatenate(series), [float(part[0]) for part in series]
+    every = np.concatenate(series)
+    first = [float(part[0]) for part, begins in zip(series, is_start, strict=True) if begins]
     return {
         "min": float(every.min()),
         "max": float(every.max()),
