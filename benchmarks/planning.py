@@ -4,14 +4,14 @@
     python benchmarks/planning.py --summary planning.jsonl
 
 A case is one rollout of a rig of :mod:`hidden_rigs`, with one effect hidden whose strength is a
-part of the rig's typical size. It counts if the verdict of ``discover`` is ``ambiguous`` and the
-hidden effect is among the causes that are left. Then one recording is planned, played on the rig,
+part of the rig's typical size. It counts if the verdict of ``discover`` is ``ambiguous``, the
+hidden effect is among the causes that are left, and so is one that a recording of the rig can tell
+from it. Then one recording is planned, played on the rig,
 and ``discover`` gets both. So does a random recording within the same limits: the first random
 excitation of the search that keeps them. The limits are the rig's greatest commands, twice the
 positions, velocities and length of the first rollout, three times its bandwidth, and any pose from
-which the rig's rollouts are let go. A case counts if a cause is left that a recording of the rig
-can tell from the hidden effect. Told apart means that no such cause is left: the verdict names the
-hidden effect or what no recording tells from it, or only these are left. Rows are written as they
+which the rig's rollouts are let go. Told apart means that no such cause is left: the verdict names
+the hidden effect or what no recording tells from it, or only these are left. Rows are written as they
 come, and a run given again continues.
 """
 

@@ -12,14 +12,22 @@ from npdr_ppl.engines.mujoco.export import ExportedMjcf, export_mjcf
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.urdf_export import export_urdf
 from npdr_ppl.errors import DataError, ModelError
+from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import add_effect, num_finer_steps, with_finer_steps
 from npdr_ppl.language.only_simulator import only_simulator
-from npdr_ppl.models.effects import effect_class
+from npdr_ppl.models.effects import effect_class, effects
 from npdr_ppl.posterior.run_folder import MAX_FINER_STEPS
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import DiscoveryRecord, FitRecord
 
-__all__ = ["Identified", "export_robot", "found_mechanism", "identified", "revised_model"]
+__all__ = [
+    "Identified",
+    "export_robot",
+    "found_effect",
+    "found_mechanism",
+    "identified",
+    "revised_model",
+]
 
 
 class Identified(NamedTuple):
@@ -78,6 +86,24 @@ def identified(run: Path) -> Identified:
     return Identified(values, finer_steps, step, verdict, reason, ripples)
 
 
+def found_effect(name: str, port: str) -> Effect:
+    """Returns an effect that a run added to its model.
+
+    Args:
+        name: Its id.
+        port: Its port.
+
+    Raises:
+        ModelError: The effect is neither of the catalogue nor added by the user.
+    """
+    if name not in effects():
+        raise ModelError(
+            f"The run has the effect {port}.{name}, which is not in the catalogue. If you have "
+            "its file, add it first, as in npdr effects --add learned_effect.py."
+        )
+    return effect_class(name)(port)
+
+
 def revised_model(model: Callable[..., Any], found: Identified) -> Callable[..., Any]:
     """Returns a model with the effects that a run's values name, and the run's steps.
 
@@ -89,7 +115,7 @@ def revised_model(model: Callable[..., Any], found: Identified) -> Callable[...,
     for name in dict.fromkeys(s.rpartition(".")[0] for s in found.values if s not in sites):
         port, _, effect = name.rpartition(".")
         if port:
-            added = effect_class(effect)(port)
+            added = found_effect(effect, port)
             if name in found.ripples:
                 added = added.with_ripples(found.ripples[name])
             model = add_effect(model, added)

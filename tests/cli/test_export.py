@@ -131,6 +131,7 @@ def test_a_discovery_is_exported_with_its_effects(fitted):
         (("fit", "arm_model.py:model", "--to", "arm.xml"), "arm.xml exists already"),
         (("fit", "arm_model.py:model", "--to", "arm.urdf"), "not made from a URDF file"),
         (("parts", "arm_model.py:model", "--to", "new.xml"), "no folder of a finished"),
+        (("own", "arm_model.py:model", "--to", "new.xml"), "as in npdr effects --add"),
         (("other", "arm_model.py:model", "--to", "new.xml"), "give the model of the run"),
         (("fit", "pendulum", "--to", "new.xml"), "has no port 'shoulder_torque'"),
     ],
@@ -139,5 +140,6 @@ def test_bad_input_gives_one_sentence(fitted, monkeypatch, words, sentence):
     folder, _ = fitted
     monkeypatch.chdir(folder)
     write_fit(folder / "other", {"mass": 1.0})
+    write_fit(folder / "own", {"kp": 44.0, "elbow_torque.learned_by_nobody.cubic": 0.1})
     code, _, err = run_for_module("export", *words)
     assert code == 2 and err.count("\n") == 1 and sentence in err
