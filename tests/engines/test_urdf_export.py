@@ -91,6 +91,13 @@ def test_only_what_changes_is_written(tmp_path):
     assert '<!-- npdr: damping 0.4 (was 0.1) --> <dynamics damping="0.4"/>' in new[0]
 
 
+def test_values_that_stay_change_nothing(tmp_path):
+    simulator = arm(tmp_path, "upper", "damping")
+    mass = float(simulator.model.body("upper").mass[0])
+    found = export_urdf(simulator, {"upper": value(mass), "damping": value(0.1)})
+    assert found.text == found.before
+
+
 def test_inertias_stay_physical(tmp_path):
     path = tmp_path / "new.urdf"
     for number in (0.2, 0.8, 3.0):

@@ -153,6 +153,8 @@ def _write_inertial(edits: MjcfText, old: Any, new: Any, body: int) -> None:
         for what, array in parts
         if not np.array_equal(getattr(old, array)[body], getattr(new, array)[body])
     ]
+    if not notes:
+        return
     edits.set(mass, {"value": repr(float(new.body_mass[body]))}, f"npdr: {', '.join(notes)}")
     if not np.array_equal(old.body_inertia[body], new.body_inertia[body]):
         edits.set(inertia, {name: repr(float(matrix[at])) for name, at in _ENTRIES.items()})
@@ -226,7 +228,11 @@ def _check(text: str, wanted: Any, folder: Path) -> None:
             path.unlink(missing_ok=True)
     for name in ("body_mass", "body_ipos", "dof_damping", "dof_frictionloss"):
         if not np.allclose(getattr(found, name), getattr(wanted, name), rtol=1e-6, atol=1e-12):
-            raise ModelError(f"The new file's {name} would differ from the model's.")
+            raise ModelError(
+                f"The new file's {name} would differ from the model's; export an .xml file."
+            )
     for body in range(found.nbody):
         if not np.allclose(_inertia(found, body), _inertia(wanted, body), rtol=1e-6, atol=1e-12):
-            raise ModelError("The new file's inertia would differ from the model's.")
+            raise ModelError(
+                "The new file's inertia would differ from the model's; export an .xml file."
+            )
