@@ -67,7 +67,7 @@ def export(
 
     The other kinds have draws of the posterior or ranges: a table, a Gymnasium wrapper that takes
     another draw at every reset, or a configuration of Isaac Lab's events. MODEL may be left out
-    for a table, and for a discovery, whose folder has its revised model.
+    for a table, and for a discovery: then revised_model.py in its folder is run.
 
     Example: npdr export fit arm.xml --to arm_identified.xml
     """

@@ -356,7 +356,7 @@ HOSTILE = "x&#10;    import os; os.environ['NPDR_HOSTILE'] = '1'&#10;&quot;&quot
 """A name in a robot's file that would be a statement in Python."""
 
 
-@pytest.mark.parametrize("kind", ["gymnasium", "isaac-lab"])
+@pytest.mark.parametrize("kind", ["gymnasium", "isaac-lab", "robot"])
 def test_names_in_a_robots_file_cannot_become_code(draws, tmp_path, monkeypatch, kind):
     monkeypatch.delenv("NPDR_HOSTILE", raising=False)
     text = (tmp_path / "arm.xml").read_text()
@@ -371,9 +371,10 @@ def test_names_in_a_robots_file_cannot_become_code(draws, tmp_path, monkeypatch,
     means = {n: v for n, v in MEANS.items() if "." not in n and n != "kp"}
     means |= {"friction": 0.7, "gear": 1.1, "motor.input_delay.delay": 0.01}
     write_fit(tmp_path / "hostile", means)
-    words = "export", "hostile", MODEL, "--to", "new.py", "--as", kind
+    to, written = ("new.xml", "new_effects.py") if kind == "robot" else ("new.py", "new.py")
+    words = "export", "hostile", MODEL, "--to", to, "--as", kind
     code, _, err = run_for_module(*words)
     assert code == 0, err
     isaac_lab_stub.install(monkeypatch)
-    runpy.run_path("new.py")
+    runpy.run_path(written)
     assert "NPDR_HOSTILE" not in os.environ
