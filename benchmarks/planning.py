@@ -11,8 +11,8 @@ and ``discover`` gets both. So does a random recording within the same limits: t
 excitation of the search that keeps them. The limits are the rig's greatest commands, twice the
 positions, velocities and length of the first rollout, three times its bandwidth, and any pose from
 which the rig's rollouts are let go. Told apart means that no such cause is left: the verdict names
-the hidden effect or what no recording tells from it, or only these are left. Rows are written as they
-come, and a run given again continues.
+the hidden effect or what no recording tells from it, or only these are left. Rows are written as
+they come, and a run given again continues.
 """
 
 import argparse

@@ -400,7 +400,7 @@ def show_plan(found: Mapping[str, Any], out: Path) -> None:
         table.title = "Standard deviation of parameters, as a share of the prior's"
         table.add_column("parameter", overflow="fold")
         rows = [(width["name"], width) for width in found["widths"]]
-        digits = ".3f"
+        digits = ".2g"
     for column in ("so far", "with the plan", "with a random recording"):
         table.add_column(column, justify="right")
     for *names, values in rows:

@@ -117,9 +117,9 @@ def plan_recording(
 ) -> Plan:
     """Designs the recording that tells causes apart, or that narrows one cause's parameters.
 
-    With several causes it maximises the smallest separation of any two. With one, or with draws of
-    the prior, it maximises the expected gain of information (Bayesian D-optimality; Chaloner &
-    Verdinelli 1995).
+    With several causes it minimises a bound on the probability of naming the wrong one; see
+    :meth:`~npdr_ppl.planning.judging.Judge.certainty`. With one, or with draws of the prior, it
+    maximises the expected gain of information (Bayesian D-optimality; Chaloner & Verdinelli 1995).
 
     Args:
         known: The causes, from :func:`~npdr_ppl.planning.causes.causes_of_run` or
