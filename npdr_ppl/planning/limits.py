@@ -128,7 +128,10 @@ def default_limits(simulator: Simulator, recorded: Mapping[str, Any] | None) -> 
         PLANNING.prior_seconds,
         PLANNING.prior_bandwidth,
         simulator.time_step,
-        {a.name: ActionLimits(a.lower, a.upper) for a in simulator.actions},
+        {
+            a.name: ActionLimits(a.lower, a.upper, start=_nearest_zero(a))
+            for a in simulator.actions
+        },
         {s.name: _declared(simulator, s) for s in simulator.sensors},
     )
 
@@ -291,11 +294,16 @@ def _inside(value: float, ends: Mapping[str, float]) -> float:
     return min(max(value, ends["min"]), ends["max"])
 
 
+def _nearest_zero(channel: Channel) -> float:
+    """Returns the value in a channel's range that is closest to zero."""
+    return _inside(0.0, {"min": channel.lower, "max": channel.upper})
+
+
 def _declared(simulator: Simulator, sensor: Channel) -> ChannelLimits:
     """Returns what a model declares of a channel."""
     ports = [port for port in simulator.ports if port.name == sensor.name]
     rated = ports[0].rated if ports else 1.0
-    start = _inside(0.0, {"min": sensor.lower, "max": sensor.upper})
+    start = _nearest_zero(sensor)
     return ChannelLimits(
         sensor.lower,
         sensor.upper,

@@ -67,6 +67,21 @@ def test_less_noise_separates_more(surviving):
 @pytest.mark.slow
 def test_certainty_is_that_of_the_pairs(surviving):
     known, limits = surviving
+    pair = replace(known, causes=known.causes[:2], separations=known.separations[:2, :2])
+    judge = Judge(pair, limits, seed=0)
+    played = judge.played(*candidates(limits))
+    before = -0.5 * np.log([cause.probability for cause in pair.causes]).sum()
+    gained = judge.certainty(played) - before
+    # Π_k (1 + d_k²/8) of parts d_k² is at least 1 + d²/8 and at most exp(d²/8).
+    square = judge.separations(played)[:, 0, 1]
+    assert (gained >= np.log1p(square / 8.0) * (1.0 - 1e-6)).all()
+    assert (gained <= square / 8.0 * (1.0 + 1e-6)).all()
+    assert (gained > 1.01 * np.log1p(square / 8.0)).any()
+
+
+@pytest.mark.slow
+def test_certainty_grows_with_the_motion(surviving):
+    known, limits = surviving
     judge = Judge(known, limits, seed=0)
     played = judge.played(*candidates(limits))
     certain = judge.certainty(played)

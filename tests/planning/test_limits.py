@@ -151,6 +151,14 @@ def test_columns_that_the_model_lacks_have_no_limits(surviving):
     assert default_limits(known.causes[0].simulator, recorded) == limits
 
 
+def test_a_command_that_cannot_be_zero_begins_at_its_end(unrecorded, monkeypatch):
+    simulator = unrecorded[0].causes[0].simulator
+    throttle = dataclasses.replace(simulator.actions[0], lower=0.2, upper=0.9)
+    monkeypatch.setattr(type(simulator), "actions", (throttle,))
+    limits = read_limits(None, default_limits(simulator, None))
+    assert limits.actions["torque"].start == 0.2
+
+
 def test_without_a_recording_the_model_declares_them(unrecorded):
     known, limits = unrecorded
     torque = known.causes[0].simulator.actions[0]
