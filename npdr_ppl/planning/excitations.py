@@ -6,7 +6,8 @@ The command of an action is
 
 with the command u₀ at rest, a window w that rises and falls smoothly, and an amplitude g: a share
 of the greatest one that keeps the limits of the command, its rate and its acceleration (Swevers et
-al., Optimal robot excitation and identification, 1997).
+al., Optimal robot excitation and identification, 1997). Where u₀ is close to a limit, the sum gets
+a constant, so that it is about the middle of the range.
 """
 
 import math
@@ -69,8 +70,8 @@ class Excitations:
             self.limits.actions.values(),
             strict=True,
         ):
-            shape = self._window * self._series(row)
-            columns.append(action.start + share * self._greatest(shape, action) * shape)
+            command = action.start + share * self._greatest(self._series(row), action)
+            columns.append(np.clip(command, action.min, action.max))  # after rounding
         return np.stack(columns, axis=-1)
 
     def start(self, candidate: Candidate) -> Array:
@@ -129,16 +130,23 @@ class Excitations:
         """Returns a candidate with smaller amplitudes."""
         return replace(candidate, amplitudes=factor * candidate.amplitudes)
 
-    def _greatest(self, shape: Array, action: ActionLimits) -> float:
-        """Returns the greatest factor of a shape that keeps a command's limits."""
-        step = self.limits.time_step
-        rate = np.diff(shape, prepend=0.0, append=0.0) / step
-        tiny = 1e-300
-        return min(
-            (action.max - action.start) / max(float(shape.max()), tiny),
-            (action.start - action.min) / max(float(-shape.min()), tiny),
+    def _greatest(self, series: Array, action: ActionLimits) -> Array:
+        """Returns the greatest deviation from the command at rest within the limits, ``(T,)``."""
+        low, high = action.min - action.start, action.max - action.start
+        step, tiny = self.limits.time_step, 1e-300
+        if min(high, -low) < PLANNING.least_room * (high - low):
+            size = 0.5 * (high - low) / max(float(np.abs(series).max()), tiny)
+            deviation = self._window * (0.5 * (low + high) + size * series)
+        else:
+            shape = self._window * series
+            largest, smallest = float(shape.max()), float(shape.min())
+            deviation = shape * min(high / max(largest, tiny), -low / max(-smallest, tiny))
+        rate = np.diff(deviation, prepend=0.0, append=0.0) / step
+        change = np.abs(np.diff(rate)) / step
+        return deviation * min(
+            1.0,
             action.max_rate / max(float(np.abs(rate).max()), tiny),
-            action.max_acceleration / max(float(np.abs(np.diff(rate)).max()) / step, tiny),
+            action.max_acceleration / max(float(change.max()), tiny),
         )
 
     def _shape(self) -> Array:

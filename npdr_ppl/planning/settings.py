@@ -29,6 +29,9 @@ class PlanningSettings:
         shrink: Factor of this step after a round that improved nothing.
         least_step: Smallest step.
         amplitudes: Multiples of the greatest permitted amplitude that random candidates have.
+        least_room: A command at rest that is closer to a limit than this share of its range moves
+            about the middle of the range. About itself, it could not move if it is at the limit,
+            as the goal of a servo that starts at its end stop.
         margin: Share of a limit that simulations keep free, because the robot is not the model.
         num_draws: Number of prior draws over which information is averaged.
         num_smoothed: Number of noisy simulated recordings from which the errors of initial states
@@ -53,6 +56,7 @@ class PlanningSettings:
     shrink: float = 0.8
     least_step: float = 0.05
     amplitudes: tuple[float, ...] = (1.0, 0.7, 0.45, 0.25, 0.1)
+    least_room: float = 0.25
     margin: float = 0.05
     num_draws: int = 5
     num_smoothed: int = 3
@@ -71,6 +75,7 @@ class PlanningSettings:
         check_range(self, 1, 100, "num_smoothed")
         check_range(self, 1, self.batch, "elites")
         check_range(self, 0.0, 1.0, "step", "shrink", "least_step", "amplitudes", "margin")
+        check_range(self, 0.0, 0.5, "least_room")
         check_range(self, 0.0, 1.0, "relative_noise")
         check_range(self, 0.1, math.inf, "most_seconds", "prior_seconds", "prior_bandwidth")
         check_range(self, 0.0, 100.0, "useful_separation")

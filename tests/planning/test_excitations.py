@@ -63,10 +63,23 @@ def test_commands_are_the_series_of_their_coefficients(bandwidth):
         assert found == pytest.approx(np.abs(found).max() * wanted / np.abs(wanted).max())
 
 
-def test_the_strongest_command_reaches_a_limit(excitations):
-    (candidate,) = excitations.random(1)
-    goal = excitations.commands(replace(candidate, amplitudes=np.ones(2)))[:, 1]
-    assert goal.max() == pytest.approx(0.3) or goal.min() == pytest.approx(0.0)
+def test_the_strongest_command_reaches_a_limit():
+    limits = replace(LIMITS, actions={"torque": ActionLimits(-1.0, 2.0, start=0.5)})
+    made = Excitations(limits, np.random.default_rng(0))
+    for candidate in made.random(20):
+        torque = made.commands(replace(candidate, amplitudes=np.ones(1)))[:, 0]
+        assert torque.max() == pytest.approx(2.0) or torque.min() == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.01, 0.3])
+def test_a_command_at_rest_at_a_limit_uses_the_range(start):
+    limits = replace(LIMITS, actions={"goal": ActionLimits(0.0, 0.3, start=start)})
+    made = Excitations(limits, np.random.default_rng(0))
+    for candidate in made.random(20):
+        goal = made.commands(replace(candidate, amplitudes=np.ones(1)))[:, 0]
+        assert goal.min() >= 0.0 and goal.max() <= 0.3
+        assert np.ptp(goal) > 0.14
+        assert goal[[0, -1]] == pytest.approx(start)
 
 
 def test_commands_are_in_the_band(excitations, candidates):
