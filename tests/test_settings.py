@@ -8,6 +8,7 @@ from npdr_ppl.discovery import settings as discovery_settings
 from npdr_ppl.discovery.proof import settings as proof_settings
 from npdr_ppl.discovery.screening import settings as screening_settings
 from npdr_ppl.discovery.search import settings as search_settings
+from npdr_ppl.planning import settings as planning_settings
 from npdr_ppl.posterior import settings as posterior_settings
 from npdr_ppl.preparation import settings as preparation_settings
 from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING, SEGMENT_FIT
@@ -21,6 +22,7 @@ STAGES = [
         search_settings,
         proof_settings,
         posterior_settings,
+        planning_settings,
     )  # fmt: skip
     for name in module.__all__
     if name.isupper()
