@@ -13,17 +13,23 @@ class LearningSettings:
 
     Attributes:
         num_parts: Number of equal parts of each segment. A pulse in each of them shows how the
-            measurements respond to a force there.
+            measurements respond to a force there. By default a segment has at least 20 steps, so
+            that a part is a step of a slow recording, and 10 ms of a fast one.
         pulse_height: Height of a pulse, as a fraction of the port's rated value. It is small,
             because the response is a derivative.
         num_folds: Parts of the recording each of which is predicted from the others.
-        beam: Formulas of each size that are extended by another term.
-        most_terms: Greatest number of terms of a formula.
-        num_waves: Greatest number of half waves in the visited range of a position.
+        beam: Formulas of each size that are extended by another term. Terms that nearly replace
+            each other come in groups of a few.
+        most_terms: Greatest number of terms of a formula. Longer ones are not understood.
+        num_waves: Greatest number of half waves in the visited range of a position. Their number
+            bounds the memory and the time.
         fewest_waves: Number of half waves that is tried however small the range is.
-        most_per_turn: Greatest number of periods per turn that is tried at a joint that turns.
-        largest_wave_number: Greatest other wave number that is tried, in 1/rad or 1/m.
-        num_harmonics: Number of harmonics of a wave that are tried together.
+        most_per_turn: Greatest number of periods per turn that is tried at a joint that turns, as
+            for cogging.
+        largest_wave_number: Greatest other wave number that is tried, in 1/rad or 1/m, unless
+            ``fewest_waves`` needs more: about two periods per radian.
+        num_harmonics: Number of harmonics of a wave that are tried together. Five describe wells
+            that are a tenth of their distance wide.
         most_laws: Greatest number of laws at different ports.
         num_fitted: Ports whose best formula is fitted by simulation.
         num_shapes: Values of every other shape constant that are tried.
