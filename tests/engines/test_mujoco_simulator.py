@@ -586,3 +586,50 @@ def test_float32_parameters_and_gradients_are_taken_as_numbers():
     assert not out.requires_grad
     assert not simulator.is_differentiable
     assert npdr.MujocoSimulator is MujocoSimulator
+
+
+ROD = """
+<mujoco>
+  <worldbody>
+    <body name="rod">
+      {joints}
+      <inertial pos="{x} 0 0" mass="1" diaginertia="0.02 0.02 0.02"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="torque" joint="hinge"/></actuator>
+</mujoco>
+"""
+HINGE = '<joint name="hinge" axis="0 1 0"/>'
+
+
+@pytest.mark.parametrize("num", [1, 100])
+def test_a_centre_of_mass_that_is_at_the_joint_in_the_file_can_move(tmp_path, num):
+    inputs = Inputs.single(
+        torch.ones(20, 1).double(),
+        torch.zeros(2).double(),
+        action_names=("torque",),
+        state_names=("hinge", "hinge_velocity"),
+        time_step=0.002,
+    )
+    for x in (0.0, 0.1):
+        (tmp_path / f"{x}.xml").write_text(ROD.format(joints=HINGE, x=x))
+    movable = npdr.MujocoSimulator(tmp_path / "0.0.xml", {"centre": "body rod centre x"})
+    there = npdr.MujocoSimulator(tmp_path / "0.1.xml", {"mass": "body rod mass"})
+    moved = movable.simulate({"centre": torch.full((num,), 0.1).double()}, inputs)
+    expected = there.simulate({"mass": torch.ones(1).double()}, inputs)
+    assert torch.allclose(moved, expected.expand_as(moved), atol=1e-12)
+
+
+def test_a_centre_of_mass_at_several_joints_that_would_not_move_is_refused(tmp_path):
+    joints = f'<joint name="slide" type="slide" axis="1 0 0"/>{HINGE}'
+    (tmp_path / "rod.xml").write_text(ROD.format(joints=joints, x=0.0))
+    simulator = npdr.MujocoSimulator(tmp_path / "rod.xml", {"centre": "body rod centre x"})
+    inputs = Inputs.single(
+        torch.ones(2, 1).double(),
+        torch.zeros(4).double(),
+        action_names=("torque",),
+        state_names=("slide", "slide_velocity", "hinge", "hinge_velocity"),
+        time_step=0.002,
+    )
+    with pytest.raises(ModelError, match="centre of mass of body 'rod' cannot be changed"):
+        simulator.simulate({"centre": torch.tensor([0.1]).double()}, inputs)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from npdr_ppl.engines.mujoco.parameters import Assignments
+from npdr_ppl.errors import ModelError
 
 __all__ = ["has_constraints", "make_batch", "prepared_copy", "quiet", "state_view"]
 
@@ -17,6 +18,9 @@ __all__ = ["has_constraints", "make_batch", "prepared_copy", "quiet", "state_vie
 # time constant of two steps, with which the joint stops after one step.
 _CRISP_IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 _CRISP_STEPS = 2.0
+
+# Numbers per body of the fields that place its inertial frame.
+_FRAMES = {"body_ipos": 3, "body_iquat": 4}
 
 # Up to this number of simulations, setting values in each one is faster than changing a shared
 # model.
@@ -39,6 +43,7 @@ def make_batch(
     # Constants such as inverse inertias depend on some fields. Computing them costs microseconds
     # per simulation, so this is done only if such a field was changed.
     followed = set(getattr(mujoco.MjModel, "_setconst_inputs", ())) or {a for a, _ in assignments}
+    model = _with_free_frames(model, {p // _FRAMES[a] for a, p in assignments if a in _FRAMES})
     shared = {}
     if num_simulations > _FEW:
         shared = {key: float(value) for key, value in assignments.items() if value.numel() == 1}
@@ -60,6 +65,37 @@ def make_batch(
         except module.SimulationError:
             pass
     return batch
+
+
+def _with_free_frames(model: Any, bodies: set[int]) -> Any:
+    """Returns a model in which the inertial frames of some bodies may move.
+
+    Where such a frame is that of its body, MuJoCo compiles shortcuts, with which it ignores a
+    frame that moves later.
+
+    Args:
+        model: A ``mujoco.MjModel``, which is not changed.
+        bodies: Indices of the bodies.
+
+    Raises:
+        ModelError: A shortcut cannot be taken back.
+    """
+    fixed = [b for b in sorted(bodies) if model.body_sameframe[b] or model.body_simple[b]]
+    if not fixed:
+        return model
+    changed = copy.copy(model)
+    for body in fixed:
+        changed.body_sameframe[body] = 0
+        if model.body_simple[body]:
+            first, num = model.body_dofadr[body], model.body_dofnum[body]
+            if num > 1:
+                raise ModelError(
+                    f"The centre of mass of body {model.body(body).name!r} cannot be changed, "
+                    "because it is at the joints' origin in the file; move it there by 1e-6 m."
+                )
+            changed.body_simple[body] = 0
+            changed.dof_simplenum[: first + num] = 0
+    return changed
 
 
 def state_view(batch: Any, name: str) -> Any:
