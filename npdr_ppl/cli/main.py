@@ -115,6 +115,8 @@ def _run() -> Any:
     try:
         return app(standalone_mode=False)
     except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):  # `npdr ... | head` has read enough
+            raise
         _refuse(f"The model or its simulator ended the program by sys.exit({error.code!r}).")
 
 

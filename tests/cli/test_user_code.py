@@ -1,8 +1,11 @@
 """Models and simulators that are wrong get one sentence and exit code 2."""
 
+import sys
+
 import numpy as np
 import pytest
 
+from npdr_ppl.cli import main
 from npdr_ppl.rollouts import Rollouts
 from tests.helpers.command_line import run
 
@@ -77,3 +80,18 @@ def test_an_error_of_several_lines_in_a_model_file_is_one_sentence(tmp_path, mon
     code, _, err = run(monkeypatch, capsys, "fit", f"{file}:m", "--data", data, "--out", out)
     assert code == 2
     assert err.startswith("npdr: ") and err.count("\n") == 1 and "GreaterThan" in err
+
+
+def test_a_pipe_that_is_closed_early_is_no_fault_of_the_model(monkeypatch, capsys):
+    def printing(**_):
+        try:
+            raise BrokenPipeError
+        except BrokenPipeError:
+            sys.exit(1)  # as click does
+
+    monkeypatch.setattr(main, "app", printing)
+    monkeypatch.setattr(sys, "argv", ["npdr", "effects"])
+    with pytest.raises(SystemExit) as stopped:
+        main._run()
+    assert stopped.value.code == 1
+    assert capsys.readouterr().err == ""
