@@ -78,6 +78,7 @@ def searched():
     return searcher, first, said
 
 
+@pytest.mark.slow
 def test_joints_without_the_law_are_no_members(searched):
     _, first, _ = searched
     law = first.laws[0]
@@ -90,6 +91,7 @@ def test_joints_without_the_law_are_no_members(searched):
         assert found == pytest.approx(magnitude, rel=0.3)
 
 
+@pytest.mark.slow
 def test_friction_in_three_joints_is_added_at_once(searched):
     searcher, first, said = searched
     found = searcher.run(first, max_effects=1)
@@ -109,6 +111,7 @@ def test_a_law_at_several_joints_counts_as_one_effect():
     assert num_counted(()) == 0
 
 
+@pytest.mark.slow
 def test_one_joint_with_friction_makes_no_group():
     options = npdr.DiscoveryOptions(effects=places(CoulombFriction, ViscousFriction))
     searcher = Searcher(model, recorded({"elbow": 0.15}), options, seed=0)

@@ -143,6 +143,7 @@ def test_a_law_with_an_implausible_shape_takes_its_simplest_form(rubbed):
     assert simplest(searcher, base, found).names == ("hinge.coulomb_friction",)
 
 
+@pytest.mark.slow
 def test_a_simple_form_can_be_left_out_in_turn(dragged):
     # Drag explains all, so a drift becomes viscous friction, and viscous friction goes.
     case, _ = dragged

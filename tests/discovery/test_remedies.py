@@ -158,6 +158,7 @@ def test_early_stamps_are_tried_only_beyond_the_delays_of_devices(step):
     assert max(early) >= 0.089
 
 
+@pytest.mark.slow
 def test_commands_beyond_the_range_of_a_model_are_said():
     rollouts = swinging(steps=240)
     plain = repair(pendulum, rollouts, npdr.DataOptions()).rollouts
@@ -212,6 +213,7 @@ def test_remedies_of_the_whole_recording_are_fewer():
     )
 
 
+@pytest.mark.slow
 def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is(monkeypatch):
     """A fit that got stuck is no fault of the data."""
     rollouts, options = swinging(steps=240), npdr.DataOptions(None, 30)
@@ -270,11 +272,13 @@ def turned(inertia, unit):
     return recording(angle, velocity, torque)
 
 
+@pytest.mark.slow
 def test_a_wrong_unit_is_found_although_other_parameters_could_explain_it():
     repaired = repair(wheel, turned(1.0, np.pi / 180.0), npdr.DataOptions())
     assert any("angle and velocity look recorded in degrees" in n for n in repaired.rollouts.notes)
 
 
+@pytest.mark.slow
 def test_parameters_beyond_their_priors_are_no_fault():
     assert not repair(wheel, turned(8.0, 1.0), npdr.DataOptions()).remedies
 

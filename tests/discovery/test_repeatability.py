@@ -103,6 +103,7 @@ def test_waves_are_compared_in_both_components():
     assert [list(part.strengths) for part in found.estimates] == [["sine", "cosine"]] * 2
 
 
+@pytest.mark.slow
 def test_a_contradiction_is_confirmed_by_fits(monkeypatch):
     hypothesis = fitted(swinging(), Backlash("hinge"), CoulombFriction("hinge"))
     compared = repeatability._compared
