@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from npdr_ppl.discovery.proof.settings import EXPERIMENT
 from npdr_ppl.errors import DataError
 from npdr_ppl.planning.causes import Known, prior_of
 from npdr_ppl.planning.excitations import Excitations
 from npdr_ppl.planning.judging import Judge, Played, information_gain
 from npdr_ppl.planning.limits import Limits
 from npdr_ppl.planning.search import Found, search_excitations
-from npdr_ppl.planning.settings import PLANNING
 from npdr_ppl.progress import Step
 from npdr_ppl.rollouts import Rollouts
 
@@ -90,7 +90,7 @@ class Plan:
         return {
             "separations": [vars(pair) for pair in self.pairs],
             "smallest_separation": self.smallest if self.pairs else None,
-            "useful_separation": PLANNING.useful_separation,
+            "useful_separation": EXPERIMENT.useful_separation,
             "widths": [vars(width) for width in self.widths],
             "information": self.information if self.widths else None,
             "duration": self.limits.duration,

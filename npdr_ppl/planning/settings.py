@@ -41,8 +41,6 @@ class PlanningSettings:
         most_seconds: Longest default duration in seconds.
         prior_seconds: Default duration without a recording.
         prior_bandwidth: Default bandwidth in Hz without a recording.
-        useful_separation: Separation, in standard deviations, from which two causes are told
-            apart: the wrong one is then exp(-12.5) times as likely.
     """
 
     batch: int = 12
@@ -64,7 +62,6 @@ class PlanningSettings:
     most_seconds: float = 10.0
     prior_seconds: float = 5.0
     prior_bandwidth: float = 2.0
-    useful_separation: float = 5.0
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
@@ -78,7 +75,6 @@ class PlanningSettings:
         check_range(self, 0.0, 0.5, "least_room")
         check_range(self, 0.0, 1.0, "relative_noise")
         check_range(self, 0.1, math.inf, "most_seconds", "prior_seconds", "prior_bandwidth")
-        check_range(self, 0.0, 100.0, "useful_separation")
 
 
 PLANNING = PlanningSettings()

@@ -162,29 +162,27 @@ def _sensor_responses(
     sizes = torch.cat([term.values(motion).square().mean((0, 1)).sqrt() for term in terms])
     num = len(sizes)
     steps = LEARNING.pulse_height * motion.port.rated / sizes.clamp_min(1e-12)
-    batch = {
-        name: value.expand(num + 1) for name, value in start.items() if not _is_coefficient(name)
-    }
-    for k in range(num):
-        batch[f"{effect.name}.c{k + 1}"] = torch.zeros(num + 1, dtype=torch.float64)
-        batch[f"{effect.name}.c{k + 1}"][k + 1] = steps[k]
-    box = segments.black_box(fit.z[None])
+    # One column at a time, and none in the last run.
+    sites = [f"{effect.name}.c{k + 1}" for k in range(num)]
+    batch = dict(zip(sites, torch.cat((steps.diag(), torch.zeros(num, 1)), dim=1), strict=True))
+    batch |= {name: value.expand(num + 1) for name, value in start.items() if name not in batch}
+    known = segments.black_box(fit.z[None]).parameters
+    runs: list[Tensor] = []
     try:
         simulator = segments.simulator.with_effects(effect)
-        offsets = fit.offsets[None].expand(num + 1, -1, -1)
-        runs = segments.run(simulator, {**box.parameters, **batch}, offsets)
+        for part in torch.arange(num + 1).split(segments.draws_per_chunk):
+            own = {name: value[part] for name, value in batch.items()}
+            offsets = fit.offsets[None].expand(len(part), -1, -1)
+            readings = segments.run(simulator, {**known, **own}, offsets)
+            runs += segments.whitened(readings, fit.scale).unbind(0)
     except (NpdrError, NotImplementedError):
         return None
-    change = segments.whitened(runs[1:] - runs[:1], fit.scale).permute(1, 2, 0) / steps
+    change = torch.stack([run - runs[-1] for run in runs[:-1]], dim=-1) / steps
     if not bool(change.isfinite().all()):
         return None
     eye = torch.eye(num, dtype=torch.float64).expand(change.shape[0], num, num)
     widths = [len(term.columns) for term in terms]
     return change, list(eye.split(widths, dim=-1))
-
-
-def _is_coefficient(site: str) -> bool:
-    return site.rpartition(".")[2][1:].isdigit()
 
 
 def law_of(port: PortFormulas, formula: Formula) -> Law:

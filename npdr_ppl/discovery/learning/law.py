@@ -1,17 +1,17 @@
 """A learned law, and the source of the effect that has it.
 
-Names and units of a robot's file become code only by :func:`~npdr_ppl.excerpts.quoted` and
-:func:`~npdr_ppl.excerpts.plain`: the code is executed.
+Names and units of a robot's file become code only by :func:`~npdr_ppl.python_text.quoted` and
+:func:`~npdr_ppl.python_text.plain`: the code is executed.
 """
 
+import inspect
 import re
-import textwrap
 import zlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 
-from npdr_ppl.discovery.learning.terms import SYMBOLS, Term
+from npdr_ppl.discovery.learning.terms import SYMBOLS, Term, hat
 from npdr_ppl.language.channels import Port
 from npdr_ppl.python_text import plain, quoted
 
@@ -212,24 +212,16 @@ def module_source(laws: Sequence[Law], about: str) -> str:
         *(["import math", ""] if has_shapes else []),
         "import pyro.distributions as dist",
         "import torch",
+        *(["from torch import Tensor"] if has_hats else []),
         "",
         "from npdr_ppl.language.channels import Parameter",
         f"from npdr_ppl.language.effects import {', '.join(bases)}",
     ]
     if has_hats:
-        lines += ["", "", textwrap.dedent(_HAT).strip()]
+        lines += ["", "", inspect.getsource(hat).strip()]
     for law in laws:
         lines += ["", "", class_source(law)]
     return "\n".join(lines) + "\n"
-
-
-_HAT = '''
-def hat(x, left, centre, right):
-    """The hat function of a linear spline; it is one beyond the first and last knots."""
-    rising = torch.ones_like(x) if left == centre else (x - left) / (centre - left)
-    falling = torch.ones_like(x) if right == centre else (right - x) / (right - centre)
-    return torch.minimum(rising, falling).clamp(0.0, 1.0)
-'''
 
 
 def class_source(law: Law) -> str:

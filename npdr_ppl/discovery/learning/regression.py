@@ -30,6 +30,10 @@ RIDGE = 1e-10
 errors of sums, 1e-13, and changes what the recording determines by about as small a share."""
 
 
+_Solved = tuple[tuple[int, ...], Tensor, Tensor]
+"""A choice of terms, its columns, and the coefficients of the parameters and the columns."""
+
+
 @dataclass(frozen=True)
 class Formula:
     """A sum of terms at one port.
@@ -163,18 +167,28 @@ class NormalEquations:
     @property
     def all_terms(self) -> Formula:
         """The formula with all terms, whose errors are not computed."""
-        information = self.information.sum(0)
-        index, theta = self._solved(
-            tuple(range(len(self.terms))), self._regular(information), self.score.sum(0)
-        )[1:]
-        explained = 2.0 * self.score.sum(0) @ theta - theta @ information @ theta
-        d = self.num_parameters
+        information, score = self._regular(self.information.sum(0)), self.score.sum(0)
+        solved = self._solved(tuple(range(len(self.terms))), information, score)
+        return self._formula(solved, torch.zeros_like(self.misfit))
+
+    def _formula(self, solved: "_Solved", errors: Tensor) -> Formula:
+        """Returns the formula of some terms, fitted to the whole recording."""
+        choice, index, theta = solved
+        explained = self._explained(self.information.sum(0), self.score.sum(0), solved)
+        own = index[self.num_parameters :] - self.num_parameters
         return Formula(
-            self.terms,
-            theta[d:] / self.sizes[index[d:] - d],
-            torch.zeros_like(self.misfit),
+            tuple(self.terms[k] for k in choice),
+            theta[self.num_parameters :] / self.sizes[own],
+            errors,
             float(self.misfit.sum() - explained),
         )
+
+    @staticmethod
+    def _explained(information: Tensor, score: Tensor, solved: "_Solved") -> Tensor:
+        """Returns by how much coefficients reduce the misfit with this information and score."""
+        _, index, theta = solved
+        own = information[index][:, index]
+        return 2.0 * score[index] @ theta - theta @ own @ theta
 
     @property
     def penalty(self) -> float:
@@ -214,30 +228,17 @@ class NormalEquations:
             paths.append(
                 self._path(self.information[others].sum(0), self.score[others].sum(0), most)
             )
-        d, formulas = self.num_parameters, []
+        formulas = []
         for size in range(min(len(path) for path in paths)):
-            errors = []
-            for fold, path in enumerate(paths[1:]):
-                index, theta = path[size][1:]
-                information = self.information[fold][index][:, index]
-                explained = 2.0 * self.score[fold][index] @ theta - theta @ information @ theta
-                errors.append(self.misfit[fold] - explained)
-            choice, index, theta = paths[0][size]
-            information = whole[0][index][:, index]
-            explained = 2.0 * whole[1][index] @ theta - theta @ information @ theta
-            formulas.append(
-                Formula(
-                    tuple(self.terms[k] for k in choice),
-                    theta[d:] / self.sizes[index[d:] - d],
-                    torch.stack(errors),
-                    float(self.misfit.sum() - explained),
-                )
-            )
+            errors = [
+                self.misfit[fold]
+                - self._explained(self.information[fold], self.score[fold], path[size])
+                for fold, path in enumerate(paths[1:])
+            ]
+            formulas.append(self._formula(paths[0][size], torch.stack(errors)))
         return formulas
 
-    def _path(
-        self, information: Tensor, score: Tensor, most: int
-    ) -> list[tuple[tuple[int, ...], Tensor, Tensor]]:
+    def _path(self, information: Tensor, score: Tensor, most: int) -> "list[_Solved]":
         """Returns for each number of terms the best choice, its columns and coefficients."""
         penalty = self.penalty
         costs = torch.tensor([term.cost for term in self.terms], dtype=torch.float64)
@@ -295,9 +296,7 @@ class NormalEquations:
         found = torch.linalg.solve(blocks + ridge[:, None, None] * eye, left)
         return base + (left * found).sum(-1)
 
-    def _solved(
-        self, choice: tuple[int, ...], information: Tensor, score: Tensor
-    ) -> tuple[tuple[int, ...], Tensor, Tensor]:
+    def _solved(self, choice: tuple[int, ...], information: Tensor, score: Tensor) -> "_Solved":
         index = self._index(choice)
         theta = torch.linalg.solve(information[index][:, index], score[index])
         return choice, index, theta

@@ -31,13 +31,11 @@ class Shape:
         name: Its name in expressions.
         value: Its value before it is fitted.
         unit: Its unit.
-        is_fitted: Whether it is a parameter of the effect, otherwise it stays as it is.
     """
 
     name: str
     value: float
     unit: str
-    is_fitted: bool = True
 
 
 @dataclass(frozen=True)
@@ -162,7 +160,7 @@ def _force_terms(motion: PortMotion) -> Iterator[Term]:
         _single("v", "v * v", "v²", f"({units['v']})²"),
     ]
     ages = [_ONE, _single("t", "t", "t", "s"), *_decays(values["t"])]
-    stribeck = _scaled("exp_v", "torch.exp(-torch.abs(v) / {0})", "exp(−|v|/{0})", "v", motion)
+    stribeck = _stribeck(motion)
     for place in places:
         for speed in (_ONE, *speeds):
             yield _product(motion, place, speed)
@@ -315,18 +313,16 @@ def _decays(t: Tensor) -> list[_Factor]:
     ]
 
 
-def _scaled(
-    name: str, column: str, formula: str, variable: str, motion: PortMotion
-) -> list[_Factor]:
-    """Returns a function of a variable over a scale, for several scales."""
-    spread = float(motion.values[variable].square().mean().sqrt())
+def _stribeck(motion: PortMotion) -> list[_Factor]:
+    """Returns exp(−|v|/vₛ) for several speeds, relative to the root mean square of the motion."""
+    spread = float(motion.values["v"].square().mean().sqrt())
     return [
         _Factor(
-            (column.format("speed"),),
-            (formula.format("vₛ"),),
-            frozenset({variable}),
+            ("torch.exp(-torch.abs(v) / speed)",),
+            ("exp(−|v|/vₛ)",),
+            frozenset({"v"}),
             "",
-            (Shape("speed", spread * share, motion.units[variable]),),
+            (Shape("speed", spread * share, motion.units["v"]),),
             cost=2.0,
         )
         for share in (0.02, 0.06, 0.2, 0.6)
@@ -337,15 +333,10 @@ def _scaled(
 def _stops(motion: PortMotion) -> Iterator[Term]:
     """Returns forces that act only beyond a position."""
     q, unit = motion.values["q"], motion.units["q"]
-    sizes = (
-        q.abs()
-        .flatten()
-        .quantile(torch.linspace(0.3, 0.97, 2 * LEARNING.num_shapes, dtype=torch.float64))
-        if q.numel() < 1_000_000
-        else q.abs()
-        .flatten()[:: q.numel() // 100_000]
-        .quantile(torch.linspace(0.3, 0.97, 2 * LEARNING.num_shapes, dtype=torch.float64))
-    )
+    # A quantile takes at most 16 million values; a part of them will do.
+    sizes = q.abs().flatten()[:: max(1, q.numel() // 100_000)]
+    shares = torch.linspace(0.3, 0.97, 2 * LEARNING.num_shapes, dtype=torch.float64)
+    sizes = sizes.quantile(shares)
     for size in sizes.tolist():
         if size <= 0.0:
             continue
