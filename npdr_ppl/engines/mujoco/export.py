@@ -27,7 +27,7 @@ from npdr_ppl.engines.mujoco.urdf_files import as_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
 
-__all__ = ["ExportedMjcf", "export_mjcf", "module_name", "written"]
+__all__ = ["ExportedMjcf", "export_mjcf", "module_name", "reloaded", "written"]
 
 Array = NDArray[np.float64]
 
@@ -211,6 +211,28 @@ def _new_text(
     return text
 
 
+def reloaded(text: str, ending: str, folder: Path | None) -> Any:
+    """Returns the model of a file that was written, as the engine reads it.
+
+    Args:
+        text: The file's text.
+        ending: ``".xml"`` or ``".urdf"``.
+        folder: Folder that has the meshes; ``None`` if there are none.
+
+    Raises:
+        ModelError: The engine cannot read it.
+    """
+    with tempfile.TemporaryDirectory() as own:
+        path = (folder or Path(own)) / f".npdr-{uuid4().hex}{ending}"
+        try:
+            path.write_text(text, encoding="utf-8")
+            return load_mjcf(path)
+        except ModelError as error:
+            raise ModelError(str(error).replace(str(path), "The new text")) from None
+        finally:
+            path.unlink(missing_ok=True)
+
+
 def _text_of(file: Path, files: RobotFiles) -> str:
     """Returns the MJCF text of a robot's file; of a URDF file, what MuJoCo makes of it."""
     return as_mjcf(file) if is_urdf(files) else flattened(files).decode()
@@ -250,15 +272,7 @@ def _check(text: str, original: _Original, wanted: Any) -> None:
         wanted: The model that it should describe.
     """
     relative, absolute = (1e-5, 1e-6) if original.has_six_digits else (1e-9, 1e-12)
-    with tempfile.TemporaryDirectory() as folder:
-        path = (original.place or Path(folder)) / f".npdr-{uuid4().hex}.xml"
-        try:
-            path.write_text(text, encoding="utf-8")
-            found = load_mjcf(path)
-        except ModelError as error:
-            raise ModelError(str(error).replace(str(path), "The new text")) from None
-        finally:
-            path.unlink(missing_ok=True)
+    found = reloaded(text, ".xml", original.place)
     for name in _COMPARED:
         if not hasattr(wanted, name) and not name.startswith("opt."):
             continue  # of a later version of the engine

@@ -1,11 +1,9 @@
 """Writes identified masses, inertias and joint dynamics into the text of a URDF file."""
 
 import copy
-import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,9 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.engines.common.robot_files import is_urdf, read_robot, references
-from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
 from npdr_ppl.engines.mujoco.effects_in_file import file_assignments, is_in_file
-from npdr_ppl.engines.mujoco.export import ExportedMjcf, written
+from npdr_ppl.engines.mujoco.export import ExportedMjcf, reloaded, written
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.mjcf_text import MjcfText
 from npdr_ppl.engines.mujoco.parameters import Assignments
@@ -216,16 +213,7 @@ def _short(value: Any) -> str:
 
 def _check(text: str, wanted: Any, folder: Path) -> None:
     """Raises a ModelError if a file does not have the numbers that it should have."""
-    with tempfile.TemporaryDirectory() as own:
-        has_meshes = "<mesh" in text
-        path = (folder if has_meshes else Path(own)) / f".npdr-{uuid4().hex}.urdf"
-        try:
-            path.write_text(text, encoding="utf-8")
-            found = load_mjcf(path)
-        except ModelError as error:
-            raise ModelError(str(error).replace(str(path), "The new text")) from None
-        finally:
-            path.unlink(missing_ok=True)
+    found = reloaded(text, ".urdf", folder if "<mesh" in text else None)
     for name in ("body_mass", "body_ipos", "dof_damping", "dof_frictionloss"):
         if not np.allclose(getattr(found, name), getattr(wanted, name), rtol=1e-6, atol=1e-12):
             raise ModelError(
