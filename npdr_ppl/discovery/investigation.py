@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery
-from npdr_ppl.discovery.finding import Finding
+from npdr_ppl.discovery.finding_of import finding_of
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.assumptions import Assumptions
 from npdr_ppl.discovery.learning.result import Learned, learn
@@ -20,7 +20,6 @@ from npdr_ppl.discovery.proof.next_experiment import NextExperiment, next_experi
 from npdr_ppl.discovery.proof.overlays import Overlays, overlay
 from npdr_ppl.discovery.proof.parameter_intervals import (
     Draws,
-    Estimate,
     estimates,
     posterior_draws,
 )
@@ -28,15 +27,13 @@ from npdr_ppl.discovery.proof.residual_map import Spot, worst_windows
 from npdr_ppl.discovery.proof.surviving_causes import surviving_causes
 from npdr_ppl.discovery.recording_repair import Repair, repair
 from npdr_ppl.discovery.screening.encoder_resolution import counts
-from npdr_ppl.discovery.screening.equivalents import equivalents
 from npdr_ppl.discovery.screening.variants import candidates_at
-from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.deadline import Deadline
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.halves import found_in_halves, search_halves
 from npdr_ppl.discovery.search.limits import limits
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
-from npdr_ppl.discovery.search.repeatability import HALVES, Repetition, repetitions
+from npdr_ppl.discovery.search.repeatability import HALVES, repetitions
 from npdr_ppl.discovery.search.rounds import Round, Search, explained
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH
 from npdr_ppl.discovery.search_progress import SearchProgress
@@ -372,7 +369,7 @@ class Investigation:
         every = estimates(final, self._draws(final), _units(final))
         again = repetitions(final)
         effects = [
-            _finding(
+            finding_of(
                 added,
                 search,
                 every,
@@ -498,50 +495,6 @@ def discover(
             seed=seed,
             progress=report,
         ).conclude()
-
-
-def _finding(
-    added: Added,
-    search: Search,
-    every: dict[str, Estimate],
-    at_edge: tuple[str, ...],
-    repetition: Repetition | None,
-    in_halves: Mapping[str, bool],
-) -> Finding:
-    effect = added.effect
-    sizes = [
-        abs(every[site].mean - p.nominal) / max(every[site].sd, 1e-300)
-        for p in effect.strengths
-        if (site := f"{effect.name}.{p.name}") in every
-    ]
-    is_zero = bool(sizes) and max(sizes) < VERDICT.fewest_deviations
-    whole = sum(other.share for other in search.added)
-    is_small = search.is_approximate and added.share <= VERDICT.minor_share * whole
-    alternatives = [
-        name
-        for name, probability in added.alternatives.items()
-        if (probability >= EVIDENCE.least_probability or name in added.fitting)
-        and name != effect.name
-    ]
-    known = equivalents(effect, search.final.names)
-    ids = dict.fromkeys([name.rsplit(".", 1)[1] for name in alternatives] + list(known))
-    return Finding(
-        effect,
-        added.probability,
-        added.alternatives,
-        tuple(name for name in ids if name != effect.id),
-        added.share,
-        {
-            site.removeprefix(f"{effect.name}."): every[site]
-            for site in effect.parameter_names
-            if site in every
-        },
-        at_edge,
-        is_zero or is_small,
-        repetition,
-        in_halves,
-        added.is_compared,
-    )
 
 
 def _unexplained(search: Search) -> float:

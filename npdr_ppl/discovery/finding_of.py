@@ -1,0 +1,68 @@
+"""What a discovery says about an effect that its search added."""
+
+from collections.abc import Mapping
+
+from npdr_ppl.discovery.finding import Finding
+from npdr_ppl.discovery.proof.parameter_intervals import Estimate
+from npdr_ppl.discovery.screening.equivalents import equivalents
+from npdr_ppl.discovery.search.alternatives import Added
+from npdr_ppl.discovery.search.repeatability import Repetition
+from npdr_ppl.discovery.search.rounds import Search
+from npdr_ppl.discovery.search.settings import EVIDENCE
+from npdr_ppl.discovery.settings import VERDICT
+
+__all__ = ["finding_of"]
+
+
+def finding_of(
+    added: Added,
+    search: Search,
+    every: dict[str, Estimate],
+    at_edge: tuple[str, ...],
+    repetition: Repetition | None,
+    in_halves: Mapping[str, bool],
+) -> Finding:
+    """Returns what a discovery says about an effect.
+
+    Args:
+        added: The effect, as the search added it.
+        search: The search.
+        every: Estimates of all parameters, by site.
+        at_edge: Its shape parameters with an implausible value.
+        repetition: Its strengths in parts of the recording, if they were compared.
+        in_halves: Whether a search of each half found it, by the half's name.
+    """
+    effect = added.effect
+    sizes = [
+        abs(every[site].mean - p.nominal) / max(every[site].sd, 1e-300)
+        for p in effect.strengths
+        if (site := f"{effect.name}.{p.name}") in every
+    ]
+    is_zero = bool(sizes) and max(sizes) < VERDICT.fewest_deviations
+    whole = sum(other.share for other in search.added)
+    is_small = search.is_approximate and added.share <= VERDICT.minor_share * whole
+    alternatives = [
+        name
+        for name, probability in added.alternatives.items()
+        if (probability >= EVIDENCE.least_probability or name in added.fitting)
+        and name != effect.name
+    ]
+    known = equivalents(effect, search.final.names)
+    ids = dict.fromkeys([name.rsplit(".", 1)[1] for name in alternatives] + list(known))
+    return Finding(
+        effect,
+        added.probability,
+        added.alternatives,
+        tuple(name for name in ids if name != effect.id),
+        added.share,
+        {
+            site.removeprefix(f"{effect.name}."): every[site]
+            for site in effect.parameter_names
+            if site in every
+        },
+        at_edge,
+        is_zero or is_small,
+        repetition,
+        in_halves,
+        added.is_compared,
+    )
