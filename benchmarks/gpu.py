@@ -20,19 +20,17 @@ row.
 """
 
 import argparse
-import importlib
-import importlib.util
 import json
 import os
-import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+from gpu_mjx import mjx_rows
+from gpu_rows import NUM_STEPS, Row, largest_difference, moment_difference, speed_up, timed
 from methods import standard_normal_problem
 from tasks import TASKS
 from torch import Tensor
@@ -43,22 +41,6 @@ from npdr_ppl.inference.parts.mixtures.ensemble import Mixture
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.randomness import seeded
-
-LEAST_SECONDS = 1.0
-"""Calls are repeated until they have taken this many seconds in all. One that takes longer is
-measured once."""
-
-NUM_STEPS = 100
-"""Steps of a replayed segment, as in a fit that re-synchronises the state every 0.2 s at 2 ms."""
-
-NUM_SEGMENTS = 64
-"""Segments of commands that the arm replays; the other simulations differ in their parameters."""
-
-BLOCK = 100_000
-"""Simulations whose results are compared at a time."""
-
-DERIVED = ("dof_invweight0",)
-"""Fields that the engine computes from the parameters and that dry friction depends on."""
 
 NUM_DRAWS = 20_000
 """Posterior draws whose moments are compared: their standard error is 0.007 standard deviations.
@@ -74,89 +56,6 @@ by how much two trainings differ anyway."""
 
 WARM_UP = 200
 """Simulations of a first training, which loads kernels and starts CUDA."""
-
-CASES = "smooth", "dry friction"
-"""Arms of the part ``mjx``."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One measurement.
-
-    Attributes:
-        part: Part of the benchmark.
-        case: What was computed.
-        size: Number of simulations.
-        where: Processor and engine.
-        seconds: Seconds of a call, or ``None`` if it was not measured.
-        first_seconds: Seconds of the first call, which includes compilation.
-        steps: Simulated steps of a call; ``None`` for training.
-        difference: Largest difference from the first row of the same case and size: in standard
-            deviations of the posterior for training, otherwise in the sensors' units.
-        note: What else there is to say, such as why there is no measurement.
-    """
-
-    part: str
-    case: str
-    size: int
-    where: str
-    seconds: float | None = None
-    first_seconds: float | None = None
-    steps: int | None = None
-    difference: float | None = None
-    note: str = ""
-
-
-def speed_up(row: Row, rows: list[Row]) -> float | None:
-    """Returns how many times faster a row is than the first of the same case and size."""
-    key = row.part, row.case, row.size
-    first = next(r for r in rows if (r.part, r.case, r.size) == key)
-    if row.seconds is None or first.seconds is None:
-        return None
-    return first.seconds / row.seconds
-
-
-def moment_difference(reference: Tensor, draws: Tensor) -> float:
-    """Returns the largest difference of means and standard deviations, in standard deviations.
-
-    Args:
-        reference: Draws of one posterior, ``(n, d)``.
-        draws: Draws of the other, ``(n, d)``.
-    """
-    scale = reference.std(0)
-    means = (draws.mean(0) - reference.mean(0)).abs() / scale
-    return float(torch.maximum(means, (draws.std(0) / scale - 1.0).abs()).max())
-
-
-def largest_difference(reference: Any, other: Any) -> float:
-    """Returns the largest difference of two arrays of equal shape; NaN if one of them has a NaN.
-
-    Compares a block of simulations at a time, so that it needs little memory.
-    """
-
-    def block(values: Any, first: int) -> Tensor:
-        return torch.as_tensor(values[first : first + BLOCK]).double().cpu()
-
-    firsts = range(0, len(reference), BLOCK)
-    largest = [(block(reference, i) - block(other, i)).abs().max() for i in firsts]
-    return float(torch.stack(largest).max())
-
-
-def timed(run: Callable[[], Any]) -> tuple[Any, float, float]:
-    """Returns the result, the seconds of the first call and the median of the calls after it.
-
-    Args:
-        run: Function that returns when its result is there.
-    """
-    start = time.perf_counter()
-    result = run()
-    first, seconds = time.perf_counter() - start, []
-    while sum(seconds) < LEAST_SECONDS:
-        del result
-        start = time.perf_counter()
-        result = run()
-        seconds.append(time.perf_counter() - start)
-    return result, first, statistics.median(seconds)
 
 
 def devices() -> tuple[str, ...]:
@@ -264,190 +163,6 @@ def furuta_replay(num_simulations: int, device: str, mode: Any) -> Callable[[], 
         return result[:, 0]
 
     return run
-
-
-LINKS = (
-    # length m, mass kg, moment of inertia across the link kg m², axis of its joint
-    (0.16, 3.8, 0.020, "0 0 1"),
-    (0.43, 8.4, 0.130, "0 1 0"),
-    (0.39, 2.3, 0.035, "0 1 0"),
-    (0.10, 1.2, 0.004, "0 1 0"),
-    (0.10, 1.2, 0.004, "0 0 1"),
-    (0.10, 0.6, 0.002, "0 1 0"),
-)
-"""An arm of the size of a UR5."""
-
-TIME_STEP = 2e-3
-"""Seconds per step of the arm."""
-
-
-def arm_mjcf(case: str) -> str:
-    """Returns the MJCF text of the arm; nothing collides.
-
-    Args:
-        case: One of :data:`CASES`.
-    """
-    friction = 'frictionloss="1"' if case == "dry friction" else ""
-    bodies, place = "", "0 0 0.1"
-    for i, (length, mass, moment, axis) in enumerate(LINKS, 1):
-        bodies += (
-            f'<body name="link_{i}" pos="{place}">'
-            f'<joint name="joint_{i}" axis="{axis}" damping="2" armature="0.1" {friction}/>'
-            f'<inertial pos="0 0 {length / 2}" mass="{mass}" '
-            f'diaginertia="{moment} {moment} {moment / 4}"/>'
-        )
-        place = f"0 0 {length}"
-    servos = "".join(
-        f'<position name="servo_{i}" joint="joint_{i}" kp="400" kv="20" ctrlrange="-3 3"/>'
-        for i in range(1, len(LINKS) + 1)
-    )
-    return (
-        f'<mujoco><option timestep="{TIME_STEP}" integrator="implicitfast"/>'
-        f"<worldbody>{bodies}{'</body>' * len(LINKS)}</worldbody>"
-        f"<actuator>{servos}</actuator></mujoco>"
-    )
-
-
-def arm(case: str, num_threads: int) -> npdr.MujocoSimulator:
-    """Returns the arm; the hand's mass and numbers of every joint and servo are parameters."""
-    mujoco: Any = importlib.import_module("mujoco")
-    joints = range(1, len(LINKS) + 1)
-    parameters = {"hand_mass": "body link_6 mass"}
-    parameters |= {f"damping_{i}": f"joint joint_{i} damping" for i in joints}
-    parameters |= {f"kp_{i}": f"actuator servo_{i} kp" for i in joints}
-    if case == "dry friction":
-        parameters |= {f"friction_{i}": f"joint joint_{i} frictionloss" for i in joints}
-    model = mujoco.MjModel.from_xml_string(arm_mjcf(case))
-    return npdr.MujocoSimulator(model, parameters, num_threads=num_threads)
-
-
-@dataclass(frozen=True)
-class Replay:
-    """Parameter sets and segments that the arm simulates, all combinations of them.
-
-    Attributes:
-        parameters: By name, ``(P,)``.
-        inputs: S segments.
-    """
-
-    parameters: Mapping[str, Tensor]
-    inputs: npdr.Inputs
-
-    @property
-    def flat(self) -> dict[str, Tensor]:
-        """The parameters of all simulations, ``(P S,)``."""
-        num_segments = self.inputs.num_segments
-        return {n: v.repeat_interleave(num_segments) for n, v in self.parameters.items()}
-
-
-def arm_replay(simulator: npdr.MujocoSimulator, size: int) -> Replay:
-    """Returns random parameters within ±20 % and random slow commands of the servos."""
-    generator = torch.Generator().manual_seed(0)
-
-    def uniform(*shape: int) -> Tensor:
-        return 2.0 * torch.rand(*shape, generator=generator, dtype=torch.float64) - 1.0
-
-    segments = min(NUM_SEGMENTS, size)
-    nominal = simulator.nominal()
-    parameters = {n: v * (1.0 + 0.2 * uniform(size // segments)) for n, v in nominal.items()}
-    joints = len(LINKS)
-    times = TIME_STEP * torch.arange(NUM_STEPS, dtype=torch.float64)[:, None]
-    start, rate = uniform(segments, 1, joints), 2.0 * uniform(segments, 1, joints)
-    state = torch.cat((start[:, 0], torch.zeros(segments, joints)), dim=-1)
-    return Replay(
-        parameters,
-        npdr.Inputs(
-            actions=start + 0.3 * torch.sin(rate * times * torch.pi),
-            action_names=tuple(action.name for action in simulator.actions),
-            initial_readings=state,
-            initial_values=state,
-            channel_names=tuple(channel.name for channel in simulator.states),
-            past_actions=torch.zeros(segments, 0, joints, dtype=torch.float64),
-            time_step=TIME_STEP,
-            mask=torch.ones(segments, NUM_STEPS, dtype=torch.bool),
-            rollout=torch.zeros(segments, dtype=torch.long),
-            start=torch.zeros(segments, dtype=torch.long),
-        ),
-    )
-
-
-def mjx_rows(sizes: list[int], num_threads: int) -> Iterator[Row]:
-    """The arm in MuJoCo on the CPU and in MJX, in single and double precision."""
-    is_installed = bool(_found("jax") and _found("mujoco.mjx"))
-    for case in CASES:
-        simulator = arm(case, num_threads)
-        for size in sizes if case == CASES[0] else [max(sizes)]:
-            replay = arm_replay(simulator, size)
-            work = size * NUM_STEPS
-
-            def native(simulator: Any = simulator, replay: Replay = replay) -> np.ndarray:
-                return simulator.simulate(replay.parameters, replay.inputs).flatten(0, 1).numpy()
-
-            reference, first, seconds = timed(native)
-            yield Row("mjx", case, size, "MuJoCo, cpu", seconds, first, work)
-            if not is_installed:
-                yield Row("mjx", case, size, "MJX", note="mjx is not installed")
-                continue
-            for precision in (32, 64) if size == max(sizes) else (32,):
-                where = f"MJX float{precision}, {_jax_device()}"
-                result, first, seconds = timed(mjx_replay(simulator, replay, precision))
-                difference = largest_difference(reference, result)
-                yield Row("mjx", case, size, where, seconds, first, work, difference)
-
-
-def _found(module: str) -> bool:
-    """Returns whether a module is installed, without importing it."""
-    return importlib.util.find_spec(module) is not None
-
-
-def _jax_device() -> str:
-    """Returns where JAX computes."""
-    jax: Any = importlib.import_module("jax")
-    return "cuda" if jax.default_backend() == "gpu" else jax.default_backend()
-
-
-def mjx_replay(
-    simulator: npdr.MujocoSimulator, replay: Replay, precision: int
-) -> Callable[[], np.ndarray]:
-    """Returns a function that simulates in MJX what ``simulator`` would, from and to NumPy arrays.
-
-    Args:
-        simulator: The arm, whose bindings set the model's fields.
-        replay: What to simulate.
-        precision: Bits of a number, 32 or 64.
-    """
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # torch needs memory too
-    jax: Any = importlib.import_module("jax")
-    mujoco: Any = importlib.import_module("mujoco")
-    mjx: Any = importlib.import_module("mujoco.mjx")
-    jax.config.update("jax_enable_x64", precision == 64)
-    # GPUs would otherwise multiply matrices with ten bits of mantissa.
-    jax.config.update("jax_default_matmul_precision", "highest")
-    dtype = np.dtype(f"float{precision}")
-    inputs, flat = replay.inputs, replay.flat
-    size = len(next(iter(flat.values())))
-    batch, _ = simulator.make_batch(flat, size, TIME_STEP, torch.zeros(()))
-    changed_fields = {*simulator.bindings.arrays, *DERIVED}
-    fields = {name: batch.expand(name).astype(dtype) for name in changed_fields}
-    segment = np.arange(size) % inputs.num_segments
-    state, commands = (v.numpy().astype(dtype) for v in (inputs.initial_values, inputs.actions))
-    model = batch.model
-    device_model = mjx.put_model(model)
-    blank = mjx.put_data(model, mujoco.MjData(model))
-
-    def one(own: dict[str, Any], row: Any, states: Any, actions: Any) -> Any:
-        changed = device_model.replace(**own)
-        start = states[row]
-        data = blank.replace(qpos=start[: model.nq], qvel=start[model.nq :])
-
-        def step(data: Any, action: Any) -> tuple[Any, Any]:
-            data = mjx.step(changed, data.replace(ctrl=action))
-            return data, jax.numpy.concatenate((data.qpos, data.qvel))
-
-        return jax.lax.scan(step, data, actions[row])[1]
-
-    run = jax.jit(jax.vmap(one, in_axes=(0, 0, None, None)))
-    return lambda: np.array(run(fields, segment, state, commands))
 
 
 HEADER = (
