@@ -41,11 +41,10 @@ types: $(VENV)/installed
 	@echo "==> types"
 	$(BIN)/pyright
 
-# Material's notice about the future of MkDocs is no warning about these pages.
 docs: $(VENV)/installed
 	@echo "==> documentation, in build/site"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[docs]"
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs build/site
 
 dist: $(VENV)/installed
 	@echo "==> source distribution and wheel, in dist/"

@@ -5,7 +5,7 @@ motion and commands gives them in one step; Muratore et al. (2021) compare with 
 conjugate posterior over β (:mod:`npdr_ppl.inference.parts.samplers.conjugate`) ignores
 plausibility: some of its draws have negative dampings or masses outside the prior's support. Such
 draws are counted and left out. Let z_f be the free coordinates that β does not determine, for
-example a motor's constants. The posterior over the parameters is then
+example a motor's constants. The posterior over the parameters is then::
 
     q(z) ∝ p(z_f) · t(β(z)) |∂β/∂z_β|   on the plausible set,
 

@@ -172,7 +172,7 @@ class Posterior(PosteriorBase):
         return self.backend.name
 
     def checks(self) -> dict[str, Any]:
-        """Returns the checks of estimator and model; see :func:`exported_checks.checks_of`."""
+        """Returns the checks of estimator and model; see :func:`checks_of`."""
         if self._checks is None:
             self._checks = checks_of(self.preparation, self.estimator)
         return self._checks

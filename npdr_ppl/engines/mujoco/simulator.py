@@ -135,7 +135,7 @@ class MujocoSimulator(MujocoMechanism):
         return replay(self, parameters, inputs)
 
     def run_episodes(self, request: EpisodeRequest) -> Episodes:
-        """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`.
+        """Simulates closed-loop episodes; see :meth:`roll_out`.
 
         The arguments for compilation have no effect, because the engine is compiled already.
         """

@@ -46,7 +46,7 @@ class ODESimulator(MechanicalSystem):
         return replay(self, parameters, inputs)
 
     def run_episodes(self, request: EpisodeRequest) -> Episodes:
-        """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`."""
+        """Simulates closed-loop episodes; see :meth:`roll_out`."""
         reward, num_steps, step = request.reward, request.num_steps, request.time_step
         initial_states = request.initial_states
         dtype = self.common_dtype(request.parameters, initial_states)

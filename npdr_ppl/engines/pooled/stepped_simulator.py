@@ -77,7 +77,7 @@ class SteppedSimulator(PooledSimulator, ClosedLoopSimulator):
         return np.array(readings, dtype=np.float64).reshape(num_steps, len(self.sensors))
 
     def run_episodes(self, request: EpisodeRequest) -> Episodes:
-        """Simulates closed-loop episodes; see :meth:`ClosedLoopSimulator.roll_out`.
+        """Simulates closed-loop episodes; see :meth:`roll_out`.
 
         The arguments for compilation have no effect.
 
