@@ -46,9 +46,13 @@ docs: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[docs]"
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs build/site
 
+# Built from what is committed, so that no file of the checkout slips in.
 dist: $(VENV)/installed
 	@echo "==> source distribution and wheel, in dist/"
-	$(BIN)/python -m build
+	@git diff --quiet HEAD || { echo "The checkout has changes. Commit them first."; exit 2; }
+	rm -rf dist build/source && mkdir -p build/source
+	git archive HEAD | tar -x -C build/source
+	$(BIN)/python -m build --outdir dist build/source
 
 bench: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev,bench]"
