@@ -170,6 +170,15 @@ class EffectPart(TypedDict):
     strengths: dict[str, EffectStrength]
 
 
+class PartRecord(TypedDict):
+    """Whether a part of a recording shows an effect."""
+
+    part: str
+    is_found: bool
+    probability: Number
+    instead: str
+
+
 class EffectRecord(TypedDict):
     """An effect that was missing."""
 
@@ -183,6 +192,7 @@ class EffectRecord(TypedDict):
     is_minor: NotRequired[bool]
     parts: NotRequired[list[EffectPart]]
     in_halves: NotRequired[dict[str, bool]]
+    found_in: NotRequired[list[PartRecord]]
 
 
 class GapRecord(TypedDict, total=False):

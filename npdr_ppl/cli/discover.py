@@ -84,10 +84,10 @@ def discover(
     repeat: Annotated[
         bool,
         typer.Option(
-            "--repeat",
-            help="Search both halves of the recording, too; name only what is found in both.",
+            help="Name only effects that both halves of the recording show, and all rollouts but "
+            "each one.",
         ),
-    ] = False,
+    ] = True,
     learn: Annotated[
         bool,
         typer.Option(

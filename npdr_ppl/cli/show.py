@@ -129,7 +129,7 @@ def show_discovery(found: Mapping[str, Any], out: Path) -> None:
 
 def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
     # Not at the top: other commands show their results without it.
-    from npdr_ppl.discovery.search.halves import missing_where
+    from npdr_ppl.discovery.search.parts import missing_where
 
     if found["effects"]:
         table = Table(title="Missing effects", box=SIMPLE, padding=(0, 1, 0, 0))
@@ -164,9 +164,9 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         if uncompared:
             console.print(f"Not compared with alternatives: {escape(', '.join(uncompared))}.")
         for effect in found["effects"]:
-            in_halves = effect.get("in_halves") or {}
-            if not all(in_halves.values()):
-                name, where = f"{effect['port']}.{effect['effect']}", missing_where(in_halves)
+            parts = {part["part"]: part["is_found"] for part in effect.get("found_in") or []}
+            if not all(parts.values()):
+                name, where = f"{effect['port']}.{effect['effect']}", missing_where(parts)
                 console.print(f"{escape(name)} was not found in {where}.")
     if found.get("learned"):
         _show_learned(console, found["learned"])

@@ -22,8 +22,8 @@ class DiscoveryOptions:
         max_effects: Greatest number of effects to add; one law at three joints or more is one.
         false_alarm_rate: Probability that an alarm fires although nothing is missing.
         confidence: Probability above which one cause is named.
-        repeat: Whether both halves of the recording are searched, too. An effect that is not found
-            in both is not named. This takes about twice as long.
+        repeat: Whether each effect must also be found in both halves of the recording and, of
+            three rollouts or more, in all but each one; otherwise it is not named.
         learn: Whether a law is learned if no effect of the catalogue explains the recording.
         symmetry: Symmetry of a law that is learned: ``"odd"`` if mirrored motion and commands
             mirror it, ``"even"`` if they do not change it, ``None`` if it may have none.
@@ -39,7 +39,7 @@ class DiscoveryOptions:
     max_effects: int = 5
     false_alarm_rate: float = 0.01
     confidence: float = 0.9
-    repeat: bool = False
+    repeat: bool = True
     learn: bool = False
     symmetry: Literal["odd", "even"] | None = None
     is_passive: bool = False

@@ -1,7 +1,7 @@
 """The result of a discovery."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -81,8 +81,6 @@ class Discovery:
         settings: Settings of the search.
         seed: Seed of all random numbers.
         seconds: Time spent, by stage.
-        halves: Names of the effects that a search of each half found, by the half's name; empty if
-            the halves were not searched.
         learned: The law that was learned because no effect explains the recording, if one was
             asked for and found.
     """
@@ -114,7 +112,6 @@ class Discovery:
     settings: DiscoveryOptions
     seed: int
     seconds: dict[str, float]
-    halves: Mapping[str, Sequence[str]] = field(default_factory=dict)
     learned: Learned | None = None
 
     @property
@@ -144,7 +141,6 @@ class Discovery:
             "finer_steps": num_finer_steps(self.revised),
             "wider_priors": wider_sites(self.revised),
             "effects": [finding.to_dict() for finding in self.effects],
-            "halves": {name: list(effects) for name, effects in self.halves.items()},
             "ranking": [describe_candidate(s, self.alarm.p_values[s.name]) for s in self.ranking],
             "separation": {
                 "names": list(self.separation_names),

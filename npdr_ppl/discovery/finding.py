@@ -1,11 +1,11 @@
 """An effect that was missing, with its probability and its parameters."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from npdr_ppl.discovery.proof.parameter_intervals import Estimate
-from npdr_ppl.discovery.search.repeatability import Repetition
+from npdr_ppl.discovery.search.parts import PartResult
+from npdr_ppl.discovery.search.repeatability import HALVES, Repetition
 from npdr_ppl.language.effects import Effect
 
 __all__ = ["Finding"]
@@ -28,8 +28,8 @@ class Finding:
         is_minor: Whether it explains too little to be named: no strength differs from zero by two
             standard deviations, or its share is small and something remains that no law explains.
         repetition: Its strengths in parts of the recording; ``None`` for short recordings.
-        in_halves: Whether it was found in each half of the recording, by the half's name; empty if
-            the halves were not searched.
+        found_in: Whether each half of the recording, and each set of all rollouts but one, shows
+            it; empty if it was not sought there.
         is_compared: Whether it was compared with alternatives. If a time limit prevented it, the
             probability says nothing.
     """
@@ -43,7 +43,7 @@ class Finding:
     at_edge: tuple[str, ...] = ()
     is_minor: bool = False
     repetition: Repetition | None = None
-    in_halves: Mapping[str, bool] = field(default_factory=dict)
+    found_in: tuple[PartResult, ...] = ()
     is_compared: bool = True
 
     @property
@@ -53,8 +53,13 @@ class Finding:
 
     @property
     def can_be_named(self) -> bool:
-        """Whether it is large enough, and was found in every half that was searched."""
-        return not self.is_minor and all(self.in_halves.values())
+        """Whether it is large enough, and every part in which it was sought shows it."""
+        return not self.is_minor and all(part.is_found for part in self.found_in)
+
+    @property
+    def in_halves(self) -> dict[str, bool]:
+        """Whether each half of the recording shows it, by the half's name."""
+        return {part.part: part.is_found for part in self.found_in if part.part in HALVES}
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values."""
@@ -71,5 +76,6 @@ class Finding:
             "is_minor": self.is_minor,
             "is_found_again": self.is_found_again,
             "parts": [] if self.repetition is None else self.repetition.to_list(),
-            "in_halves": dict(self.in_halves),
+            "in_halves": self.in_halves,
+            "found_in": [part.to_dict() for part in self.found_in],
         }

@@ -1,11 +1,12 @@
 """What a discovery says about an effect that its search added."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 from npdr_ppl.discovery.finding import Finding
 from npdr_ppl.discovery.proof.parameter_intervals import Estimate
 from npdr_ppl.discovery.screening.equivalents import equivalents
 from npdr_ppl.discovery.search.alternatives import Added
+from npdr_ppl.discovery.search.parts import PartResult
 from npdr_ppl.discovery.search.repeatability import Repetition
 from npdr_ppl.discovery.search.rounds import Search
 from npdr_ppl.discovery.search.settings import EVIDENCE
@@ -20,7 +21,7 @@ def finding_of(
     every: dict[str, Estimate],
     at_edge: tuple[str, ...],
     repetition: Repetition | None,
-    in_halves: Mapping[str, bool],
+    found_in: Sequence[PartResult],
 ) -> Finding:
     """Returns what a discovery says about an effect.
 
@@ -30,7 +31,7 @@ def finding_of(
         every: Estimates of all parameters, by site.
         at_edge: Its shape parameters with an implausible value.
         repetition: Its strengths in parts of the recording, if they were compared.
-        in_halves: Whether a search of each half found it, by the half's name.
+        found_in: Whether parts of the recording show it.
     """
     effect = added.effect
     sizes = [
@@ -63,6 +64,6 @@ def finding_of(
         at_edge,
         is_zero or is_small,
         repetition,
-        in_halves,
+        tuple(found_in),
         added.is_compared,
     )

@@ -24,7 +24,8 @@ def headline(result: Mapping[str, Any]) -> tuple[str, str]:
     large = [
         effect
         for effect in effects
-        if not effect.get("is_minor") and all((effect.get("in_halves") or {}).values())
+        if not effect.get("is_minor")
+        and all(part["is_found"] for part in effect.get("found_in") or [])
     ] or effects
     labels = [effect_label(effect) for effect in large]
     p_value = number((result.get("alarm") or {}).get("p_value"))

@@ -30,10 +30,10 @@ from npdr_ppl.discovery.screening.encoder_resolution import counts
 from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.deadline import Deadline
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.search.halves import found_in_halves, search_halves
 from npdr_ppl.discovery.search.limits import limits
+from npdr_ppl.discovery.search.parts import PartResult, found_in_parts
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
-from npdr_ppl.discovery.search.repeatability import HALVES, repetitions
+from npdr_ppl.discovery.search.repeatability import repetitions
 from npdr_ppl.discovery.search.rounds import Round, Search, explained
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH
 from npdr_ppl.discovery.search_progress import SearchProgress
@@ -50,9 +50,6 @@ from npdr_ppl.rollouts.notes import faults_among, remarks_among
 
 __all__ = ["Investigation", "discover"]
 
-
-NOT_REPEATED = "The recording is too short to search its halves, or a half cannot be fitted."
-"""Added to the reason if both halves were to be searched, and were not."""
 
 COARSE = (
     "The model's integration steps are too coarse for this recording; the revised model takes "
@@ -225,19 +222,14 @@ class Investigation:
             return self._searcher.run(first, max_effects=self.settings.max_effects)
 
     @cached_property
-    def halves(self) -> dict[str, Search]:
-        """The missing effects of each half of the recording; empty if that was not asked for."""
+    def found_in(self) -> dict[str, list[PartResult]]:
+        """Whether parts of the recording show each effect; empty if that was not asked for."""
         is_asked = self.settings.repeat and self.search.added
         if not is_asked or self.search.has_stopped:
             return {}
-        first = self.search.rounds[0].hypothesis
-        with self._stage("search halves"):
-            return search_halves(
-                self._searcher,
-                first,
-                max_effects=self.settings.max_effects,
-                report=self.progress.say,
-            )
+        with self._stage("search parts"):
+            step = self.progress.stage("seek the effects in parts of the recording")
+            return found_in_parts(self.search, self.progress.say, step)
 
     @cached_property
     def _at_edge(self) -> list[tuple[str, ...]]:
@@ -361,9 +353,7 @@ class Investigation:
 
     def conclude(self) -> Discovery:
         """Runs all stages and returns the result."""
-        search, halves = self.search, self.halves
-        if any(half.has_stopped for half in halves.values()):
-            search, halves = replace(search, has_stopped=True), {}
+        search, found_in = self.search, self.found_in
         final = search.final
         unexplained = _unexplained(search)
         every = estimates(final, self._draws(final), _units(final))
@@ -375,7 +365,7 @@ class Investigation:
                 every,
                 at_edge,
                 again.get(added.effect.name),
-                found_in_halves(added.effect, halves),
+                found_in.get(added.effect.name, []),
             )
             for added, at_edge in zip(search.added, self._at_edge, strict=True)
         ]
@@ -406,9 +396,6 @@ class Investigation:
                 effects = [found for found in effects if found.effect.name in kept]
         if self.narrow_priors:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
-        is_short = len(halves) < len(HALVES) and not search.has_stopped
-        if self.settings.repeat and effects and is_short:
-            reason = f"{reason} {NOT_REPEATED}"
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"
         with self._stage("next experiment"):
@@ -448,9 +435,6 @@ class Investigation:
             settings=self.settings,
             seed=self.seed,
             seconds=self.seconds,
-            halves={
-                name: [added.effect.name for added in half.added] for name, half in halves.items()
-            },
             learned=learned,
         )
 

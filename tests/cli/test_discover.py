@@ -62,7 +62,7 @@ def model_file(tmp_path_factory):
 def words(recording, model_file, tmp_path_factory):
     return [
         "discover", f"{model_file}:rod", "--data", recording, "--holdout", 3, "--candidates",
-        CANDIDATES, "--max-effects", 1, "--repeat",
+        CANDIDATES, "--max-effects", 1,
         "--out", tmp_path_factory.mktemp("out") / "discovery",
     ]  # fmt: skip
 
@@ -294,7 +294,8 @@ def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
         "data_problems": [], "verdict": "named", "reason": "Missing: hinge.bias.", "gap": {},
         "effects": [
             {"effect": effect, "port": "hinge", "probability": 0.99, "is_minor": is_minor,
-             "parameters": {"size": strength}, "in_halves": {"the first half": not is_minor}}
+             "parameters": {"size": strength},
+             "found_in": [{"part": "the first half", "is_found": not is_minor}]}
             for effect, is_minor in (("bias", False), ("wind", True))
         ],
         "remainder": {"fired": False, "unexplained": 0.0}, "counts": {}, "next_experiment": None,

@@ -126,13 +126,22 @@ def test_small_effects_and_parts_of_the_recording_are_shown(runs, tmp_path):
 def test_an_effect_that_a_half_does_not_show_is_no_headline(runs, tmp_path):
     folder = shutil.copytree(runs["discover"], tmp_path / "run")
     content = json.loads((folder / "discovery.json").read_text())
-    content["effects"][0]["in_halves"] = {"the first half": True, "the second half": False}
+    content["effects"][0]["found_in"] = [
+        {"part": "the first half", "is_found": True, "probability": 1.0, "instead": ""},
+        {
+            "part": "the second half",
+            "is_found": False,
+            "probability": 0.9,
+            "instead": "hinge.bias",
+        },
+    ]
     bias = {"effect": "bias", "port": "hinge", "probability": 1.0, "share": 0.9}
     content["effects"].append(bias)
     (folder / "discovery.json").write_text(json.dumps(content))
     text = write_report(folder).read_text()
     assert "Missing: constant force at hinge" in text
-    assert "Found by a search of only half of the recording?" in text
+    assert "Does a part of the recording alone show the effect?" in text
+    assert "explained better by" in text and "constant force at hinge</td>" in text
 
 
 def test_a_learned_law_is_the_headline_and_is_shown_where_it_was_checked(tmp_path):

@@ -140,6 +140,15 @@ class Projection:
         """Information of the parameters in each segment, ``(S, d, d)``."""
         return self._by_z.mT @ self._weights
 
+    def offsets_after(self, step: Tensor) -> Tensor:
+        """Returns the closest offsets of the initial states after a step, ``(S, m)``.
+
+        Args:
+            step: Change of the parameters, ``(d,)``.
+        """
+        left = self.residual[..., None] - (self._by_z @ step)[..., None]
+        return torch.linalg.solve(self._inner, self._starts.mT @ left)[..., 0]
+
     def solve(self, columns: Tensor) -> Tensor:
         """Returns C⁻¹ x, ``(S, N, P)``."""
         inner = torch.linalg.solve(self._inner, self._starts.mT @ columns)

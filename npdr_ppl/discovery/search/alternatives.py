@@ -32,6 +32,7 @@ __all__ = [
     "Alternatives",
     "find_alternatives",
     "log_prior",
+    "probabilities",
     "tried_before",
     "weigh_alternatives",
 ]
@@ -180,11 +181,11 @@ def weigh_alternatives(
     )
     checked: set[str] = {effect.name}
     while True:
-        probabilities = _probabilities(trials, without, is_approximate)
+        weights = probabilities(trials, without, is_approximate)
         # Alternatives that the recording contradicts do not make the effect uncertain.
         asked = [
             name
-            for name, probability in probabilities.items()
+            for name, probability in weights.items()
             if probability >= EVIDENCE.least_probability and name not in checked
         ]
         checked.update(asked)
@@ -192,7 +193,7 @@ def weigh_alternatives(
         if not refuted:
             break
         trials = {name: trial for name, trial in trials.items() if name not in refuted}
-    best = max(probabilities, key=lambda name: probabilities[name])
+    best = max(weights, key=lambda name: weights[name])
     swapped = trials[best]
     chosen = next(e for e in swapped.effects if e.name == best)
     scale = closest([base, swapped]).fit.scale
@@ -200,7 +201,7 @@ def weigh_alternatives(
     share = max(0.0, lost) / max(whole, 1e-12)
     fitting = _fitting(trials, best)
     swapped = current if best == effect.name else swapped
-    return swapped, Added(chosen, effect.name, share, probabilities, fitting)
+    return swapped, Added(chosen, effect.name, share, weights, fitting)
 
 
 def _linear_share(base: Hypothesis, current: Hypothesis, effect: Effect) -> float:
@@ -211,10 +212,16 @@ def _linear_share(base: Hypothesis, current: Hypothesis, effect: Effect) -> floa
     return min(1.0, lost / max(whole, 1e-12)) if math.isfinite(lost) else 1.0
 
 
-def _probabilities(
+def probabilities(
     trials: Mapping[str, Hypothesis], without: Hypothesis, is_approximate: bool
 ) -> dict[str, float]:
-    """Returns the probability of each candidate, by name."""
+    """Returns the probability of each candidate, by name.
+
+    Args:
+        trials: The model with each candidate, by the candidate's name.
+        without: The model without the candidates.
+        is_approximate: Whether something remains that no law of the catalogue explains.
+    """
     strains = _strains(trials, without, is_approximate)
     prior = [log_prior(t) - strain for t, strain in zip(trials.values(), strains, strict=True)]
     return dict(zip(trials, weigh(list(trials.values()), prior), strict=True))

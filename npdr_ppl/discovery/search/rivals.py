@@ -76,6 +76,8 @@ def with_rivals(
             others = {} if alternatives is None else alternatives.others
             for name, trial in ({effect.name: asked} | others).items():
                 tried[effect.name, name] = trial
+            if alternatives is not None:
+                tried[effect.name, ""] = alternatives.without
             compared = num - len(waiting)
             progress(compared / num, f"{compared} of {num} effects compared")
             if current is not asked:

@@ -56,7 +56,7 @@ class Search:
         final: The final model.
         added: Its effects.
         trials: The final model with each alternative in an effect's place, by the names of the
-            effect and of the alternative.
+            effect and of the alternative; ``""`` for the model without the effect.
         is_approximate: Whether something remains that no law of the catalogue explains.
         has_stopped: Whether a time limit ended it before all was tried.
     """

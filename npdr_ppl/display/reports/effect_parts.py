@@ -43,7 +43,7 @@ def effects_section(effects: Rows, ranking: Rows) -> Section:
     columns = ("effect", "probability", "share of the misfit", "could also be")
     is_any_small = any(effect.get("is_minor") for effect in effects)
     caption = "Small effects are in the revised model, but are not named." if is_any_small else ""
-    folded = [*_parameters(effects), *_repeated(effects), *_halves(effects)]
+    folded = [*_parameters(effects), *_repeated(effects), *_found_in(effects)]
     parts = [TablePart(columns, rows, caption)]
     if folded:
         parts.append(
@@ -114,17 +114,24 @@ def _repeated(effects: Rows) -> list[Part]:
     return [TablePart(("strength", "part", "mean ± sd"), rows, caption)] if rows else []
 
 
-def _halves(effects: Rows) -> list[Part]:
+def _found_in(effects: Rows) -> list[Part]:
     rows = [
-        [_named(effect), *("yes" if is_in else "no" for is_in in halves.values())]
+        [
+            _named(effect),
+            str(part.get("part")),
+            "yes" if part.get("is_found") else "no",
+            number(part.get("probability"), ".0%"),
+            in_words(str(part.get("instead") or "")) or "–",
+        ]
         for effect in effects
-        if (halves := effect.get("in_halves") or {})
+        for part in effect.get("found_in") or []
     ]
-    if not rows:
-        return []
-    names = next(e["in_halves"] for e in effects if e.get("in_halves"))
-    caption = "Found by a search of only half of the recording?"
-    return [TablePart(("effect", *names), rows, caption)]
+    columns = ("effect", "part", "found", "probability", "explained better by")
+    caption = (
+        "Does a part of the recording alone show the effect? The probability is that of the "
+        "effect against the model without it, in this part."
+    )
+    return [TablePart(columns, rows, caption)] if rows else []
 
 
 def _alternatives(effects: Rows) -> list[Part]:

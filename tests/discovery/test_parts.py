@@ -1,22 +1,15 @@
-"""Searches of both halves of a recording."""
+"""Whether parts of a recording show an effect."""
 
 import dataclasses
 
 import pytest
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.search.halves import found_in_halves, search_halves
+from npdr_ppl.discovery.search.parts import found_in_parts
 from npdr_ppl.discovery.search.repeatability import HALVES
+from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.verdict import judge, most_doubtful
-from npdr_ppl.errors import DataError
-from npdr_ppl.models.effects import (
-    Bias,
-    CoulombFriction,
-    PreslidingFriction,
-    QuadraticDrag,
-    ViscousFriction,
-)
+from npdr_ppl.models.effects import Bias, CoulombFriction, ViscousFriction
 from npdr_ppl.models.pendulum import pendulum
 from tests.discovery.test_repeatability import joined
 from tests.helpers.pendulum_recordings import swinging
@@ -30,20 +23,23 @@ EFFECTS = (CoulombFriction("hinge"), ViscousFriction("hinge"), Bias("hinge"))
 def rubbed_late():
     """A discovery in a recording whose second half alone has dry friction."""
     rollouts = joined(swinging(rollouts=2), swinging(rollouts=2, friction=0.3, seed=1))
-    search = npdr.DiscoveryOptions(effects=EFFECTS, repeat=True)
+    search = npdr.DiscoveryOptions(effects=EFFECTS)
     return npdr.discover(pendulum, rollouts, search=search)
 
 
 def test_an_effect_of_all_rollouts_is_found_in_both_halves():
-    search = npdr.DiscoveryOptions(effects=EFFECTS, repeat=True)
+    search = npdr.DiscoveryOptions(effects=EFFECTS)
     found = npdr.discover(pendulum, swinging(rollouts=4, friction=0.2), search=search)
     assert found.verdict == "named"
     (friction,) = found.effects
     assert friction.effect.name == "hinge.coulomb_friction"
     assert friction.in_halves == dict.fromkeys(HALVES, True)
-    assert friction.to_dict()["in_halves"] == dict.fromkeys(HALVES, True)
-    both = dict.fromkeys(HALVES, ["hinge.coulomb_friction"])
-    assert found.to_dict()["halves"] == both
+    record = friction.to_dict()
+    assert record["in_halves"] == dict.fromkeys(HALVES, True)
+    assert [part["part"] for part in record["found_in"]] == [
+        *HALVES,
+        *(f"all but rollout {number}" for number in range(4)),
+    ]
 
 
 def test_an_effect_of_one_half_only_is_not_named(rubbed_late):
@@ -69,41 +65,36 @@ def test_the_reason_says_in_which_half_an_effect_was_not_found(rubbed_late):
     assert reason == "hinge.coulomb_friction was not found in the first half of the recording."
     # One that explains little does not change the verdict, and is not named.
     small = dataclasses.replace(friction, share=0.01)
-    other = dataclasses.replace(friction, effect=Bias("hinge"), share=1.0, in_halves={})
+    other = dataclasses.replace(friction, effect=Bias("hinge"), share=1.0, found_in=())
     assert judge(search, [other, small], 0.0, {}, settings) == ("named", "Missing: hinge.bias.")
     doubtful = [dataclasses.replace(each, probability=0.5) for each in (friction, other)]
     assert most_doubtful(doubtful, settings).effect.name == "hinge.bias"
 
 
-def test_a_half_that_cannot_be_fitted_is_left_out(monkeypatch):
-    rollouts = swinging(rollouts=2, friction=0.2)
-    searcher = Searcher(pendulum, rollouts, npdr.DiscoveryOptions(effects=EFFECTS))
-    first, told = searcher.fit_base(), []
-    fit_base = Searcher.fit_base
-
-    def failing(self, **options):
-        if self.base.inputs.rollout.max() == 0:
-            raise DataError("No fit.")
-        return fit_base(self, **options)
-
-    monkeypatch.setattr(Searcher, "fit_base", failing)
-    found = search_halves(searcher, first, max_effects=1, report=told.append)
-    assert set(found) == {"the second half"}
-    assert "the first half is left out: No fit." in told
+def test_fits_confirm_that_a_part_does_not_show_an_effect(rubbed_late):
+    """One step says so, and a fit of the part says the same."""
+    search = rubbed_late.search
+    first, second = found_in_parts(search)["hinge.coulomb_friction"][:2]
+    assert (first.part, second.part) == HALVES
+    assert first.probability < 0.5 < second.probability
 
 
-def test_another_form_of_a_law_counts_as_found():
-    rollouts = swinging(rollouts=2, friction=0.2)
-    searcher = Searcher(pendulum, rollouts, npdr.DiscoveryOptions(effects=EFFECTS))
-    halves = search_halves(searcher, searcher.fit_base(), max_effects=2)
-    assert found_in_halves(PreslidingFriction("hinge"), halves) == dict.fromkeys(HALVES, True)
-    assert not any(found_in_halves(QuadraticDrag("hinge"), halves).values())
+def test_another_law_that_explains_a_part_better_is_reported(rubbed_late):
+    """In the second half, a bias stands no chance in the place of dry friction."""
+    search = rubbed_late.search
+    (added,) = (a for a in search.added if a.effect.name == "hinge.coulomb_friction")
+    true, without = search.trials[added.place, added.effect.name], search.trials[added.place, ""]
+    bias = Trials(without.segments).refitted(without, (Bias("hinge"),))
+    trials = {("hinge.bias", ""): without, ("hinge.bias", "hinge.bias"): bias}
+    trials["hinge.bias", "hinge.coulomb_friction"] = true
+    wrong = dataclasses.replace(added, effect=Bias("hinge"), place="hinge.bias", fitting=())
+    found = found_in_parts(dataclasses.replace(search, added=[wrong], trials=trials))
+    second = found["hinge.bias"][1]
+    assert not second.is_found
+    assert second.instead == "hinge.coulomb_friction"
 
 
-def test_short_recordings_are_not_halved_and_the_reason_says_so():
-    search = npdr.DiscoveryOptions(effects=EFFECTS, repeat=True)
-    rollouts = swinging(rollouts=1, steps=140, friction=0.3)
-    options = npdr.DataOptions(segment_length=10)
-    found = npdr.discover(pendulum, rollouts, search=search, options=options)
-    assert found.effects[0].in_halves == {}
-    assert "too short to search its halves" in found.reason
+def test_without_repetition_no_parts_are_compared():
+    search = npdr.DiscoveryOptions(effects=EFFECTS, repeat=False)
+    found = npdr.discover(pendulum, swinging(rollouts=2, friction=0.2), search=search)
+    assert found.effects[0].found_in == ()

@@ -1,0 +1,226 @@
+"""Whether parts of a recording alone show the effects that a search of all of it found.
+
+:mod:`~npdr_ppl.discovery.search.repeatability` compares an effect's strengths in two parts. This
+asks whether a part shows the effect at all, and whether another law explains the part better.
+
+The search has fitted the model with the effect, without it, and with alternatives in its place.
+Let J be the derivatives by the parameters and C the covariance of the residuals r, as in
+:mod:`~npdr_ppl.discovery.screening.projection`. Information and scores are sums over segments, so
+the closest fit z + δ to a part P follows, to first order, without another search:
+
+    δ = (ρ Σ_P Jᵀ C⁻¹ J + 1)⁻¹ (ρ Σ_P Jᵀ C⁻¹ r − z)
+
+with the share ρ of independent measurements. Each model is simulated once at its z + δ, and the
+models' evidence is compared along the part. One step can be wrong where the motion is sensitive or
+sticks. So "not found" counts only if fits of the part confirm it.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.search.alternatives import Added, probabilities
+from npdr_ppl.discovery.search.evidence import weigh
+from npdr_ppl.discovery.search.parsimony import overlap
+from npdr_ppl.discovery.search.repeatability import halves
+from npdr_ppl.discovery.search.rounds import Search
+from npdr_ppl.discovery.search.settings import EVIDENCE, REPEATABILITY, TRIALS
+from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.progress import Step
+
+__all__ = ["PartResult", "found_in_parts", "missing_where"]
+
+
+@dataclass(frozen=True)
+class PartResult:
+    """Whether a part of a recording shows an effect.
+
+    Attributes:
+        part: Which part, e.g. ``"the first half"``.
+        is_found: Whether the part's evidence favours the model with the effect, or with another
+            form of the same law, and no other law explains the part clearly better.
+        probability: Probability of the effect against the model without it, in this part.
+        instead: Name of a law that explains the part clearly better; empty if there is none.
+    """
+
+    part: str
+    is_found: bool
+    probability: float
+    instead: str = ""
+
+    def to_dict(self) -> dict[str, object]:
+        """Returns JSON-serialisable values."""
+        return asdict(self)
+
+
+def found_in_parts(
+    search: Search,
+    report: Callable[[str], None] = lambda _: None,
+    progress: Step = lambda fraction, status: None,
+) -> dict[str, list[PartResult]]:
+    """Returns which parts of the recording show each effect, by the effect's name.
+
+    Parts are both halves, and of three rollouts or more all but each one.
+
+    Args:
+        search: The search of the whole recording.
+        report: Called with a sentence about each effect that a part does not show.
+        progress: Called with the fraction of the effects that is compared.
+
+    Returns:
+        The results; empty if the recording has fewer than ``REPEATABILITY.fewest_segments``
+        segments. A part is left out if the model cannot be simulated along it.
+    """
+    if len(search.final.fit.offsets) < REPEATABILITY.fewest_segments:
+        return {}
+    num, result = len(search.added), dict[str, list[PartResult]]()
+    for number, added in enumerate(search.added):
+        progress(number / num, f"{number} of {num} effects sought in parts of the recording")
+        compared = _Compared(search, added)
+        name = added.effect.name
+        result[name] = []
+        for part, index in _parts(search.final):
+            found = compared.along(part, index)
+            if found is not None:
+                result[name].append(found)
+                if not found.is_found:
+                    because = f": {found.instead} explains it better" if found.instead else ""
+                    report(f"{part} does not show {name}{because}")
+    progress(1.0, f"{num} of {num} effects sought in parts of the recording")
+    return result
+
+
+def missing_where(in_parts: Mapping[str, bool]) -> str:
+    """Returns where an effect was not found: the part's name, or ``"either half"``.
+
+    Args:
+        in_parts: Whether it was found in each part, by the part's name.
+    """
+    missed = [name for name, is_in in in_parts.items() if not is_in]
+    return missed[0] if len(missed) == 1 or len(in_parts) > 2 else "either half"
+
+
+def _parts(hypothesis: Hypothesis) -> Iterator[tuple[str, Tensor]]:
+    """Yields the parts' names and segments: the halves, and all but one of several rollouts."""
+    rollout = hypothesis.segments.inputs.rollout
+    yield from halves(len(rollout))
+    names = rollout.unique().tolist()
+    for name in names if len(names) > 2 else ():
+        yield f"all but rollout {name}", (rollout != name).nonzero()[:, 0]
+
+
+class _Compared:
+    """An effect's model and its alternatives, compared along parts of the recording.
+
+    Args:
+        search: The search of the whole recording.
+        added: The effect.
+    """
+
+    def __init__(self, search: Search, added: Added) -> None:
+        self._effect, self._is_approximate = added.effect, search.is_approximate
+        trials = {name: h for (place, name), h in search.trials.items() if place == added.place}
+        self._without = trials.pop("", None)
+        self._trials = {added.effect.name: search.final} | trials
+        self._fitting = added.fitting
+        self._steps: dict[str, _Step | None] = {}
+
+    def along(self, part: str, index: Tensor) -> PartResult | None:
+        """Returns whether a part shows the effect, ``None`` if it cannot be simulated.
+
+        Args:
+            part: Name of the part.
+            index: Its segments.
+        """
+        if self._without is None:
+            return PartResult(part, True, 1.0)
+        own = self._effect.name
+        models = {name: h for name, h in self._closest(index).items() if h is not None}
+        if own not in models or "" not in models:
+            return None
+        found = self._judged(part, models)
+        if found.is_found:
+            return found
+        asked = (own, "", found.instead) if found.instead else (own, "")
+        return self._judged(part, {name: _refitted(models[name]) for name in asked})
+
+    def _closest(self, index: Tensor) -> dict[str, Hypothesis | None]:
+        """Returns the models with the least loss along a part, fitted to it by one step."""
+        assert self._without is not None
+        every = {"": self._without} | self._trials
+        scale = self._trials[self._effect.name].fit.scale
+        losses = {name: float(h.losses(scale)[index].sum()) for name, h in every.items()}
+        others = sorted(set(self._trials) - {self._effect.name}, key=lambda name: losses[name])
+        chosen = [self._effect.name, "", *others[: TRIALS.most_converged]]
+        for name in chosen:
+            if name not in self._steps:
+                self._steps[name] = _Step(every[name]) if every[name].can_be_linearised else None
+        return {
+            name: None if (step := self._steps[name]) is None else step.along(index)
+            for name in chosen
+        }
+
+    def _judged(self, part: str, models: Mapping[str, Hypothesis]) -> PartResult:
+        """Returns what models that are fitted to a part say."""
+        own = self._effect.name
+        without = models[""]
+        laws = {name: h for name, h in models.items() if name}
+        against_none = weigh([without, models[own]], [0.0, 0.0])[1]
+        weights = probabilities(laws, without, self._is_approximate)
+        likeliest = max(weights, key=lambda name: weights[name])
+        is_likely = weights[own] >= EVIDENCE.least_probability or self._is_same(likeliest, models)
+        is_found = against_none >= 0.5 and is_likely
+        return PartResult(part, is_found, against_none, "" if is_likely else likeliest)
+
+    def _is_same(self, name: str, models: Mapping[str, Hypothesis]) -> bool:
+        """Returns whether a law is another form of the effect."""
+        if name in self._fitting:
+            return True
+        law = next(effect for effect in models[name].effects if effect.name == name)
+        return overlap(law, self._effect)
+
+
+def _refitted(part: Hypothesis) -> Hypothesis:
+    """Returns a model fitted along its part; the given one if the fit fails."""
+    segments = part.segments
+    return Trials(segments).refitted_along(segments, part, part.effects) or part
+
+
+class _Step:
+    """One Gauss-Newton step from a fit to the whole recording to a fit to a part.
+
+    Args:
+        hypothesis: The fit to the whole recording.
+    """
+
+    def __init__(self, hypothesis: Hypothesis) -> None:
+        self._whole, self._projection = hypothesis, Projection(hypothesis)
+        self._information = self._projection.parameter_information_by_segment
+
+    def along(self, index: Tensor) -> Hypothesis:
+        """Returns the model along a part, at the better end of the step.
+
+        Args:
+            index: The part's segments.
+        """
+        whole, share = self._whole, self._whole.share
+        z = whole.fit.z.double()
+        eye = torch.eye(len(z), dtype=torch.float64)
+        score = share * self._projection.parameter_scores[index].sum(0) - z
+        step = torch.linalg.solve(share * self._information[index].sum(0) + eye, score)
+        here = whole.along(index)
+        here.keep_difference(whole.difference[index])
+        offsets = self._projection.offsets_after(step)[index]
+        there = replace(here, fit=replace(here.fit, z=z + step, offsets=offsets))
+        return min(here, there, key=self._loss)
+
+    def _loss(self, part: Hypothesis) -> float:
+        """Returns minus the log density along a part, the prior included."""
+        loss = self._whole.share * float(part.losses(part.fit.scale).sum())
+        loss += 0.5 * float(part.fit.z.square().sum())
+        return loss if math.isfinite(loss) else math.inf
