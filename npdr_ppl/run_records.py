@@ -250,11 +250,11 @@ class DiscoveryRecord(TypedDict, total=False):
     alarm: Alarm | None
     remainder: Alarm | None
     effects: list[EffectRecord] | None
-    halves: dict[str, list[str]]
     learned: dict[str, Any] | None
     ranking: list[dict[str, Any]] | None
     where: list[dict[str, Any]] | None
     gap: dict[str, GapRecord] | None
+    estimated_anew: dict[str, dict[str, Number]]
     parameters: dict[str, EffectInterval]
     counts: dict[str, dict[str, Number]]
     finer_steps: int

@@ -29,6 +29,7 @@ class SensorLowPass(SensorEffect):
 
     id = "sensor_low_pass"
     parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
+    per_recording = ("time_constant",)
     spans = ("joint", "rate", "rates", "all")
     law = "ẏ = (x − y)/T"
     equivalence = (FIRST_ORDER_LAG,)
@@ -76,6 +77,7 @@ class EncoderBias(SensorEffect):
 
     id = "encoder_bias"
     parameters = (Parameter("offset", "{port}", 0.0, "offset β of the measurement"),)
+    per_recording = ("offset",)
     spans = ("position",)
     law = "q + β"
     equivalence = (ANGLE_OFFSET,)

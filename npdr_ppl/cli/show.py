@@ -128,7 +128,8 @@ def show_discovery(found: Mapping[str, Any], out: Path) -> None:
 
 
 def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
-    # Not at the top: other commands show their results without it.
+    # Not at the top: other commands show their results without them.
+    from npdr_ppl.discovery.proof.estimated_anew import ANEW
     from npdr_ppl.discovery.search.parts import missing_where
 
     if found["effects"]:
@@ -179,6 +180,13 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             values = [number(gap[k], ".4g") for k in ("before", "after", "noise_floor")]
             table.add_row(metric, *values, number(gap["closed"], ".0%"))
         console.print(table)
+    for site, values in (found.get("estimated_anew") or {}).items():
+        searched, first, second = (f"{values[key]:.4g}" for key in ANEW)
+        console.print(
+            f"{escape(site)} was estimated anew on the held-out rollouts: {first} and {second} in "
+            f"their halves, {searched} in the recording.",
+            highlight=False,
+        )
     if found.get("preparation") is not None:
         console.print(found["preparation"]["sentence"], highlight=False)
     _print_reason(console, found["verdict"], found["reason"])

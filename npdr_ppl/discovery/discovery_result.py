@@ -13,6 +13,7 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.finding import Finding
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.result import Learned
+from npdr_ppl.discovery.proof.estimated_anew import EstimatedAnew
 from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.discovery.proof.next_experiment import NextExperiment
 from npdr_ppl.discovery.proof.overlays import Overlays
@@ -68,6 +69,8 @@ class Discovery:
             standard deviations, ``(n, n)``; the diagonal is the distance from no effect.
         separation_names: Names of the leading candidates.
         gap: Metrics on the held-out recording; empty without one.
+        anew: Parameters that belong to a recording, as an encoder's zero does, estimated anew on
+            the held-out one; ``None`` if there are none.
         next_experiment: What to record next, if candidates could not be told apart.
         causes: The causes that the recording leaves possible, for ``npdr plan``.
         model: The original model.
@@ -100,6 +103,7 @@ class Discovery:
     separation: Tensor
     separation_names: tuple[str, ...]
     gap: dict[str, Gap]
+    anew: EstimatedAnew | None
     next_experiment: NextExperiment | None
     causes: SurvivingCauses
     model: Model
@@ -147,6 +151,7 @@ class Discovery:
                 "distance": self.separation.tolist(),
             },
             "gap": {name: gap.to_dict() for name, gap in self.gap.items()},
+            "estimated_anew": {} if self.anew is None else self.anew.to_dict(),
             "next_experiment": self.next_experiment and self.next_experiment.to_dict(),
             "surviving_causes": self.causes.to_dict(),
             "parameters": {name: e.to_dict() for name, e in self.parameters.items()},

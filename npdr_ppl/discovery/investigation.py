@@ -15,6 +15,7 @@ from npdr_ppl.discovery.finding_of import finding_of
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.assumptions import Assumptions
 from npdr_ppl.discovery.learning.result import Learned, learn
+from npdr_ppl.discovery.proof.estimated_anew import EstimatedAnew, estimated_anew
 from npdr_ppl.discovery.proof.held_out_gap import Gap, prove
 from npdr_ppl.discovery.proof.next_experiment import NextExperiment, next_experiment
 from npdr_ppl.discovery.proof.overlays import Overlays, overlay
@@ -111,6 +112,7 @@ class Investigation:
         self._data_options = segment_options(rollouts, options)
         self._deadline = Deadline(self.settings.time_limit)
         self._drawn: list[tuple[Hypothesis, Draws]] = []
+        self._anew: list[tuple[Hypothesis, EstimatedAnew | None]] = []
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
@@ -281,7 +283,19 @@ class Investigation:
                 draws_before=draws_before,
                 draws_after=draws_after,
                 seed=self.seed,
+                anew=self._anew_of(final),
             )
+
+    def _anew_of(self, final: Hypothesis) -> EstimatedAnew | None:
+        """Returns what belongs to a recording in a revised model, as in the held-out recording."""
+        if self.holdout is None:
+            return None
+        for known, anew in self._anew:
+            if known is final:
+                return anew
+        data_options = _like(self._data_options, self.rollouts, self.holdout)
+        self._anew.append((final, estimated_anew(final, self.holdout, data_options)))
+        return self._anew[-1][1]
 
     @cached_property
     def learned(self) -> Learned | None:
@@ -423,6 +437,7 @@ class Investigation:
             separation=self.first.separation,
             separation_names=tuple(c.name for c in self.first.ranking[: SEARCH.num_leading]),
             gap=gap,
+            anew=self._anew_of(final),
             next_experiment=advice,
             causes=causes,
             model=search.rounds[0].hypothesis.model,

@@ -85,6 +85,8 @@ class Effect(ABC):
         has_ripples: Whether it repeats a whole and unknown number of times per turn of a joint. A
             search finds the number in the same way, and sets it by :meth:`with_ripples`.
         incidental: Names of shape parameters without which the law is still the same cause.
+        per_recording: Names of parameters that may have another value in each recording of one
+            device, as the zero of an encoder that is switched on anew.
         contains: Ids of the simpler laws at the same port whose sum it equals at a limit of its
             shape.
         beside: Ids of laws at the same port that act together with it, and that it does not
@@ -106,6 +108,7 @@ class Effect(ABC):
     wave: ClassVar[str] = ""
     has_ripples: bool = False
     incidental: ClassVar[tuple[str, ...]] = ()
+    per_recording: ClassVar[tuple[str, ...]] = ()
     contains: ClassVar[tuple[str, ...]] = ()
     beside: ClassVar[tuple[str, ...]] = ()
     law: ClassVar[str] = ""

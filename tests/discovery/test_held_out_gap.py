@@ -8,14 +8,16 @@ import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.proof.estimated_anew import estimated_anew
 from npdr_ppl.discovery.proof.held_out_gap import Gap, _Simulated, prove
 from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.language.handlers import with_finer_steps
-from npdr_ppl.models.effects import CoulombFriction
+from npdr_ppl.models.effects import CoulombFriction, EncoderBias
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.preparation import data_options
 from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.segment_model import SegmentModel
 from tests.helpers.pendulum_recordings import swinging
 
 DISTURBANCE = 0.5
@@ -148,3 +150,69 @@ def test_no_segment_widens_its_own_band(proven):
     after = simulated._start_factors()
     assert torch.equal(after[::2], before[::2])
     assert bool((after[1::2] > 2.0 * before[1::2]).any())
+
+
+def shifted(rollouts, offset):
+    """Returns rollouts whose angle has an offset."""
+    return npdr.Rollouts.from_arrays(
+        readings=[r + [offset, 0.0] for r in rollouts.readings], actions=rollouts.actions,
+        channel_names=rollouts.channel_names, action_names=rollouts.action_names,
+        time_step=rollouts.time_step,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def switched_on_twice():
+    """A fit to a recording with one zero of the encoder, and rollouts with another one."""
+    model = with_finer_steps(with_finer_steps(pendulum))
+    rollouts, held_out = shifted(swinging(), 0.02), shifted(swinging(seed=1), -0.03)
+    options = segment_options(rollouts)
+    before = fit_hypothesis(model, rollouts, options)
+    after = fit_hypothesis(model, rollouts, options, effects=(EncoderBias("angle"),))
+    return before, after, held_out, options
+
+
+def test_an_encoders_zero_is_estimated_anew_on_held_out_rollouts(switched_on_twice):
+    before, after, held_out, options = switched_on_twice
+    anew = estimated_anew(after, held_out, options)
+    assert anew is not None
+    (values,) = anew.to_dict().values()
+    assert values["searched"] == pytest.approx(0.02, abs=0.003)
+    assert values["first half"] == pytest.approx(-0.03, abs=0.003)
+    assert values["second half"] == pytest.approx(-0.03, abs=0.003)
+    draws = [posterior_draws(each, seed=0) for each in (before, after)]
+    old, new = (
+        prove(
+            before, after, held_out, options,
+            draws_before=draws[0], draws_after=draws[1], seed=0, anew=each,
+        )["rmse"]
+        for each in (None, anew)
+    )  # fmt: skip
+    assert old.before == new.before
+    assert old.has_grown and old.is_open
+    assert new.after == pytest.approx(new.noise_floor, rel=0.12)
+
+
+def test_no_half_is_predicted_with_its_own_values(switched_on_twice):
+    _, after, held_out, options = switched_on_twice
+    anew = estimated_anew(after, held_out, options)
+    assert anew is not None
+    segments = SegmentModel(after.model, held_out, options)
+    late = torch.arange(segments.inputs.num_segments) >= segments.inputs.num_segments // 2
+    # What is added to the first half's own value appears in the second half only.
+    moved = replace(anew, shifts=anew.shifts.clone())
+    moved.shifts[0, -1] += 1.0
+    z, offsets = after.fit.z[None], segments.no_offsets[None]
+    plain, other = (each.simulate(segments, z, offsets, late)[0] for each in (anew, moved))
+    assert torch.equal(plain[~late], other[~late])
+    assert not torch.isclose(plain[late], other[late]).all()
+
+
+def test_other_parameters_keep_their_values(switched_on_twice):
+    before, after, held_out, options = switched_on_twice
+    assert estimated_anew(before, held_out, options) is None
+    anew = estimated_anew(after, held_out, options)
+    assert anew is not None
+    sites = {site.name: site.coordinates for site in after.segments.prior.sites}
+    for name, coordinates in sites.items():
+        assert bool((anew.shifts[:, coordinates] != 0.0).all()) == ("encoder_bias" in name)

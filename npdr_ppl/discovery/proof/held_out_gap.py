@@ -8,6 +8,7 @@ from torch import Tensor
 
 from npdr_ppl import metrics
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.proof.estimated_anew import EstimatedAnew
 from npdr_ppl.discovery.proof.parameter_intervals import Draws
 from npdr_ppl.discovery.proof.settings import GAP
 from npdr_ppl.preparation.data_options import DataOptions
@@ -81,6 +82,7 @@ def prove(
     draws_before: Draws,
     draws_after: Draws,
     seed: int,
+    anew: EstimatedAnew | None = None,
 ) -> dict[str, Gap]:
     """Compares two fitted models on rollouts that neither was fitted to.
 
@@ -92,11 +94,12 @@ def prove(
         draws_before: Draws of the posterior of the original model.
         draws_after: Draws of the posterior of the revised model.
         seed: Seed of the predictive draws.
+        anew: Parameters of the revised model that were estimated anew on the held-out recording.
     """
     with seeded(seed, "discovery", "proof"):
         drawn = draws_after.resampled(GAP.num_draws)
         old = _Simulated(before, draws_before.resampled(GAP.num_draws), rollouts, options).scores()
-        revised = _Simulated(after, drawn, rollouts, options)
+        revised = _Simulated(after, drawn, rollouts, options, anew)
         new, floor = revised.scores(), revised.floor()
     return {
         "rmse": Gap(old.rmse, new.rmse, floor.rmse),
@@ -122,18 +125,26 @@ class _Simulated:
         drawn: Draws of its posterior, ``(n, d)``.
         rollouts: The recording.
         options: How it is cut into segments.
+        anew: Parameters that were estimated anew on this recording.
     """
 
     def __init__(
-        self, hypothesis: Hypothesis, drawn: Tensor, rollouts: Rollouts, options: DataOptions
+        self,
+        hypothesis: Hypothesis,
+        drawn: Tensor,
+        rollouts: Rollouts,
+        options: DataOptions,
+        anew: EstimatedAnew | None = None,
     ) -> None:
         segments = SegmentModel(hypothesis.model, rollouts, options, is_complete=True)
         self.fit, self.drawn, self.segments = hypothesis.fit, drawn, segments
         self.recorded = rollouts.series(segments.channel_names)
-        self.centre = segments.simulate(self.fit.z[None], segments.no_offsets[None])[0].double()
         self.used = options.used_segments(rollouts)
         # Draws are compared along these segments only, to bound memory.
         self.part = segments.along(self.used)
+        self.anew = anew
+        self._every = torch.arange(segments.inputs.num_segments)
+        self.centre = self._simulate(segments, self.fit.z[None], segments.no_offsets[None])[0]
 
     def scores(self) -> _Scores:
         """Returns the metrics of the recording."""
@@ -147,7 +158,7 @@ class _Simulated:
         """
         segments = self.segments
         offsets = self._true_starts()
-        made = segments.simulate(self.fit.z[None], offsets[None])[0].double()
+        made = self._simulate(segments, self.fit.z[None], offsets[None])[0]
         made = made + measurement_noise(self.recorded) * torch.randn(made.shape).double()
         recorded = stitch(made, segments.inputs, segments.channel_names)
         return self._scores(recorded, made[self.used])
@@ -160,15 +171,15 @@ class _Simulated:
             factors = error_factors(now.residual, now.by_starts)
         offsets = []
         # As many segments at once as are used elsewhere, to bound memory.
-        for index in torch.arange(self.segments.inputs.num_segments).split(len(self.used)):
-            if len(index) < self.segments.inputs.num_segments:
-                now = self._linearised(self.segments.along(index))
+        for index in self._every.split(len(self.used)):
+            if len(index) < len(self._every):
+                now = self._linearised(self.segments.along(index), index)
             offsets.append(error_draws(now.residual, now.by_starts, factors))
         return torch.cat(offsets)
 
     @cached_property
     def _along_part(self) -> Linearisation:
-        return self._linearised(self.part)
+        return self._linearised(self.part, self.used)
 
     def _start_factors(self) -> Tensor:
         """Returns by how much the initial states' errors are larger than assumed, ``(S, m)``.
@@ -185,8 +196,24 @@ class _Simulated:
                     factors[own::2] = error_factors(residual, by_starts)
         return factors
 
-    def _linearised(self, segments: SegmentModel) -> Linearisation:
+    def _linearised(self, segments: SegmentModel, index: Tensor) -> Linearisation:
+        """Returns derivatives along some of the segments, which have these indices."""
+        if self.anew is not None:
+            return self.anew.linearise(segments, self.fit, segments.no_offsets, self._late(index))
         return segments.linearise(self.fit.z, segments.no_offsets, self.fit.scale, is_rough=True)
+
+    def _simulate(
+        self, segments: SegmentModel, z: Tensor, offsets: Tensor, index: Tensor | None = None
+    ) -> Tensor:
+        """Returns simulated measurements along segments; ``index`` as in :meth:`_linearised`."""
+        if self.anew is None:
+            return segments.simulate(z, offsets).double()
+        late = self._late(self._every if index is None else index)
+        return self.anew.simulate(segments, z, offsets, late).double()
+
+    def _late(self, index: Tensor) -> Tensor:
+        """Returns whether segments come after the middle of those that draws are made along."""
+        return index >= self.used[(len(self.used) + 1) // 2]
 
     def _scores(self, recorded: list[Tensor], observed: Tensor) -> _Scores:
         """Returns the metrics of rollouts, and of their segments that draws are made along."""
@@ -206,7 +233,7 @@ class _Simulated:
         """
         shape = len(self.drawn), *self.part.no_offsets.shape
         offsets = self._start_factors() * torch.randn(shape, dtype=torch.float64)
-        draws = self.part.simulate(self.drawn, offsets).double()
+        draws = self._simulate(self.part, self.drawn, offsets, self.used)
         return draws + self.fit.scale * torch.randn(draws.shape, dtype=torch.float64)
 
 

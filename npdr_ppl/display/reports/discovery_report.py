@@ -67,7 +67,7 @@ def discovery_report(folder: Path) -> Report:
         *learned_section(result.get("learned") or {}),
         *recording_section(overlays),
         where_section(overlays, result.get("where") or []),
-        Section("Gap on held-out rollouts", _gap(gap)),
+        Section("Gap on held-out rollouts", _gap(gap, result.get("estimated_anew") or {})),
         *estimates_section(result.get("parameters") or {}),
         *_preparation(result),
         *revision_section(folder, description),
@@ -115,7 +115,7 @@ def _key_figures(result: Mapping[str, Any]) -> list[KeyFigure]:
     return figures
 
 
-def _gap(gap: Mapping[str, Any]) -> list[Part]:
+def _gap(gap: Mapping[str, Any], anew: Mapping[str, Any]) -> list[Part]:
     if not gap:
         return [TextPart("No gap was measured: give held-out rollouts with --holdout.")]
     names = ("before", "after", "noise_floor")
@@ -131,7 +131,22 @@ def _gap(gap: Mapping[str, Any]) -> list[Part]:
         "Closed: share of the distance from before to the noise floor, the error of the revised "
         "model on a recording that it simulated itself. By chance a model can be below the floor."
     )
-    return [TablePart(("metric", "before", "after", "noise floor", "closed"), rows, caption)]
+    table = TablePart(("metric", "before", "after", "noise floor", "closed"), rows, caption)
+    return [table, *_anew(anew)]
+
+
+def _anew(anew: Mapping[str, Any]) -> list[Part]:
+    """Returns the values of parameters that were estimated anew on held-out rollouts."""
+    names = ("searched", "first half", "second half")
+    rows = [
+        [site.replace("_", " "), *(number(values.get(name), ".4g") for name in names)]
+        for site, values in anew.items()
+    ]
+    caption = (
+        "Parameters that can differ between recordings of one device, estimated anew on the "
+        "held-out rollouts. Each half was predicted with the values of the other half."
+    )
+    return [TablePart(("parameter", *names), rows, caption)] if rows else []
 
 
 def _preparation(result: Mapping[str, Any]) -> list[Section]:
