@@ -100,11 +100,15 @@ def test_a_servo_of_the_gallery_follows_its_goal(name, signal):
     assert np.abs(sag - weight / 10.5 * np.cos(late[-len(sag) :])).max() < 0.001
 
 
-def test_the_script_of_the_payload_prints_a_load_for_each_link(tmp_path, capsys):
+LINKS = "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"
+
+
+@pytest.fixture
+def six_joints(tmp_path):
+    """An arm of six joints, and logs of it without and with a load."""
     joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-    links = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
     bodies = motors = ""
-    for k, (joint, link) in enumerate(zip(joints, links, strict=True)):
+    for k, (joint, link) in enumerate(zip(joints, LINKS, strict=True)):
         axis = "1 0 0" if k % 2 else "0 1 0"
         bodies += f'<body name="{link}_link" pos="0 0 0.2"><joint name="{joint}_joint" '
         bodies += f'axis="{axis}"/><geom size="0.05" pos="0.02 0.01 0.1"/>'
@@ -120,14 +124,27 @@ def test_the_script_of_the_payload_prints_a_load_for_each_link(tmp_path, capsys)
             log[f"joint_{k}_position"] = np.sin((1.0 + 0.3 * k) * time) + noise[0]
             log[f"joint_{k}_current"] = noise[1]
         log.to_parquet(tmp_path / f"{name}.parquet")
+    return robot, [str(tmp_path / f"{name}.parquet") for name in ("unload", "load")]
+
+
+def test_the_script_of_the_payload_prints_a_load_for_each_link(six_joints, tmp_path, capsys):
+    robot, logs = six_joints
     gallery = EXAMPLES / "gallery"
     main = runpy.run_path(str(gallery / "ur10e_payload.py"))["main"]
-    logs = [str(tmp_path / f"{name}.parquet") for name in ("unload", "load")]
     figure = tmp_path / "payload.png"
     for gains in ("identified", "published"):
         mapping = str(gallery / f"ur10e_arm_{gains}_gains.toml")
         main(str(robot), mapping, *logs, str(figure))
-        assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == [
-            *links[2:]
-        ]
+        lines = capsys.readouterr().out.splitlines()[1:]
+        assert [line.split()[0] for line in lines] == [*LINKS[2:]]
     assert figure.stat().st_size > 1000
+
+
+def test_the_script_of_friction_prints_each_joint(six_joints, capsys):
+    robot, logs = six_joints
+    gallery = EXAMPLES / "gallery"
+    main = runpy.run_path(str(gallery / "ur10e_friction.py"))["main"]
+    main(str(robot), str(gallery / "ur10e_arm_identified_gains.toml"), logs[0])
+    header, *lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 6 and lines[0].startswith("shoulder_pan_joint")
+    assert header.index("share") + len("share") == len(lines[0])

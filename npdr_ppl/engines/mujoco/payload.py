@@ -40,7 +40,7 @@ from npdr_ppl.rollouts.differentiation import (
     thin,
 )
 
-__all__ = ["Payload", "identify_payload"]
+__all__ = ["Payload", "identify_payload", "least_squares", "load_robot", "torque_rows"]
 
 Array = NDArray[np.float64]
 
@@ -92,10 +92,7 @@ def identify_payload(
         ModelError: The file is not such a robot, or has no such moving body.
         DataError: A joint or a command was not recorded, or the recordings are too short.
     """
-    with quiet():  # Meshes are not needed.
-        model = load_mjcf(robot)
-    if model.nq != model.nv:
-        raise ModelError(f"{robot} has free or ball joints; a payload needs hinges and slides.")
+    model = load_robot(robot)
     dynamics = MujocoInverseDynamics(model)
     names = element_names(model, "body")
     moving = [names[number] for number in dynamics.bodies]
@@ -103,7 +100,7 @@ def identify_payload(
         raise ModelError(f"{robot} has no moving body {body!r}; {hint(body, moving)}")
     first = len(INERTIAL) * moving.index(body)
     columns = slice(first, first + len(INERTIAL))
-    empty, full = (_rows(model, dynamics, rollouts) for rollouts in (without, loaded))
+    empty, full = (torque_rows(model, dynamics, rollouts) for rollouts in (without, loaded))
     _check_mass(full, columns, body)
     # Joints count by their own errors: without the weights the largest torques alone would.
     weights = np.ones(model.nv)
@@ -127,8 +124,30 @@ def identify_payload(
     return Payload(body, mass, centre, half_masses, by_joint)
 
 
-def _rows(model: Any, dynamics: MujocoInverseDynamics, rollouts: Rollouts) -> Array:
-    """Returns filtered Y, columns of constant torques, and τ, ``(N, nv, P + nv + 1)``."""
+def load_robot(robot: str | PathLike[str]) -> Any:
+    """Returns the ``mujoco.MjModel`` of a robot whose joints are hinges and slides.
+
+    Raises:
+        ModelError: The file is not such a robot.
+    """
+    with quiet():  # Meshes are not needed.
+        model = load_mjcf(robot)
+    if model.nq != model.nv:
+        raise ModelError(f"{robot} has free or ball joints; only hinges and slides are possible.")
+    return model
+
+
+def torque_rows(model: Any, dynamics: MujocoInverseDynamics, rollouts: Rollouts) -> Array:
+    """Returns filtered Y, columns of constant torques, and τ, ``(N, nv, P + nv + 1)``.
+
+    Args:
+        model: The ``mujoco.MjModel``.
+        dynamics: Its inverse dynamics.
+        rollouts: Rollouts with every joint's position and every command.
+
+    Raises:
+        DataError: A joint or a command was not recorded, or the rollouts are too short.
+    """
     joints, commands = element_names(model, "joint"), actuator_names(model)
     places = _places("channels", rollouts.channel_names, joints)
     inputs = _places("actions", rollouts.action_names, commands)
@@ -161,7 +180,7 @@ def _places(kind: str, present: tuple[str, ...], wanted: list[str]) -> list[int]
     missing = [name for name in wanted if name not in present]
     if missing:
         raise DataError(
-            f"A payload needs every joint and command of the robot, but the recording has no "
+            f"This needs every joint and command of the robot, but the recording has no "
             f"{kind} {', '.join(missing)}; rename signals with a mapping."
         )
     return [present.index(name) for name in wanted]
@@ -176,14 +195,26 @@ def _solve(
     below = np.concatenate((full[..., :-1], full[..., columns]), axis=-1)
     matrix = np.concatenate((above, below))
     torques = np.concatenate((empty[..., -1], full[..., -1]))
+    solution = least_squares(matrix, torques, weights)
+    errors = torques - matrix @ solution
+    return solution[-len(INERTIAL) :], errors[: len(empty)], errors[len(empty) :]
+
+
+def least_squares(matrix: Array, torques: Array, weights: Array) -> Array:
+    """Returns the weighted least-squares solution of Y π = τ, ``(P,)``.
+
+    Combinations of parameters that the motion does not determine stay zero; they change no torque.
+
+    Args:
+        matrix: Y, ``(N, nv, P)``.
+        torques: τ, ``(N, nv)``.
+        weights: Weight of each joint, ``(nv,)``.
+    """
     scaled = (matrix * weights[:, None]).reshape(-1, matrix.shape[-1])
     lengths = np.linalg.norm(scaled, axis=0)
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     target = (torques * weights).reshape(-1)
-    # Combinations that the motion does not determine stay zero; they change no torque.
-    solution = np.linalg.lstsq(scaled / lengths, target, rcond=SINGULAR)[0] / lengths
-    errors = torques - matrix @ solution
-    return solution[-len(INERTIAL) :], errors[: len(empty)], errors[len(empty) :]
+    return np.linalg.lstsq(scaled / lengths, target, rcond=SINGULAR)[0] / lengths
 
 
 def _check_mass(full: Array, columns: slice, body: str) -> None:
