@@ -12,7 +12,7 @@ the closest fit z + δ to a part P follows, to first order, without another sear
 
 with the share ρ of independent measurements. Each model is simulated once at its z + δ, and the
 models' evidence is compared along the part. One step can be wrong where the motion is sensitive or
-sticks. So "not found" counts only if fits of the part confirm it.
+sticks. So fits of the part must confirm a result that is not certain, and every "not found".
 """
 
 import math
@@ -144,7 +144,7 @@ class _Compared:
         if own not in models or "" not in models:
             return None
         found = self._judged(part, models)
-        if found.is_found:
+        if found.is_found and found.probability >= REPEATABILITY.certain_probability:
             return found
         asked = (own, "", found.instead) if found.instead else (own, "")
         return self._judged(part, {name: _refitted(models[name]) for name in asked})

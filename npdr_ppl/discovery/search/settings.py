@@ -223,15 +223,18 @@ class RepeatabilitySettings:
             half.
         false_alarm_rate: Upper bound of the probability that a real effect is reported as not
             found again, if its law is right.
+        certain_probability: Probability of an effect in a part, after one Gauss-Newton step, from
+            which fits of the part need not confirm it.
     """
 
     fewest_segments: int = 8
     false_alarm_rate: float = 1e-3
+    certain_probability: float = 0.99
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 2, 1000, "fewest_segments")
-        check_range(self, 0.0, 1.0, "false_alarm_rate")
+        check_range(self, 0.0, 1.0, "false_alarm_rate", "certain_probability")
 
 
 BASE_FIT = BaseFitSettings()
