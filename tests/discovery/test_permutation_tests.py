@@ -53,6 +53,24 @@ class WhiteNoise:
     projected = whitened
 
 
+def test_scores_are_those_of_the_definition():
+    """Blocks of two segments, each weighted by its own spread; candidates of two strengths."""
+    generator = torch.Generator().manual_seed(0)
+    residual = torch.randn(60, 20, generator=generator).double()
+    changes = torch.randn(60, 20, 3, 2, generator=generator).double()
+    found = LargestStatistic(WhiteNoise(residual), seed=0, draws=10)
+    weights = (changes * found._spread[..., None]).unflatten(0, (30, 2)).flatten(1, 2)
+    signals = (changes / found._spread[..., None]).unflatten(0, (30, 2)).flatten(1, 2)
+    signals = signals / signals.square().sum((0, 1)).sqrt()
+    wanted = torch.einsum("bnpk,cn->pbck", weights, found._standard)
+    scale = (wanted.square().sum((1, 2)) / 30).sqrt()
+    scores, expected = found._scores(changes, found._standard)
+    torch.testing.assert_close(scores, wanted / scale[:, None, None])
+    torch.testing.assert_close(
+        expected, torch.einsum("bnpk,cnpl->pbckl", weights / scale, signals)
+    )
+
+
 def test_an_effect_in_only_one_segment_is_detected():
     """A permutation that could leave a segment its own residuals would not detect it."""
     generator = torch.Generator().manual_seed(0)

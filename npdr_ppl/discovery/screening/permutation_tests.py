@@ -176,20 +176,7 @@ class LargestStatistic:
             standard: Standardised residuals of each block in the same coordinates.
         """
         size = changes.shape[-1]
-        weights, signals = (
-            self._joined(by_segment)
-            for by_segment in (
-                changes * self._spread[..., None],
-                changes / self._spread[..., None],
-            )
-        )
-        # Score of block b with the residuals of block c, (P, b, c, k), standardised.
-        scores = torch.einsum("bnpk,cn->pbck", weights, standard)
-        scale = (scores.square().sum((1, 2)) / self._blocks).clamp_min(1e-300).sqrt()
-        scores, weights = scores / scale[:, None, None], weights / scale
-        # Score of block b with the change of each strength in block c, (P, b, c, k, strength).
-        signals = signals / signals.square().sum((0, 1)).clamp_min(1e-300).sqrt()
-        expected = torch.einsum("bnpk,cnpl->pbckl", weights, signals)
+        scores, expected = self._scores(changes, standard)
         covariance = torch.einsum("pbci,pbcj->pij", scores, scores) / self._blocks
         towards = torch.einsum("pbckl,pbek->pcel", expected, scores)
         permuted = self._permuted(torch.cat((scores, towards), dim=-1))
@@ -206,6 +193,39 @@ class LargestStatistic:
         taken = ((both @ (gram.mT @ gram)) * both).sum(-1) / self._blocks
         left = (1.0 - taken / statistic.clamp_min(1e-300)).clamp_min(1e-6)
         return statistic / left
+
+    def _scores(self, changes: Tensor, standard: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns what each block's changes explain of the residuals and changes of another one.
+
+        Within a block, each segment is weighted by its own spread.
+
+        Args:
+            changes: See :meth:`_statistics`.
+            standard: See :meth:`_statistics`.
+
+        Returns:
+            Score of block b with the residuals of block c, ``(P, b, c, k)``, standardised; and
+            with the change of each strength in block c, ``(P, b, c, k, strength)``.
+        """
+        blocks, size = self._blocks, changes.shape[-1]
+        # One copy in the order of the products: (segment of the block, P, b · k, N).
+        by_place = changes.unflatten(0, (blocks, -1)).permute(1, 3, 0, 4, 2)
+        by_place = by_place.reshape(*by_place.shape[:2], blocks * size, -1)
+        residual = standard.unflatten(-1, (len(by_place), -1)).permute(1, 2, 0)  # (j, N, c)
+        spread = self._spread.reshape(blocks, -1).mT.repeat_interleave(size, 1)  # (j, b · k)
+        own = (by_place.flatten(1, 2) @ residual).unflatten(1, (-1, blocks * size))
+        own = (spread[:, None, :, None] * own).sum(0)
+        scores = own.unflatten(1, (blocks, size)).transpose(2, 3)
+        matrices = by_place.flatten(0, 1)  # products of more dimensions would copy the transpose
+        products = (matrices @ matrices.mT).unflatten(0, by_place.shape[:2])  # (j, P, b k, c k)
+        ratios = spread[:, None, :, None] / spread[:, None, None]
+        expected = (ratios * products).sum(0).unflatten(2, (blocks, size))
+        expected = expected.unflatten(1, (blocks, size)).transpose(2, 3)
+        squares = products.diagonal(dim1=-2, dim2=-1) / spread.square()[:, None]
+        length = squares.sum(0).unflatten(1, (blocks, size)).sum(1).clamp_min(1e-300).sqrt()
+        scale = (scores.square().sum((1, 2)) / blocks).clamp_min(1e-300).sqrt()
+        expected = expected / scale[:, None, None, :, None] / length[:, None, None, None]
+        return scores / scale[:, None, None], expected
 
     def _permuted(self, table: Tensor) -> Tensor:
         """Returns a table's sums in every permutation, ``(P, b, c, Q)`` to ``(P, draws, Q)``."""
