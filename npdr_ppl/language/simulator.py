@@ -1,6 +1,7 @@
 """The protocol of a simulator: anything that maps parameters and inputs to a trajectory."""
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, Self
@@ -125,11 +126,15 @@ class Simulator(ABC):
         """Returns a copy with smaller integration errors; ``None`` if there is none."""
         return None
 
-    def with_coarser_steps(self) -> Self | None:
+    def with_coarser_steps(self, num_simulations: float = math.inf) -> Self | None:
         """Returns a copy that costs much less, from which finer steps differ almost constantly.
 
         Differences between simulations of similar parameters are then almost the same in both.
-        ``None`` if there is no such copy.
+        ``None`` if there is no such copy, or if it saves nothing.
+
+        Args:
+            num_simulations: How many simulations of a segment it would be used for. One more of
+                every segment with each of both steps tells what the coarser ones miss.
         """
         return None
 

@@ -68,7 +68,8 @@ class SegmentLikelihood:
         """The model in coarser steps, if the likelihood is the same with them around the fit.
 
         It is compared at two standard deviations along the direction that the recording determines
-        least, and along the one that it determines best.
+        least, and along the one that it determines best. Along a curved ridge, these points can be
+        far from it: the less likely they are, the more it may err there.
         """
         model = self.segments.in_coarser_steps(self.fit.z, self.fit.offsets)
         if model is self.segments:
@@ -76,13 +77,17 @@ class SegmentLikelihood:
         eye = torch.eye(len(self.fit.z), dtype=torch.float64)
         values, vectors = torch.linalg.eigh(self.information() + eye)
         ends = 2.0 * (vectors / values.sqrt()).mT[[0, -1]]
-        z = torch.cat((self.fit.z + ends, self.fit.z - ends))
+        z = torch.cat((self.fit.z[None], self.fit.z + ends, self.fit.z - ends))
         coarser, own = (
-            torch.cat([self._squares(part).sum(-1) for part in self._residuals_of(each, z)])
+            0.5
+            * self.share
+            / self.variance
+            * torch.cat([self._squares(part).sum(-1) for part in self._residuals_of(each, z)])
             for each in (model, self.segments)
         )
-        error = 0.5 * self.share / self.variance * (coarser - own).abs().max()
-        return model if error < LINEARISATION.largest_step_error else self.segments
+        allowed = LINEARISATION.largest_step_error * (0.5 * (own - own[0])).clamp_min(1.0)
+        is_alike = (coarser - own).abs() < allowed
+        return model if bool(is_alike.all()) else self.segments
 
     @cached_property
     def misfit(self) -> float:

@@ -8,6 +8,7 @@ states. The simulator stays a black box.
 """
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property, partial
@@ -141,7 +142,9 @@ class SegmentModel:
         part._start_from(None if self.starts is None else self.starts.segments(index))
         return part
 
-    def in_coarser_steps(self, z: Tensor, offsets: Tensor) -> "SegmentModel":
+    def in_coarser_steps(
+        self, z: Tensor, offsets: Tensor, num_draws: float = math.inf
+    ) -> "SegmentModel":
         """Returns a cheaper model with the same residuals at a point, and similar ones around it.
 
         It takes the simulator's coarser steps. What they miss at the point is taken from the
@@ -150,16 +153,20 @@ class SegmentModel:
         Args:
             z: Parameters, ``(d,)``.
             offsets: Offsets of the initial states, ``(S, m)``.
+            num_draws: Number of simulations of the whole recording that it is meant for.
 
         Returns:
-            This model if there are no coarser steps, or if simulations at the point fail.
+            This model if there are no coarser steps, if they save nothing, or if they are
+            unstable: simulations at the point fail, or miss more than the recording's size.
         """
-        if self.simulator.with_coarser_steps() is None:
+        num_simulations = num_draws * self.inputs.num_segments
+        if self.simulator.with_coarser_steps(num_simulations) is None:
             return self
         coarser = self.with_model(with_coarser_steps(self.model))
         here = z[None], offsets[None]
         missed = (self.simulate(*here) - coarser.simulate(*here))[0]
-        if not bool(missed.isfinite().all()):
+        largest = (self.observed * self.is_measured).abs().amax((0, 1))
+        if not bool((self.root_mean_square(missed) <= largest).all()):
             return self
         coarser.observed = self.observed - missed
         if "_without_influence" in self.__dict__:
@@ -385,7 +392,8 @@ class SegmentModel:
         It is :meth:`in_coarser_steps`, or this model if that cannot be linearised. Residuals of
         the linearisation are this model's own; see :meth:`linearise`.
         """
-        coarser = self.in_coarser_steps(z, offsets)
+        num_draws = (1 if is_rough else 2) * (len(z) + self.num_offsets)
+        coarser = self.in_coarser_steps(z, offsets, num_draws)
         if coarser is not self:
             found = coarser._linearised(z, offsets, scale, is_rough=is_rough)
             self.__dict__["_without_influence"] = coarser._without_influence

@@ -52,7 +52,7 @@ class LinearisationSettings:
             in the channel's unit.
         largest_step_error: Error of a log likelihood in corrected coarser steps, two standard
             deviations from the fit, from which a posterior is drawn in the model's own steps. The
-            log density itself falls by two there.
+            log density itself falls by two there; where it falls by more, proportionally more.
     """
 
     parameter_step: float = 1e-2

@@ -7,9 +7,12 @@ import pytest
 import torch
 
 from npdr_ppl.engines.mujoco import MujocoSimulator
+from npdr_ppl.engines.ode import simulator as simulator_of_equations
+from npdr_ppl.engines.ode.simulator import ODESimulator
 from npdr_ppl.language.handlers import with_finer_steps
 from npdr_ppl.language.sites import simulate
 from npdr_ppl.models.effects import CoulombFriction
+from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_fit import fit_segments
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
@@ -34,14 +37,40 @@ def model(inputs):
     return simulate("motion", SIMULATOR, {"mass": mass, "damping": damping}, inputs)
 
 
-@pytest.fixture(scope="module")
-def segments():
+EQUATIONS = Pendulum(integrator="rk4")
+
+
+def equations(inputs):
+    mass = pyro.sample("mass", dist.Uniform(0.5, 1.7))
+    damping = pyro.sample("damping", dist.HalfNormal(0.1))
+    return simulate("motion", EQUATIONS, {"mass": mass, "damping": damping}, inputs)
+
+
+def stiff(inputs):
+    """Damped by 2.3 per step; midpoint steps are unstable from 2 on, of order four from 2.8 on."""
+    mass = pyro.sample("mass", dist.Uniform(0.5, 1.7))
+    damping = pyro.sample("damping", dist.Uniform(38.0, 39.0))
+    given = {"mass": 1.0 + 0.0 * mass, "damping": damping}
+    return simulate("motion", EQUATIONS, given, inputs)
+
+
+PROGRAMS = {"mujoco": with_finer_steps(model), "equations": equations}
+
+
+@pytest.fixture(autouse=True)
+def whatever_the_number_of_simulations(monkeypatch):
+    monkeypatch.setattr(simulator_of_equations, "COARSER_SIMULATIONS", 0)
+
+
+@pytest.fixture(scope="module", params=PROGRAMS)
+def segments(request):
     recording = swinging(rollouts=2, steps=120)
-    return SegmentModel(with_finer_steps(model), recording, DataOptions(None, 40))
+    return SegmentModel(PROGRAMS[request.param], recording, DataOptions(None, 40))
 
 
 def in_fine_steps_only(monkeypatch):
-    monkeypatch.setattr(MujocoSimulator, "with_coarser_steps", lambda self: None)
+    for simulator in (MujocoSimulator, ODESimulator):
+        monkeypatch.setattr(simulator, "with_coarser_steps", lambda self, num=0: None)
 
 
 def test_finer_steps_lead_back_to_the_files_own():
@@ -54,6 +83,24 @@ def test_finer_steps_lead_back_to_the_files_own():
     assert coarser.with_coarser_steps() is None
 
 
+def test_steps_of_order_four_lead_to_midpoint_steps_where_these_save_time(monkeypatch):
+    friction = CoulombFriction("hinge")
+    coarser = EQUATIONS.with_effects(friction).with_coarser_steps()
+    assert (coarser.integrator.name, coarser.effects) == ("midpoint", (friction,))
+    assert coarser.with_coarser_steps() is None
+    monkeypatch.setattr(simulator_of_equations, "COARSER_SIMULATIONS", 100)
+    assert EQUATIONS.with_coarser_steps(99) is None
+    assert EQUATIONS.with_coarser_steps(100) is not None
+
+
+def test_unstable_coarser_steps_are_not_used(segments):
+    z = torch.zeros(2, dtype=torch.float64)
+    overdamped = segments.with_model(stiff)
+    offsets = overdamped.no_offsets
+    assert bool(overdamped.scale_of(z, offsets).isfinite().all())
+    assert overdamped.in_coarser_steps(z, offsets) is overdamped
+
+
 def test_residuals_at_the_point_are_those_of_the_fine_steps(segments, monkeypatch):
     z = torch.tensor([0.2, -0.5], dtype=torch.float64)
     offsets = 0.3 * torch.ones_like(segments.no_offsets)
@@ -61,7 +108,7 @@ def test_residuals_at_the_point_are_those_of_the_fine_steps(segments, monkeypatc
     near = segments.in_coarser_steps(z, offsets)
     here = segments.residuals(z[None], offsets[None], scale)
     torch.testing.assert_close(near.residuals(z[None], offsets[None], scale), here)
-    assert near.simulator.num_substeps(0.02) == 1
+    assert near.simulator.with_coarser_steps() is None
     in_fine_steps_only(monkeypatch)
     assert segments.in_coarser_steps(z, offsets) is segments
 

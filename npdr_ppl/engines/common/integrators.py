@@ -82,16 +82,18 @@ def _rk4(
     a3 = acceleration(_advance(q, v2, 0.5 * h), v3)
     v4 = _advance(v, a3, h)
     a4 = acceleration(_advance(q, v3, h), v4)
-    sixth = h / 6.0
-    positions = tuple(
-        x + sixth * (r1 + 2.0 * (r2 + r3) + r4)
-        for x, r1, r2, r3, r4 in zip(q, v, v2, v3, v4, strict=True)
+    return _weighted(q, v, v2, v3, v4, h), _weighted(v, a, a2, a3, a4, h)
+
+
+def _weighted(
+    x: Components, r1: Components, r2: Components, r3: Components, r4: Components, h: float
+) -> Components:
+    """Returns x + h/6 (r1 + 2 r2 + 2 r3 + r4)."""
+    # Four operations; see _advance.
+    return tuple(
+        torch.add(start, torch.add(a + d, b + c, alpha=2.0), alpha=h / 6.0)
+        for start, a, b, c, d in zip(x, r1, r2, r3, r4, strict=True)
     )
-    velocities = tuple(
-        x + sixth * (r1 + 2.0 * (r2 + r3) + r4)
-        for x, r1, r2, r3, r4 in zip(v, a, a2, a3, a4, strict=True)
-    )
-    return positions, velocities
 
 
 INTEGRATORS: dict[str, Integrator] = {

@@ -2,6 +2,7 @@
 
 import copy
 import importlib
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -122,7 +123,7 @@ class MujocoSimulator(MujocoMechanism):
             changed.model.opt.integrator = rk4
         return changed
 
-    def with_coarser_steps(self) -> Self | None:
+    def with_coarser_steps(self, num_simulations: float = math.inf) -> Self | None:
         """Returns a copy with the file's own steps; ``None`` if these are its steps."""
         if self.unrefined is None:
             return None

@@ -1,6 +1,7 @@
 """Batched simulation of mechanical systems whose accelerations are written in torch."""
 
 import copy
+import math
 from collections.abc import Mapping
 from typing import Self
 
@@ -24,6 +25,16 @@ FINER = "midpoint", "rk4"
 included models, the error of the first is a hundredth of that of an Euler step, which is mostly
 negligible, and it takes half the time of the second."""
 
+COARSER = "midpoint"
+"""Integrator of :meth:`ODESimulator.with_coarser_steps`. On the Furuta pendulum of
+``benchmarks/discovery.py`` (seed 0, steps of 2 ms), its derivatives by the parameters differ from
+those of order four by less than 1e-3, and those of Euler steps by up to 3e-2."""
+
+COARSER_SIMULATIONS = 10_000
+"""Number of simulations of a segment from which on midpoint steps save time. Each step of a batch
+costs about as much as 2000 simulations in it, measured with the same pendulum. Two further batches
+are needed to find what midpoint steps miss."""
+
 
 class ODESimulator(MechanicalSystem):
     """Simulates the system that a subclass declares; see :class:`MechanicalSystem`.
@@ -40,6 +51,15 @@ class ODESimulator(MechanicalSystem):
                 changed.integrator = finer
                 return changed
         return None
+
+    def with_coarser_steps(self, num_simulations: float = math.inf) -> Self | None:
+        """Returns a copy with midpoint steps in place of Runge-Kutta steps of order four."""
+        coarser = integrator(COARSER)
+        if self.integrator.order <= coarser.order or num_simulations < COARSER_SIMULATIONS:
+            return None
+        changed = copy.copy(self)
+        changed.integrator = coarser
+        return changed
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
         """Replays the inputs' actions; see :meth:`Simulator.simulate`."""
