@@ -275,8 +275,10 @@ class RidgeCoordinates:
         w = torch.cat((weak, self.bend(weak)), dim=-1)
         best, value = w.clone(), torch.full((len(w),), -torch.inf, dtype=torch.float64)
         predicted, prior = value, likelihood.segments.prior
+        is_moving = torch.ones(len(w), dtype=torch.bool)
         for step in range(steps + 1):
             z, inside = straight.to_reference(w)
+            inside &= is_moving
             # Points outside the support cannot be simulated and have no score.
             score, density = torch.full_like(w, torch.nan), torch.full_like(value, -torch.inf)
             if bool(inside.any()):
@@ -291,8 +293,12 @@ class RidgeCoordinates:
             best[is_better], value[is_better] = w[is_better], density[is_better]
             # The prior's gradient is approximated by that of a normal one of the same variance.
             change = ((score @ by_w)[:, k:] - w[:, k:]) / stiff
+            change = change.nan_to_num(0.0).clamp(-RIDGE.longest_step, RIDGE.longest_step)
+            is_moving = (change * stiff.sqrt()).norm(dim=-1) > RIDGE.shortest_step
+            if not bool(is_moving.any()):
+                break
             w = w.clone()
-            w[:, k:] += change.nan_to_num(0.0).clamp(-RIDGE.longest_step, RIDGE.longest_step)
+            w[is_moving, k:] += change[is_moving]
         return best, predicted, value
 
     def _bent_through(self, w: Tensor, log_density: Tensor) -> "RidgeCoordinates":

@@ -244,6 +244,8 @@ class RidgeSettings:
             the weights are tempered.
         longest_step: Greatest chord step along a stiff direction, in standard deviations of the
             prior.
+        shortest_step: Chord steps to a point end with one that is shorter, in standard deviations
+            of the posterior. It would raise the log density by half its square.
         fitted_share: Share of the points to which the polynomial is fitted, those closest to the
             recording. Chord steps need not converge everywhere.
     """
@@ -264,6 +266,7 @@ class RidgeSettings:
     growth: float = 1.3
     even_share: float = 0.1
     longest_step: float = 1.0
+    shortest_step: float = 0.1
     fitted_share: float = 0.75
 
     def __post_init__(self) -> None:
@@ -273,7 +276,8 @@ class RidgeSettings:
         check_range(self, 1, 100, "first_chord_steps", "chord_steps", "most_rounds")
         check_range(self, 1, 20, "most_degree", "points_per_coefficient")
         check_range(self, 0.0, 1.0, "least_found_share", "even_share", "fitted_share")
-        check_range(self, 0.0, 100.0, "straight_gain", "close_gain", "reach", "longest_step")
+        check_range(self, 0.0, 100.0, "straight_gain", "close_gain", "reach")
+        check_range(self, 0.0, 100.0, "longest_step", "shortest_step")
         check_range(self, 1.0, 100.0, "growth")
 
 
