@@ -27,6 +27,9 @@ from npdr_ppl.preparation.solving import solve_or_zero
 
 __all__ = ["SegmentFit", "fit_segments"]
 
+_Place = tuple[SegmentModel, Linearisation]
+"""A model that is like the fitted one near a point, and its linearisation there."""
+
 
 @dataclass(frozen=True)
 class SegmentFit:
@@ -78,24 +81,43 @@ def fit_segments(
     z = z.double()
     if offsets is None:
         offsets = segments.no_offsets
-    present = segments.scale_of(z, offsets)
-    if not bool(present.isfinite().all()):
-        raise DataError("The simulation fails at the parameters that the fit begins with.")
     held = torch.zeros(z.shape, dtype=torch.bool) if held is None else held
+    unit = torch.ones(len(segments.channel_names), dtype=torch.float64)
+    begun = unit if scale is None else scale.double()
+    model, now = segments.corrected(z, offsets, begun, is_rough=scale is None)
+    if not bool(now.residual.isfinite().all()):
+        raise DataError("The simulation fails at the parameters that the fit begins with.")
     if scale is not None:
-        known = scale.double()
-        z, offsets, _ = _steps(segments, z, offsets, known, held, max_steps, is_rough=False)
-        return SegmentFit(z, offsets, known)
-    z, offsets, left = _steps(segments, z, offsets, present, held, max_steps, is_rough=True)
+        first = model, now
+        z, offsets, _ = _steps(
+            segments, z, offsets, begun, held, max_steps, is_rough=False, first=first
+        )
+        return SegmentFit(z, offsets, begun)
+    present = _scale(segments, _by_channel(now.residual, unit), unit)
+    first = model, now.rescaled(unit / present)
+    z, offsets, left = _steps(
+        segments, z, offsets, present, held, max_steps, is_rough=True, first=first
+    )
     if not is_rough:
-        share = _share(segments, z, offsets, left)
+        first = segments.corrected(z, offsets, left)
+        share = segments.effective_share(first[1].residual)
 
-        def precise(z: Tensor, offsets: Tensor, scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        def precise(
+            z: Tensor, offsets: Tensor, scale: Tensor, first: _Place | None = None
+        ) -> tuple[Tensor, Tensor, Tensor]:
             return _steps(
-                segments, z, offsets, scale, held, max_steps, is_rough=False, share=share
+                segments,
+                z,
+                offsets,
+                scale,
+                held,
+                max_steps,
+                is_rough=False,
+                share=share,
+                first=first,
             )
 
-        z, offsets, left = precise(z, offsets, left)
+        z, offsets, left = precise(z, offsets, left, first)
         unstuck = _unstuck_offsets(segments, z, offsets, left)
         if unstuck is not None:
             z, offsets, left = precise(z, unstuck, left)
@@ -105,18 +127,6 @@ def fit_segments(
                 break
             z, offsets, left = precise(*better, left)
     return SegmentFit(z, offsets, left)
-
-
-def _share(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) -> float:
-    """Returns the effective number of independent measurements as a share of all.
-
-    Args:
-        segments: The model and the recording.
-        z: Parameters, ``(d,)``.
-        offsets: Offsets of the initial states, ``(S, m)``.
-        scale: Standard deviation of each channel's residuals, ``(C,)``.
-    """
-    return segments.effective_share(segments.residuals(z[None], offsets[None], scale)[0])
 
 
 def _unstuck_offsets(
@@ -218,6 +228,7 @@ def _steps(
     *,
     is_rough: bool,
     share: float = 1.0,
+    first: _Place | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Takes steps until they gain little.
 
@@ -243,6 +254,7 @@ def _steps(
         is_rough: Whether steps are rough.
         share: Effective number of measurements as a share of all; the fewer, the less log evidence
             is in a gain.
+        first: :meth:`SegmentModel.corrected` at the first point, if it is known.
 
     Returns:
         Parameters, offsets and the scale of the residuals.
@@ -260,11 +272,11 @@ def _steps(
         if now is None:
             if num_linearised == max_steps:
                 break
-            model, now = segments.corrected(z, offsets, scale, is_rough=is_rough)
+            model, now = first or segments.corrected(z, offsets, scale, is_rough=is_rough)
+            first = None
             if model is not segments:
                 # The squares of the last step had an earlier correction.
-                square = now.residual.square().unflatten(-1, (-1, len(scale)))
-                present_scale = _scale(segments, square.sum((0, 1)), scale)
+                present_scale = _scale(segments, _by_channel(now.residual, scale), scale)
             now = replace(now, by_parameters=now.by_parameters * ~held)
             num_updates, num_linearised = 0, num_linearised + 1
         if not now.is_finite:
@@ -337,6 +349,11 @@ def _steps(
         if num_updates > most_updates:
             now = None
     return z, offsets, present_scale
+
+
+def _by_channel(residual: Tensor, scale: Tensor) -> Tensor:
+    """Returns the sums of squares of residuals ``(S, N)`` by channel, ``(C,)``."""
+    return residual.square().unflatten(-1, (-1, len(scale))).sum((0, 1))
 
 
 def _scale(segments: SegmentModel, square: Tensor, scale: Tensor) -> Tensor:

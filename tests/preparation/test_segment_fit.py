@@ -143,9 +143,10 @@ def test_most_fits_leap_out_of_the_dents_that_play_leaves_in_the_misfit(monkeypa
 
 
 def test_where_the_simulation_fails_is_said(segments, monkeypatch):
-    monkeypatch.setattr(
-        segments, "simulate", lambda z, offsets: torch.nan * segments.observed[None]
-    )
+    def fails(z, offsets):
+        return torch.nan * segments.observed.expand(len(z), -1, -1, -1)
+
+    monkeypatch.setattr(segments, "simulate", fails)
     with pytest.raises(DataError, match="simulation fails at the parameters"):
         fit_segments(segments, START)
 
