@@ -24,15 +24,18 @@ __all__ = ["Furuta", "SwingUpReward", "furuta", "furuta_paper", "initial_states"
 class FurutaConstants(NamedTuple):
     """Combinations of the parameters in the equations of motion, see :class:`Furuta`.
 
-    Those of the pole's equation are divided by c₃. ``lateral`` holds the tilted gravity's terms:
-    (M_p L_r g_x, M_p L_r g_y, M_p L_p g_x/2, M_p L_p g_y/2, the last two also over c₃).
+    Those of the pole's equation are divided by c₃. The arm's inertia once α̈ is eliminated is
+    c₀ + c₁ sin²α − c₂²/c₃ cos²α = ``greatest_inertia`` − ``inertia_drop`` cos²α. ``lateral`` holds
+    the tilted gravity's terms: (M_p L_r g_x, M_p L_r g_y, M_p L_p g_x/2, M_p L_p g_y/2, the last
+    two also over c₃).
     """
 
     motor_gain: Tensor
     arm_drag: Tensor
-    c0: Tensor
-    c1: Tensor
+    twice_c1: Tensor
     c2: Tensor
+    greatest_inertia: Tensor
+    inertia_drop: Tensor
     coupling: Tensor
     half_centrifugal: Tensor
     pole_drag: Tensor
@@ -121,7 +124,9 @@ class Furuta(ODESimulator):
             c1 = c1 + extra * p["pole_length"]
             # A factor that is exactly 1 without payload.
             inverse_c3 = inverse_c3 / (1.0 + extra * p["pole_length"] * inverse_c3)
+        c0 = (p["arm_mass"] / 12.0 + end_mass) * arm_length * arm_length
         c2 = moment * arm_length
+        coupling = c2 * inverse_c3
         motor_gain = p["motor_constant"] / p["motor_resistance"]
         x, y, z = environment["gravity"]
         lateral = None
@@ -133,10 +138,11 @@ class Furuta(ODESimulator):
         return FurutaConstants(
             motor_gain=motor_gain,
             arm_drag=motor_gain * p["motor_constant"] + p["arm_damping"],
-            c0=(p["arm_mass"] / 12.0 + end_mass) * arm_length * arm_length,
-            c1=c1,
+            twice_c1=2.0 * c1,
             c2=c2,
-            coupling=c2 * inverse_c3,
+            greatest_inertia=c0 + c1,
+            inertia_drop=c1 + c2 * coupling,
+            coupling=coupling,
             half_centrifugal=c1 * inverse_c3,
             pole_drag=p["pole_damping"] * inverse_c3,
             pole_gravity=moment * z * inverse_c3,
@@ -152,38 +158,45 @@ class Furuta(ODESimulator):
         forces: Forces,
         constants: FurutaConstants,
     ) -> Components:
-        """Returns (θ̈, α̈). The pole's equation is divided by c₃ and α̈ is eliminated."""
+        """Returns (θ̈, α̈). The pole's equation is divided by c₃ and α̈ is eliminated.
+
+        Products and sums are fused, because the number of operations limits eager simulations.
+        """
         k = constants
         theta, alpha = positions
         theta_rate, alpha_rate = velocities
         sin, cos = torch.sin(alpha), torch.cos(alpha)
-        arm_torque = k.motor_gain * actions[0] - k.arm_drag * theta_rate + forces[0]
-        pole = k.pole_gravity * sin - k.pole_drag * alpha_rate + forces[1] * k.inverse_c3
+        arm = torch.addcmul(k.motor_gain * actions[0], k.arm_drag, theta_rate, value=-1.0)
+        pole = torch.addcmul(k.pole_gravity * sin, k.pole_drag, alpha_rate, value=-1.0)
+        # Without effects, forces are the number zero.
+        if isinstance(forces[0], Tensor) or forces[0] != 0.0:
+            arm = arm + forces[0]
+        if isinstance(forces[1], Tensor) or forces[1] != 0.0:
+            pole = pole + forces[1] * k.inverse_c3
         if k.lateral is not None:
             arm_x, arm_y, pole_x, pole_y, pole_x_c3, pole_y_c3 = k.lateral
             sin_theta, cos_theta = torch.sin(theta), torch.cos(theta)
-            arm_torque = arm_torque + (arm_y * cos_theta - arm_x * sin_theta)
-            arm_torque = arm_torque - sin * (pole_x * cos_theta + pole_y * sin_theta)
+            arm = arm + (arm_y * cos_theta - arm_x * sin_theta)
+            arm = arm - sin * (pole_x * cos_theta + pole_y * sin_theta)
             pole = pole + cos * (pole_y_c3 * cos_theta - pole_x_c3 * sin_theta)
-        spin = sin * theta_rate
-        pole = pole + k.half_centrifugal * cos * spin * theta_rate
-        centrifugal = k.c1 * cos * spin
-        arm = arm_torque - (2.0 * centrifugal * alpha_rate - k.c2 * sin * alpha_rate * alpha_rate)
-        pole_per_arm = k.coupling * cos
-        arm_per_pole = k.c2 * cos
-        inertia = k.c0 + k.c1 * sin * sin - arm_per_pole * pole_per_arm
-        arm_acceleration = (arm - arm_per_pole * pole) / inertia
-        return arm_acceleration, pole - pole_per_arm * arm_acceleration
+        spin = cos * sin * theta_rate
+        pole = torch.addcmul(pole, k.half_centrifugal * spin, theta_rate)
+        # c₂ sin α α̇² − c₁ sin 2α θ̇ α̇
+        per_rate = torch.addcmul(k.c2 * sin * alpha_rate, k.twice_c1, spin, value=-1.0)
+        arm = torch.addcmul(arm, per_rate, alpha_rate)
+        inertia = torch.addcmul(k.greatest_inertia, k.inertia_drop, cos * cos, value=-1.0)
+        arm_acceleration = torch.addcmul(arm, k.c2 * cos, pole, value=-1.0) / inertia
+        turned = torch.addcmul(pole, k.coupling * cos, arm_acceleration, value=-1.0)
+        return arm_acceleration, turned
 
     def inverse_inertia(
         self, positions: Components, velocities: Components, constants: FurutaConstants
     ) -> tuple[Components, ...]:
         """Returns the inverse of the mass matrix."""
         k = constants
-        sin, cos = torch.sin(positions[1]), torch.cos(positions[1])
+        cos = torch.cos(positions[1])
         pole_per_arm = k.coupling * cos
-        inertia = k.c0 + k.c1 * sin * sin - k.c2 * cos * pole_per_arm
-        arm = 1.0 / inertia
+        arm = 1.0 / (k.greatest_inertia - k.inertia_drop * cos * cos)
         cross = -pole_per_arm * arm
         return (arm, cross), (cross, k.inverse_c3 - pole_per_arm * cross)
 

@@ -163,7 +163,11 @@ class Stepper(EffectChain):
         if not self.force_effects:
             return dry
         smooth = self.applied_forces(positions, velocities, state, tables, before_step=before_step)
-        return tuple(d if f is None else d + f for d, f in zip(dry, smooth, strict=True))
+        # Without dry friction, d is the number zero, and adding it would be an operation more.
+        return tuple(
+            d if f is None else (d + f if isinstance(d, Tensor) else f)
+            for d, f in zip(dry, smooth, strict=True)
+        )
 
 
 def _shifted(values: tuple[Any, ...], moments: Moments) -> tuple[Any, ...]:
