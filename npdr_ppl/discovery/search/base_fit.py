@@ -1,8 +1,9 @@
 """The original model's fit to a recording: fit, compare, train and discover all begin with it.
 
-The search for the closest parameters and initial states begins at two points. Then the initial
-states are estimated again along the fitted motion, and the integration steps are refined if they
-are too coarse for the recording.
+The search for the closest parameters and initial states begins in the prior's middle, and, unless
+the misfit has one minimum only, also at the result of a search of the whole prior. Then the
+initial states are estimated again along the fitted motion, and the integration steps are refined
+if they are too coarse for the recording.
 """
 
 import math
@@ -20,6 +21,7 @@ from npdr_ppl.discovery.hypothesis import (
 from npdr_ppl.discovery.kept_fits import made_or_read
 from npdr_ppl.discovery.search.evidence import closest, weigh
 from npdr_ppl.discovery.search.settings import BASE_FIT
+from npdr_ppl.discovery.search.single_minimum import has_single_minimum
 from npdr_ppl.discovery.search.trials import Trials, refit
 from npdr_ppl.discovery.settings import HYPOTHESIS
 from npdr_ppl.errors import DataError
@@ -75,15 +77,20 @@ def fit_base(
     step = progress or (lambda fraction, status: None)
     begun: list[Hypothesis] = []
     failure: DataError | None = None
-    starts = _starts(segments, near, seed, progress)
     few = segments.along(part_of(segments, seed=seed))
-    for number, start in enumerate(starts, 1):
+
+    def begin(start: Mapping[str, Tensor]) -> None:
+        nonlocal failure
         # How many steps a fit takes is not known.
-        step(None, f"rough fit {number} of {len(starts)}")
+        step(None, f"rough fit {len(begun) + 1}")
         try:
             begun.append(fit_segment_model(few, start=start, is_rough=True))
         except DataError as error:
             failure = error
+
+    begin(near or {})
+    if not near and not (begun and has_single_minimum(few, seed=seed)):
+        begin(_searched(segments, seed, progress))
     finer_parameters = None
     if may_be_rough and begun:
         step(None, "compare with finer integration steps")
@@ -256,15 +263,8 @@ def in_finer_steps(
     return BaseFit(bases[0], current, is_coarse)
 
 
-def _starts(
-    segments: SegmentModel,
-    near: Mapping[str, Tensor] | None,
-    seed: int,
-    progress: Step | None,
-) -> list[Mapping[str, Tensor]]:
-    """Returns initial guesses: the prior's middle and a search's result, or known parameters."""
-    if near:
-        return [near]
+def _searched(segments: SegmentModel, seed: int, progress: Step | None) -> Mapping[str, Tensor]:
+    """Returns the parameters that a search of the whole prior finds."""
     iterations = PRIOR_SEARCH.iterations_before_steps
 
     def search() -> dict[str, Tensor]:
@@ -272,7 +272,7 @@ def _starts(
 
     z = made_or_read(search, segments, "search", iterations, seed)["z"]
     found = segments.prior.to_parameters(z[None])
-    return [{}, {name: value[0] for name, value in found.items()}]
+    return {name: value[0] for name, value in found.items()}
 
 
 def _in_finer_steps(segments: SegmentModel) -> SegmentModel | None:

@@ -38,18 +38,28 @@ class BaseFitSettings:
             previous one.
         least_gain: Least gain of such a refit in log density, a tenth of what makes one model ten
             times as likely as another.
+        num_linear_draws: Number of draws of the prior along which simulations must be nearly
+            linear, so that no better fit is searched for. If they are along 32 draws, they are
+            along more than nine tenths of the prior with a probability of 0.97.
+        largest_linear_error: Greatest error of a linear prediction along them, as a share of the
+            predicted change. In the recordings of ``benchmarks/sysid.py`` it is up to 0.19, on the
+            rigs of ``benchmarks/discovery.py`` 0.45 and more.
     """
 
     noticeable_change: float = 2.5
     coarse_probability: float = 0.9
     most_refits: int = 4
     least_gain: float = 0.23
+    num_linear_draws: int = 32
+    largest_linear_error: float = 0.25
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 0.0, 100.0, "noticeable_change", "least_gain")
         check_range(self, 0.5, 1.0, "coarse_probability")
         check_range(self, 1, 100, "most_refits")
+        check_range(self, 1, 10_000, "num_linear_draws")
+        check_range(self, 0.0, 0.5, "largest_linear_error")
 
 
 @dataclass(frozen=True)
