@@ -179,14 +179,13 @@ def overlay(
     steps = max(2, round(RESTART_SECONDS / rollouts.time_step))
     options = replace(options, segment_length=min(steps, max(rollouts.lengths)))
     nominal = torch.zeros_like(before.fit.z)
-    models = dict(
-        zip(MODELS, ((before, nominal), (before, before.fit.z), (after, after.fit.z)), strict=True)
-    )
     segments = SegmentModel(before.model, rollouts, options, is_complete=True)
-    series = {
-        name: _simulated(hypothesis, z, rollouts, options)
-        for name, (hypothesis, z) in models.items()
-    }
+    # Several parameters of a model take hardly longer than one.
+    made = [
+        *_simulated(before, torch.stack((nominal, before.fit.z)), rollouts, options),
+        *_simulated(after, after.fit.z[None], rollouts, options),
+    ]
+    series = dict(zip(MODELS, made, strict=True))
     measured = [s.double().numpy() for s in rollouts.series(segments.channel_names)]
     channels = segments.channel_names
     found = []
@@ -205,14 +204,21 @@ def overlay(
 
 def _simulated(
     hypothesis: Hypothesis, z: Tensor, rollouts: Rollouts, options: DataOptions
-) -> list[Array] | None:
-    """Returns the simulated series ``(T, C)`` of each rollout; ``None`` if the simulator fails."""
+) -> list[list[Array] | None]:
+    """Returns the simulated series ``(T, C)`` of each rollout for each parameters, ``(n, d)``.
+
+    ``None`` if the simulator fails.
+    """
     try:
         segments = SegmentModel(hypothesis.model, rollouts, options, is_complete=True)
-        made = segments.simulate(z[None], segments.no_offsets[None])[0].double()
+        made = segments.simulate(z, segments.no_offsets.expand(len(z), -1, -1)).double()
     except NpdrError:
-        return None
-    return [s.numpy() for s in stitch(made, segments.inputs, segments.channel_names)]
+        if len(z) == 1:
+            return [None]
+        return [_simulated(hypothesis, one[None], rollouts, options)[0] for one in z]
+    return [
+        [s.numpy() for s in stitch(one, segments.inputs, segments.channel_names)] for one in made
+    ]
 
 
 def _misfit(made: Array, measured: Array, channels: Sequence[str]) -> dict[str, float]:
