@@ -118,7 +118,7 @@ def measured(number: int, seconds: float) -> dict[str, Any]:
     rollouts = recorded(number, seconds)
     searcher = Searcher(model, rollouts, npdr.DiscoveryOptions(), seed=0)
     begun = time.process_time()
-    fitted = searcher.settled(searcher.fit_base())
+    fitted = searcher.settled(searcher.fit_base(may_be_rough=True))
     row: dict[str, Any] = {"joints": number, "fit_seconds": time.process_time() - begun}
     everything = candidate_effects(fitted.simulator)
     for name, effects in (("all", everything), ("fourth", everything[::4])):

@@ -189,7 +189,7 @@ def fit_closest(folder: Path) -> Fitted:
     begun = time.process_time()
     model = resolve_model(f"{folder / 'arm_model.py'}:model")
     searcher = Searcher(model, rollouts, DiscoveryOptions())
-    found = searcher.settled(searcher.fit_base())
+    found = searcher.settled(searcher.fit_base(may_be_rough=True))
     took = time.process_time() - begun
     return {name: float(value) for name, value in found.parameters.items()}, took
 
