@@ -71,6 +71,16 @@ class Hypothesis:
         self.__dict__["difference"] = difference
         _KEPT.add(self, "difference", difference.nbytes)
 
+    def keep_linearisation(self, linearisation: Linearisation) -> None:
+        """Sets :attr:`linearisation`, which is known, so that it is not simulated again."""
+        self.__dict__["_linearised"] = linearisation
+        _KEPT.add(self, "_linearised", linearisation.num_bytes)
+
+    @property
+    def known_linearisation(self) -> Linearisation | None:
+        """:attr:`linearisation` if it need not be computed."""
+        return vars(self).get("_linearised")
+
     @cached_property
     def _linearised(self) -> Linearisation:
         found = self.segments.linearise(self.fit.z, self.fit.offsets, self.fit.scale)
@@ -307,11 +317,20 @@ def fit_segment_model(
         if held and site.name in held:
             z[site.coordinates], stays[site.coordinates] = held[site.name], True
 
+    last: Linearisation | None = None
+
     def make() -> dict[str, Tensor]:
+        nonlocal last
         found = fit_segments(
             segments, z, offsets=offsets, held=stays, max_steps=max_steps, is_rough=is_rough
         )
+        last = found.linearisation
         return {"z": found.z, "offsets": found.offsets, "scale": found.scale}
 
     fit = made_or_read(make, segments, z, offsets, stays, max_steps, is_rough)
-    return Hypothesis(segments.model, effects, segments, SegmentFit(**fit))
+    made = Hypothesis(
+        segments.model, effects, segments, SegmentFit(fit["z"], fit["offsets"], fit["scale"])
+    )
+    if last is not None:
+        made.keep_linearisation(last)
+    return made

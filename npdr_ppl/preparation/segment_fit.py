@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.preparation.gauss_newton import possible_gain, step
 from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import SEGMENT_FIT
@@ -40,11 +41,14 @@ class SegmentFit:
         offsets: Offsets of the initial states, in standard deviations of the smoother's error,
             ``(S, m)``.
         scale: Root-mean-square residual per channel, in its unit, ``(C,)``.
+        linearisation: Residuals and derivatives there, whitened by the scale; ``None`` if the fit
+            ended without them.
     """
 
     z: Tensor
     offsets: Tensor
     scale: Tensor
+    linearisation: Linearisation | None = None
 
 
 def fit_segments(
@@ -89,13 +93,13 @@ def fit_segments(
         raise DataError("The simulation fails at the parameters that the fit begins with.")
     if scale is not None:
         first = model, now
-        z, offsets, _ = _steps(
+        z, offsets, _, _ = _steps(
             segments, z, offsets, begun, held, max_steps, is_rough=False, first=first
         )
         return SegmentFit(z, offsets, begun)
     present = _scale(segments, _by_channel(now.residual, unit), unit)
     first = model, now.rescaled(unit / present)
-    z, offsets, left = _steps(
+    z, offsets, left, last = _steps(
         segments, z, offsets, present, held, max_steps, is_rough=True, first=first
     )
     if not is_rough:
@@ -104,7 +108,7 @@ def fit_segments(
 
         def precise(
             z: Tensor, offsets: Tensor, scale: Tensor, first: _Place | None = None
-        ) -> tuple[Tensor, Tensor, Tensor]:
+        ) -> tuple[Tensor, Tensor, Tensor, Linearisation | None]:
             return _steps(
                 segments,
                 z,
@@ -117,16 +121,16 @@ def fit_segments(
                 first=first,
             )
 
-        z, offsets, left = precise(z, offsets, left, first)
+        z, offsets, left, last = precise(z, offsets, left, first)
         unstuck = _unstuck_offsets(segments, z, offsets, left)
         if unstuck is not None:
-            z, offsets, left = precise(z, unstuck, left)
+            z, offsets, left, last = precise(z, unstuck, left)
         for _ in range(SEGMENT_FIT.most_restarts):
             better = _restart(segments, z, offsets, left, held)
             if better is None:
                 break
-            z, offsets, left = precise(*better, left)
-    return SegmentFit(z, offsets, left)
+            z, offsets, left, last = precise(*better, left)
+    return SegmentFit(z, offsets, left, None if is_rough or bool(held.any()) else last)
 
 
 def _unstuck_offsets(
@@ -229,7 +233,7 @@ def _steps(
     is_rough: bool,
     share: float = 1.0,
     first: _Place | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Linearisation | None]:
     """Takes steps until they gain little.
 
     Where the simulator has coarser steps, each linearisation and the trials after it take those,
@@ -257,7 +261,8 @@ def _steps(
         first: :meth:`SegmentModel.corrected` at the first point, if it is known.
 
     Returns:
-        Parameters, offsets and the scale of the residuals.
+        Parameters, offsets, the scale of the residuals, and the linearisation there, whitened by
+        that scale, if it is known.
     """
     damping, dampings = (
         SEGMENT_FIT.first_damping,
@@ -266,6 +271,7 @@ def _steps(
     factors, present_scale = SEGMENT_FIT.near_factors, scale
     has_minima = bool((segments.coordinates_with_minima & ~held).any())
     now, model, num_updates, num_linearised = None, segments, 0, 0
+    known: tuple[Tensor, Tensor, Tensor, Linearisation] | None = None
     found: tuple[float, Tensor, Tensor, Tensor] | None = None
     most_updates = 0 if has_minima else _most_updates(segments, held, is_rough=is_rough)
     while True:
@@ -278,6 +284,7 @@ def _steps(
                 # The squares of the last step had an earlier correction.
                 present_scale = _scale(segments, _by_channel(now.residual, scale), scale)
             now = replace(now, by_parameters=now.by_parameters * ~held)
+            known = z, offsets, scale, now
             num_updates, num_linearised = 0, num_linearised + 1
         if not now.is_finite:
             if not num_updates:
@@ -295,12 +302,12 @@ def _steps(
                     _, z, offsets, present_scale = found
                 break
             found = present, z, offsets, present_scale
-        if not has_minima and _possible_gain(now, z, offsets, held) < enough:
+        if not has_minima and possible_gain(now, z, offsets, held) < enough:
             if not num_updates:
                 break
             now = None
             continue
-        moves = [_step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]
+        moves = [step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]
         tried = torch.stack([point for point, _ in moves])
         begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
         squares = _squares(model, tried, begun, scale)  # (a, b, S, C)
@@ -348,7 +355,10 @@ def _steps(
         num_updates += 1
         if num_updates > most_updates:
             now = None
-    return z, offsets, present_scale
+    last = None
+    if known is not None and known[0] is z and known[1] is offsets:
+        last = known[3].rescaled(known[2] / present_scale)
+    return z, offsets, present_scale, last
 
 
 def _by_channel(residual: Tensor, scale: Tensor) -> Tensor:
@@ -394,106 +404,3 @@ def _squares(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) 
         for point, starts in zip(points, offsets.flatten(0, 1).split(together), strict=True)
     ]
     return torch.cat(squares).unflatten(0, (a, b))
-
-
-def _possible_gain(now: Linearisation, z: Tensor, offsets: Tensor, held: Tensor) -> float:
-    """Returns by how much the best step would reduce the objective if residuals were linear.
-
-    Args:
-        now: Residuals and derivatives.
-        z: Parameters, ``(d,)``.
-        offsets: Offsets, ``(S, m)``.
-        held: Mask of coordinates that are not fitted, ``(d,)``; their derivatives are zero.
-    """
-    system = _System.of(now, z, offsets)
-    eye = torch.eye(offsets.shape[-1], dtype=torch.float64)
-    parts = solve_or_zero(system.own + eye, system.sides)[0]
-    hessian, gradient = system.reduced(parts)
-    gradient = gradient.masked_fill(held, 0.0)
-    change = solve_or_zero(hessian + torch.eye(len(z), dtype=torch.float64), gradient[:, None])[0]
-    by_offsets = (system.sides[..., -1] * parts[..., -1]).sum()
-    return float(by_offsets + gradient @ change[:, 0])
-
-
-@dataclass(frozen=True)
-class _System:
-    """The normal equations of a Gauss-Newton step, without the prior's and the damping's part.
-
-    Attributes:
-        own: Those of each segment's offsets, Gᵀ G, ``(S, m, m)``.
-        sides: Gᵀ J and the offsets' gradient, ``(S, m, d + 1)``.
-        by_parameters: Jᵀ J, ``(d, d)``.
-        gradient: The parameters' gradient, ``(d,)``.
-    """
-
-    own: Tensor
-    sides: Tensor
-    by_parameters: Tensor
-    gradient: Tensor
-
-    @classmethod
-    def of(cls, now: Linearisation, z: Tensor, offsets: Tensor) -> "_System":
-        by_z, by_start, residual = now.by_parameters, now.by_starts, now.residual[..., None]
-        pull = by_start.mT @ residual - offsets[..., None]
-        return cls(
-            by_start.mT @ by_start,
-            torch.cat((by_start.mT @ by_z, pull), dim=-1),
-            (by_z.mT @ by_z).sum(0),
-            (by_z.mT @ residual).sum(0)[:, 0] - z,
-        )
-
-    def reduced(self, parts: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the parameters' Hessian and gradient once the offsets are eliminated.
-
-        Each segment's offsets can be, because no other segment depends on them.
-
-        Args:
-            parts: The solution of each segment's own system, ``(S, m, d + 1)``.
-        """
-        d = len(self.gradient)
-        taken = (self.sides[..., :d].mT @ parts).sum(0)
-        return self.by_parameters - taken[:, :d], self.gradient - taken[:, d]
-
-
-def _step(
-    now: Linearisation,
-    z: Tensor,
-    offsets: Tensor,
-    held: Tensor,
-    damping: float,
-    dampings: Tensor,
-    factors: tuple[float, ...],
-) -> tuple[Tensor, Tensor]:
-    """Returns parameters after one damped Gauss-Newton step, and offsets to try with them.
-
-    A segment whose own system cannot be solved keeps its offsets, which then count as known. If
-    the parameters' system cannot be solved, the parameters stay.
-
-    Args:
-        now: Residuals and derivatives.
-        z: Parameters, ``(d,)``.
-        offsets: Offsets, ``(S, m)``.
-        held: Mask of coordinates that are not fitted, ``(d,)``; their derivatives are zero.
-        damping: Damping of the parameters, relative to their curvatures.
-        dampings: Damping of the offsets of each segment, ``(S,)``.
-        factors: Multiples of ``dampings`` to try, among them 1.
-
-    Returns:
-        Parameters ``(d,)``, and offsets for each factor, ``(b, S, m)``.
-    """
-    system, d = _System.of(now, z, offsets), len(z)
-    eye = torch.eye(offsets.shape[-1], dtype=torch.float64)
-    parts = {
-        f: solve_or_zero(system.own + (1.0 + f * dampings)[:, None, None] * eye, system.sides)[0]
-        for f in factors
-    }
-    hessian, gradient = system.reduced(parts[1.0])
-    curvature = hessian.diagonal().clamp_min(1.0)
-    hessian = hessian + torch.diag(1.0 + damping * curvature)
-    change = solve_or_zero(hessian, gradient.masked_fill(held, 0.0)[:, None])[0][:, 0]
-    change = change * min(
-        1.0, SEGMENT_FIT.longest_step / float(change.abs().max().clamp_min(1e-12))
-    )
-    moved = (z + change).clamp(-SEGMENT_FIT.largest_coordinate, SEGMENT_FIT.largest_coordinate)
-    begun = [offsets + part[..., d] - part[..., :d] @ (moved - z) for part in parts.values()]
-    return moved, torch.stack(begun)

@@ -15,7 +15,7 @@ from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import Backlash, CoulombFriction, StribeckFriction
 from npdr_ppl.models.pendulum import Pendulum
-from npdr_ppl.preparation import segment_fit
+from npdr_ppl.preparation import gauss_newton, segment_fit
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_fit import fit_segments
@@ -170,7 +170,7 @@ def step_from(now, *, is_alone=slice(None)):
     dampings = torch.full((num,), 1e-2).double()
     held = torch.zeros(2, dtype=torch.bool)
     offsets = torch.zeros(num, 2, dtype=torch.float64)
-    return segment_fit._step(now, START, offsets, held, 1e-2, dampings, (0.1, 1.0, 10.0))
+    return gauss_newton.step(now, START, offsets, held, 1e-2, dampings, (0.1, 1.0, 10.0))
 
 
 def test_a_segment_whose_derivatives_explode_keeps_its_start_and_holds_up_no_other():
@@ -326,6 +326,21 @@ def test_corrected_derivatives_lead_to_the_same_fit(segments, monkeypatch):
     assert abs(ends[1] - ends[0]) < 2 * SEGMENT_FIT.least_gain
 
 
+def test_the_linearisation_of_a_fit_is_that_at_its_end(segments):
+    found = fit_segments(segments, START)
+    assert found.linearisation is not None
+    again = segments.linearise(found.z, found.offsets, found.scale)
+    for field in dataclasses.fields(again):
+        known, computed = (getattr(each, field.name) for each in (found.linearisation, again))
+        torch.testing.assert_close(known, computed, rtol=1e-9, atol=1e-9)
+
+
+def test_a_fit_does_not_keep_derivatives_that_do_not_belong_to_its_end(segments):
+    first = torch.tensor([True, False])
+    assert fit_segments(segments, START, held=first).linearisation is None
+    assert fit_segments(segments, START, is_rough=True).linearisation is None
+
+
 def test_a_gain_counts_less_where_residuals_are_correlated(segments, monkeypatch):
     gains = []
     steps = segment_fit._steps
@@ -363,4 +378,4 @@ def test_the_possible_gain_is_the_greatest_that_a_linear_model_allows():
     target = torch.cat((now.residual.flatten(), -z[:2], -offsets.flatten()))
     left = target - matrix @ torch.linalg.lstsq(matrix, target[:, None]).solution[:, 0]
     expected = float(target.square().sum() - left.square().sum())
-    assert segment_fit._possible_gain(now, z, offsets, held) == pytest.approx(expected)
+    assert gauss_newton.possible_gain(now, z, offsets, held) == pytest.approx(expected)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.preparation.initial_states import InitialStates
+from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_fit import SegmentFit
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.progress import Step
@@ -221,8 +223,10 @@ class Trials:
             if fit is None or result is None:
                 yield None
                 continue
-            hypothesis = Hypothesis(fit.segments.model, fit.effects, fit.segments, result[0])
-            hypothesis.keep_difference(result[1])
+            hypothesis = Hypothesis(fit.segments.model, fit.effects, fit.segments, result.fit)
+            hypothesis.keep_difference(result.difference)
+            if result.linearisation is not None:
+                hypothesis.keep_linearisation(result.linearisation)
             yield hypothesis
 
 
@@ -244,12 +248,21 @@ def refit(
     return Fit(segments, effects, {**begin, **start}, begun)
 
 
-def _fitted(asked: Fit) -> tuple[SegmentFit, Tensor] | None:
-    """Fits a model; returns ``None`` if it cannot be simulated.
+@dataclass(frozen=True)
+class _Fitted:
+    """What is known of a fit; the asking process has the segments."""
 
-    A parallel process sends only the fit and the difference from the recording, because the
-    asking process has the segments.
-    """
+    fit: SegmentFit
+    difference: Tensor
+    linearisation: Linearisation | None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out the linearisation, which the asking process computes again if it needs it."""
+        return {**vars(self), "linearisation": None}
+
+
+def _fitted(asked: Fit) -> _Fitted | None:
+    """Fits a model; returns ``None`` if it cannot be simulated."""
     try:
         found = fit_segment_model(
             asked.segments,
@@ -262,4 +275,4 @@ def _fitted(asked: Fit) -> tuple[SegmentFit, Tensor] | None:
         )
     except NpdrError:
         return None
-    return found.fit, found.difference
+    return _Fitted(found.fit, found.difference, found.known_linearisation)
