@@ -61,6 +61,10 @@ class Start(NamedTuple):
             effects that are not on sensors or do not request it.
         is_rate: Whether the value is a measured velocity. With commands that are constant within
             a step, velocities have kinks between steps, while positions are smooth.
+        displacements: How far a joint moved in each interval before the start, oldest first, as
+            recorded. Empty for effects that are not on joints or do not request it, and where no
+            recording tells: in an episode, or if the joint's position was not measured.
+        interval: Length of these intervals, in s.
     """
 
     time: Tensor
@@ -69,6 +73,8 @@ class Start(NamedTuple):
     history: int = 0
     changes: tuple[Tensor, ...] = ()
     is_rate: bool = False
+    displacements: tuple[Tensor, ...] = ()
+    interval: float = 0.0
 
     def past(self, value: Tensor) -> tuple[Tensor, ...]:
         """Returns :attr:`history` true values of a sensor channel before the start, latest first.

@@ -246,6 +246,7 @@ class ForceEffect(Effect):
     Attributes:
         needs_joint: Whether :meth:`begin_step` is called, which costs the engine two evaluations
             of the accelerations per step.
+        needs_past: Whether its initial memory needs :attr:`Start.displacements`.
         standard_law: ``"damping"`` with the parameter ``damping``, or ``"spring"`` with
             ``stiffness`` and ``rest``, if the law is one that engines have themselves; else empty.
             A subclass with another law makes it empty.
@@ -253,6 +254,7 @@ class ForceEffect(Effect):
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("force",)
     needs_joint: ClassVar[bool] = False
+    needs_past: ClassVar[bool] = False
     standard_law: ClassVar[str] = ""
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Any:

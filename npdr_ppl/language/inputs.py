@@ -50,6 +50,8 @@ class Inputs:
         is_read: Whether each channel was measured after each step, ``(S, K, C)``; ``None`` if all
             were, at the end of the step.
         lateness: Time from the end of the step to the measurement, in steps, ``(S, K, C)``.
+        recorded: Measurements of all R rollouts, from their first step on, ``(R, T, C)``; forces
+            that depend on past motion need them. ``None`` if the past motion is unknown.
     """
 
     actions: Tensor
@@ -67,6 +69,7 @@ class Inputs:
     initial_rate_errors: Tensor | None = None
     is_read: Tensor | None = None
     lateness: Tensor | None = None
+    recorded: Tensor | None = None
 
     def __post_init__(self) -> None:
         """Checks that the shapes match."""
@@ -207,7 +210,25 @@ class Inputs:
             **self._starts(lambda value: value[..., columns]),
             **self._sampling(lambda value: value[..., columns]),
             channel_names=tuple(names),
+            recorded=None if self.recorded is None else self.recorded[..., columns],
         )
+
+    def earlier(self, name: str, steps: Tensor) -> Tensor | None:
+        """Returns measurements of a channel before the segments, ``(M, S)``.
+
+        Before its rollout began, a channel had the value of the first measurement.
+
+        Args:
+            name: The channel.
+            steps: How many steps before the segments' starts, ``(M,)``.
+
+        Returns:
+            ``None`` if they are unknown.
+        """
+        if self.recorded is None or name not in self.channel_names:
+            return None
+        rows = (self.start - steps[:, None]).clamp_min(0)
+        return self.recorded[self.rollout, rows, self.channel_names.index(name)]
 
     def element(self, index: int) -> "Inputs":
         """Returns the inputs of one element of the (flattened) batch; unbatched ones unchanged."""

@@ -35,7 +35,7 @@ draws its initial state from the estimate and its error."""
 
 _HISTORY_SECONDS = 5.0
 _LEAST_HISTORY = 64
-_MOST_PAST_COMMANDS = 1 << 22
+_MOST_PAST_VALUES = 1 << 22
 
 
 def default_history(time_step: float, num_segments: int, num_actions: int) -> int:
@@ -50,7 +50,7 @@ def default_history(time_step: float, num_segments: int, num_actions: int) -> in
         num_segments: Number of segments.
         num_actions: Number of commands.
     """
-    most = _MOST_PAST_COMMANDS // max(1, num_segments * num_actions)
+    most = _MOST_PAST_VALUES // max(1, num_segments * num_actions)
     return max(_LEAST_HISTORY, min(round(_HISTORY_SECONDS / time_step), most))
 
 
@@ -142,9 +142,28 @@ def cut(
         mask=torch.tensor(mask),
         rollout=torch.tensor([rollout for rollout, _, _ in layout]),
         start=torch.tensor([start for _, start, _ in layout]),
+        recorded=_recorded(rollouts, dtype),
         **sampling,
         **{name: torch.tensor(value, dtype=dtype) for name, value in starts.items()},
     )
+
+
+def _recorded(rollouts: Recording, dtype: torch.dtype) -> Tensor | None:
+    """Returns the measurements of all rollouts, ``(R, T, C)``; missing ones are interpolated.
+
+    ``None`` if they would take more than 32 MiB.
+    """
+    longest = max(len(readings) for readings in rollouts.readings)
+    result = np.zeros((len(rollouts), longest, len(rollouts.channel_names)))
+    if result.size > _MOST_PAST_VALUES:
+        return None
+    for row, readings in zip(result, rollouts.readings, strict=True):
+        steps = np.arange(len(row))
+        for column, values in zip(row.T, readings.T, strict=True):
+            known = np.isfinite(values).nonzero()[0]
+            if len(known):
+                column[:] = np.interp(steps, known, values[known])
+    return torch.tensor(result, dtype=dtype)
 
 
 def observation(

@@ -17,7 +17,9 @@ def made_up(kind, **values):
     motion["t"] = motion["t"].abs()
     port = Port("hinge", kind, "N m", rated=2.0)
     edges = torch.arange(11)
-    return PortMotion(port, motion, {name: units[name] for name in motion}, None, edges)
+    past = 0.3 * torch.randn(2, 7, generator=generator, dtype=torch.float64)
+    own = {name: units[name] for name in motion}
+    return PortMotion(port, motion, own, None, edges, 0.01, past, 0.03)
 
 
 JOINT = made_up("force", q=1.5, v=3.0, tau=1.0, t=2.0)

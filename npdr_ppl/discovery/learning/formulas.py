@@ -8,7 +8,8 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.assumptions import Assumptions
-from npdr_ppl.discovery.learning.law import Law, module_source
+from npdr_ppl.discovery.learning.effect_source import module_source
+from npdr_ppl.discovery.learning.law import Law
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion, motion_at_ports
 from npdr_ppl.discovery.learning.regression import (
     Formula,
@@ -17,7 +18,7 @@ from npdr_ppl.discovery.learning.regression import (
     pareto_front,
 )
 from npdr_ppl.discovery.learning.settings import LEARNING
-from npdr_ppl.discovery.learning.terms import Term, terms_at, with_harmonics
+from npdr_ppl.discovery.learning.terms import Term, terms_at, wave_in_time, with_harmonics
 from npdr_ppl.discovery.revised_model import LEARNED
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.errors import NpdrError
@@ -37,6 +38,7 @@ class PortFormulas:
     Attributes:
         products: Products of the responses at the port.
         terms: The terms that were compared.
+        num_others: Number of waves in time that were examined and are not among the terms.
         weights: Weights of the responses in each term's columns, ``(S, P, k)`` each; ``None`` if
             they follow from the motion.
         penalty: Reduction of the misfit that the best of so many spurious coefficients brings.
@@ -45,6 +47,7 @@ class PortFormulas:
 
     products: PortProducts
     terms: list[Term]
+    num_others: int
     weights: list[Tensor] | None
     penalty: float
     front: list[Formula]
@@ -56,7 +59,8 @@ class PortFormulas:
 
     def equations(self) -> NormalEquations:
         """Returns the products of the terms, which are not kept: a joint has 100 MB of them."""
-        return _equations(self.products, self.terms, self.weights)
+        found = _equations(self.products, self.terms, self.weights)
+        return replace(found, num_others=self.num_others)
 
 
 def _equations(
@@ -90,16 +94,43 @@ def formulas_by_port(
             responses, weights = known
         else:
             responses, weights = motion.responses, None
-        products = PortProducts(projection, motion, responses)
-        equations = _equations(products, terms, weights)
+        products, num_others = PortProducts(projection, motion, responses), 0
+        if motion.port.kind == "force":
+            waves, num_others = _waves_in_time(products)
+            terms += assumptions.applied_to(waves, motion)
+        equations = replace(_equations(products, terms, weights), num_others=num_others)
         penalty, front = equations.penalty, equations.front()
         del equations
         if motion.responses is not None:
             front += _with_harmonics(products, terms, front)
             front = [_refined(products, formula) for formula in pareto_front(front)]
-        front = [formula for formula in front if assumptions.agrees(formula, motion)]
-        result.append(PortFormulas(products, terms, weights, penalty, pareto_front(front)))
+        front = pareto_front([each for each in front if assumptions.agrees(each, motion)])
+        result.append(PortFormulas(products, terms, num_others, weights, penalty, front))
     return sorted(result, key=lambda port: min(f.error for f in port.front))
+
+
+def _waves_in_time(products: PortProducts) -> tuple[list[Term], int]:
+    """Returns the waves in time that best explain the residuals, and how many others were tried.
+
+    The frequencies are half a period per longest rollout apart. The waves are the greatest local
+    maxima of the periodogram of the missing force.
+    """
+    motion = products.motion
+    longest = float(motion.values["t"].max())
+    width = float((motion.edges[1:] - motion.edges[:-1]).min()) * motion.time_step
+    most = min(LEARNING.most_frequencies, int(longest / width))
+    waves = [wave_in_time(0.5 * k / longest) for k in range(1, most + 1)]
+    gains = [
+        _equations(products, waves[k : k + LEARNING.num_waves]).gains_alone()
+        for k in range(0, len(waves), LEARNING.num_waves)
+    ]
+    if not gains:
+        return [], 0
+    gain = torch.cat((torch.full((1,), -torch.inf), *gains, torch.full((1,), -torch.inf)))
+    is_peak = (gain[1:-1] >= gain[:-2]) & (gain[1:-1] >= gain[2:])
+    best = gain[1:-1].where(is_peak, -torch.inf).argsort(descending=True)
+    found = [waves[k] for k in best[: LEARNING.num_peaks].tolist() if bool(is_peak[k])]
+    return found, len(waves) - len(found)
 
 
 def _refined(products: PortProducts, formula: Formula) -> Formula:

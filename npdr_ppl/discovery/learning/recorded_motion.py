@@ -27,15 +27,21 @@ class _Recorder(ForceEffect):
 
     id = "recorder"
     needs_joint = True
+    needs_past = True
     parameters = (Parameter("nothing", "1", 0.0, "not used"),)
 
     def __init__(self, port: str) -> None:
         super().__init__(port)
         self.seen: list[Joint] = []
+        self.start: Start | None = None
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Returns a prior that is not used: a recorder is never inferred."""
         return {"nothing": dist.Normal(0.0, 1.0)}
+
+    def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> None:
+        """Keeps what is known of the motion before."""
+        self.start = start
 
     def begin_step(
         self, joint: Joint, parameters: Mapping[str, Tensor], memory: Any, time_step: float
@@ -93,6 +99,10 @@ class PortMotion:
         responses: Change of the whitened measurements per unit of the law, ``(S, N, P)``, in
             each of P parts of a segment; ``None`` at a sensor, where they depend on the law.
         edges: Steps at which the parts begin, and the last one ends, ``(P + 1,)``.
+        time_step: Length of a step in s.
+        past: What happened before each segment, oldest first, ``(S, M)``: at a joint its
+            displacement in each of M intervals, at an action its command in each of M steps.
+        interval: Length of these intervals in s.
     """
 
     port: Port
@@ -100,6 +110,9 @@ class PortMotion:
     units: dict[str, str]
     responses: Tensor | None
     edges: Tensor
+    time_step: float
+    past: Tensor
+    interval: float
 
     def parts(self, values: Tensor) -> Tensor:
         """Returns the mean over each of the P parts, ``(S, P)``, of ``(S, K)``."""
@@ -129,7 +142,8 @@ def motion_at_ports(hypothesis: Hypothesis) -> list[PortMotion]:
     """
     fit = hypothesis.fit
     segments = hypothesis.segments.in_coarser_steps(fit.z, fit.offsets)
-    steps = segments.inputs.num_steps
+    inputs = segments.inputs
+    steps = inputs.num_steps
     edges = torch.linspace(0, steps, min(LEARNING.num_parts, steps) + 1).round().long().unique()
     base = _run(segments, segments.simulator, fit.z, fit.offsets[None], {})
     found = []
@@ -144,17 +158,17 @@ def motion_at_ports(hypothesis: Hypothesis) -> list[PortMotion]:
             continue
         if seen is None:
             continue
+        values, units, past, interval = seen
+        end = edges, inputs.time_step, past, interval
         if port.kind == "sensor":
-            found.append(PortMotion(port, *seen, None, edges))
+            found.append(PortMotion(port, values, units, None, *end))
             continue
-        values, units = seen
         moved = _pulsed(hypothesis, segments, port, edges)
         if moved is None:
             continue
         change = segments.whitened(moved - base, fit.scale) / _height(port)
         if bool(change.isfinite().all()) and bool((change != 0.0).any()):
-            responses = change.permute(1, 2, 0)
-            found.append(PortMotion(port, values, units, responses, edges))
+            found.append(PortMotion(port, values, units, change.permute(1, 2, 0), *end))
     return found
 
 
@@ -195,7 +209,8 @@ def _pulsed(
         return None
 
 
-_Seen = tuple[dict[str, Tensor], dict[str, str]]
+_Seen = tuple[dict[str, Tensor], dict[str, str], Tensor, float]
+"""Variables, their units, what happened before, and the length of its intervals in s."""
 
 
 def _joint_motion(hypothesis: Hypothesis, segments: SegmentModel, port: Port) -> _Seen | None:
@@ -221,7 +236,11 @@ def _joint_motion(hypothesis: Hypothesis, segments: SegmentModel, port: Port) ->
     if port.is_driven:
         values["tau"], units["tau"] = collected("drive"), port.unit
     values["t"], units["t"] = _time(segments), "s"
-    return values, units
+    past, interval = torch.zeros(num, 0, dtype=torch.float64), inputs.time_step
+    if recorder.start is not None and recorder.start.displacements:
+        moved = [step.reshape(-1, num)[0] for step in recorder.start.displacements]
+        past, interval = torch.stack(moved, dim=1).double(), recorder.start.interval
+    return values, units, past, interval
 
 
 def _command(segments: SegmentModel, port: Port) -> _Seen | None:
@@ -230,7 +249,14 @@ def _command(segments: SegmentModel, port: Port) -> _Seen | None:
         return None
     column = inputs.action_names.index(port.name)
     values = {"u": inputs.actions[..., column].double(), "t": _time(segments)}
-    return values, {"u": port.unit, "t": "s"}
+    past = inputs.past_actions[..., column].double()
+    if port.kind == "servo":
+        # A servo holds the first goal before a rollout begins.
+        num = past.shape[1]
+        first = (num - inputs.start).clamp_min(0)[:, None]
+        every = torch.cat((past, values["u"]), dim=1)
+        past = torch.where(torch.arange(num) < first, every.gather(1, first), past)
+    return values, {"u": port.unit, "t": "s"}, past, inputs.time_step
 
 
 def _reading(hypothesis: Hypothesis, segments: SegmentModel, port: Port) -> _Seen | None:
@@ -242,7 +268,8 @@ def _reading(hypothesis: Hypothesis, segments: SegmentModel, port: Port) -> _See
         return None
     column = segments.channel_names.index(port.name)
     value = (segments.observed - hypothesis.difference)[..., column].double()
-    return {"y": value, "t": _time(segments)}, {"y": port.unit, "t": "s"}
+    none = torch.zeros(len(value), 0, dtype=torch.float64)
+    return {"y": value, "t": _time(segments)}, {"y": port.unit, "t": "s"}, none, 0.0
 
 
 def _time(segments: SegmentModel) -> Tensor:

@@ -152,6 +152,7 @@ class NormalEquations:
         precision: Precision of the prior of each column's coefficient, ``(d + k,)``.
         num_parameters: d.
         inflation: Number of measurements per independent one.
+        num_others: Number of terms that were examined before, and are not among these.
     """
 
     terms: tuple[Term, ...]
@@ -163,6 +164,7 @@ class NormalEquations:
     precision: Tensor
     num_parameters: int
     inflation: float
+    num_others: int = 0
 
     @property
     def all_terms(self) -> Formula:
@@ -193,7 +195,7 @@ class NormalEquations:
     @property
     def penalty(self) -> float:
         """Reduction of the misfit that the best of so many spurious coefficients brings."""
-        return self.inflation * 2.0 * math.log(max(2, len(self.terms)))
+        return self.inflation * 2.0 * math.log(max(2, len(self.terms) + self.num_others))
 
     def without_terms(self, uses: str) -> "NormalEquations":
         """Returns the equations of the terms that do not depend on a variable."""
@@ -213,6 +215,13 @@ class NormalEquations:
             score=self.score[:, index],
             precision=self.precision[index],
         )
+
+    def gains_alone(self) -> Tensor:
+        """Returns by how much each term alone reduces the misfit; all have as many columns."""
+        information, score = self._regular(self.information.sum(0)), self.score.sum(0)
+        width = self.slices[0].stop - self.slices[0].start
+        every = list(range(len(self.terms)))
+        return self._gains(information, score, self._index(()), every, width)
 
     def front(self, most: int = LEARNING.most_terms) -> list[Formula]:
         """Returns the best formula of each number of terms, from none to the most.

@@ -10,8 +10,9 @@ from torch import Tensor
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.assumptions import Assumptions
 from npdr_ppl.discovery.learning.curves import Curve, curves
+from npdr_ppl.discovery.learning.effect_source import module_source
 from npdr_ppl.discovery.learning.formulas import NO_ASSUMPTIONS, PortFormulas
-from npdr_ppl.discovery.learning.law import Law, module_source
+from npdr_ppl.discovery.learning.law import Law
 from npdr_ppl.discovery.learning.learn import LearnedModel, learned_model
 from npdr_ppl.discovery.learning.proof import Check, checks
 from npdr_ppl.discovery.learning.settings import LEARNING

@@ -33,6 +33,15 @@ class LearningSettings:
         most_laws: Greatest number of laws at different ports.
         num_fitted: Ports whose best formula is fitted by simulation.
         num_shapes: Values of every other shape constant that are tried.
+        narrowest_hysteresis: Least width of a hysteresis that is tried, as a multiple of the
+            typical displacement in a step. Narrower ones are dry friction.
+        asymmetry: Asymmetry of a hysteresis that is tried first, between 0 and 0.5.
+        shortest_relaxation: Least time constant of a relaxation that is tried, in steps. Shorter
+            ones are damping.
+        longest_lag: Longest lag and delay of a command that are tried, in steps. Control loops
+            with longer ones are not used.
+        most_frequencies: Greatest number of frequencies at which a wave in time is looked for.
+        num_peaks: Number of the strongest of these frequencies that become terms.
         negligible: Terms are left out that explain less than this share of what all explain.
             With a precise recording, everything that the model simplifies is significant; a
             formula with many small terms says nothing to a mechanic.
@@ -58,6 +67,12 @@ class LearningSettings:
     most_laws: int = 3
     num_fitted: int = 3
     num_shapes: int = 6
+    narrowest_hysteresis: float = 2.0
+    asymmetry: float = 0.3
+    shortest_relaxation: float = 3.0
+    longest_lag: float = 10.0
+    most_frequencies: int = 1000
+    num_peaks: int = 8
     negligible: float = 0.01
     shape_step: float = 0.16
     finest_shape_step: float = 0.002
@@ -74,6 +89,10 @@ class LearningSettings:
         check_range(self, 1, 1000, "num_waves", "most_laws", "num_fitted", "num_drawn_laws")
         check_range(self, 2, 1000, "num_bins")
         check_range(self, 0.0, 1000.0, "pulse_height", "prior_spread", "largest_wave_number")
+        check_range(self, 1, 10_000, "most_frequencies", "num_peaks")
+        check_range(self, 0.1, 100.0, "narrowest_hysteresis", "shortest_relaxation")
+        check_range(self, 0.5, 100.0, "longest_lag")
+        check_range(self, 0.0, 0.45, "asymmetry")
         check_range(self, 0.0, 1.0, "negligible")
         check_range(self, 1e-6, 0.5, "shape_step", "finest_shape_step")
 

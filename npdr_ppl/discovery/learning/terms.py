@@ -1,23 +1,27 @@
-"""Terms from which a law is composed: each is an expression in the variables of a port.
+"""Terms from which a law is composed: each is an expression in the variables of a port."""
 
-An expression is Python source. It is evaluated along the recorded motion to choose terms, and it
-is copied into the file of the learned effect, so both are the same law.
-"""
-
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from itertools import product
-from types import CodeType
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from npdr_ppl.discovery.learning.expressions import evaluated
+from npdr_ppl.discovery.learning.memory import (
+    DELAY,
+    HYSTERESIS,
+    LAG,
+    RELAXATION,
+    UNEVEN_HYSTERESIS,
+    Memory,
+)
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 from npdr_ppl.discovery.learning.settings import LEARNING
 
-__all__ = ["SYMBOLS", "Shape", "Term", "hat", "terms_at", "with_harmonics"]
+__all__ = ["SYMBOLS", "Shape", "Term", "terms_at", "wave_in_time", "with_harmonics"]
 
 SYMBOLS = {"q": "q", "v": "v", "tau": "τ", "u": "u", "y": "y", "t": "t"}
 """Variables as they are written in formulas."""
@@ -52,6 +56,7 @@ class Term:
         is_dry: Whether it is dry friction: the columns are the bound, times minus the direction
             of motion.
         is_spline: Whether the columns are the hats of a spline.
+        memory: A state on which the columns depend.
         cost: Its complexity: coefficients, fitted constants and operations.
     """
 
@@ -63,36 +68,19 @@ class Term:
     shapes: tuple[Shape, ...] = ()
     is_dry: bool = False
     is_spline: bool = False
+    memory: Memory | None = None
     cost: float = field(default=1.0)
 
     def values(self, motion: PortMotion) -> Tensor:
         """Returns the columns along the motion, ``(S, K, k)``."""
-        known: dict[str, Any] = {**motion.values, **{s.name: s.value for s in self.shapes}}
+        constants = {shape.name: shape.value for shape in self.shapes}
+        known: dict[str, Any] = {**motion.values, **constants}
+        if self.memory is not None:
+            known[self.memory.symbol] = self.memory.along(motion, constants)
         some = motion.values["t"]
-        columns = [_evaluated(column, known).expand_as(some) for column in self.columns]
+        columns = [evaluated(column, known).expand_as(some) for column in self.columns]
         values = torch.stack(columns, dim=-1)
         return -values * motion.values["v"].sign()[..., None] if self.is_dry else values
-
-
-def hat(x: Tensor, left: float, centre: float, right: float) -> Tensor:
-    """Returns the hat function of a linear spline; it is one beyond the first and last knots."""
-    rising = torch.ones_like(x) if left == centre else (x - left) / (centre - left)
-    falling = torch.ones_like(x) if right == centre else (right - x) / (right - centre)
-    return torch.minimum(rising, falling).clamp(0.0, 1.0)
-
-
-_FUNCTIONS = {"torch": torch, "hat": hat}
-
-
-@lru_cache(maxsize=4096)
-def _compiled(expression: str) -> CodeType:
-    return compile(expression, "<term>", "eval")
-
-
-def _evaluated(expression: str, known: Mapping[str, Any]) -> Tensor:
-    """Returns an expression of this module along the motion."""
-    found = eval(_compiled(expression), {**_FUNCTIONS, "__builtins__": {}}, dict(known))
-    return torch.as_tensor(found, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -175,6 +163,7 @@ def _force_terms(motion: PortMotion) -> Iterator[Term]:
             yield _product(motion, age, speed)
         yield _product(motion, age, is_dry=True)
     yield from _stops(motion)
+    yield from _remembering_forces(motion)
     for variable in ("q", "v", "t"):
         yield _spline(motion, variable)
         yield _spline(motion, variable, is_dry=True)
@@ -247,6 +236,80 @@ def _static_terms(motion: PortMotion, name: str) -> Iterator[Term]:
             edge,
         )
     yield _spline(motion, name)
+    if name == "u":
+        yield from _remembering_commands(motion)
+
+
+def _remembering_forces(motion: PortMotion) -> Iterator[Term]:
+    """Returns forces that depend on the past motion."""
+    q, v, unit = motion.values["q"], motion.values["v"], motion.units["q"]
+    step = motion.time_step * float(v.square().mean().sqrt())
+    span = float(q.max() - q.min())
+    if not 0.0 < LEARNING.narrowest_hysteresis * step < span:
+        return
+    num = 2 * LEARNING.num_shapes
+    for width in _logarithmic(LEARNING.narrowest_hysteresis * step, span, num):
+        wide = Shape("width", width, unit)
+        yield _with_memory(HYSTERESIS, "bend", "b", "1", {"q", "v"}, wide)
+        uneven = Shape("asymmetry", LEARNING.asymmetry, "1")
+        yield _with_memory(UNEVEN_HYSTERESIS, "bend", "b", "1", {"q", "v"}, wide, uneven)
+    longest = motion.interval * max(1, motion.past.shape[1])
+    shortest = LEARNING.shortest_relaxation * motion.time_step
+    if shortest < longest:
+        for time in _logarithmic(shortest, longest, LEARNING.num_shapes):
+            constant = Shape("time_constant", time, "s")
+            yield _with_memory(RELAXATION, "stretch", "r", unit, {"q", "v"}, constant)
+
+
+def _remembering_commands(motion: PortMotion) -> Iterator[Term]:
+    """Returns the changes of a command by a lag and by a delay."""
+    unit, step = motion.units["u"], motion.time_step
+    num = 2 * LEARNING.num_shapes
+    for time in _logarithmic(0.3 * step, LEARNING.longest_lag * step, num):
+        constant = Shape("time_constant", time, "s")
+        yield _with_memory(LAG, "output - u", "(z − u)", unit, {"u"}, constant)
+    for time in _logarithmic(0.3 * step, LEARNING.longest_lag * step, num):
+        constant = Shape("delay", time, "s")
+        yield _with_memory(DELAY, "late - u", "(u(t − d) − u)", unit, {"u"}, constant)
+
+
+def _logarithmic(low: float, high: float, num: int) -> list[float]:
+    return torch.logspace(math.log10(low), math.log10(high), num, dtype=torch.float64).tolist()
+
+
+def _with_memory(
+    memory: Memory, column: str, formula: str, unit: str, uses: set[str], *shapes: Shape
+) -> Term:
+    """Returns a term with a state, whose own complexity counts as one operation."""
+    values = "".join(f" {shape.value:.6g}" for shape in shapes)
+    return Term(
+        f"{formula} {memory.equation}{values}",
+        (column,),
+        (formula,),
+        (unit,),
+        frozenset(uses),
+        shapes,
+        memory=memory,
+        cost=2.0 + len(shapes) + column.count("-"),
+    )
+
+
+def wave_in_time(frequency: float) -> Term:
+    """Returns sine and cosine of the time since a rollout began.
+
+    Args:
+        frequency: Frequency in Hz.
+    """
+    angle = f"{2.0 * math.pi!r} * frequency * t"
+    return Term(
+        f"sin(2π f t) + cos(2π f t) {frequency:.6g}",
+        (f"torch.sin({angle})", f"torch.cos({angle})"),
+        ("sin(2π f t)", "cos(2π f t)"),
+        ("1", "1"),
+        frozenset({"t"}),
+        (Shape("frequency", frequency, "Hz"),),
+        cost=4.0,
+    )
 
 
 def _single(variable: str, column: str, formula: str, unit: str, cost: float = 0.0) -> _Factor:

@@ -12,6 +12,7 @@ from npdr_ppl.engines.common.commands import RecentCommands
 from npdr_ppl.engines.common.compilation import signature
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.common.measurement_times import earlier_changes
+from npdr_ppl.engines.common.past_motion import PastMotion
 from npdr_ppl.language.effect_context import Joint, Start
 from npdr_ppl.language.effects import (
     ActionEffect,
@@ -120,6 +121,18 @@ class EffectChain(ABC):
         self.needs_joints = any(effect.needs_joint for _, effect, _ in self.force_effects)
 
     @property
+    def position_channels(self) -> tuple[str | None, ...]:
+        """Name of the state that is each joint's position, ``None`` if it is no state."""
+        return tuple(state.name for state in self.simulator.states)
+
+    @property
+    def channels_with_past(self) -> tuple[str | None, ...]:
+        """The same; ``None`` also where no force effect needs the motion before a segment."""
+        joints = {joint for _, effect, joint in self.force_effects if effect.needs_past}
+        names = self.position_channels if joints else ()
+        return tuple(name if joint in joints else None for joint, name in enumerate(names))
+
+    @property
     def force_step(self) -> float:
         """Seconds between two evaluations of the force effects."""
         return self.time_step
@@ -207,6 +220,7 @@ class EffectChain(ABC):
         *,
         commands_before: Callable[[int], Components] | None = None,
         num_past: int = 0,
+        past_motion: PastMotion | None = None,
     ) -> State:
         """Returns the state at the start of an episode or segment.
 
@@ -223,8 +237,10 @@ class EffectChain(ABC):
                 ``None`` for ``commands``.
             num_past: Steps before the start through which the caller will advance the action
                 effects.
+            past_motion: Motion of the joints before the start; ``None`` if it is unknown.
         """
         step, split = self.time_step, len(self.action_effects)
+        moved = past_motion or PastMotion()
         earlier = time - num_past * step
         joint_positions, joint_velocities = positions, velocities
         if self.force_effects:
@@ -236,7 +252,7 @@ class EffectChain(ABC):
                 effect.initial_memory(
                     joint_positions[joint],
                     joint_velocities[joint],
-                    Start(time, self.force_step, tables.effects[place]),
+                    moved.put_into(Start(time, self.force_step, tables.effects[place]), joint),
                 )
                 for place, effect, joint in self.force_effects
             ),

@@ -18,6 +18,7 @@ from torch import Tensor
 from npdr_ppl.engines.common.batching import flatten
 from npdr_ppl.engines.common.commands import CommandRecord, command_records, commands_at
 from npdr_ppl.engines.common.effect_chain import State, Tables
+from npdr_ppl.engines.common.past_motion import PastMotion, past_motion
 from npdr_ppl.engines.common.segment_start import recorded_start, true_start, with_past_commands
 from npdr_ppl.engines.mujoco.batches import quiet
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
@@ -129,6 +130,7 @@ class _Replay:
                 recorded.time,
                 commands_before=partial(commands_at, records),
                 num_past=past,
+                past_motion=self._past_motion(chain).part(first, last),
             )
             controls = self._controls(chain, state, tables, records, first, last)
             if chain.has_forces:
@@ -163,6 +165,11 @@ class _Replay:
         kept = chain.num_kept_steps(self.inputs.past_actions.shape[-2])
         records = command_records(self.simulator, self.inputs, self.shape, torch.float64, kept)
         return tuple(record.part(first, last) for record in records)
+
+    def _past_motion(self, chain: MujocoStepper) -> PastMotion:
+        """Returns the motion of the joints at which a force needs it."""
+        channels = chain.channels_with_past
+        return past_motion(self.inputs, channels, self.shape, torch.float64)
 
     def _controls(
         self,

@@ -23,6 +23,7 @@ from npdr_ppl.engines.common.compilation import (
 )
 from npdr_ppl.engines.common.effect_chain import State, Tables
 from npdr_ppl.engines.common.integrators import Components
+from npdr_ppl.engines.common.past_motion import past_motion
 from npdr_ppl.engines.common.segment_start import recorded_start, true_start, with_past_commands
 from npdr_ppl.engines.ode.mechanical_system import MechanicalSystem
 from npdr_ppl.engines.ode.stepping import Stepper
@@ -212,5 +213,6 @@ def _start(
         recorded.time,
         commands_before=partial(commands_at, records),
         num_past=past,
+        past_motion=past_motion(inputs, stepper.channels_with_past, shape, recorded.time.dtype),
     )
     return with_past_commands(stepper, state, tables, records, past)

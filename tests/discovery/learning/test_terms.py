@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from npdr_ppl.discovery.learning.effect_source import module_source
 from npdr_ppl.discovery.learning.formulas import effects_of
-from npdr_ppl.discovery.learning.law import Law, module_source
+from npdr_ppl.discovery.learning.law import Law
 from npdr_ppl.discovery.learning.terms import terms_at, with_harmonics
 from npdr_ppl.language.channels import Port
 from npdr_ppl.language.effect_context import Joint, Start
@@ -28,6 +29,8 @@ def waves_with_harmonics(motion):
 @pytest.mark.parametrize("extra", [terms_at, waves_with_harmonics])
 def test_a_force_is_the_same_in_the_file_as_along_the_motion(extra):
     for term in extra(JOINT):
+        if term.memory is not None:
+            continue
         law = law_with(JOINT, term)
         (effect,), values = effects_of([law])
         parameters = {name.rpartition(".")[2]: value for name, value in values.items()}
@@ -58,6 +61,8 @@ def test_a_command_is_changed_in_the_file_as_along_the_motion():
             return self.command
 
     for term in terms_at(COMMAND):
+        if term.memory is not None:
+            continue
         law = law_with(COMMAND, term)
         (effect,), values = effects_of([law])
         parameters = {name.rpartition(".")[2]: value for name, value in values.items()}
@@ -66,7 +71,7 @@ def test_a_command_is_changed_in_the_file_as_along_the_motion():
         found, later = effect.act(Present(u), parameters, memory, 0.01)
         expected = (term.values(COMMAND) * torch.tensor(law.coefficients)).sum(-1).flatten()
         assert torch.allclose(found - u, expected, rtol=1e-4, atol=1e-5), term.key
-        assert torch.allclose(later, t + 0.01)
+        assert later is None or torch.allclose(later["t"], t + 0.01)
 
 
 def test_a_sensor_reads_in_the_file_what_the_term_says():

@@ -1,0 +1,137 @@
+"""Laws that remember: the same in the file as along the motion, and what they remember."""
+
+import math
+
+import pytest
+import torch
+
+from npdr_ppl.discovery.learning.expressions import bent, bent_unevenly, relaxed
+from npdr_ppl.discovery.learning.formulas import effects_of
+from npdr_ppl.discovery.learning.law import Law
+from npdr_ppl.discovery.learning.terms import terms_at, wave_in_time
+from npdr_ppl.engines.common.commands import RecentCommands
+from npdr_ppl.language.effect_context import Start
+from tests.helpers.port_motions import COMMAND, JOINT
+
+STEP = JOINT.time_step
+
+
+def remembering(motion):
+    return [term for term in terms_at(motion) if term.memory is not None]
+
+
+def law_with(motion, *terms):
+    num = sum(len(term.columns) for term in terms)
+    coefficients = tuple(0.3 + 0.1 * k for k in range(num))
+    ranges = {name: (float(x.min()), float(x.max())) for name, x in motion.values.items()}
+    return Law(motion.port, terms, coefficients, (1.0,) * num, ranges, motion.units)
+
+
+def expected(law, motion):
+    columns = torch.cat([term.values(motion) for term in law.terms], dim=-1)
+    return columns @ torch.tensor(law.coefficients, dtype=torch.float64)
+
+
+def made(law):
+    (effect,), values = effects_of([law])
+    return effect, {name.rpartition(".")[2]: value for name, value in values.items()}
+
+
+def forces(law, motion):
+    """Forces of the effect's file, step by step, in the middle of each step."""
+    effect, parameters = made(law)
+    q, v = motion.values["q"], motion.values["v"]
+    start = Start(
+        motion.values["t"][:, 0] - 0.5 * STEP,
+        STEP,
+        parameters,
+        displacements=motion.past.unbind(1),
+        interval=motion.interval,
+    )
+    memory = effect.initial_memory(q[:, 0], v[:, 0], start)
+    found = []
+    for k in range(q.shape[1]):
+        place = q[:, k] + 0.5 * STEP * v[:, k]
+        found.append(effect.force(place, v[:, k], parameters, memory))
+        memory = effect.next_memory(place, v[:, k], parameters, memory, STEP)
+    return torch.stack(found, dim=1)
+
+
+def test_forces_that_remember_are_the_same_in_the_file_as_along_the_motion():
+    terms = remembering(JOINT)
+    assert {term.memory.symbol for term in terms} == {"bend", "stretch"}
+    for term in terms:
+        law = law_with(JOINT, term)
+        assert torch.allclose(forces(law, JOINT), expected(law, JOINT), rtol=1e-4, atol=1e-4)
+
+
+def test_a_law_may_have_several_states():
+    terms = {term.memory.symbol: term for term in remembering(JOINT)}
+    law = law_with(JOINT, terms["bend"], terms["stretch"])
+    assert torch.allclose(forces(law, JOINT), expected(law, JOINT), rtol=1e-4, atol=1e-4)
+    assert "b₁" in law.formula and "r₂'" in law.formula_with_numbers
+
+
+def test_commands_that_remember_are_the_same_in_the_file_as_along_the_commands():
+    terms = remembering(COMMAND)
+    assert {term.memory.symbol for term in terms} == {"output", "late"}
+    every = torch.cat((COMMAND.past, COMMAND.values["u"]), dim=1)
+    num = COMMAND.past.shape[1]
+    for term in terms:
+        law = law_with(COMMAND, term)
+        effect, parameters = made(law)
+        memory = effect.initial_memory(every[:, 0], Start(torch.zeros(2), STEP, parameters))
+        past = [every[:, 0]] * 20
+        found = []
+        for command in every.unbind(1):
+            seen = RecentCommands(command, tuple(past))
+            changed, memory = effect.act(seen, parameters, memory, STEP)
+            found.append(changed - command)
+            past = [command, *past[:-1]]
+        changes = torch.stack(found[num:], dim=1)
+        assert torch.allclose(changes, expected(law, COMMAND), rtol=1e-4, atol=1e-4), term.key
+        if term.memory.symbol == "late":
+            delay = float(parameters["delay"])
+            assert effect.history(parameters, STEP) == math.floor(delay / STEP) + 2
+
+
+def test_the_bend_settles_at_the_side_of_a_long_motion_and_keeps_still_at_rest():
+    bend = torch.tensor([-0.8, 0.0, 0.5], dtype=torch.float64)
+    for function, more in ((bent, ()), (bent_unevenly, (0.4,))):
+        assert torch.allclose(
+            function(bend, torch.tensor(50.0), 1.0, *more), torch.ones(3).double()
+        )
+        assert torch.equal(function(bend, torch.tensor(0.0), 1.0, *more), bend)
+
+
+def test_the_bend_of_one_motion_is_that_of_its_parts():
+    bend = torch.linspace(-0.95, 0.95, 9, dtype=torch.float64)
+    for function, more in ((bent, ()), (bent_unevenly, (0.4,))):
+        for moved in (0.3, -0.7, 2.0):
+            whole = function(bend, torch.tensor(moved), 0.5, *more)
+            parts = bend
+            for _ in range(7):
+                parts = function(parts, torch.tensor(moved / 7.0), 0.5, *more)
+            assert torch.allclose(whole, parts, atol=1e-9)
+
+
+def test_an_uneven_bend_follows_its_equation():
+    width, beta, bend, step = 0.5, 0.4, -0.7, 1e-5
+    exact = float(bent_unevenly(torch.tensor(bend).double(), torch.tensor(0.6), width, beta))
+    for _ in range(60_000):
+        sign = 1.0 if bend > 0.0 else -1.0
+        bend += step * (1.0 - (1.0 - beta + beta * sign) * bend) / width
+    assert exact == pytest.approx(bend, abs=1e-4)
+
+
+def test_a_relaxed_spring_carries_a_steady_motion_as_a_damper():
+    stretch = torch.zeros(())
+    for _ in range(400):
+        stretch = relaxed(stretch, torch.tensor(0.02), 0.01, 0.3)
+    assert float(stretch) == pytest.approx(2.0 * 0.3, rel=1e-3)
+
+
+def test_a_wave_in_time_has_its_frequency():
+    (sine, cosine) = wave_in_time(2.0).values(JOINT).unbind(-1)
+    angle = 4.0 * math.pi * JOINT.values["t"]
+    assert torch.allclose(sine, angle.sin()) and torch.allclose(cosine, angle.cos())
