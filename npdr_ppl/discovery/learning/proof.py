@@ -4,6 +4,7 @@ The terms of the law are chosen from the whole recording, and its constants are 
 at a time. So the halves check the constants, and only held-out rollouts check the terms as well.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -23,6 +24,11 @@ from npdr_ppl.rollouts import Rollouts
 __all__ = ["Check", "checks", "misfit"]
 
 
+SIGNIFICANT = 2.0
+"""Standard deviations by which a law must reduce a misfit: noise alone does with a probability of
+2 %."""
+
+
 @dataclass(frozen=True)
 class Check:
     """The misfit of measurements to which the constants of neither of two models were fitted.
@@ -31,20 +37,27 @@ class Check:
         where: Which measurements.
         before: Misfit of the model without the law, over its number of measurements.
         after: Misfit of the model with it.
+        noise: Standard deviation of the difference from the noise of the measurements.
     """
 
     where: str
     before: float
     after: float
+    noise: float = 0.0
 
     @property
     def helps(self) -> bool:
-        """Whether the law reduces the misfit."""
-        return self.after < self.before
+        """Whether the law reduces the misfit by more than the noise does."""
+        return self.before - self.after > SIGNIFICANT * self.noise
 
     def to_dict(self) -> dict[str, object]:
         """Returns JSON-serialisable values."""
-        return {"where": self.where, "before": self.before, "after": self.after}
+        return {
+            "where": self.where,
+            "before": self.before,
+            "after": self.after,
+            "noise": self.noise,
+        }
 
 
 def misfit(hypothesis: Hypothesis, segments: SegmentModel, scale: Tensor) -> float:
@@ -57,13 +70,53 @@ def misfit(hypothesis: Hypothesis, segments: SegmentModel, scale: Tensor) -> flo
         segments: A model along the other segments.
         scale: Standard deviation of each channel, ``(C,)``.
     """
+    residual = _residual(hypothesis, segments, scale)
+    return _mean_square(residual, segments)
+
+
+def _residual(hypothesis: Hypothesis, segments: SegmentModel, scale: Tensor) -> Tensor | None:
+    """Returns residuals of independent components, ``(S, N)``; ``None`` if simulations fail."""
     own = segments.with_model(hypothesis.model)
     fit = SegmentFit(hypothesis.fit.z, own.no_offsets, scale)
     there = Hypothesis(hypothesis.model, hypothesis.effects, own, fit)
     if not there.can_be_linearised:
+        return None
+    projection = Projection(there, torch.zeros(len(fit.z), dtype=torch.bool))
+    return projection.whitened(projection.residual[..., None])[..., 0]
+
+
+def _mean_square(residual: Tensor | None, segments: SegmentModel) -> float:
+    if residual is None:
         return float("inf")
-    nothing = torch.zeros(len(fit.z), dtype=torch.bool)
-    return Projection(there, nothing).misfit / float(own.num_measured.sum())
+    return float(residual.square().sum()) / float(segments.num_measured.sum())
+
+
+def _check(
+    where: str,
+    segments: SegmentModel,
+    both: Sequence[Hypothesis | None],
+    scale: Tensor,
+    share: float,
+) -> Check:
+    """Compares two models on measurements.
+
+    If the truth is half-way between them, their residuals are e ± δ/2 with the noise e. The
+    difference of their misfits is then 2 e · δ, of standard deviation 2 |δ|. Of dependent
+    measurements, only a share counts.
+
+    Args:
+        where: Which measurements.
+        segments: A model along them.
+        both: The model without the law and with it; ``None`` if it could not be fitted.
+        scale: Standard deviation of each channel, ``(C,)``.
+        share: Number of independent measurements, as a share of all.
+    """
+    before, after = (None if h is None else _residual(h, segments, scale) for h in both)
+    noise = 0.0
+    if before is not None and after is not None:
+        size = float((before - after).norm())
+        noise = 2.0 * size / share**0.5 / float(segments.num_measured.sum())
+    return Check(where, _mean_square(before, segments), _mean_square(after, segments), noise)
 
 
 def checks(
@@ -81,7 +134,7 @@ def checks(
     parts = dict(halves(before.segments.inputs.num_segments))
     result = []
     for fitted, other in (HALVES, HALVES[::-1]):
-        found: list[float] = []
+        found: list[Hypothesis | None] = []
         for hypothesis in (before, after):
             half = hypothesis.segments.along(parts[fitted])
             try:
@@ -91,12 +144,13 @@ def checks(
                     start=hypothesis.parameters,
                     offsets=hypothesis.fit.offsets[parts[fitted]],
                 )
-                found.append(misfit(own, hypothesis.segments.along(parts[other]), scale))
             except DataError:
-                found.append(float("inf"))
-        result.append(Check(other, found[0], found[1]))
+                own = None
+            found.append(own)
+        segments = before.segments.along(parts[other])
+        result.append(_check(other, segments, found, scale, after.share))
     if holdout is not None and options is not None:
         segments = SegmentModel(before.model, holdout, options)
-        both = (misfit(h, segments, scale) for h in (before, after))
-        result.append(Check("the held-out rollouts", *both))
+        where = "the held-out rollouts"
+        result.append(_check(where, segments, (before, after), scale, after.share))
     return result

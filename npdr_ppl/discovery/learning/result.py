@@ -222,8 +222,7 @@ def _alike(model: LearnedModel, candidates: tuple[Effect, ...]) -> dict[str, Lik
         best: Likeness | None = None
         for variant in sensitivities(model.start, there):
             columns = projection.projected(variant.change).flatten(0, 1)
-            solved = torch.linalg.lstsq(columns, target[:, None], driver="gelsd").solution
-            explained = (columns @ solved)[:, 0]
+            explained = columns @ _within(columns, target, variant.lower, variant.upper)
             size = float(explained.norm() * target.norm())
             likeness = float(explained @ target) / size if size > 0.0 else 0.0
             if best is None or likeness > best.correlation:
@@ -231,6 +230,32 @@ def _alike(model: LearnedModel, candidates: tuple[Effect, ...]) -> dict[str, Lik
         if best is not None:
             result[law.port.name] = best
     return result
+
+
+def _within(columns: Tensor, target: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Returns coefficients within limits, ``(k,)``, by least squares.
+
+    What is beyond a limit stays at it while the others are fitted again: friction does not push.
+
+    Args:
+        columns: The columns, ``(n, k)``.
+        target: What they are fitted to, ``(n,)``.
+        lower: Least coefficients, ``(k,)``.
+        upper: Greatest coefficients, ``(k,)``.
+    """
+    solution = torch.zeros_like(lower)
+    is_free = torch.ones_like(lower, dtype=torch.bool)
+    while bool(is_free.any()):
+        left = target - columns[:, ~is_free] @ solution[~is_free]
+        found = torch.linalg.lstsq(columns[:, is_free], left[:, None], driver="gelsd").solution
+        solution[is_free] = found[:, 0]
+        limited = torch.minimum(torch.maximum(solution, lower), upper)
+        is_beyond = is_free & (limited != solution)
+        solution = limited
+        if not bool(is_beyond.any()):
+            break
+        is_free &= ~is_beyond
+    return solution
 
 
 def _change(model: LearnedModel, effect: Effect) -> Tensor | None:
