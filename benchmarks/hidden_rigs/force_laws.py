@@ -61,10 +61,10 @@ def wind(p: Values, q: Array, v: Array, t: float) -> Array:
     return np.copysign(p["force"] * (relative / p["speed"]) ** 2, relative)
 
 
-def periodic_disturbance(p: Values, q: Array, v: Array, t: float) -> Array:
+def periodic_disturbance(p: Values, q: Array, v: Array, t: float | Array) -> Array:
     """Shakes at one frequency."""
     angle = 2.0 * math.pi * p["frequency"] * t
-    force = p["sine"] * math.sin(angle) + p["cosine"] * math.cos(angle)
+    force = p["sine"] * np.sin(angle) + p["cosine"] * np.cos(angle)
     return np.full_like(q, force)
 
 
