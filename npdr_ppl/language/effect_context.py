@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 import torch
@@ -110,6 +111,7 @@ class Joint(NamedTuple):
             known, the part that depends on the actions: a motor's torque without its back-EMF.
         takes_moments: Whether the engine uses the moment of a force within a step in addition to
             its mean; see :meth:`ForceEffect.moment`.
+        others: Position and velocity of the other joints with a force port, by port.
     """
 
     position: Tensor
@@ -118,3 +120,4 @@ class Joint(NamedTuple):
     inverse_inertia: Tensor
     drive: Tensor
     takes_moments: bool = False
+    others: Mapping[str, tuple[Tensor, Tensor]] = MappingProxyType({})

@@ -18,7 +18,7 @@ from npdr_ppl.discovery.learning.memory import (
     Delay,
     MotionMemory,
 )
-from npdr_ppl.discovery.learning.terms import SYMBOLS
+from npdr_ppl.discovery.learning.terms import symbol_of
 from npdr_ppl.python_text import plain, quoted
 
 __all__ = ["class_source", "module_source"]
@@ -68,16 +68,20 @@ def class_source(law: Law) -> str:
     """Returns the source of the class of an effect with a law."""
     constants, uses = law.constants, law.uses
     kind = law.port.kind
-    known = ", ".join(f"{SYMBOLS[u]} in {law.units[u]}" for u in sorted(uses))
+    known = ", ".join(f"{symbol_of(u)} in {law.units[u]}" for u in sorted(uses))
     lines = [
         f"class {law.class_name}({_BASES[kind]}):",
         f'    """{law.formula}',
         "",
         "    " + plain(f"A law at {law.port.name} in {law.port.unit}, of {known}."),
         *(f"    {text}" for text in _states(law)),
+        *(
+            "    " + plain(f"{symbol_of(name)} is the {('position', 'velocity')[k]} at {port}.")
+            for name, k, port in _other_joints(law)
+        ),
         "    It was learned for "
         + ", ".join(
-            f"{SYMBOLS[u]} from {law.ranges[u][0]:.4g} to {law.ranges[u][1]:.4g}"
+            f"{symbol_of(u)} from {law.ranges[u][0]:.4g} to {law.ranges[u][1]:.4g}"
             for u in sorted(uses)
         )
         + ".",
@@ -95,7 +99,7 @@ def class_source(law: Law) -> str:
         f"    strength = ({_quoted([c.name for c in constants if not c.is_shape])})",
         f'    law = "{law.formula}"',
     ]
-    if kind == "force" and "tau" in uses:
+    if kind == "force" and ("tau" in uses or _other_joints(law)):
         lines.append("    needs_joint = True")
     if any(isinstance(term.memory, MotionMemory) for term in law.terms):
         lines.append("    needs_past = True")
@@ -186,19 +190,22 @@ def _entries(indent: str, begin: str, entries: Mapping[str, str]) -> list[str]:
 
 def _force_methods(law: Law) -> list[str]:
     uses, states = law.uses, _remembered(law, MotionMemory)
-    has_time, has_load = "t" in uses, "tau" in uses
+    given = {"tau": "joint.drive"} if "tau" in uses else {}
+    for name, part, port in _other_joints(law):
+        given[name] = f"joint.others[{quoted(port)}][{part}]"
     lines: list[str] = []
-    if has_time or has_load or states:
-        lines += _force_memory(law)
-    if has_load:
+    if "t" in uses or given or states:
+        lines += _force_memory(law, list(given))
+    if given:
         lines += [
             "",
             "    def begin_step(self, joint, parameters, memory, time_step):",
-            '        """Keeps the drive\'s force."""',
-            '        return {**memory, "tau": joint.drive}',
+            '        """Keeps what the step\'s force needs of the joints."""',
+            *_entries("        ", "known =", given),
+            "        return {**memory, **known}",
         ]
     known = ["        q, v, p = position, velocity, parameters"]
-    known += [f'        {name} = memory["{name}"]' for name in ("t", "tau") if name in uses]
+    known += [f'        {name} = memory["{name}"]' for name in ("t", *given) if name in uses]
     within = ['        moved = q - memory["q"]'] if states else []
     for number, name, memory in states:
         within.append(f'        {name} = memory["{name}"]')
@@ -228,20 +235,33 @@ def _force_methods(law: Law) -> list[str]:
     return lines
 
 
-def _force_memory(law: Law) -> list[str]:
-    """Returns the methods that begin and advance the memory of a force."""
+def _other_joints(law: Law) -> list[tuple[str, int, str]]:
+    """Returns variable, its place among position and velocity, and port of other joints."""
+    found = []
+    for variable in sorted(law.uses):
+        symbol, _, number = variable.partition("_")
+        if number:
+            found.append((variable, "qv".index(symbol), law.others[int(number) - 1]))
+    return found
+
+
+def _force_memory(law: Law, given: Sequence[str]) -> list[str]:
+    """Returns the methods that begin and advance the memory of a force.
+
+    Args:
+        law: The law.
+        given: Variables that each step's beginning gives.
+    """
     uses, states = law.uses, _remembered(law, MotionMemory)
     indent = "        "
     first = {"t": "start.time + 0.5 * start.time_step"} if "t" in uses else {}
     later = {"t": 'memory["t"] + time_step'} if "t" in uses else {}
-    if "tau" in uses:
-        first["tau"], later["tau"] = "torch.zeros_like(position)", 'memory["tau"]'
+    for name in given:
+        first[name], later[name] = "torch.zeros_like(position)", f'memory["{name}"]'
     lines = [
         "",
         "    def initial_memory(self, position, velocity, start):",
-        '        """Returns the memory at a segment\'s start, from the motion before it."""'
-        if states
-        else '        """Returns the time in the middle of the step, and the drive\'s force."""',
+        '        """Returns the memory at a segment\'s start; t is in the middle of a step."""',
     ]
     if states:
         lines.append(f"{indent}p, seconds = start.parameters, start.interval")

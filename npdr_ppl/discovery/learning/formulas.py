@@ -229,6 +229,7 @@ def law_of(port: PortFormulas, formula: Formula) -> Law:
         tuple(spreads),
         {name: (float(x.min()), float(x.max())) for name, x in motion.values.items()},
         motion.units,
+        others=motion.others,
     )
 
 

@@ -46,6 +46,7 @@ class Law:
         ranges: Least and greatest value of each variable that was visited.
         units: Units of the variables.
         number: Tells it from other learned effects at ports of this name.
+        others: Ports of the other joints on which it may depend, in the order of their numbers.
     """
 
     port: Port
@@ -55,6 +56,7 @@ class Law:
     ranges: Mapping[str, tuple[float, float]]
     units: Mapping[str, str]
     number: int = 1
+    others: tuple[str, ...] = ()
 
     @property
     def class_name(self) -> str:

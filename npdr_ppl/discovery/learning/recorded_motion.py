@@ -1,7 +1,8 @@
 """What a missing law may depend on, recorded at every port along the simulated motion."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import pyro.distributions as dist
@@ -93,8 +94,9 @@ class PortMotion:
     Attributes:
         port: The port.
         values: Mean over each step of each variable, ``(S, K)``, by symbol: at a joint ``q``,
-            ``v``, the drive's force ``tau``; at an action its command ``u``; at a sensor its
-            value ``y``; and the time ``t`` in s since the rollout began.
+            ``v``, the drive's force ``tau``, and ``q_1``, ``v_1`` and so on of other joints; at
+            an action its command ``u``; at a sensor its value ``y``; and the time ``t`` in s since
+            the rollout began.
         units: Units of the variables.
         responses: Change of the whitened measurements per unit of the law, ``(S, N, P)``, in
             each of P parts of a segment; ``None`` at a sensor, where they depend on the law.
@@ -103,6 +105,7 @@ class PortMotion:
         past: What happened before each segment, oldest first, ``(S, M)``: at a joint its
             displacement in each of M intervals, at an action its command in each of M steps.
         interval: Length of these intervals in s.
+        others: Ports of the other joints, in the order of their numbers.
     """
 
     port: Port
@@ -113,6 +116,7 @@ class PortMotion:
     time_step: float
     past: Tensor
     interval: float
+    others: tuple[str, ...] = ()
 
     def parts(self, values: Tensor) -> Tensor:
         """Returns the mean over each of the P parts, ``(S, P)``, of ``(S, K)``."""
@@ -158,8 +162,8 @@ def motion_at_ports(hypothesis: Hypothesis) -> list[PortMotion]:
             continue
         if seen is None:
             continue
-        values, units, past, interval = seen
-        end = edges, inputs.time_step, past, interval
+        values, units, past, interval, others = seen
+        end = edges, inputs.time_step, past, interval, others
         if port.kind == "sensor":
             found.append(PortMotion(port, values, units, None, *end))
             continue
@@ -209,8 +213,8 @@ def _pulsed(
         return None
 
 
-_Seen = tuple[dict[str, Tensor], dict[str, str], Tensor, float]
-"""Variables, their units, what happened before, and the length of its intervals in s."""
+_Seen = tuple[dict[str, Tensor], dict[str, str], Tensor, float, tuple[str, ...]]
+"""Variables, their units, what happened before, the length of its intervals, other joints."""
 
 
 def _joint_motion(hypothesis: Hypothesis, segments: SegmentModel, port: Port) -> _Seen | None:
@@ -226,21 +230,32 @@ def _joint_motion(hypothesis: Hypothesis, segments: SegmentModel, port: Port) ->
     if not recorder.seen or len(recorder.seen) % steps:
         return None
 
-    def collected(name: str) -> Tensor:
-        every = torch.stack([torch.as_tensor(getattr(j, name)).reshape(-1) for j in recorder.seen])
+    def collected(of: Callable[[Joint], Tensor]) -> Tensor:
+        every = torch.stack([torch.as_tensor(of(joint)).reshape(-1) for joint in recorder.seen])
         # (steps × substeps, S) → the mean over the substeps, (S, steps)
         return every.double().expand(-1, num).unflatten(0, (steps, -1)).mean(1).mT.contiguous()
 
-    values = {"q": collected("position"), "v": collected("velocity")}
+    values = {"q": collected(lambda joint: joint.position)}
+    values["v"] = collected(lambda joint: joint.velocity)
     units = {"q": port.coordinate, "v": f"{port.coordinate}/s"}
     if port.is_driven:
-        values["tau"], units["tau"] = collected("drive"), port.unit
+        values["tau"], units["tau"] = collected(lambda joint: joint.drive), port.unit
     values["t"], units["t"] = _time(segments), "s"
+    others = tuple(recorder.seen[0].others)
+    for number, name in enumerate(others, 1):
+        unit = simulator.port(name).coordinate
+        for symbol, part, own in (("q", 0, unit), ("v", 1, f"{unit}/s")):
+            values[f"{symbol}_{number}"] = collected(partial(_of_other, name, part))
+            units[f"{symbol}_{number}"] = own
     past, interval = torch.zeros(num, 0, dtype=torch.float64), inputs.time_step
     if recorder.start is not None and recorder.start.displacements:
         moved = [step.reshape(-1, num)[0] for step in recorder.start.displacements]
         past, interval = torch.stack(moved, dim=1).double(), recorder.start.interval
-    return values, units, past, interval
+    return values, units, past, interval, others
+
+
+def _of_other(name: str, part: int, joint: Joint) -> Tensor:
+    return joint.others[name][part]
 
 
 def _command(segments: SegmentModel, port: Port) -> _Seen | None:
@@ -256,7 +271,7 @@ def _command(segments: SegmentModel, port: Port) -> _Seen | None:
         first = (num - inputs.start).clamp_min(0)[:, None]
         every = torch.cat((past, values["u"]), dim=1)
         past = torch.where(torch.arange(num) < first, every.gather(1, first), past)
-    return values, {"u": port.unit, "t": "s"}, past, inputs.time_step
+    return values, {"u": port.unit, "t": "s"}, past, inputs.time_step, ()
 
 
 def _reading(hypothesis: Hypothesis, segments: SegmentModel, port: Port) -> _Seen | None:
@@ -269,7 +284,7 @@ def _reading(hypothesis: Hypothesis, segments: SegmentModel, port: Port) -> _See
     column = segments.channel_names.index(port.name)
     value = (segments.observed - hypothesis.difference)[..., column].double()
     none = torch.zeros(len(value), 0, dtype=torch.float64)
-    return {"y": value, "t": _time(segments)}, {"y": port.unit, "t": "s"}, none, 0.0
+    return {"y": value, "t": _time(segments)}, {"y": port.unit, "t": "s"}, none, 0.0, ()
 
 
 def _time(segments: SegmentModel) -> Tensor:

@@ -21,10 +21,16 @@ from npdr_ppl.discovery.learning.memory import (
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 from npdr_ppl.discovery.learning.settings import LEARNING
 
-__all__ = ["SYMBOLS", "Shape", "Term", "terms_at", "wave_in_time", "with_harmonics"]
+__all__ = ["Shape", "Term", "symbol_of", "terms_at", "wave_in_time", "with_harmonics"]
 
 SYMBOLS = {"q": "q", "v": "v", "tau": "τ", "u": "u", "y": "y", "t": "t"}
-"""Variables as they are written in formulas."""
+"""Variables as they are written in formulas, but for those of other joints."""
+
+
+def symbol_of(variable: str) -> str:
+    """Returns a variable as it is written in formulas; the first other joint has ``q₁``."""
+    name, _, number = variable.partition("_")
+    return SYMBOLS[name] + number.translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
 
 
 @dataclass(frozen=True)
@@ -164,6 +170,8 @@ def _force_terms(motion: PortMotion) -> Iterator[Term]:
         yield _product(motion, age, is_dry=True)
     yield from _stops(motion)
     yield from _remembering_forces(motion)
+    for number in range(1, len(motion.others) + 1):
+        yield from _of_another_joint(motion, f"q_{number}", f"v_{number}")
     for variable in ("q", "v", "t"):
         yield _spline(motion, variable)
         yield _spline(motion, variable, is_dry=True)
@@ -206,7 +214,7 @@ def _static_terms(motion: PortMotion, name: str) -> Iterator[Term]:
     """Returns terms in a command and the time."""
     unit = motion.units[name]
     own = [
-        _single(name, name, SYMBOLS[name], unit),
+        _single(name, name, symbol_of(name), unit),
         _single(name, f"torch.abs({name})", f"|{name}|", unit, 1),
         _single(name, f"{name} * torch.abs({name})", f"{name}|{name}|", f"({unit})²", 1),
         _single(name, f"{name} * {name}", f"{name}²", f"({unit})²", 1),
@@ -238,6 +246,31 @@ def _static_terms(motion: PortMotion, name: str) -> Iterator[Term]:
     yield _spline(motion, name)
     if name == "u":
         yield from _remembering_commands(motion)
+
+
+def _of_another_joint(motion: PortMotion, q: str, v: str) -> Iterator[Term]:
+    """Returns forces that depend on another joint's position and velocity, and on both joints."""
+    units, position, speed = motion.units, symbol_of(q), symbol_of(v)
+    place, rate = _single(q, q, position, units[q]), _single(v, v, speed, units[v])
+    squares = [
+        _single(v, f"{v} * torch.abs({v})", f"{speed}|{speed}|", f"({units[v]})²", 1),
+        _single(v, f"{v} * {v}", f"{speed}²", f"({units[v]})²", 1),
+    ]
+    turns = _turns(units, q, range(1, 3))
+    own = [_single("q", "q", "q", units["q"]), _single("v", "v", "v", units["v"])]
+    for one in (place, rate, *squares, *turns):
+        yield _product(motion, one)
+    for one, other in product((place, rate), own):
+        yield _product(motion, one, other)
+    for one, other in product(turns[:1], (own[1], rate, squares[1])):
+        yield _product(motion, one, other)
+    if units[q] == units["q"] == "rad":
+        for sign, mark in (("+", "+"), ("-", "−")):
+            columns = f"torch.sin(q {sign} {q})", f"torch.cos(q {sign} {q})"
+            formulas = f"sin(q {mark} {position})", f"cos(q {mark} {position})"
+            both = _Factor(columns, formulas, frozenset({"q", q}), "", cost=2.0)
+            yield _product(motion, both)
+            yield _product(motion, both, squares[1])
 
 
 def _remembering_forces(motion: PortMotion) -> Iterator[Term]:
@@ -337,7 +370,8 @@ def _turns(units: Mapping[str, str], name: str, numbers: range) -> list[_Factor]
         return []
     found = []
     for n in numbers:
-        argument, text = (name, name) if n == 1 else (f"{n} * {name}", f"{n} {name}")
+        symbol = symbol_of(name)
+        argument, text = (name, symbol) if n == 1 else (f"{n} * {name}", f"{n} {symbol}")
         columns = f"torch.sin({argument})", f"torch.cos({argument})"
         formulas = f"sin {text}", f"cos {text}"
         found.append(_Factor(columns, formulas, frozenset({name}), "", cost=1.0))
@@ -470,7 +504,7 @@ def _spline(motion: PortMotion, variable: str, *, is_dry: bool = False) -> Term:
         f"hat({variable}, {every[k]:.6g}, {every[k + 1]:.6g}, {every[k + 2]:.6g})"
         for k in range(len(knots))
     )
-    symbol = SYMBOLS[variable]
+    symbol = symbol_of(variable)
     sign = " · sign v" if is_dry else ""
     return Term(
         f"spline({symbol}){sign}",

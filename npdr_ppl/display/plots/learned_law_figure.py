@@ -4,7 +4,7 @@ from matplotlib.figure import Figure
 
 from npdr_ppl.discovery.learning.curves import Curve
 from npdr_ppl.discovery.learning.result import Learned
-from npdr_ppl.discovery.learning.terms import SYMBOLS
+from npdr_ppl.discovery.learning.terms import symbol_of
 from npdr_ppl.display.plots.marginals import add_legend
 from npdr_ppl.drawing.theme import COLORS, theme
 
@@ -50,7 +50,7 @@ def plot_learned_law(learned: Learned) -> Figure:
                         label="estimated without a law",
                     )
                 axis.axhline(0.0, color="0.8", lw=0.6, zorder=0)
-                axis.set_xlabel(f"{SYMBOLS[curve.variable]} [{curve.variable_unit}]")
+                axis.set_xlabel(f"{symbol_of(curve.variable)} [{curve.variable_unit}]")
             row[0].set_ylabel(f"{found[0].port} [{found[0].unit}]")
             for axis in row[len(found) :]:
                 axis.set_visible(False)

@@ -100,6 +100,7 @@ class EffectChain(ABC):
         histories: tuple[int, ...],
     ) -> None:
         self.simulator = simulator
+        self.joints = joints
         self.time_step = time_step
         self.histories = histories
         actions = [channel.name for channel in simulator.actions]
@@ -486,6 +487,14 @@ class EffectChain(ABC):
         for k, (place, effect, joint) in enumerate(self.force_effects):
             seen = joints[joint]
             if effect.needs_joint and seen is not None:
+                others = zip(self.joints, joints, strict=True)
+                seen = seen._replace(
+                    others={
+                        name: (other.position, other.velocity)
+                        for place_of_other, (name, other) in enumerate(others)
+                        if other is not None and place_of_other != joint
+                    }
+                )
                 memory[k] = effect.begin_step(
                     seen, tables.effects[place], memory[k], self.force_step
                 )

@@ -19,7 +19,10 @@ def law_with(motion, term):
     num = len(term.columns)
     coefficients = tuple(0.3 + 0.1 * k for k in range(num))
     ranges = {name: (float(x.min()), float(x.max())) for name, x in motion.values.items()}
-    return Law(motion.port, (term,), coefficients, (1.0,) * num, ranges, motion.units)
+    spreads = (1.0,) * num
+    return Law(
+        motion.port, (term,), coefficients, spreads, ranges, motion.units, others=motion.others
+    )
 
 
 def waves_with_harmonics(motion):
@@ -36,10 +39,11 @@ def test_a_force_is_the_same_in_the_file_as_along_the_motion(extra):
         parameters = {name.rpartition(".")[2]: value for name, value in values.items()}
         x = {name: value.flatten() for name, value in JOINT.values.items()}
         memory = None
-        if law.uses & {"t", "tau"}:
+        if law.uses & {"t", "tau", "q_1", "v_1"}:
             start = Start(x["t"] - 0.005, 0.01, parameters)
             memory = effect.initial_memory(x["q"], x["v"], start)
-            joint = Joint(x["q"], x["v"], x["q"], x["q"], x["tau"])
+            others = {"elbow": (x["q_1"], x["v_1"])}
+            joint = Joint(x["q"], x["v"], x["q"], x["q"], x["tau"], others=others)
             if effect.needs_joint:
                 memory = effect.begin_step(joint, parameters, memory, 0.01)
         expected = (term.values(JOINT) * torch.tensor(law.coefficients)).sum(-1).flatten()
@@ -158,3 +162,11 @@ def test_a_law_has_another_name_than_effects_that_are_known():
     other = law.apart_from({"learned_hinge", "learned_hinge__2"})
     effects, _ = effects_of([law, other])
     assert [effect.id for effect in effects] == ["learned_hinge", "learned_hinge__3"]
+
+
+def test_a_law_that_depends_on_another_joint_names_it():
+    term = next(t for t in terms_at(JOINT) if t.key == "q₁ · v")
+    law = law_with(JOINT, term)
+    assert law.formula == "c₁ q₁ · v"
+    source = module_source([law], "From a test.")
+    assert "q₁ is the position at elbow." in source and 'joint.others["elbow"][0]' in source

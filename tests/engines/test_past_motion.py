@@ -1,0 +1,60 @@
+"""Forces that remember are told how their joint moved before a segment."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hidden_rigs import make_case
+from hidden_rigs.rigs import RIGS
+from pyro.distributions import Normal
+
+from npdr_ppl.language.channels import Parameter
+from npdr_ppl.language.effects import ForceEffect
+
+
+class Witness(ForceEffect):
+    """No force: it keeps what it is told."""
+
+    id = "witness"
+    needs_past = True
+    needs_joint = True
+    parameters = (Parameter("nothing", "1", 0.0, "not used"),)
+
+    def default_priors(self, port):
+        return {"nothing": Normal(0.0, 1.0)}
+
+    def initial_memory(self, position, velocity, start):
+        self.start, self.others = start, None
+
+    def begin_step(self, joint, parameters, memory, time_step):
+        self.others = self.others or joint.others
+        return memory
+
+
+@pytest.mark.parametrize("rig", ["furuta", "furuta_mujoco"])
+def test_displacements_are_those_of_the_recorded_positions(rig):
+    rollouts = make_case("furuta", "null", seed=3).fit
+    inputs = rollouts.inputs(100)
+    witness = Witness("pole")
+    simulator = RIGS[rig].simulator().with_effects(witness)
+    simulator.simulate({"pole.witness.nothing": torch.zeros(3)}, inputs)
+    start, column = witness.start, inputs.channel_names.index("pole_angle")
+    moved = torch.stack(start.displacements, dim=-1).reshape(3, inputs.num_segments, -1)
+    assert torch.equal(moved[0], moved[2])
+    stride = round(start.interval / inputs.time_step)
+    for segment in (1, 7, inputs.num_segments - 1):
+        readings = rollouts.readings[int(inputs.rollout[segment])][:, column]
+        first = int(inputs.start[segment])
+        for back in (1, 3):
+            expected = readings[first] - readings[max(0, first - back * stride)]
+            assert float(moved[0, segment, -back:].sum()) == pytest.approx(expected, abs=1e-9)
+    assert not moved[0, 0].any()  # nothing is known before a rollout begins
+    assert set(witness.others) == {"arm"}
+
+
+def test_nothing_is_told_where_no_recording_is():
+    inputs = make_case("furuta", "null", seed=3).fit.inputs(100)
+    witness = Witness("pole")
+    simulator = RIGS["furuta"].simulator().with_effects(witness)
+    simulator.simulate({"pole.witness.nothing": torch.zeros(1)}, replace(inputs, recorded=None))
+    assert witness.start.displacements == ()
