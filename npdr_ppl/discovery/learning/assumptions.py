@@ -56,6 +56,8 @@ class Assumptions:
 
     def _part_of(self, term: Term, motion: PortMotion) -> Term | None:
         """Returns a term with the columns that agree; ``None`` if none does."""
+        if self.symmetry is None and not self.is_passive:
+            return term
         values = term.values(motion)
         kept = torch.ones(values.shape[-1], dtype=torch.bool)
         if self.symmetry is not None:
