@@ -215,6 +215,8 @@ def _show_learned(console: Console, learned: Mapping[str, Any]) -> None:
     console.print(table)
     for law in learned["laws"]:
         port = law["port"]
+        for letter, about in law.get("letters", {}).items():
+            console.print(f"{escape(letter)} is {escape(about)}.")
         shares = learned["depends_on"].get(port, {})
         words = ", ".join(f"{symbol} {share:.0%}" for symbol, share in shares.items())
         if words:

@@ -68,17 +68,15 @@ def class_source(law: Law) -> str:
     """Returns the source of the class of an effect with a law."""
     constants, uses = law.constants, law.uses
     kind = law.port.kind
+    has_states = any(term.memory is not None for term in law.terms)
     known = ", ".join(f"{symbol_of(u)} in {law.units[u]}" for u in sorted(uses))
     lines = [
         f"class {law.class_name}({_BASES[kind]}):",
         f'    """{law.formula}',
         "",
         "    " + plain(f"A law at {law.port.name} in {law.port.unit}, of {known}."),
-        *(f"    {text}" for text in _states(law)),
-        *(
-            "    " + plain(f"{symbol_of(name)} is the {('position', 'velocity')[k]} at {port}.")
-            for name, k, port in _other_joints(law)
-        ),
+        *("    " + plain(f"{letter} is {about}.") for letter, about in law.letters.items()),
+        *(["    A segment begins with what the past 5 s left."] if has_states else []),
         "    It was learned for "
         + ", ".join(
             f"{symbol_of(u)} from {law.ranges[u][0]:.4g} to {law.ranges[u][1]:.4g}"
@@ -99,7 +97,7 @@ def class_source(law: Law) -> str:
         f"    strength = ({_quoted([c.name for c in constants if not c.is_shape])})",
         f'    law = "{law.formula}"',
     ]
-    if kind == "force" and ("tau" in uses or _other_joints(law)):
+    if kind == "force" and ("tau" in uses or law.of_other_joints):
         lines.append("    needs_joint = True")
     if any(isinstance(term.memory, MotionMemory) for term in law.terms):
         lines.append("    needs_past = True")
@@ -151,19 +149,6 @@ def _own(law: Law, number: int, expression: str) -> str:
     return expression
 
 
-def _states(law: Law) -> list[str]:
-    """Returns sentences about the states on which a law depends."""
-    result = []
-    for number, term in enumerate(law.terms, 1):
-        memory = term.memory
-        if memory is not None:
-            letter = law.marked(memory.letter, number)
-            from_where = "the motion" if isinstance(memory, MotionMemory) else "the commands"
-            begins = f"; a segment begins with what {from_where} of the past 5 s left"
-            result.append(f"{letter} is {memory.about}{begins}.")
-    return result
-
-
 def _sum(summands: Sequence[str], indent: str) -> str:
     if not summands:
         return "0.0"
@@ -191,7 +176,7 @@ def _entries(indent: str, begin: str, entries: Mapping[str, str]) -> list[str]:
 def _force_methods(law: Law) -> list[str]:
     uses, states = law.uses, _remembered(law, MotionMemory)
     given = {"tau": "joint.drive"} if "tau" in uses else {}
-    for name, part, port in _other_joints(law):
+    for name, part, port in law.of_other_joints:
         given[name] = f"joint.others[{quoted(port)}][{part}]"
     lines: list[str] = []
     if "t" in uses or given or states:
@@ -233,16 +218,6 @@ def _force_methods(law: Law) -> list[str]:
                 "        )",
             ]
     return lines
-
-
-def _other_joints(law: Law) -> list[tuple[str, int, str]]:
-    """Returns variable, its place among position and velocity, and port of other joints."""
-    found = []
-    for variable in sorted(law.uses):
-        symbol, _, number = variable.partition("_")
-        if number:
-            found.append((variable, "qv".index(symbol), law.others[int(number) - 1]))
-    return found
 
 
 def _force_memory(law: Law, given: Sequence[str]) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
 
-from npdr_ppl.discovery.learning.terms import Term
+from npdr_ppl.discovery.learning.terms import Term, symbol_of
 from npdr_ppl.language.channels import Port
 
 __all__ = ["Constant", "Law"]
@@ -88,6 +88,28 @@ class Law:
     def uses(self) -> frozenset[str]:
         """Symbols of the variables that it depends on."""
         return frozenset(symbol for term in self.terms for symbol in term.uses)
+
+    @property
+    def letters(self) -> dict[str, str]:
+        """What the letters of states and of other joints in its formula mean."""
+        found = {
+            self.marked(term.memory.letter, number): term.memory.about
+            for number, term in enumerate(self.terms, 1)
+            if term.memory is not None
+        }
+        for variable, part, port in self.of_other_joints:
+            found[symbol_of(variable)] = f"the {('position', 'velocity')[part]} at {port}"
+        return found
+
+    @property
+    def of_other_joints(self) -> list[tuple[str, int, str]]:
+        """Its variables of other joints, their places among position and velocity, and ports."""
+        parts = [(variable, *variable.partition("_")[::2]) for variable in sorted(self.uses)]
+        return [
+            (variable, "qv".index(symbol), self.others[int(number) - 1])
+            for variable, symbol, number in parts
+            if number
+        ]
 
     @property
     def constants(self) -> list[Constant]:

@@ -197,9 +197,9 @@ class NormalEquations:
         """Reduction of the misfit that the best of so many spurious coefficients brings."""
         return self.inflation * 2.0 * math.log(max(2, len(self.terms) + self.num_others))
 
-    def without_terms(self, uses: str) -> "NormalEquations":
+    def without_terms(self, variable: str) -> "NormalEquations":
         """Returns the equations of the terms that do not depend on a variable."""
-        kept = [k for k, term in enumerate(self.terms) if uses not in term.uses]
+        kept = [k for k, term in enumerate(self.terms) if not term.depends_on(variable)]
         index = self._index(kept)
         slices, first = [], 0
         for k in kept:

@@ -16,6 +16,7 @@ from npdr_ppl.discovery.learning.law import Law
 from npdr_ppl.discovery.learning.learn import LearnedModel, learned_model
 from npdr_ppl.discovery.learning.proof import Check, checks
 from npdr_ppl.discovery.learning.settings import LEARNING
+from npdr_ppl.discovery.learning.terms import HISTORY
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.search.evidence import closest
@@ -117,6 +118,7 @@ def _law(law: Law) -> dict[str, Any]:
         "unit": law.port.unit,
         "formula": law.formula,
         "with_numbers": law.formula_with_numbers,
+        "letters": law.letters,
         "constants": {c.name: {"value": c.value, "unit": c.unit} for c in law.constants},
         "ranges": {name: list(law.ranges[name]) for name in sorted(law.uses)},
     }
@@ -199,12 +201,17 @@ def _dependence(port: PortFormulas) -> dict[str, float]:
         return {}
     result = {}
     equations = port.equations()
-    for symbol in port.motion.values:
+    own = {name: name for name in port.motion.values}
+    for number, other in enumerate(port.motion.others, 1):
+        own |= {f"q_{number}": f"q of {other}", f"v_{number}": f"v of {other}"}
+    if any(term.memory is not None for term in port.terms):
+        own[HISTORY] = HISTORY
+    for variable, name in own.items():
         # Harmonics are only in the port's own formulas.
-        without = [f for f in port.front if all(symbol not in term.uses for term in f.terms)]
-        without += equations.without_terms(symbol).front()
+        without = [f for f in port.front if not any(t.depends_on(variable) for t in f.terms)]
+        without += equations.without_terms(variable).front()
         lost = min(formula.error for formula in without) - best
-        result[symbol] = min(1.0, max(0.0, lost / (none - best)))
+        result[name] = min(1.0, max(0.0, lost / (none - best)))
     return dict(sorted(result.items(), key=lambda item: -item[1]))
 
 

@@ -21,10 +21,14 @@ from npdr_ppl.discovery.learning.memory import (
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 from npdr_ppl.discovery.learning.settings import LEARNING
 
-__all__ = ["Shape", "Term", "symbol_of", "terms_at", "wave_in_time", "with_harmonics"]
+__all__ = ["HISTORY", "Shape", "Term", "symbol_of", "terms_at", "wave_in_time", "with_harmonics"]
 
 SYMBOLS = {"q": "q", "v": "v", "tau": "τ", "u": "u", "y": "y", "t": "t"}
 """Variables as they are written in formulas, but for those of other joints."""
+
+
+HISTORY = "history"
+"""Stands for the past motion and commands, among the variables."""
 
 
 def symbol_of(variable: str) -> str:
@@ -76,6 +80,10 @@ class Term:
     is_spline: bool = False
     memory: Memory | None = None
     cost: float = field(default=1.0)
+
+    def depends_on(self, variable: str) -> bool:
+        """Returns whether it depends on a variable, by symbol, or on the ``"history"``."""
+        return self.memory is not None if variable == HISTORY else variable in self.uses
 
     def values(self, motion: PortMotion) -> Tensor:
         """Returns the columns along the motion, ``(S, K, k)``."""

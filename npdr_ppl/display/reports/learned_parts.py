@@ -48,6 +48,9 @@ def _law(law: Mapping[str, Any], learned: Mapping[str, Any]) -> list[Part]:
             ("constant", "value", "unit"), rows, f"{law.get('formula')} at {port}; for {where}."
         )
     ]
+    meanings = [f"{letter} is {about}." for letter, about in (law.get("letters") or {}).items()]
+    if meanings:
+        parts.append(TextPart(" ".join(meanings)))
     shares = (learned.get("depends_on") or {}).get(port) or {}
     if shares:
         words = ", ".join(f"{symbol} {number(share, '.0%')}" for symbol, share in shares.items())

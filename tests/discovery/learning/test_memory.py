@@ -70,6 +70,7 @@ def test_a_law_may_have_several_states():
     law = law_with(JOINT, terms["bend"], terms["stretch"])
     assert torch.allclose(forces(law, JOINT), expected(law, JOINT), rtol=1e-4, atol=1e-4)
     assert "b₁" in law.formula and "r₂'" in law.formula_with_numbers
+    assert set(law.letters) == {"b₁", "r₂"}
 
 
 def test_commands_that_remember_are_the_same_in_the_file_as_along_the_commands():

@@ -167,6 +167,6 @@ def test_a_law_has_another_name_than_effects_that_are_known():
 def test_a_law_that_depends_on_another_joint_names_it():
     term = next(t for t in terms_at(JOINT) if t.key == "q₁ · v")
     law = law_with(JOINT, term)
-    assert law.formula == "c₁ q₁ · v"
+    assert law.formula == "c₁ q₁ · v" and law.letters == {"q₁": "the position at elbow"}
     source = module_source([law], "From a test.")
     assert "q₁ is the position at elbow." in source and 'joint.others["elbow"][0]' in source
