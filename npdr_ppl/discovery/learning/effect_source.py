@@ -13,7 +13,6 @@ from npdr_ppl.discovery.learning.expressions import FUNCTIONS
 from npdr_ppl.discovery.learning.law import Law
 from npdr_ppl.discovery.learning.memory import (
     DELAY,
-    TIME_CONSTANTS,
     CommandMemory,
     Delay,
     MotionMemory,
@@ -270,10 +269,11 @@ def _action_methods(law: Law) -> list[str]:
         later["t"] = "t + time_step"
         known.append(f'{indent}t = memory["t"]')
     for number, name, memory in states:
-        first[name], later[name] = "command", _own(law, number, memory.later)
+        first[name], later[name] = memory.settled, _own(law, number, memory.later)
         known.append(f'{indent}{name} = memory["{name}"]')
         now.append(f"{indent}{name} = {_own(law, number, memory.now)}")
-        times.append(f"{TIME_CONSTANTS * law.terms[number - 1].shapes[0].value:.3g}")
+        shapes = {shape.name: shape.value for shape in law.terms[number - 1].shapes}
+        times.append(f"{memory.fades_in(shapes):.3g}")
     own = {name: f'"{law.own_name("delay", number)}"' for number, name, _ in delays}
     now += [f"{indent}{name} = delayed(commands, p[{d}], seconds)" for name, d in own.items()]
     lines = ["", f"    memory_time = {max(times, key=float)}"]

@@ -223,6 +223,7 @@ LETTERS = {
     "width": "w",
     "asymmetry": "β",
     "delay": "d",
+    "damping": "ζ",
 }
 """Letters of the shape constants in formulas."""
 

@@ -21,6 +21,7 @@ __all__ = [
     "HYSTERESIS",
     "LAG",
     "RELAXATION",
+    "RESONANCE",
     "UNEVEN_HYSTERESIS",
     "CommandMemory",
     "Delay",
@@ -74,7 +75,7 @@ class MotionMemory(Memory):
 
     def along(self, motion: PortMotion, constants: Mapping[str, float]) -> Tensor:
         """Returns the state in the middle of each step; it is zero where the past begins."""
-        known: dict[str, Any] = dict(constants)
+        known: dict[str, Any] = _tensors(constants)
         state = torch.zeros_like(motion.values["t"][:, 0])
         for moved in motion.past.unbind(1):
             known |= {self.symbol: state, "moved": moved, "seconds": motion.interval}
@@ -97,23 +98,33 @@ class CommandMemory(Memory):
     Attributes:
         now: Expression of the state's mean over a step, from that at the step's start.
         later: Expression of the state after ``seconds`` with a command.
+        settled: Expression of the state after a long time with one ``command``.
+        is_resonant: Whether it oscillates.
     """
 
     now: str
     later: str
+    settled: str = "command"
+    is_resonant: bool = False
+
+    def fades_in(self, constants: Mapping[str, float]) -> float:
+        """Returns the time in s after which it has forgotten."""
+        slowness = 1.0 / constants["damping"] if self.is_resonant else 1.0
+        return TIME_CONSTANTS * slowness * constants["time_constant"]
 
     def along(self, motion: PortMotion, constants: Mapping[str, float]) -> Tensor:
         """Returns the state's mean over each step; it is settled where the past begins."""
-        known = {**constants, "seconds": motion.time_step}
-        most = math.ceil(TIME_CONSTANTS * constants["time_constant"] / motion.time_step)
+        known: dict[str, Any] = {**_tensors(constants), "seconds": motion.time_step}
+        most = math.ceil(self.fades_in(constants) / motion.time_step)
         past = motion.past[:, max(0, motion.past.shape[1] - most) :]
         u = torch.cat((past, motion.values["u"]), dim=1)
-        state, found = u[:, 0], []
-        for command in u.unbind(1):
+        state, found = evaluated(self.settled, {"command": u[:, 0]}), []
+        for step, command in enumerate(u.unbind(1), -past.shape[1]):
             known |= {self.symbol: state, "u": command}
-            found.append(evaluated(self.now, known))
+            if step >= 0:
+                found.append(evaluated(self.now, known))
             state = evaluated(self.later, known)
-        return torch.stack(found[past.shape[1] :], dim=1)
+        return torch.stack(found, dim=1)
 
 
 @dataclass(frozen=True)
@@ -130,6 +141,10 @@ class Delay(Memory):
         first = u.shape[1] - num - whole
         later, earlier = u[:, first : first + num], u[:, first - 1 : first - 1 + num]
         return later + (steps - whole) * (earlier - later)
+
+
+def _tensors(constants: Mapping[str, float]) -> dict[str, Any]:
+    return {name: torch.tensor(x, dtype=torch.float64) for name, x in constants.items()}
 
 
 HYSTERESIS = MotionMemory(
@@ -169,6 +184,17 @@ LAG = CommandMemory(
     "the command after a first-order lag",
     "mean_lagged(output, u, seconds, time_constant)",
     "lagged(output, u, seconds, time_constant)",
+)
+
+RESONANCE = CommandMemory(
+    "ring",
+    "z",
+    "T² z'' + 2 ζ T z' = u − z",
+    "the command after a resonance",
+    "mean_ringing(ring, u, seconds, time_constant, damping)",
+    "ringing(ring, u, seconds, time_constant, damping)",
+    "(command, torch.zeros_like(command))",
+    is_resonant=True,
 )
 
 DELAY = Delay("late", "u(t − d)", "", "the command a time d ago")

@@ -38,6 +38,7 @@ class LearningSettings:
         asymmetry: Asymmetry of a hysteresis that is tried first, between 0 and 0.5.
         shortest_relaxation: Least time constant of a relaxation that is tried, in steps. Shorter
             ones are damping.
+        damping: Damping ratio of a resonance that is tried first, that of a metal gear.
         longest_lag: Longest lag and delay of a command that are tried, in steps. Control loops
             with longer ones are not used.
         most_frequencies: Greatest number of frequencies at which a wave in time is looked for.
@@ -70,6 +71,7 @@ class LearningSettings:
     narrowest_hysteresis: float = 2.0
     asymmetry: float = 0.3
     shortest_relaxation: float = 3.0
+    damping: float = 0.05
     longest_lag: float = 10.0
     most_frequencies: int = 1000
     num_peaks: int = 8
@@ -93,6 +95,7 @@ class LearningSettings:
         check_range(self, 0.1, 100.0, "narrowest_hysteresis", "shortest_relaxation")
         check_range(self, 0.5, 100.0, "longest_lag")
         check_range(self, 0.0, 0.45, "asymmetry")
+        check_range(self, 1e-3, 0.9, "damping")
         check_range(self, 0.0, 1.0, "negligible")
         check_range(self, 1e-6, 0.5, "shape_step", "finest_shape_step")
 

@@ -15,6 +15,7 @@ from npdr_ppl.discovery.learning.memory import (
     HYSTERESIS,
     LAG,
     RELAXATION,
+    RESONANCE,
     UNEVEN_HYSTERESIS,
     Memory,
 )
@@ -92,7 +93,10 @@ class Term:
         if self.memory is not None:
             known[self.memory.symbol] = self.memory.along(motion, constants)
         some = motion.values["t"]
-        columns = [evaluated(column, known).expand_as(some) for column in self.columns]
+        columns = [
+            torch.as_tensor(evaluated(column, known), dtype=torch.float64).expand_as(some)
+            for column in self.columns
+        ]
         values = torch.stack(columns, dim=-1)
         return -values * motion.values["v"].sign()[..., None] if self.is_dry else values
 
@@ -303,12 +307,17 @@ def _remembering_forces(motion: PortMotion) -> Iterator[Term]:
 
 
 def _remembering_commands(motion: PortMotion) -> Iterator[Term]:
-    """Returns the changes of a command by a lag and by a delay."""
+    """Returns the changes of a command by a lag, by a resonance, and by a delay.
+
+    An elastic joint is a resonance: the force that its motor passes on to the link.
+    """
     unit, step = motion.units["u"], motion.time_step
     num = 2 * LEARNING.num_shapes
     for time in _logarithmic(0.3 * step, LEARNING.longest_lag * step, num):
         constant = Shape("time_constant", time, "s")
         yield _with_memory(LAG, "output - u", "(z − u)", unit, {"u"}, constant)
+        damping = Shape("damping", LEARNING.damping, "1")
+        yield _with_memory(RESONANCE, "ring - u", "(z − u)", unit, {"u"}, constant, damping)
     for time in _logarithmic(0.3 * step, LEARNING.longest_lag * step, num):
         constant = Shape("delay", time, "s")
         yield _with_memory(DELAY, "late - u", "(u(t − d) − u)", unit, {"u"}, constant)

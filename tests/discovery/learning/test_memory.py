@@ -5,7 +5,13 @@ import math
 import pytest
 import torch
 
-from npdr_ppl.discovery.learning.expressions import bent, bent_unevenly, relaxed
+from npdr_ppl.discovery.learning.expressions import (
+    bent,
+    bent_unevenly,
+    mean_ringing,
+    relaxed,
+    ringing,
+)
 from npdr_ppl.discovery.learning.formulas import effects_of
 from npdr_ppl.discovery.learning.law import Law
 from npdr_ppl.discovery.learning.terms import terms_at, wave_in_time
@@ -14,6 +20,10 @@ from npdr_ppl.language.effect_context import Start
 from tests.helpers.port_motions import COMMAND, JOINT
 
 STEP = JOINT.time_step
+
+
+def tensor(value):
+    return torch.tensor(value, dtype=torch.float64)
 
 
 def remembering(motion):
@@ -75,7 +85,7 @@ def test_a_law_may_have_several_states():
 
 def test_commands_that_remember_are_the_same_in_the_file_as_along_the_commands():
     terms = remembering(COMMAND)
-    assert {term.memory.symbol for term in terms} == {"output", "late"}
+    assert {term.memory.symbol for term in terms} == {"output", "ring", "late"}
     every = torch.cat((COMMAND.past, COMMAND.values["u"]), dim=1)
     num = COMMAND.past.shape[1]
     for term in terms:
@@ -98,27 +108,29 @@ def test_commands_that_remember_are_the_same_in_the_file_as_along_the_commands()
 
 def test_the_bend_settles_at_the_side_of_a_long_motion_and_keeps_still_at_rest():
     bend = torch.tensor([-0.8, 0.0, 0.5], dtype=torch.float64)
-    for function, more in ((bent, ()), (bent_unevenly, (0.4,))):
+    for function, more in ((bent, ()), (bent_unevenly, (tensor(0.4),))):
         assert torch.allclose(
-            function(bend, torch.tensor(50.0), 1.0, *more), torch.ones(3).double()
+            function(bend, torch.tensor(50.0), tensor(1.0), *more), torch.ones(3).double()
         )
-        assert torch.equal(function(bend, torch.tensor(0.0), 1.0, *more), bend)
+        assert torch.equal(function(bend, torch.tensor(0.0), tensor(1.0), *more), bend)
 
 
 def test_the_bend_of_one_motion_is_that_of_its_parts():
     bend = torch.linspace(-0.95, 0.95, 9, dtype=torch.float64)
-    for function, more in ((bent, ()), (bent_unevenly, (0.4,))):
+    for function, more in ((bent, ()), (bent_unevenly, (tensor(0.4),))):
         for moved in (0.3, -0.7, 2.0):
-            whole = function(bend, torch.tensor(moved), 0.5, *more)
+            whole = function(bend, torch.tensor(moved), tensor(0.5), *more)
             parts = bend
             for _ in range(7):
-                parts = function(parts, torch.tensor(moved / 7.0), 0.5, *more)
+                parts = function(parts, torch.tensor(moved / 7.0), tensor(0.5), *more)
             assert torch.allclose(whole, parts, atol=1e-9)
 
 
 def test_an_uneven_bend_follows_its_equation():
     width, beta, bend, step = 0.5, 0.4, -0.7, 1e-5
-    exact = float(bent_unevenly(torch.tensor(bend).double(), torch.tensor(0.6), width, beta))
+    exact = float(
+        bent_unevenly(torch.tensor(bend).double(), torch.tensor(0.6), tensor(width), tensor(beta))
+    )
     for _ in range(60_000):
         sign = 1.0 if bend > 0.0 else -1.0
         bend += step * (1.0 - (1.0 - beta + beta * sign) * bend) / width
@@ -128,8 +140,23 @@ def test_an_uneven_bend_follows_its_equation():
 def test_a_relaxed_spring_carries_a_steady_motion_as_a_damper():
     stretch = torch.zeros(())
     for _ in range(400):
-        stretch = relaxed(stretch, torch.tensor(0.02), 0.01, 0.3)
+        stretch = relaxed(stretch, torch.tensor(0.02), 0.01, tensor(0.3))
     assert float(stretch) == pytest.approx(2.0 * 0.3, rel=1e-3)
+
+
+def test_a_resonance_follows_its_equation_and_so_does_its_mean():
+    time, damping, step, u = tensor(0.02), tensor(0.1), 1e-5, tensor(1.5)
+    output, rate, total = 0.3, -20.0, 0.0
+    ring = tensor(output), tensor(rate)
+    for _ in range(2_000):
+        rate += step * ((1.5 - output) / 0.02 - 2.0 * 0.1 * rate) / 0.02
+        output += step * rate
+        total += output / 2_000
+    after = ringing(ring, u, 0.02, time, damping)
+    assert float(after[0]) == pytest.approx(output, abs=2e-3)
+    assert float(after[1]) == pytest.approx(rate, abs=0.1)
+    mean = mean_ringing(ring, u, 0.02, time, damping)
+    assert float(mean) == pytest.approx(total, abs=2e-3)
 
 
 def test_a_wave_in_time_has_its_frequency():
