@@ -18,7 +18,7 @@ from npdr_ppl.discovery.learning.regression import (
     pareto_front,
 )
 from npdr_ppl.discovery.learning.settings import LEARNING
-from npdr_ppl.discovery.learning.terms import Term, terms_at, wave_in_time, with_harmonics
+from npdr_ppl.discovery.learning.terms import Term, series_at, terms_at, with_harmonics
 from npdr_ppl.discovery.revised_model import LEARNED
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.errors import NpdrError
@@ -38,7 +38,7 @@ class PortFormulas:
     Attributes:
         products: Products of the responses at the port.
         terms: The terms that were compared.
-        num_others: Number of waves in time that were examined and are not among the terms.
+        num_others: Number of terms of the series that were examined and are not among the terms.
         weights: Weights of the responses in each term's columns, ``(S, P, k)`` each; ``None`` if
             they follow from the motion.
         penalty: Reduction of the misfit that the best of so many spurious coefficients brings.
@@ -95,9 +95,10 @@ def formulas_by_port(
         else:
             responses, weights = motion.responses, None
         products, num_others = PortProducts(projection, motion, responses), 0
-        if motion.port.kind == "force":
-            waves, num_others = _waves_in_time(products)
-            terms += assumptions.applied_to(waves, motion)
+        series = assumptions.applied_to(series_at(motion), motion)
+        if series:
+            found = _strongest(products, series)
+            terms, num_others = [*terms, *found], len(series) - len(found)
         equations = replace(_equations(products, terms, weights), num_others=num_others)
         penalty, front = equations.penalty, equations.front()
         del equations
@@ -109,28 +110,25 @@ def formulas_by_port(
     return sorted(result, key=lambda port: min(f.error for f in port.front))
 
 
-def _waves_in_time(products: PortProducts) -> tuple[list[Term], int]:
-    """Returns the waves in time that best explain the residuals, and how many others were tried.
+def _strongest(products: PortProducts, every: Sequence[Term]) -> list[Term]:
+    """Returns those of a series of terms that are local maxima of what a term alone explains.
 
-    The frequencies are half a period per longest rollout apart. The waves are the greatest local
-    maxima of the periodogram of the missing force.
+    Args:
+        products: Products of the responses at the port.
+        every: Terms with as many columns, in the order of their constant.
     """
-    motion = products.motion
-    longest = float(motion.values["t"].max())
-    width = float((motion.edges[1:] - motion.edges[:-1]).min()) * motion.time_step
-    most = min(LEARNING.most_frequencies, int(longest / width))
-    waves = [wave_in_time(0.5 * k / longest) for k in range(1, most + 1)]
     gains = [
-        _equations(products, waves[k : k + LEARNING.num_waves]).gains_alone()
-        for k in range(0, len(waves), LEARNING.num_waves)
+        _equations(products, every[k : k + LEARNING.num_waves]).gains_alone()
+        for k in range(0, len(every), LEARNING.num_waves)
     ]
-    if not gains:
-        return [], 0
-    gain = torch.cat((torch.full((1,), -torch.inf), *gains, torch.full((1,), -torch.inf)))
-    is_peak = (gain[1:-1] >= gain[:-2]) & (gain[1:-1] >= gain[2:])
-    best = gain[1:-1].where(is_peak, -torch.inf).argsort(descending=True)
-    found = [waves[k] for k in best[: LEARNING.num_peaks].tolist() if bool(is_peak[k])]
-    return found, len(waves) - len(found)
+    gain = torch.cat(gains)
+    if len(gain) < len(every):  # some do not change anything, at a command that is constant
+        return []
+    end = torch.full((1,), -torch.inf, dtype=gain.dtype)
+    padded = torch.cat((end, gain, end))
+    is_peak = (gain >= padded[:-2]) & (gain >= padded[2:])
+    order = gain.where(is_peak, -torch.inf).argsort(descending=True).tolist()
+    return [every[k] for k in order[: LEARNING.num_peaks] if bool(is_peak[k])]
 
 
 def _refined(products: PortProducts, formula: Formula) -> Formula:

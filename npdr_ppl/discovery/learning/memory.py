@@ -29,9 +29,8 @@ __all__ = [
     "MotionMemory",
 ]
 
-TIME_CONSTANTS = 10.0
-"""Time, in time constants, after which a lag has forgotten: exp(−10) is below the resolution of
-any measurement."""
+TIME_CONSTANTS = 7.0
+"""Time, in time constants, after which a lag has forgotten all but exp(−7), a thousandth."""
 
 
 @dataclass(frozen=True)

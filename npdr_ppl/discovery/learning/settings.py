@@ -42,7 +42,9 @@ class LearningSettings:
         longest_lag: Longest lag and delay of a command that are tried, in steps. Control loops
             with longer ones are not used.
         most_frequencies: Greatest number of frequencies at which a wave in time is looked for.
-        num_peaks: Number of the strongest of these frequencies that become terms.
+        num_resonances: Number of time constants of a resonance that are tried. They are a few
+            percent apart, as wide as the peak of a resonance with a damping ratio of 0.05.
+        num_peaks: Number of the strongest waves and resonances that become terms.
         negligible: Terms are left out that explain less than this share of what all explain.
             With a precise recording, everything that the model simplifies is significant; a
             formula with many small terms says nothing to a mechanic.
@@ -74,6 +76,7 @@ class LearningSettings:
     damping: float = 0.05
     longest_lag: float = 10.0
     most_frequencies: int = 1000
+    num_resonances: int = 60
     num_peaks: int = 8
     negligible: float = 0.01
     shape_step: float = 0.16
@@ -91,7 +94,7 @@ class LearningSettings:
         check_range(self, 1, 1000, "num_waves", "most_laws", "num_fitted", "num_drawn_laws")
         check_range(self, 2, 1000, "num_bins")
         check_range(self, 0.0, 1000.0, "pulse_height", "prior_spread", "largest_wave_number")
-        check_range(self, 1, 10_000, "most_frequencies", "num_peaks")
+        check_range(self, 1, 10_000, "most_frequencies", "num_peaks", "num_resonances")
         check_range(self, 0.1, 100.0, "narrowest_hysteresis", "shortest_relaxation")
         check_range(self, 0.5, 100.0, "longest_lag")
         check_range(self, 0.0, 0.45, "asymmetry")

@@ -22,7 +22,7 @@ from npdr_ppl.discovery.learning.memory import (
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 from npdr_ppl.discovery.learning.settings import LEARNING
 
-__all__ = ["HISTORY", "Shape", "Term", "symbol_of", "terms_at", "wave_in_time", "with_harmonics"]
+__all__ = ["HISTORY", "Shape", "Term", "series_at", "symbol_of", "terms_at", "with_harmonics"]
 
 SYMBOLS = {"q": "q", "v": "v", "tau": "τ", "u": "u", "y": "y", "t": "t"}
 """Variables as they are written in formulas, but for those of other joints."""
@@ -307,17 +307,12 @@ def _remembering_forces(motion: PortMotion) -> Iterator[Term]:
 
 
 def _remembering_commands(motion: PortMotion) -> Iterator[Term]:
-    """Returns the changes of a command by a lag, by a resonance, and by a delay.
-
-    An elastic joint is a resonance: the force that its motor passes on to the link.
-    """
+    """Returns the changes of a command by a lag and by a delay."""
     unit, step = motion.units["u"], motion.time_step
     num = 2 * LEARNING.num_shapes
     for time in _logarithmic(0.3 * step, LEARNING.longest_lag * step, num):
         constant = Shape("time_constant", time, "s")
         yield _with_memory(LAG, "output - u", "(z − u)", unit, {"u"}, constant)
-        damping = Shape("damping", LEARNING.damping, "1")
-        yield _with_memory(RESONANCE, "ring - u", "(z − u)", unit, {"u"}, constant, damping)
     for time in _logarithmic(0.3 * step, LEARNING.longest_lag * step, num):
         constant = Shape("delay", time, "s")
         yield _with_memory(DELAY, "late - u", "(u(t − d) − u)", unit, {"u"}, constant)
@@ -344,12 +339,35 @@ def _with_memory(
     )
 
 
-def wave_in_time(frequency: float) -> Term:
-    """Returns sine and cosine of the time since a rollout began.
+def series_at(motion: PortMotion) -> list[Term]:
+    """Returns terms of which only the strongest are combined with others.
+
+    Their constant must be known too closely for a few values of it: the frequency of a wave in
+    time at a joint, and the time constant of a resonance at a command. An elastic joint is such a
+    resonance: it changes the force that the motor passes on to the link.
 
     Args:
-        frequency: Frequency in Hz.
+        motion: The motion at the port.
     """
+    if motion.port.kind == "force":
+        # A fast recording cannot tell frequencies apart that differ by less than half a period.
+        longest = float(motion.values["t"].max())
+        width = float((motion.edges[1:] - motion.edges[:-1]).min()) * motion.time_step
+        most = min(LEARNING.most_frequencies, int(longest / width))
+        return [_wave_in_time(0.5 * k / longest) for k in range(1, most + 1)]
+    if motion.port.kind == "sensor":
+        return []
+    ends = 0.2 * motion.time_step, 0.5 * LEARNING.longest_lag * motion.time_step
+    damping, found = Shape("damping", LEARNING.damping, "1"), []
+    for time in _logarithmic(*ends, LEARNING.num_resonances):
+        own = Shape("time_constant", time, "s"), damping
+        unit = motion.units["u"]
+        found.append(_with_memory(RESONANCE, "ring - u", "(z − u)", unit, {"u"}, *own))
+    return found
+
+
+def _wave_in_time(frequency: float) -> Term:
+    """Returns sine and cosine of the time since a rollout began, for a frequency in Hz."""
     angle = f"{2.0 * math.pi!r} * frequency * t"
     return Term(
         f"sin(2π f t) + cos(2π f t) {frequency:.6g}",

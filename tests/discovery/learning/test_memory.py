@@ -14,7 +14,7 @@ from npdr_ppl.discovery.learning.expressions import (
 )
 from npdr_ppl.discovery.learning.formulas import effects_of
 from npdr_ppl.discovery.learning.law import Law
-from npdr_ppl.discovery.learning.terms import terms_at, wave_in_time
+from npdr_ppl.discovery.learning.terms import series_at, terms_at
 from npdr_ppl.engines.common.commands import RecentCommands
 from npdr_ppl.language.effect_context import Start
 from tests.helpers.port_motions import COMMAND, JOINT
@@ -27,7 +27,8 @@ def tensor(value):
 
 
 def remembering(motion):
-    return [term for term in terms_at(motion) if term.memory is not None]
+    every = [*terms_at(motion), *series_at(motion)]
+    return [term for term in every if term.memory is not None]
 
 
 def law_with(motion, *terms):
@@ -159,7 +160,11 @@ def test_a_resonance_follows_its_equation_and_so_does_its_mean():
     assert float(mean) == pytest.approx(total, abs=2e-3)
 
 
-def test_a_wave_in_time_has_its_frequency():
-    (sine, cosine) = wave_in_time(2.0).values(JOINT).unbind(-1)
-    angle = 4.0 * math.pi * JOINT.values["t"]
+def test_waves_in_time_have_their_frequencies_and_are_half_a_period_apart():
+    waves = [term for term in series_at(JOINT) if term.memory is None]
+    frequencies = [term.shapes[0].value for term in waves]
+    longest = float(JOINT.values["t"].max())
+    assert frequencies[:2] == pytest.approx([0.5 / longest, 1.0 / longest])
+    sine, cosine = waves[3].values(JOINT).unbind(-1)
+    angle = 2.0 * math.pi * frequencies[3] * JOINT.values["t"]
     assert torch.allclose(sine, angle.sin()) and torch.allclose(cosine, angle.cos())
