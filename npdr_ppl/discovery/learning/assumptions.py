@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 from npdr_ppl.discovery.learning.regression import Formula
-from npdr_ppl.discovery.learning.terms import Term
+from npdr_ppl.discovery.learning.term import Term
 
 __all__ = ["Assumptions", "Symmetry"]
 

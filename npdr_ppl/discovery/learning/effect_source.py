@@ -17,7 +17,7 @@ from npdr_ppl.discovery.learning.memory import (
     Delay,
     MotionMemory,
 )
-from npdr_ppl.discovery.learning.terms import symbol_of
+from npdr_ppl.discovery.learning.term import symbol_of
 from npdr_ppl.python_text import plain, quoted
 
 __all__ = ["class_source", "module_source"]

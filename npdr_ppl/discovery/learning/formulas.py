@@ -18,7 +18,9 @@ from npdr_ppl.discovery.learning.regression import (
     pareto_front,
 )
 from npdr_ppl.discovery.learning.settings import LEARNING
-from npdr_ppl.discovery.learning.terms import Term, series_at, terms_at, with_harmonics
+from npdr_ppl.discovery.learning.term import Term
+from npdr_ppl.discovery.learning.terms import terms_at, with_harmonics
+from npdr_ppl.discovery.learning.terms_with_memory import series_at
 from npdr_ppl.discovery.revised_model import LEARNED
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.errors import NpdrError

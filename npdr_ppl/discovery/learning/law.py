@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
 
-from npdr_ppl.discovery.learning.terms import Term, symbol_of
+from npdr_ppl.discovery.learning.term import Term, symbol_of
 from npdr_ppl.language.channels import Port
 
 __all__ = ["Constant", "Law"]

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 from npdr_ppl.discovery.learning.settings import LEARNING
-from npdr_ppl.discovery.learning.terms import Term
+from npdr_ppl.discovery.learning.term import Term
 from npdr_ppl.discovery.screening.projection import Projection
 
 __all__ = ["Formula", "NormalEquations", "PortProducts", "pareto_front", "simplest"]

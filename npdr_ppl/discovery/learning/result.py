@@ -16,7 +16,7 @@ from npdr_ppl.discovery.learning.law import Law
 from npdr_ppl.discovery.learning.learn import LearnedModel, learned_model
 from npdr_ppl.discovery.learning.proof import Check, checks
 from npdr_ppl.discovery.learning.settings import LEARNING
-from npdr_ppl.discovery.learning.terms import HISTORY
+from npdr_ppl.discovery.learning.term import HISTORY
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.search.evidence import closest

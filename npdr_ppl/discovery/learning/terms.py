@@ -1,104 +1,21 @@
 """Terms from which a law is composed: each is an expression in the variables of a port."""
 
-import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from npdr_ppl.discovery.learning.expressions import evaluated
-from npdr_ppl.discovery.learning.memory import (
-    DELAY,
-    HYSTERESIS,
-    LAG,
-    RELAXATION,
-    RESONANCE,
-    UNEVEN_HYSTERESIS,
-    Memory,
-)
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 from npdr_ppl.discovery.learning.settings import LEARNING
+from npdr_ppl.discovery.learning.term import Shape, Term, symbol_of
+from npdr_ppl.discovery.learning.terms_with_memory import (
+    remembering_commands,
+    remembering_forces,
+)
 
-__all__ = ["HISTORY", "Shape", "Term", "series_at", "symbol_of", "terms_at", "with_harmonics"]
-
-SYMBOLS = {"q": "q", "v": "v", "tau": "τ", "u": "u", "y": "y", "t": "t"}
-"""Variables as they are written in formulas, but for those of other joints."""
-
-
-HISTORY = "history"
-"""Stands for the past motion and commands, among the variables."""
-
-
-def symbol_of(variable: str) -> str:
-    """Returns a variable as it is written in formulas; the first other joint has ``q₁``."""
-    name, _, number = variable.partition("_")
-    return SYMBOLS[name] + number.translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
-
-
-@dataclass(frozen=True)
-class Shape:
-    """A constant inside of a term.
-
-    Attributes:
-        name: Its name in expressions.
-        value: Its value before it is fitted.
-        unit: Its unit.
-    """
-
-    name: str
-    value: float
-    unit: str
-
-
-@dataclass(frozen=True)
-class Term:
-    """One or more functions of the variables, each with a coefficient.
-
-    Attributes:
-        key: Unique name.
-        columns: Expressions; the law is their sum, each times a coefficient.
-        formulas: The same for people.
-        units: Unit of each column.
-        uses: Symbols of the variables that it depends on.
-        shapes: Constants inside of the expressions.
-        is_dry: Whether it is dry friction: the columns are the bound, times minus the direction
-            of motion.
-        is_spline: Whether the columns are the hats of a spline.
-        memory: A state on which the columns depend.
-        cost: Its complexity: coefficients, fitted constants and operations.
-    """
-
-    key: str
-    columns: tuple[str, ...]
-    formulas: tuple[str, ...]
-    units: tuple[str, ...]
-    uses: frozenset[str]
-    shapes: tuple[Shape, ...] = ()
-    is_dry: bool = False
-    is_spline: bool = False
-    memory: Memory | None = None
-    cost: float = field(default=1.0)
-
-    def depends_on(self, variable: str) -> bool:
-        """Returns whether it depends on a variable, by symbol, or on the ``"history"``."""
-        return self.memory is not None if variable == HISTORY else variable in self.uses
-
-    def values(self, motion: PortMotion) -> Tensor:
-        """Returns the columns along the motion, ``(S, K, k)``."""
-        constants = {shape.name: shape.value for shape in self.shapes}
-        known: dict[str, Any] = {**motion.values, **constants}
-        if self.memory is not None:
-            known[self.memory.symbol] = self.memory.along(motion, constants)
-        some = motion.values["t"]
-        columns = [
-            torch.as_tensor(evaluated(column, known), dtype=torch.float64).expand_as(some)
-            for column in self.columns
-        ]
-        values = torch.stack(columns, dim=-1)
-        return -values * motion.values["v"].sign()[..., None] if self.is_dry else values
+__all__ = ["terms_at", "with_harmonics"]
 
 
 @dataclass(frozen=True)
@@ -181,7 +98,7 @@ def _force_terms(motion: PortMotion) -> Iterator[Term]:
             yield _product(motion, age, speed)
         yield _product(motion, age, is_dry=True)
     yield from _stops(motion)
-    yield from _remembering_forces(motion)
+    yield from remembering_forces(motion)
     for number in range(1, len(motion.others) + 1):
         yield from _of_another_joint(motion, f"q_{number}", f"v_{number}")
     for variable in ("q", "v", "t"):
@@ -257,7 +174,7 @@ def _static_terms(motion: PortMotion, name: str) -> Iterator[Term]:
         )
     yield _spline(motion, name)
     if name == "u":
-        yield from _remembering_commands(motion)
+        yield from remembering_commands(motion)
 
 
 def _of_another_joint(motion: PortMotion, q: str, v: str) -> Iterator[Term]:
@@ -283,101 +200,6 @@ def _of_another_joint(motion: PortMotion, q: str, v: str) -> Iterator[Term]:
             both = _Factor(columns, formulas, frozenset({"q", q}), "", cost=2.0)
             yield _product(motion, both)
             yield _product(motion, both, squares[1])
-
-
-def _remembering_forces(motion: PortMotion) -> Iterator[Term]:
-    """Returns forces that depend on the past motion."""
-    q, v, unit = motion.values["q"], motion.values["v"], motion.units["q"]
-    step = motion.time_step * float(v.square().mean().sqrt())
-    span = float(q.max() - q.min())
-    if not 0.0 < LEARNING.narrowest_hysteresis * step < span:
-        return
-    num = 2 * LEARNING.num_shapes
-    for width in _logarithmic(LEARNING.narrowest_hysteresis * step, span, num):
-        wide = Shape("width", width, unit)
-        yield _with_memory(HYSTERESIS, "bend", "b", "1", {"q", "v"}, wide)
-        uneven = Shape("asymmetry", LEARNING.asymmetry, "1")
-        yield _with_memory(UNEVEN_HYSTERESIS, "bend", "b", "1", {"q", "v"}, wide, uneven)
-    longest = motion.interval * max(1, motion.past.shape[1])
-    shortest = LEARNING.shortest_relaxation * motion.time_step
-    if shortest < longest:
-        for time in _logarithmic(shortest, longest, LEARNING.num_shapes):
-            constant = Shape("time_constant", time, "s")
-            yield _with_memory(RELAXATION, "stretch", "r", unit, {"q", "v"}, constant)
-
-
-def _remembering_commands(motion: PortMotion) -> Iterator[Term]:
-    """Returns the changes of a command by a lag and by a delay."""
-    unit, step = motion.units["u"], motion.time_step
-    num = 2 * LEARNING.num_shapes
-    for time in _logarithmic(0.3 * step, LEARNING.longest_lag * step, num):
-        constant = Shape("time_constant", time, "s")
-        yield _with_memory(LAG, "output - u", "(z − u)", unit, {"u"}, constant)
-    for time in _logarithmic(0.3 * step, LEARNING.longest_lag * step, num):
-        constant = Shape("delay", time, "s")
-        yield _with_memory(DELAY, "late - u", "(u(t − d) − u)", unit, {"u"}, constant)
-
-
-def _logarithmic(low: float, high: float, num: int) -> list[float]:
-    return torch.logspace(math.log10(low), math.log10(high), num, dtype=torch.float64).tolist()
-
-
-def _with_memory(
-    memory: Memory, column: str, formula: str, unit: str, uses: set[str], *shapes: Shape
-) -> Term:
-    """Returns a term with a state, whose own complexity counts as one operation."""
-    values = "".join(f" {shape.value:.6g}" for shape in shapes)
-    return Term(
-        f"{formula} {memory.equation}{values}",
-        (column,),
-        (formula,),
-        (unit,),
-        frozenset(uses),
-        shapes,
-        memory=memory,
-        cost=2.0 + len(shapes) + column.count("-"),
-    )
-
-
-def series_at(motion: PortMotion) -> list[Term]:
-    """Returns terms of which only the strongest are combined with others.
-
-    Their constant must be known too closely for a few values of it: the frequency of a wave in
-    time at a joint, and the time constant of a resonance at a command. An elastic joint is such a
-    resonance: it changes the force that the motor passes on to the link.
-
-    Args:
-        motion: The motion at the port.
-    """
-    if motion.port.kind == "force":
-        # A fast recording cannot tell frequencies apart that differ by less than half a period.
-        longest = float(motion.values["t"].max())
-        width = float((motion.edges[1:] - motion.edges[:-1]).min()) * motion.time_step
-        most = min(LEARNING.most_frequencies, int(longest / width))
-        return [_wave_in_time(0.5 * k / longest) for k in range(1, most + 1)]
-    if motion.port.kind == "sensor":
-        return []
-    ends = 0.2 * motion.time_step, 0.5 * LEARNING.longest_lag * motion.time_step
-    damping, found = Shape("damping", LEARNING.damping, "1"), []
-    for time in _logarithmic(*ends, LEARNING.num_resonances):
-        own = Shape("time_constant", time, "s"), damping
-        unit = motion.units["u"]
-        found.append(_with_memory(RESONANCE, "ring - u", "(z − u)", unit, {"u"}, *own))
-    return found
-
-
-def _wave_in_time(frequency: float) -> Term:
-    """Returns sine and cosine of the time since a rollout began, for a frequency in Hz."""
-    angle = f"{2.0 * math.pi!r} * frequency * t"
-    return Term(
-        f"sin(2π f t) + cos(2π f t) {frequency:.6g}",
-        (f"torch.sin({angle})", f"torch.cos({angle})"),
-        ("sin(2π f t)", "cos(2π f t)"),
-        ("1", "1"),
-        frozenset({"t"}),
-        (Shape("frequency", frequency, "Hz"),),
-        cost=4.0,
-    )
 
 
 def _single(variable: str, column: str, formula: str, unit: str, cost: float = 0.0) -> _Factor:

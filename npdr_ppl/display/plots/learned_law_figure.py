@@ -4,7 +4,7 @@ from matplotlib.figure import Figure
 
 from npdr_ppl.discovery.learning.curves import Curve
 from npdr_ppl.discovery.learning.result import Learned
-from npdr_ppl.discovery.learning.terms import symbol_of
+from npdr_ppl.discovery.learning.term import symbol_of
 from npdr_ppl.display.plots.marginals import add_legend
 from npdr_ppl.drawing.theme import COLORS, theme
 

@@ -14,9 +14,9 @@ from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.models.effects import QuadraticDrag
 
 
-def learned_from(place, strength, rig="pendulum"):
+def learned_from(place, strength, rig="pendulum", condition="outside"):
     """The truth, the laws learned of a case, and how they were checked."""
-    case = make_case(rig, "outside", (place,), strength=strength, seed=2001)
+    case = make_case(rig, condition, (place,), strength=strength, seed=2001)
     options = segment_options(case.fit)
     start = fit_hypothesis(case.model, case.fit, options)
     model = learned_model(Trials(start.segments), start)
@@ -92,3 +92,40 @@ def test_what_the_catalogue_names_is_not_learned():
     search = npdr.DiscoveryOptions(effects=(QuadraticDrag("hinge"),), learn=True)
     found = npdr.discover(case.model, case.fit, search=search)
     assert (found.verdict, found.learned) == ("named", None)
+
+
+@pytest.mark.slow
+def test_hysteresis_is_learned_with_the_motion_before_each_segment():
+    true, law, found = learned_from(("hinge", "bouc_wen_hysteresis"), 1.0)
+    (term,) = (term for term in law.terms if term.memory is not None)
+    assert term.memory is not None and term.memory.symbol == "bend"
+    width = next(shape.value for shape in term.shapes if shape.name == "width")
+    assert width == pytest.approx(true["deflection"], rel=0.5)
+    assert all(check.helps for check in found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("port", "effect", "symbol", "name"),
+    [
+        ("voltage", "input_delay", "late", "delay"),
+        ("carriage", "joint_elasticity", "ring", "time_constant"),
+    ],
+)
+def test_a_command_that_is_late_or_rings_is_learned_with_its_time(port, effect, symbol, name):
+    true, law, found = learned_from((port, effect), 0.5, rig="emps", condition="one")
+    assert law.port.name == "voltage"
+    (term,) = (t for t in law.terms if t.memory is not None and t.memory.symbol == symbol)
+    value = next(shape.value for shape in term.shapes if shape.name == name)
+    assert value == pytest.approx(true[name], rel=0.1)
+    assert all(check.helps for check in found)
+
+
+@pytest.mark.slow
+def test_a_wave_in_time_is_learned_with_its_frequency():
+    true, law, found = learned_from(
+        ("hinge", "periodic_disturbance"), 1.0, rig="pendulum", condition="one"
+    )
+    (frequency,) = (s.value for t in law.terms for s in t.shapes if s.name == "frequency")
+    assert frequency == pytest.approx(true["frequency"], rel=0.01)
+    assert all(check.helps for check in found)

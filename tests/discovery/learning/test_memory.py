@@ -14,7 +14,8 @@ from npdr_ppl.discovery.learning.expressions import (
 )
 from npdr_ppl.discovery.learning.formulas import effects_of
 from npdr_ppl.discovery.learning.law import Law
-from npdr_ppl.discovery.learning.terms import series_at, terms_at
+from npdr_ppl.discovery.learning.terms import terms_at
+from npdr_ppl.discovery.learning.terms_with_memory import series_at
 from npdr_ppl.engines.common.commands import RecentCommands
 from npdr_ppl.language.effect_context import Start
 from tests.helpers.port_motions import COMMAND, JOINT

@@ -8,7 +8,7 @@ from npdr_ppl.discovery.learning.regression import (
     pareto_front,
     simplest,
 )
-from npdr_ppl.discovery.learning.terms import Term
+from npdr_ppl.discovery.learning.term import Term
 
 
 def formula(cost, *errors):
