@@ -81,6 +81,7 @@ def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, A
                 "unit": p.unit,
                 "nominal": p.nominal,
                 "prior": [p.low, p.high],
+                "family": p.family,
             }
             for p in derived.parameters
         ],
@@ -96,16 +97,18 @@ def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, A
 def _lines(found: dict[str, Any]) -> list[str]:
     """Returns the description as text."""
     step, parameters, columns = found["time step"], found["parameters"], found["columns"]
-    rows = [("parameter", "file", "uniform prior", "unit", "sets")]
+    rows = [("parameter", "file", "prior", "unit", "sets")]
     for p in parameters:
         low, high = p["prior"]
-        prior = f"{low:.4g} … {high:.4g}"
+        prior = f"{low:.4g} … {high:.4g}" + ("*" if p["family"] == "log-normal" else "")
         rows.append((p["name"], f"{p['nominal']:.4g}", prior, p["unit"], p["sets"]))
     lines = [
         f"{found['file']}: {len(parameters)} parameters, time step {step:g} s ({1 / step:.4g} Hz)",
         "",
         *_table(rows),
     ]
+    if any(p["family"] == "log-normal" for p in parameters):
+        lines += ["  * log-normal about the file's value; the range has 95 % of it"]
     if found["not varied"]:
         lines += ["", "Not varied, because positions do not determine them:"]
         lines += [f"  {field}: {reason}" for field, reason in found["not varied"].items()]

@@ -80,23 +80,29 @@ def inputs(simulator, num_steps=40):
     )
 
 
+def gains(value):
+    """Quantiles between which 95 % of a gain's prior are."""
+    prior = dist.LogNormal(math.log(value), 1.5)
+    return [float(prior.icdf(torch.tensor(share))) for share in (0.025, 0.975)]
+
+
 def test_moving_masses_positive_friction_and_gains_are_varied(arm):
     derived = derive_model(arm)
     found = {p.name: (p.field, p.unit, p.nominal, p.low, p.high) for p in derived.parameters}
     expected = {
         "upper_mass": ("body upper mass_and_inertia", "kg", 0.8, 0.56, 1.04),
         "hand_mass": ("body hand mass_and_inertia", "kg", 0.3, 0.21, 0.39),
-        "elbow_frictionloss": ("joint elbow frictionloss", "N m", 0.05, 0.0, 0.1),
+        "elbow_frictionloss": ("joint elbow frictionloss", "N m", 0.05, 0.0, 0.3),
         "shoulder_armature": ("joint shoulder armature", "kg m²", 0.02, 0.01, 0.03),
-        "shoulder_servo_kp": ("actuator shoulder_servo kp", "N m/rad", 40.0, 20.0, 60.0),
-        "shoulder_servo_kv": ("actuator shoulder_servo kv", "N m s/rad", 2.0, 1.0, 3.0),
-        "elbow_command_kv": ("actuator elbow_command kv", "N m s/rad", 0.5, 0.25, 0.75),
+        "shoulder_servo_kp": ("actuator shoulder_servo kp", "N m/rad", 40.0, *gains(40.0)),
+        "shoulder_servo_kv": ("actuator shoulder_servo kv", "N m s/rad", 2.0, *gains(2.0)),
+        "elbow_command_kv": ("actuator elbow_command kv", "N m s/rad", 0.5, *gains(0.5)),
     }
     # The stand does not move, the tip weighs nothing, and damping acts as kv does.
     assert list(found) == list(expected)
     for name, (field, unit, *numbers) in expected.items():
         assert found[name][:2] == (field, unit)
-        assert found[name][2:] == pytest.approx(tuple(numbers))
+        assert found[name][2:] == pytest.approx(tuple(numbers), rel=1e-3)
     assert derived.held == {"joint shoulder damping": ("actuator shoulder_servo kv",)}
     assert derived.reason("joint shoulder damping") == "same effect as actuator shoulder_servo kv"
 
@@ -114,7 +120,9 @@ def test_the_python_simulates_as_an_edited_file_does(arm):
     assert isinstance(robot, npdr.MujocoSimulator)
     given = inputs(robot)
     trace = pyro.poutine.trace(scope["model"]).get_trace(given)
-    priors = {n: s["fn"] for n, s in trace.nodes.items() if isinstance(s.get("fn"), dist.Uniform)}
+    priors = {name: trace.nodes[name]["fn"] for name in scope["PRIORS"]}
+    assert isinstance(priors["shoulder_servo_kp"], dist.LogNormal)
+    assert isinstance(priors["upper_mass"], dist.Uniform)
     assert set(priors) == {p.name for p in robot.parameters}
     values = {name: trace.nodes[name]["value"].double() for name in priors}
     # The same changes, made in the text of the file.
@@ -170,7 +178,9 @@ def test_a_urdf_file_gets_motors(tmp_path):
     scope = loaded(derive_model(path).source(path))
     assert list(scope["PRIORS"]) == ["rod_mass", "hinge_damping", "hinge_armature"]
     # The rod's inertia about the hinge.
-    assert scope["PRIORS"]["hinge_armature"] == pytest.approx((0.0, 10 * 0.3333), rel=1e-3)
+    armature = scope["PRIORS"]["hinge_armature"]
+    assert (armature.low, armature.high) == pytest.approx((0.0, 10 * 0.3333), rel=1e-3)
+    assert "math" not in scope
     robot = scope["robot"]
     assert [(a.name, a.unit, a.lower, a.upper) for a in robot.actions] == [
         ("hinge_motor", "N m", -math.inf, math.inf)

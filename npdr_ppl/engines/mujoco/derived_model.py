@@ -5,11 +5,12 @@ The model is Python text, so that what runs is what a user can print and edit.
 
 import copy
 import importlib
+import math
 import re
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from npdr_ppl.engines.common.robot_files import is_urdf, read_robot
 from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
@@ -34,12 +35,15 @@ ARMATURE_RANGE = (0.5, 1.5)
 """Prior of an armature as factors on the file's value. It is the rotor's inertia times the gear
 ratio squared, and both are in data sheets."""
 
-GAIN_RANGE = (0.5, 1.5)
-"""Prior of a servo's kp and kv as factors on the file's values, which are often tuned by hand."""
+GAIN_SPREAD = 1.5
+"""Standard deviation of the logarithm of a servo's kp and kv about the file's values: 95 % of the
+prior are within a factor of 19. These gains are often tuned until a simulation looks right, not
+measured: the kp of 998 N m/rad in the file of the SO-101 is 93 times that of its wrist, and 3
+standard deviations away."""
 
-FRICTION_RANGE = (0.0, 2.0)
-"""Prior of joint damping and friction loss as factors on the file's values. Lubricant, wear and
-temperature change friction by such factors."""
+FRICTION_RANGE = (0.0, 6.0)
+"""Prior of joint damping and friction loss as factors on the file's values. Both are rarely
+measured. Dry friction of two joints of the SO-101 is 2 and 5 times that of its file."""
 
 ROTOR_RANGE = (0.0, 10.0)
 """Prior of an armature of a URDF file, which cannot state any, as factors on a typical value: the
@@ -56,7 +60,7 @@ joint's load would change. Such bodies are placeholders in the file."""
 
 _TEMPLATE = '''"""Model of a robot, derived from its file."""
 
-import pyro
+{imports}import pyro
 import pyro.distributions as dist
 
 import npdr_ppl as npdr
@@ -66,7 +70,7 @@ PARAMETERS = {{
 {parameters}
 }}
 
-# Smallest and largest value. A parameter that is not listed here keeps the file's value.
+# A parameter that is not listed here keeps the file's value.
 PRIORS = {{
 {priors}
 }}
@@ -75,7 +79,7 @@ robot = npdr.MujocoSimulator({path}, PARAMETERS)
 
 
 def model(inputs):
-    parameters = {{name: pyro.sample(name, dist.Uniform(*ends)) for name, ends in PRIORS.items()}}
+    parameters = {{name: pyro.sample(name, prior) for name, prior in PRIORS.items()}}
     return npdr.simulate("trajectory", robot, parameters, inputs)
 '''
 
@@ -89,8 +93,9 @@ class DerivedParameter:
         field: What it sets, e.g. ``"joint elbow damping"``.
         unit: Its unit.
         nominal: Its value in the file.
-        low: Smallest value of the uniform prior.
-        high: Largest value of the uniform prior.
+        low: Smallest value of a uniform prior, or the 2.5 % quantile of a log-normal one.
+        high: Largest value of a uniform prior, or the 97.5 % quantile of a log-normal one.
+        family: Family of the prior. The median of a log-normal one is the file's value.
     """
 
     name: str
@@ -99,6 +104,14 @@ class DerivedParameter:
     nominal: float
     low: float
     high: float
+    family: Literal["uniform", "log-normal"] = "uniform"
+
+    @property
+    def prior(self) -> str:
+        """The prior as Python."""
+        if self.family == "log-normal":
+            return f"dist.LogNormal(math.log({self.nominal:.4g}), {GAIN_SPREAD:g})"
+        return f"dist.Uniform({self.low:.4g}, {self.high:.4g})"
 
 
 @dataclass(frozen=True)
@@ -133,13 +146,15 @@ class DerivedModel:
         """
         parameters = [f'    "{p.name}": {_quoted(p.field)},' for p in self.parameters]
         priors = [
-            f'    "{p.name}": ({p.low:.4g}, {p.high:.4g}),  # file: {p.nominal:.4g} {p.unit}'
+            f'    "{p.name}": {p.prior},  # file: {p.nominal:.4g} {p.unit}'
             for p in self.parameters
         ]
         held = [f"#   {_quoted(field)}: {_quoted(self.reason(field))}" for field in self.held]
         if held:
             held = ["", "# Not varied, because positions do not determine them:", *held]
+        has_logarithms = any(p.family == "log-normal" for p in self.parameters)
         return _TEMPLATE.format(
+            imports="import math\n\n" if has_logarithms else "",
             parameters="\n".join(parameters),
             priors="\n".join(priors),
             held="\n".join([*held, ""]),
@@ -153,8 +168,9 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
     These are the masses of the bodies that joints move, with their inertias; damping, armature and
     friction loss of joints, where the file has positive values; and kp and kv of position and
     velocity servos. Of a URDF file, which cannot state armatures, those of all joints are varied,
-    too. The priors are uniform, around the file's values or from zero. What positions do not
-    determine beside the others keeps the file's value; see
+    too. Priors of gains are log-normal about the file's values, the others uniform, around the
+    file's values or from zero. What positions do not determine beside the others keeps the file's
+    value; see
     :func:`~npdr_ppl.engines.mujoco.dependent_fields.dependent_fields`.
 
     Args:
@@ -176,7 +192,7 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
     has_rotors = not is_urdf(read_robot(source))
     typical = model if has_rotors else _with_rotors(model)
     armature = ARMATURE_RANGE if has_rotors else ROTOR_RANGE
-    chosen: dict[str, tuple[Field, str, tuple[float, float]]] = {}
+    chosen: dict[str, tuple[Field, str, tuple[float, float] | None]] = {}
     for kind, name, quantity, ends in [
         *_masses(typical),
         *_joints(typical, armature),
@@ -189,20 +205,26 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
     with quiet():
         held = dependent_fields(typical, order) if order else {}
     found: list[DerivedParameter] = []
-    for text, (field, name, (low, high)) in chosen.items():
+    for text, (field, name, ends) in chosen.items():
         if text not in held:
             own, value = _identifier(name, [p.name for p in found]), field.nominal or 0.0
             in_file = find_field(model, text).nominal or 0.0
+            low, high = ends or (1.0 / _FACTOR, _FACTOR)
+            family = "log-normal" if ends is None else "uniform"
             found.append(
-                DerivedParameter(own, text, field.unit, in_file, low * value, high * value)
+                DerivedParameter(own, text, field.unit, in_file, low * value, high * value, family)
             )
     if not found:
         raise ModelError(f"{title} has no masses, friction or gains that its motion depends on.")
     return DerivedModel(title, tuple(found), held)
 
 
-_Choice = tuple[str, str, str, tuple[float, float]]
-"""Kind and name of an element, a quantity of it, and factors on the file's value."""
+_Choice = tuple[str, str, str, tuple[float, float] | None]
+"""Kind and name of an element, a quantity of it, and ends of its uniform prior as factors on the
+file's value; ``None`` for a log-normal prior about it."""
+
+_FACTOR = math.exp(1.96 * GAIN_SPREAD)
+"""The factor that 95 % of a log-normal prior are within."""
 
 
 def _with_rotors(model: Any) -> Any:
@@ -246,7 +268,7 @@ def _joints(model: Any, armature: tuple[float, float]) -> list[_Choice]:
 def _servos(model: Any) -> list[_Choice]:
     names = actuator_names(model)
     return [
-        ("actuator", name, word, GAIN_RANGE)
+        ("actuator", name, word, None)
         for word in ("kp", "kv")
         for actuator, name in enumerate(names)
         if word in servo_gains(model, actuator)
